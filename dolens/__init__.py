@@ -1,0 +1,1 @@
+"""dolens: end-to-end co-design of optics and reconstruction."""

@@ -1,0 +1,1 @@
+"""What a sensor sees: pupil and pixel sampling, point spread functions, renderers, the sensor."""

@@ -1,0 +1,1 @@
+"""Lightning modules, data modules and callbacks: the glue between dolens and a training run."""
