@@ -1,0 +1,1 @@
+"""What light does: surfaces, materials, rays, tracing, first-order optics."""

@@ -1,0 +1,95 @@
+"""Rays, and what became of them."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Status(IntEnum):
+    """How a ray ended.
+
+    A miss or a total reflection ends a ray.  A vignetted ray is traced on as if unclipped, and is
+    VIGNETTED when nothing ends it later.
+    """
+
+    OK = 0
+    VIGNETTED = 1
+    TIR = 2
+    MISSED = 3
+
+
+class Components(NamedTuple):
+    """Rays as six tensors of one broadcast shape: position in mm and direction cosines.
+
+    Separate components trace several times faster than an array of triples, because every
+    operation then runs over contiguous memory.
+    """
+
+    x: Tensor
+    y: Tensor
+    z: Tensor
+    l: Tensor  # noqa: E741 - the field's own names for direction cosines are l, m, n
+    m: Tensor
+    n: Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A bundle of rays.
+
+    Args:
+        position: (..., 3), mm, in the lens's axes (first vertex at z = 0, light towards +z).
+        direction: (..., 3), unit vectors; they are used as given, not normalised.
+        wavelength: nm, a number or a tensor that broadcasts with the leading shape.
+    """
+
+    position: Tensor
+    direction: Tensor
+    wavelength: float | Tensor = 587.5618
+
+    def components(self) -> Components:
+        """The rays as six tensors of the common leading shape."""
+        shape = torch.broadcast_shapes(self.position.shape, self.direction.shape)
+        if isinstance(self.wavelength, Tensor):
+            shape = (*torch.broadcast_shapes(shape[:-1], self.wavelength.shape), shape[-1])
+        position = self.position.expand(shape)
+        direction = self.direction.expand(shape)
+        return Components(*position.unbind(-1), *direction.unbind(-1))
+
+    @staticmethod
+    def from_components(ray: Components, wavelength: float | Tensor) -> "Rays":
+        """Join six tensors to a bundle; the inverse of `components`."""
+        position = torch.stack((ray.x, ray.y, ray.z), -1)
+        direction = torch.stack((ray.l, ray.m, ray.n), -1)
+        return Rays(position, direction, wavelength)
+
+
+@dataclass(frozen=True)
+class TracedRays:
+    """Rays after a trace, with the leading shape of the rays that went in.
+
+    Attributes:
+        position: (..., 3), mm: on the sensor plane (forward) or on surface 1 (backward).
+        direction: (..., 3), unit vectors in the last medium.
+        valid: (...), bool: met every surface on its sag branch, strictly inside each aperture,
+            without total reflection.
+        status: (...), int8, a `Status`.
+        surface: (...), int16: number of the surface where that happened, 0 where the ray is valid.
+        path_length: (...), mm: Σ n·t along the ray, from its origin.
+        points: (surfaces, ..., 3), mm, or None: the intersections in the order of the surfaces
+            that the ray met, when the trace was asked to record them.
+
+    Numbers of invalid rays are finite and carry no gradient.  A vignetted ray is traced on as if
+    unclipped; a missed or totally reflected one goes on from the vertex plane, unrefracted.
+    """
+
+    position: Tensor
+    direction: Tensor
+    valid: Tensor
+    status: Tensor
+    surface: Tensor
+    path_length: Tensor
+    points: Tensor | None = None

@@ -1,0 +1,52 @@
+"""A lens as pure functions see it: tensors and names, no state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dolens.optics.materials import Material
+from dolens.optics.surfaces.base import SurfaceState
+
+
+@dataclass(frozen=True)
+class OpticalSystem:
+    """A centred sequence of surfaces and a sensor plane.
+
+    Attributes:
+        surfaces: in the order that light meets them.
+        thicknesses: gaps between neighbouring vertices, mm, one fewer than surfaces.
+        sensor_distance: from the last vertex to the sensor plane, mm.
+        materials: before surface 1 and after each surface.
+        stop: number of the stop surface, from 1.
+    """
+
+    surfaces: Sequence[SurfaceState]
+    thicknesses: Sequence[Tensor]
+    sensor_distance: Tensor
+    materials: Sequence[Material]
+    stop: int
+
+    def indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
+        """Indices before surface 1 and after each surface, at a wavelength in nm."""
+        return [material.index(wavelength) for material in self.materials]
+
+    @cached_property
+    def vertices(self) -> list[Tensor]:
+        """z of every vertex, then of the sensor, in mm; the first vertex is at 0."""
+        positions = [torch.zeros_like(self.sensor_distance)]
+        for gap in (*self.thicknesses, self.sensor_distance):
+            positions.append(positions[-1] + gap)
+        return positions
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision that rays are traced in."""
+        return self.sensor_distance.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the lens lives."""
+        return self.sensor_distance.device

@@ -1,0 +1,141 @@
+"""The training loss of equation S20: squared error, total variation, perceptual error."""
+
+import difflib
+import logging
+import math
+
+import torch
+from torch import Tensor, nn
+
+from dolens.errors import InputError
+from dolens.reconstruction.perceptual import (
+    PerceptualWeightsUnavailable,
+    VGG16Features,
+    load_vgg16_weights,
+    perceptual_loss,
+)
+
+logger = logging.getLogger(__name__)
+
+PERCEPTUAL_CHOICES = ("auto", "vgg16", "none")
+
+
+def mean_squared_error(restored: Tensor, truth: Tensor) -> Tensor:
+    """Return the mean of (restored − truth)² over all elements, a scalar.
+
+    Raises:
+        ValueError: the shapes differ (they are not broadcast).
+    """
+    if restored.shape != truth.shape:
+        raise ValueError(f"restored {tuple(restored.shape)} and truth {tuple(truth.shape)} differ")
+    return (restored - truth).square().mean()
+
+
+def total_variation(image: Tensor) -> Tensor:
+    """Return the anisotropic total variation of (..., H, W) per pixel, a scalar.
+
+    mean |I[y+1, x] − I[y, x]| + mean |I[y, x+1] − I[y, x]|: forward differences, each mean over
+    all pairs inside the image, all channels and all images.  A single row or column has no
+    pairs across and adds zero.
+    """
+    return sum(
+        (
+            difference.abs().sum() / max(difference.numel(), 1)
+            for difference in (image.diff(dim=-2), image.diff(dim=-1))
+        ),
+        start=image.new_zeros(()),
+    )
+
+
+class RestorationLoss(nn.Module):
+    """Equation S20, with means in place of the norms so that weights do not depend on size.
+
+        total = mse_weight · mse + tv_weight · tv + perceptual_weight · perceptual
+
+    Total variation is that of the restored image.
+
+    Args:
+        mse_weight: α₁.
+        tv_weight: α₂.
+        perceptual_weight: α₃; at 0 no VGG-16 weights are looked for.
+        perceptual: "vgg16" requires the perceptual term; "auto" leaves it out, with a warning,
+            where VGG-16's weights cannot be had; "none" leaves it out.
+        vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`.
+
+    Attributes:
+        perceptual_available: whether the perceptual term is part of the loss.
+
+    Raises:
+        InputError: a negative weight, another word for `perceptual`, or a wrong weights file.
+        PerceptualWeightsUnavailable: `perceptual="vgg16"` and no weights were found.
+    """
+
+    def __init__(
+        self,
+        mse_weight: float = 1.0,
+        tv_weight: float = 1e-4,
+        perceptual_weight: float = 1e-2,
+        perceptual: str = "auto",
+        vgg16_weights: str | None = None,
+    ) -> None:
+        super().__init__()
+        self.weights = {"mse": mse_weight, "tv": tv_weight, "perceptual": perceptual_weight}
+        for term, weight in self.weights.items():
+            if not (weight >= 0 and math.isfinite(weight)):
+                raise InputError(f"{term}_weight={weight}: must be finite and at least 0")
+        _check_choice(perceptual)
+        wanted = perceptual != "none" and perceptual_weight > 0
+        # In a tuple, which nn.Module does not look into: the network is constant, and as a
+        # submodule its weights would enter every checkpoint and every optimizer.
+        self._features = _find_features(perceptual, vgg16_weights) if wanted else ()
+
+    @property
+    def perceptual_available(self) -> bool:
+        """Whether the perceptual term is part of the loss."""
+        return len(self._features) > 0
+
+    def forward(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:
+        """Compare sRGB images (B, 3, H, W).
+
+        Returns:
+            Scalars by name: "mse", "tv" and, where available, "perceptual", all unweighted,
+            and "total", their weighted sum.
+
+        Raises:
+            ValueError: the shapes differ.
+        """
+        terms = {
+            "mse": mean_squared_error(restored, truth),
+            "tv": total_variation(restored),
+        }
+        for features in self._features:
+            # Never below float32, or a half-precision batch would round the weights for good.
+            dtype = torch.promote_types(restored.dtype, torch.float32)
+            # Validation may come first and in inference mode; weights moved there could never
+            # be differentiated through afterwards.
+            with torch.inference_mode(False):
+                features.to(device=restored.device, dtype=dtype)
+            terms["perceptual"] = perceptual_loss(features, restored.to(dtype), truth.to(dtype))
+        total = sum(
+            (self.weights[term] * value for term, value in terms.items()),
+            start=torch.zeros_like(terms["mse"]),
+        )
+        return {"total": total, **terms}
+
+
+def _check_choice(perceptual: str) -> None:
+    if perceptual in PERCEPTUAL_CHOICES:
+        return
+    nearest = difflib.get_close_matches(str(perceptual), PERCEPTUAL_CHOICES, n=1, cutoff=0.0)
+    allowed = ", ".join(PERCEPTUAL_CHOICES)
+    raise InputError(f"perceptual={perceptual}: allowed are {allowed}; did you mean {nearest[0]}?")
+
+
+def _find_features(perceptual: str, vgg16_weights: str | None) -> tuple[VGG16Features, ...]:
+    try:
+        return (VGG16Features(load_vgg16_weights(vgg16_weights)),)
+    except PerceptualWeightsUnavailable as error:
+        if perceptual == "vgg16":
+            raise
+        logger.warning("TRAINING WITHOUT THE PERCEPTUAL TERM: %s", error)
+        return ()

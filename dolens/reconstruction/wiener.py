@@ -1,0 +1,121 @@
+"""Wiener deconvolution with a prior for natural images, differentiable in all that enters it."""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def wiener_deconvolve(
+    image: Tensor,
+    point_spread_function: Tensor,
+    noise_to_signal: Tensor | float,
+    margin: int,
+) -> Tensor:
+    """Undo a blur by the linear filter of least expected error.
+
+    The image model is a true convolution plus white noise,
+
+        image[i] = Σ_j psf[K//2 + i − j] true[j] + noise[i],
+
+    and natural images have a power spectrum ∝ 1/f², so noise over signal grows as f².  With H
+    the transfer function (the transform of the point spread function, its pixel (K//2, K//2)
+    taken as the origin) the filter is
+
+        W(f) = conj(H) / max(|H|² + r (f / f_N)², ε),   f² = f_x² + f_y²,   f_N = 1/2 cycle/pixel,
+
+    r being noise over signal power at the Nyquist frequency f_N along an axis.  At f = 0 the
+    gain is 1/H(0): exactly 1 for a point spread function of unit sum, so a uniform image stays
+    what it is; a lens that loses light has it restored.  The floor ε, the machine epsilon of
+    the dtype, only keeps frequencies without any signal finite.
+
+    The discrete transform sees the image as periodic.  Each axis is therefore extended by at
+    least 2·`margin` pixels, in which the last row (column) turns into the first along a
+    raised cosine: near each edge this repeats the edge, and opposite edges meet without a
+    step.  The lengths are rounded up to products of 2, 3 and 5, and the result is cropped.
+
+    Args:
+        image: linear light, (B, C, H, W), float32 or float64; its dtype is computed in.
+        point_spread_function: (C, K, K), K odd, centred on the pixel (K//2, K//2).
+        noise_to_signal: r > 0, one number or one a channel, (C,).
+        margin: pixels at each edge, at least 0; K//2 keeps light from reaching across.
+
+    Returns:
+        (B, C, H, W), not clamped.  Gradients reach all three tensors.
+
+    Raises:
+        ValueError: an even or oblong point spread function, channels that do not match, or a
+            negative margin.
+    """
+    channels, height, width = image.shape[-3:]
+    _check(channels, point_spread_function, margin)
+    size = point_spread_function.shape[-1]
+    rows = fast_fft_length(max(height + 2 * margin, size))
+    columns = fast_fft_length(max(width + 2 * margin, size))
+
+    point_spread_function = point_spread_function.to(image.dtype)
+    ratio = torch.as_tensor(noise_to_signal, dtype=image.dtype, device=image.device)
+    transfer = _transfer_function(point_spread_function, rows, columns)
+    prior = _squared_frequency(rows, columns, image) * ratio.reshape(-1, 1, 1)
+    power = transfer.real**2 + transfer.imag**2
+    # A floor and not a sum, so that the gain at f = 0 stays exact.
+    weight = transfer.conj() / (power + prior).clamp(min=torch.finfo(image.dtype).eps)
+
+    spectrum = torch.fft.rfft2(_close_periodically(image, rows, columns))
+    restored = torch.fft.irfft2(spectrum * weight, s=(rows, columns))
+    return restored[..., :height, :width]
+
+
+def fast_fft_length(length: int) -> int:
+    """Return the smallest product of twos, threes and fives that is at least `length`."""
+    candidate = max(length, 1)
+    while True:
+        rest = candidate
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return candidate
+        candidate += 1
+
+
+def _check(channels: int, point_spread_function: Tensor, margin: int) -> None:
+    shape = tuple(point_spread_function.shape)
+    if len(shape) != 3 or shape[1] != shape[2] or shape[1] % 2 == 0:
+        raise ValueError(f"point spread function of shape {shape}: expected (C, K, K) with K odd")
+    if shape[0] != channels:
+        raise ValueError(
+            f"point spread function of {shape[0]} channels for an image of {channels} channels"
+        )
+    if margin < 0:
+        raise ValueError(f"margin={margin}: must be at least 0 pixels")
+
+
+def _transfer_function(point_spread_function: Tensor, rows: int, columns: int) -> Tensor:
+    size = point_spread_function.shape[-1]
+    padded = functional.pad(point_spread_function, (0, columns - size, 0, rows - size))
+    # The centre goes to the origin, the part before it wraps to the far end.
+    centred = torch.roll(padded, shifts=(-(size // 2), -(size // 2)), dims=(-2, -1))
+    return torch.fft.rfft2(centred)
+
+
+def _squared_frequency(rows: int, columns: int, like: Tensor) -> Tensor:
+    # (f / f_N)² on the grid of rfft2; cycles per pixel over one half.
+    vertical = torch.fft.fftfreq(rows, dtype=like.dtype, device=like.device) / 0.5
+    horizontal = torch.fft.rfftfreq(columns, dtype=like.dtype, device=like.device) / 0.5
+    return vertical[:, None] ** 2 + horizontal[None, :] ** 2
+
+
+def _close_periodically(image: Tensor, rows: int, columns: int) -> Tensor:
+    # The bridge is appended after the last row; being periodic, it also lies before the first.
+    for dimension, length in ((-2, rows), (-1, columns)):
+        gap = length - image.shape[dimension]
+        step = torch.arange(1, gap + 1, dtype=image.dtype, device=image.device) / (gap + 1)
+        blend = 0.5 - 0.5 * torch.cos(math.pi * step)
+        if dimension == -2:
+            blend = blend[:, None]
+        last = image.narrow(dimension, image.shape[dimension] - 1, 1)
+        first = image.narrow(dimension, 0, 1)
+        image = torch.cat([image, last + blend * (first - last)], dim=dimension)
+    return image

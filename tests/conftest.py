@@ -1,0 +1,24 @@
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+torch.set_num_threads(min(2, os.cpu_count() or 1))
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """Reader of the golden data in tests/reference (see its README for where it comes from)."""
+
+    def read(name: str) -> dict:
+        return json.loads((ROOT / "tests" / "reference" / name).read_text())
+
+    return read
