@@ -1,0 +1,211 @@
+"""What the data modules share: from photographs to batches of crops."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import lightning
+import torch
+from torch.utils.data import DataLoader
+
+from dolens.errors import InputError
+from experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
+from experiments.data.photographs import Photograph
+from experiments.data.resumable import ResumableLoader, ResumableSampler
+
+Split = Literal["train", "validation", "test"]
+
+_SPLITS_OF_STAGE: dict[str | None, tuple[Split, ...]] = {
+    "fit": ("train", "validation"),
+    "validate": ("validation",),
+    "test": ("test",),
+    "predict": (),
+    None: ("train", "validation", "test"),
+}
+
+
+class CropDataModule(lightning.LightningDataModule):
+    """Crops of photographs in linear light; a subclass says which photographs.
+
+    A batch is a tensor (batch, 3, height, width), float32, linear light in [0, 1], where
+    height and width are `item_size`: the crop with `margin` texels more on each side.
+
+    Training samples are numbered through the whole run, and sample i is a function of
+    (seed, i).  A run resumed from any checkpoint, in the middle of an epoch too, sees the
+    samples an uninterrupted one would have seen.  Evaluation crops are always the same.
+
+    Args:
+        crop_size: texels of the crop, one number for a square or (height, width).
+        margin: texels added on each side, so that a renderer's blur finds no edge.
+        batch_size: crops in a batch.
+        steps_per_epoch: batches in a training epoch.
+        scale_range: (smallest, largest) photograph pixels per texel in training, drawn
+            log-uniformly.
+        evaluation_crops_per_photograph: crops of each validation and test photograph.
+        evaluation_scale: photograph pixels per texel in validation and test.
+        flip_horizontal: mirror half of the training crops left and right.
+        flip_vertical: mirror half of the training crops top and bottom.
+        num_workers: processes that cut crops; 0 cuts them in the training process.
+        seed: of the training crops.
+
+    Raises:
+        InputError: an argument is out of range; the line names it.
+    """
+
+    def __init__(
+        self,
+        crop_size: int | Sequence[int] = 256,
+        margin: int = 0,
+        batch_size: int = 4,
+        steps_per_epoch: int = 100,
+        scale_range: Sequence[float] = (1.0, 2.0),
+        evaluation_crops_per_photograph: int = 4,
+        evaluation_scale: float = 1.0,
+        flip_horizontal: bool = True,
+        flip_vertical: bool = False,
+        num_workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.crop_size = _size("data.crop_size", crop_size)
+        self.margin = _count("data.margin", margin, 0)
+        self.batch_size = _count("data.batch_size", batch_size, 1)
+        self.steps_per_epoch = _count("data.steps_per_epoch", steps_per_epoch, 1)
+        self.scale_range = _range("data.scale_range", scale_range)
+        self.evaluation_crops_per_photograph = _count(
+            "data.evaluation_crops_per_photograph", evaluation_crops_per_photograph, 1
+        )
+        self.evaluation_scale = _range(
+            "data.evaluation_scale", (evaluation_scale, evaluation_scale)
+        )[0]
+        self.flip_horizontal = flip_horizontal
+        self.flip_vertical = flip_vertical
+        self.num_workers = _count("data.num_workers", num_workers, 0)
+        self.seed = _count("data.seed", seed, 0)
+        self._photographs: dict[Split, Sequence[Photograph]] = {}
+
+    @property
+    def item_size(self) -> tuple[int, int]:
+        """(height, width) of an item in texels: the crop and its margins."""
+        return self.crop_size[0] + 2 * self.margin, self.crop_size[1] + 2 * self.margin
+
+    @property
+    def samples_per_epoch(self) -> int:
+        """Crops in a whole training epoch."""
+        return self.steps_per_epoch * self.batch_size
+
+    def load_split(self, split: Split) -> Sequence[Photograph]:
+        """The photographs of one split; may decode on demand.  For subclasses."""
+        raise NotImplementedError(f"{type(self).__name__}.load_split")
+
+    def setup(self, stage: str | None = None) -> None:
+        """Find the photographs a stage needs (`fit`, `validate`, `test`; None: all).
+
+        Raises:
+            InputError: a photograph is missing or unreadable, or a split is empty.
+        """
+        for split in _SPLITS_OF_STAGE[stage]:
+            self.photographs(split)
+
+    def photographs(self, split: Split) -> Sequence[Photograph]:
+        """The photographs of a split, loaded at the first call."""
+        if split not in self._photographs:
+            self._photographs[split] = self.load_split(split)
+        return self._photographs[split]
+
+    def train_dataloader(self) -> DataLoader:
+        """Batches of the training epoch under way, from the next sample on.
+
+        Raises:
+            InputError: the trainer runs several processes, or overfits batches: both would
+                replace the sampler.
+        """
+        trainer = self.trainer
+        if trainer is not None and trainer.world_size > 1:
+            raise InputError(
+                f"trainer.devices: {trainer.world_size} processes; allowed: 1, samples are "
+                "numbered within one process"
+            )
+        if trainer is not None and trainer.overfit_batches:
+            raise InputError(
+                f"trainer.overfit_batches: {trainer.overfit_batches}; allowed: 0, crops do not "
+                "repeat; use few photographs and trainer.limit_train_batches"
+            )
+        dataset = TrainingCrops(
+            self.photographs("train"),
+            self.item_size,
+            self.seed,
+            self.scale_range,
+            flip_horizontal=self.flip_horizontal,
+            flip_vertical=self.flip_vertical,
+        )
+        sampler = ResumableSampler(self.samples_per_epoch, self.first_sample)
+        return ResumableLoader(dataset, sampler=sampler, **self._loader_arguments())
+
+    def val_dataloader(self) -> DataLoader:
+        """The validation crops, always the same."""
+        return self._evaluation_loader("validation")
+
+    def test_dataloader(self) -> DataLoader:
+        """The test crops, always the same."""
+        return self._evaluation_loader("test")
+
+    def first_sample(self) -> tuple[int, int]:
+        """(Global number of the next training sample, samples that remain in the epoch).
+
+        Read from the trainer's count of processed batches, which a checkpoint restores before
+        the loader is iterated.  `processed` is raised after the optimizer's step and before
+        `on_train_batch_end`, where checkpoints are written; `ready` would count a batch that an
+        exception interrupted, `completed` would miss the one whose end wrote the checkpoint,
+        and the trainer's `global_step` counts steps, not batches, where gradients accumulate.
+        """
+        if self.trainer is None:
+            return 0, self.samples_per_epoch
+        epoch_loop = self.trainer.fit_loop.epoch_loop
+        progress = epoch_loop.batch_progress
+        done = progress.current.processed if epoch_loop.restarting else 0
+        if done >= self.steps_per_epoch:
+            done = 0  # the checkpoint closed an epoch, and the next one begins
+        first = progress.total.processed * self.batch_size
+        return first, (self.steps_per_epoch - done) * self.batch_size
+
+    def _evaluation_loader(self, split: Split) -> DataLoader:
+        dataset = EvaluationCrops(
+            self.photographs(split),
+            self.item_size,
+            self.evaluation_crops_per_photograph,
+            self.evaluation_scale,
+        )
+        return DataLoader(dataset, shuffle=False, **self._loader_arguments())
+
+    def _loader_arguments(self) -> dict[str, Any]:
+        return {
+            "batch_size": self.batch_size,
+            "num_workers": self.num_workers,
+            "pin_memory": torch.cuda.is_available(),
+        }
+
+
+def _count(key: str, value: int, smallest: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < smallest:
+        raise InputError(f"{key}: {value!r}; allowed: an integer of {smallest} or more")
+    return value
+
+
+def _size(key: str, value: int | Sequence[int]) -> tuple[int, int]:
+    if isinstance(value, int):
+        value = (value, value)
+    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 2:
+        raise InputError(f"{key}: {value!r}; allowed: one number of texels or (height, width)")
+    return _count(key, value[0], 1), _count(key, value[1], 1)
+
+
+def _range(key: str, value: Sequence[float]) -> tuple[float, float]:
+    pair = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2
+    numbers = pair and all(
+        isinstance(number, int | float) and not isinstance(number, bool) for number in value
+    )
+    if not numbers or not 0 < value[0] <= value[1] < float("inf"):
+        raise InputError(
+            f"{key}: {value!r}; allowed: photograph pixels per texel, above 0, the smaller first"
+        )
+    return float(value[0]), float(value[1])

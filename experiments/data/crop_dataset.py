@@ -1,0 +1,124 @@
+"""Datasets of crops: an endless one to train on, a fixed one to evaluate on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from dolens.errors import InputError
+from experiments.data.crops import (
+    centred_crop,
+    check_scale_range,
+    check_size,
+    random_crop,
+    random_order,
+)
+from experiments.data.photographs import Photograph
+
+
+class TrainingCrops(Dataset):
+    """Random crops without end, indexed by the global number of the sample in the run.
+
+    Sample i belongs to pass i // n over the n photographs.  Each pass visits every photograph
+    once, in an order of its own; the crop is `random_crop(photo, size, seed, i, …)`.  An item
+    is therefore a function of (seed, i), and has no length to speak of.
+
+    Args:
+        photographs: what to cut from; may decode on demand.
+        size: (height, width) of an item in texels.
+        seed: of the run.
+        scale_range: (smallest, largest) photograph pixels per texel.
+        flip_horizontal: mirror half of the crops left and right.
+        flip_vertical: mirror half of the crops top and bottom.
+
+    Raises:
+        InputError: no photographs, or a bad size or scale range.
+    """
+
+    def __init__(
+        self,
+        photographs: Sequence[Photograph],
+        size: tuple[int, int],
+        seed: int,
+        scale_range: tuple[float, float] = (1.0, 1.0),
+        *,
+        flip_horizontal: bool = True,
+        flip_vertical: bool = False,
+    ) -> None:
+        if len(photographs) == 0:
+            raise InputError("training crops: no photographs; allowed: at least one")
+        check_size(size)
+        check_scale_range(scale_range)
+        self.photographs = photographs
+        self.size = size
+        self.seed = seed
+        self.scale_range = scale_range
+        self.flip_horizontal = flip_horizontal
+        self.flip_vertical = flip_vertical
+        self._orders: dict[int, np.ndarray] = {}
+
+    def __getitem__(self, index: int) -> Tensor:
+        """Sample number `index`: (3, height, width) float32, linear light in [0, 1]."""
+        return random_crop(
+            self.photographs[self.photograph_number(index)],
+            self.size,
+            self.seed,
+            index,
+            self.scale_range,
+            flip_horizontal=self.flip_horizontal,
+            flip_vertical=self.flip_vertical,
+        )
+
+    def photograph_number(self, index: int) -> int:
+        """Which photograph sample number `index` is cut from."""
+        number, position = divmod(index, len(self.photographs))
+        if number not in self._orders:
+            # A batch touches two passes at most, unless there are few photographs, when orders
+            # are cheap: keep the latest two.
+            while len(self._orders) > 1:
+                del self._orders[min(self._orders)]
+            self._orders[number] = random_order(len(self.photographs), self.seed, number)
+        return int(self._orders[number][position])
+
+
+class EvaluationCrops(Dataset):
+    """A fixed list of crops: `count` of each photograph, by `centred_crops`.
+
+    Args:
+        photographs: what to cut from; may decode on demand.
+        size: (height, width) of an item in texels.
+        count: crops of each photograph.
+        scale: photograph pixels per texel.
+
+    Raises:
+        InputError: no photographs, a count below 1, or a bad size or scale.
+    """
+
+    def __init__(
+        self,
+        photographs: Sequence[Photograph],
+        size: tuple[int, int],
+        count: int,
+        scale: float = 1.0,
+    ) -> None:
+        if len(photographs) == 0:
+            raise InputError("evaluation crops: no photographs; allowed: at least one")
+        if count < 1:
+            raise InputError(f"evaluation crops of a photograph: {count}; allowed: 1 or more")
+        check_size(size)
+        check_scale_range((scale, scale))
+        self.photographs = photographs
+        self.size = size
+        self.count = count
+        self.scale = scale
+
+    def __len__(self) -> int:
+        return len(self.photographs) * self.count
+
+    def __getitem__(self, index: int) -> Tensor:
+        """Crop `index`, photograph by photograph: (3, height, width) float32, linear light."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"crop {index} of {len(self)}")
+        photograph, number = divmod(index, self.count)
+        return centred_crop(self.photographs[photograph], self.size, self.count, number, self.scale)

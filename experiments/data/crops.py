@@ -1,0 +1,227 @@
+"""Crops of photographs, in linear light.
+
+A random crop is a pure function of a seed and a counter, so any sample of a run can be made
+again without the state of a generator: a resumed run equals an uninterrupted one to the bit.
+"""
+
+import logging
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from dolens.errors import InputError
+from dolens.imaging.color import srgb_to_linear
+from experiments.data.photographs import Photograph
+
+_log = logging.getLogger(__name__)
+_LINEAR_OF_BYTE = srgb_to_linear(torch.arange(256, dtype=torch.float64) / 255).float()
+_CROP_STREAM = 0
+_ORDER_STREAM = 1
+_warned_of: set[str] = set()
+
+
+def linear_light(encoded: Tensor) -> Tensor:
+    """Decode sRGB bytes, any shape, to linear light in [0, 1], float32."""
+    return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
+
+
+def random_crop(
+    photo: Photograph,
+    size: tuple[int, int],
+    seed: int,
+    index: int,
+    scale_range: tuple[float, float] = (1.0, 1.0),
+    *,
+    flip_horizontal: bool = True,
+    flip_vertical: bool = False,
+) -> Tensor:
+    """Cut the crop that belongs to sample number `index` of the run seeded with `seed`.
+
+    Scale, position and flips depend on (seed, index) alone.  The scale is the number of
+    photograph pixels along the side of one texel, log-uniform in `scale_range`; the cut region
+    is converted to linear light and only then resized (bicubic, antialiased, clamped to
+    [0, 1]).  A photograph too small for the largest scale narrows the range from above; one
+    too small even for the smallest scale (at scale 1: smaller than the crop) is enlarged until
+    the crop fits into it, with one warning that names it.
+
+    Args:
+        photo: where to cut.
+        size: (height, width) of the crop in texels.
+        seed: of the run, not negative.
+        index: the global number of the sample, not negative.
+        scale_range: (smallest, largest) scale, photograph pixels per texel.
+        flip_horizontal: mirror left and right with probability 1/2.
+        flip_vertical: mirror top and bottom with probability 1/2.
+
+    Returns:
+        (3, height, width) float32, linear light in [0, 1].
+
+    Raises:
+        InputError: a size below 1, a seed or index below 0, a scale range out of order.
+    """
+    check_size(size)
+    check_scale_range(scale_range)
+    draws = _uniform(seed, _CROP_STREAM, index, 5)
+    scale = _scale(photo, size, scale_range, draws[0])
+    height, width = _region(photo, size, scale)
+    top = min(int(draws[1] * (photo.height - height + 1)), photo.height - height)
+    left = min(int(draws[2] * (photo.width - width + 1)), photo.width - width)
+    crop = _cut(photo, (top, left), (height, width), size)
+    flips = [
+        axis
+        for axis, wanted, draw in ((2, flip_horizontal, draws[3]), (1, flip_vertical, draws[4]))
+        if wanted and draw < 0.5
+    ]
+    return crop.flip(flips) if flips else crop
+
+
+def random_order(count: int, seed: int, number: int) -> np.ndarray:
+    """The permutation of 0 … count-1 numbered `number` of a run, a function of its arguments.
+
+    Raises:
+        InputError: a seed or number below 0.
+    """
+    return np.argsort(_uniform(seed, _ORDER_STREAM, number, count), kind="stable")
+
+
+def centred_crops(
+    photo: Photograph, size: tuple[int, int], count: int, scale: float = 1.0
+) -> Tensor:
+    """Cut `count` crops evenly spaced over a photograph; nothing in this is random.
+
+    One crop is cut from the centre.  More lie on a grid whose rows and columns are chosen to
+    overlap as little as possible.  A photograph too small for the crop is treated as in
+    `random_crop`.
+
+    Args:
+        photo: where to cut.
+        size: (height, width) of a crop in texels.
+        count: how many.
+        scale: photograph pixels along the side of one texel.
+
+    Returns:
+        (count, 3, height, width) float32, linear light in [0, 1].
+
+    Raises:
+        InputError: a size or count below 1, a scale that is not positive.
+    """
+    if count < 1:
+        raise InputError(f"crops of one photograph: {count}; allowed: 1 or more")
+    return torch.stack([centred_crop(photo, size, count, number, scale) for number in range(count)])
+
+
+def centred_crop(
+    photo: Photograph, size: tuple[int, int], count: int, number: int, scale: float = 1.0
+) -> Tensor:
+    """Crop `number` (from 0) of the `count` that `centred_crops` cuts: (3, height, width)."""
+    check_size(size)
+    check_scale_range((scale, scale))
+    if not 0 <= number < count:
+        raise InputError(f"crop {number} of {count}; allowed: 0 to one less than their count")
+    region = _region(photo, size, _scale(photo, size, (scale, scale), 0.0))
+    rows, columns = _grid(photo, region, count)
+    cell = (2 * number + 1) * rows * columns // (2 * count)
+    top = _cell_start(cell // columns, rows, photo.height, region[0])
+    left = _cell_start(cell % columns, columns, photo.width, region[1])
+    return _cut(photo, (top, left), region, size)
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raise `InputError` unless `size` is two counts of texels of at least 1."""
+    if len(size) != 2 or min(size) < 1:
+        raise InputError(f"crop size: {size}; allowed: (height, width) in texels, 1 or more")
+
+
+def check_scale_range(scale_range: tuple[float, float]) -> None:
+    """Raise `InputError` unless 0 < smallest <= largest scale, both finite."""
+    if len(scale_range) != 2 or not 0 < scale_range[0] <= scale_range[1] < math.inf:
+        raise InputError(
+            f"crop scale: {scale_range}; allowed: (smallest, largest) photograph pixels "
+            "per texel, 0 < smallest <= largest"
+        )
+
+
+def _uniform(seed: int, stream: int, counter: int, count: int) -> np.ndarray:
+    """`count` numbers in [0, 1), a function of the arguments."""
+    if seed < 0 or counter < 0:
+        raise InputError(f"seed {seed}, sample {counter}; allowed: integers of 0 or more")
+    sequence = np.random.SeedSequence(seed, spawn_key=(stream, counter))
+    return np.random.Generator(np.random.PCG64(sequence)).random(count)
+
+
+def _scale(
+    photo: Photograph,
+    size: tuple[int, int],
+    scale_range: tuple[float, float],
+    draw: float,
+) -> float:
+    """The scale at `draw` in [0, 1) of the range, as far as the photograph allows it."""
+    smallest, largest = scale_range
+    limit = min(photo.height / size[0], photo.width / size[1])
+    if limit < smallest:
+        if photo.name not in _warned_of:
+            _warned_of.add(photo.name)
+            _log.warning(
+                "%s: %d×%d pixels, too small for crops of %d×%d texels at %g pixels per texel; "
+                "enlarged to fit, at %.3g pixels per texel",
+                photo.name,
+                photo.height,
+                photo.width,
+                *size,
+                smallest,
+                limit,
+            )
+        return limit
+    return smallest * (min(largest, limit) / smallest) ** draw
+
+
+def _region(photo: Photograph, size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """(height, width) in photograph pixels that a crop of `size` texels covers."""
+    height = min(max(round(size[0] * scale), 1), photo.height)
+    width = min(max(round(size[1] * scale), 1), photo.width)
+    return height, width
+
+
+def _cut(
+    photo: Photograph,
+    corner: tuple[int, int],
+    region: tuple[int, int],
+    size: tuple[int, int],
+) -> Tensor:
+    (top, left), (height, width) = corner, region
+    linear = linear_light(photo.encoded[:, top : top + height, left : left + width])
+    if region == tuple(size):
+        return linear
+    resized = interpolate(
+        linear[None], size=tuple(size), mode="bicubic", align_corners=False, antialias=True
+    )
+    return resized[0].clamp_(0.0, 1.0)
+
+
+def _grid(photo: Photograph, region: tuple[int, int], count: int) -> tuple[int, int]:
+    """(rows, columns) with at least `count` cells: least overlap, then fewest cells."""
+
+    def cost(grid: tuple[int, int]) -> tuple[float, int, float]:
+        rows, columns = grid
+        overlap = max(
+            _overlap(rows, photo.height, region[0]), _overlap(columns, photo.width, region[1])
+        )
+        cell_shape = (photo.height * region[1] * columns) / (photo.width * region[0] * rows)
+        return overlap, rows * columns, abs(math.log(cell_shape))
+
+    return min(((rows, math.ceil(count / rows)) for rows in range(1, count + 1)), key=cost)
+
+
+def _overlap(cells: int, extent: int, length: int) -> float:
+    """The share of a crop that its neighbour along one axis covers too."""
+    return 0.0 if cells == 1 else max(0.0, 1.0 - (extent - length) / ((cells - 1) * length))
+
+
+def _cell_start(cell: int, cells: int, extent: int, length: int) -> int:
+    """Where the crop of a cell begins: centred in it if it fits, else from edge to edge."""
+    if cells * length <= extent:
+        return ((2 * cell + 1) * extent - cells * length) // (2 * cells)
+    return 0 if cells == 1 else (extent - length) * cell // (cells - 1)
