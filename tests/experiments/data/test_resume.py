@@ -172,6 +172,28 @@ def test_resuming_a_run_limited_by_steps(tmp_path, step):
     _same(resumed, module, step)
 
 
+@pytest.mark.parametrize("step", [2, 4])
+def test_resuming_from_a_checkpoint_written_by_validation(tmp_path, step):
+    options = {"val_check_interval": 2}
+    best = ModelCheckpoint(tmp_path, "{step}", save_top_k=-1, monitor="val/loss")
+    module, _ = _fit(tmp_path, callbacks=[best], **options)
+    resumed, _ = _fit(tmp_path, resume=tmp_path / f"step={step}.ckpt", **options)
+    _same(resumed, module, step)
+
+
+def test_samples_outlive_a_slip_of_lightning_in_the_count_of_epochs(tmp_path):
+    # Lightning 2.6.6 appends a batch to the closed epoch when a run limited by steps, without
+    # validation, resumes from the end of an epoch.  Samples and weights must not care.
+    options = {"max_steps": 12, "limit_val_batches": 0}
+    ends = ModelCheckpoint(
+        tmp_path, "{step}", save_top_k=-1, every_n_epochs=1, save_on_train_epoch_end=True
+    )
+    module, _ = _fit(tmp_path, callbacks=[ends], **options)
+    resumed, _ = _fit(tmp_path, resume=tmp_path / "step=5.ckpt", **options)
+    assert torch.equal(torch.stack(resumed.seen), torch.stack(module.seen[5:]))
+    assert torch.equal(resumed.layer.weight, module.layer.weight)
+
+
 def test_a_limit_on_batches_wastes_no_samples(tmp_path):
     options = {"limit_train_batches": 3}
     module, _ = _fit(tmp_path, callbacks=[_every_step(tmp_path)], **options)
