@@ -1,13 +1,24 @@
 """Sequential tracing, forward and backward (Algorithm 1 of the source)."""
 
 from dataclasses import dataclass
+from functools import reduce
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.optics.rays import Components, Status
-from dolens.optics.surfaces.base import Hit, PlaneRay
+from dolens.optics.surfaces.base import FAR, GRAZING, PlaneRay
 from dolens.optics.system import OpticalSystem
+
+
+class Margins(NamedTuple):
+    """Why a ray may end at a surface: each is positive where it does not (None: it cannot)."""
+
+    number: int
+    met: Tensor | None
+    inside: Tensor | None
+    transmitted: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -17,14 +28,14 @@ class Trace:
     Attributes:
         ray: z is measured from the vertex of the first surface.
         valid: bool.
-        failures: per surface met, its number and the masks missed, outside, reflected.
+        margins: per surface met.
         path_length: Σ n·t in mm, or None when it was not asked for.
         points: per surface met, x, y, z; empty when not recorded.
     """
 
     ray: Components
     valid: Tensor
-    failures: list[tuple[int, Tensor, Tensor, Tensor | None]]
+    margins: list[Margins]
     path_length: Tensor | None
     points: list[tuple[Tensor, Tensor, Tensor]]
 
@@ -36,41 +47,12 @@ def transfer(ray: Components, distance: Tensor) -> Components:
 
 
 def distance_to_plane(ray: Components, z: Tensor | float, sense: float) -> tuple[Tensor, Tensor]:
-    """Distance (mm) along rays to the plane at z, and where they travel in the given sense.
+    """Distance (mm) along rays to the plane at z, and a margin: their cosine in this sense.
 
-    Rays that do not travel towards it get the finite distance of a ray along the axis.
+    The distance of rays that do not travel towards it is finite and means nothing.
     """
-    towards = sense * ray.n > 0.0
-    return (z - ray.z) / torch.where(towards, ray.n, torch.full_like(ray.n, sense)), towards
-
-
-def refract(
-    ray: PlaneRay, hit: Hit, ratio: float | Tensor, sense: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Snell's law in vector form.
-
-    Args:
-        ray: direction cosines of a unit vector.
-        hit: unit normal towards +z.
-        ratio: index before over index after, in the order of the light's travel.
-        sense: +1 forward, -1 backward; the sign of direction · normal.
-
-    Returns:
-        The refracted direction d' = μ·d + (s·cos t - μ·cos i)·N, with cos²t = 1 - μ²(1 - cos²i),
-        and the mask of rays that are not totally reflected; those that are keep finite numbers.
-    """
-    _, _, l, m, n = ray  # noqa: E741
-    cosine = l * hit.nx + m * hit.ny + n * hit.nz
-    squared = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-    transmitted = squared > 0.0
-    root = torch.sqrt(torch.where(transmitted, squared, torch.ones_like(squared)))
-    along = sense * root - ratio * cosine
-    return (
-        ratio * l + along * hit.nx,
-        ratio * m + along * hit.ny,
-        ratio * n + along * hit.nz,
-        transmitted,
-    )
+    cosine = ray.n if sense > 0.0 else -ray.n
+    return sense * (z - ray.z) / cosine.clamp(min=GRAZING), cosine.detach()
 
 
 def trace_surfaces(
@@ -98,44 +80,45 @@ def trace_surfaces(
     vertices = system.vertices
     count = len(system.surfaces)
     order = range(count) if sense > 0 else range(count - 1, -1, -1)
-    valid = torch.ones_like(ray.n, dtype=torch.bool)
     path = torch.zeros_like(ray.n) if path_length else None
-    failures: list[tuple[int, Tensor, Tensor, Tensor | None]] = []
+    margins: list[Margins] = []
     points: list[tuple[Tensor, Tensor, Tensor]] = []
+    x, y, z, l, m, n = ray  # noqa: E741
     # z is kept relative to the vertex at hand: float32 then errs by the sag's rounding only.
     origin: Tensor | float = 0.0
     for i in order:
         surface = system.surfaces[i]
+        shape, parameters = surface.shape, surface.parameters
         before, after = (indices[i], indices[i + 1]) if sense > 0 else (indices[i + 1], indices[i])
-        ray = ray._replace(z=ray.z + (origin - vertices[i]))
+        here = Components(x, y, z + (origin - vertices[i]), l, m, n)
         origin = vertices[i]
-        to_plane, towards = distance_to_plane(ray, 0.0, sense)
-        x = ray.x + to_plane * ray.l
-        y = ray.y + to_plane * ray.m
-        at_plane = PlaneRay(x, y, ray.l, ray.m, ray.n)
-        hit = surface.shape.intersect(surface.parameters, at_plane, sense, surface.semi_diameter)
-        met = towards & hit.met
-        t = torch.where(met, hit.t, torch.zeros_like(hit.t))
-        x, y, z = x + t * ray.l, y + t * ray.m, t * ray.n
-        inside = x * x + y * y < surface.semi_diameter**2
+        to_plane, towards = distance_to_plane(here, 0.0, sense)
+        limit = FAR * surface.semi_diameter
+        x = torch.addcmul(x, to_plane, l).clamp(-limit, limit)
+        y = torch.addcmul(y, to_plane, m).clamp(-limit, limit)
+        t, met = shape.intersect(parameters, PlaneRay(x, y, l, m, n), sense, surface.semi_diameter)
+        met = towards if met is None else torch.minimum(towards, met)
+        t = t.clamp(-limit, limit)
+        x, y, z = torch.addcmul(x, t, l), torch.addcmul(y, t, m), t * n
+        inside = surface.semi_diameter**2 - torch.addcmul(x * x, y, y).detach()
         if path is not None:
             path = path + before * (to_plane + t)
         if record:
             points.append((x, y, z + vertices[i]))
         transmitted = None
-        l, m, n = ray.l, ray.m, ray.n  # noqa: E741
-        passing = met
         if system.materials[i] != system.materials[i + 1]:
-            *bent, transmitted = refract(at_plane, hit, before / after, sense)
-            passing = met & transmitted
-            l, m, n = (  # noqa: E741
-                torch.where(passing, new, old) for new, old in zip(bent, (l, m, n), strict=True)
+            l, m, n, transmitted = shape.refract(  # noqa: E741
+                parameters, (x, y, z), (l, m, n), before / after, sense
             )
-        failures.append((i + 1, ~met, ~inside, None if transmitted is None else ~transmitted))
-        valid = valid & passing & inside
-        ray = Components(x, y, z, l, m, n)
-    ray = ray._replace(z=ray.z + origin)
-    return Trace(ray, valid, failures, path, points)
+        margins.append(Margins(i + 1, met, inside, transmitted))
+    ray = Components(x, y, z + origin, l, m, n)
+    return Trace(ray, _all_positive(margins), margins, path, points)
+
+
+def _all_positive(margins: list[Margins]) -> Tensor:
+    """Where every margin is positive; a NaN is not."""
+    kept = [m for row in margins for m in row[1:] if m is not None]
+    return reduce(torch.minimum, kept) > 0.0
 
 
 def trace_to_plane(
@@ -155,8 +138,8 @@ def trace_to_plane(
         path = path + system.indices(wavelength)[-1 if sense > 0 else 0] * distance
     return Trace(
         transfer(traced.ray, distance),
-        traced.valid & towards,
-        [*traced.failures, (len(system.surfaces) + 1, ~towards, torch.zeros_like(towards), None)],
+        traced.valid & (towards > 0.0),
+        [*traced.margins, Margins(len(system.surfaces) + 1, towards, None, None)],
         path,
         traced.points,
     )
@@ -171,17 +154,22 @@ def first_failure(traced: Trace) -> tuple[Tensor, Tensor]:
     """
     status = torch.zeros_like(traced.valid, dtype=torch.int8)
     surface = torch.zeros_like(traced.valid, dtype=torch.int16)
-    traced_on = torch.ones_like(traced.valid)
-    for number, missed, outside, reflected in traced.failures:
-        clipped = traced_on & outside & ~missed & (status == Status.OK)
-        status = status.masked_fill(clipped, int(Status.VIGNETTED))
-        surface = surface.masked_fill(clipped, number)
-        for cause, mask in ((Status.MISSED, missed), (Status.TIR, reflected)):
-            if mask is not None:
-                ends = traced_on & mask
-                status = status.masked_fill(ends, int(cause))
-                surface = surface.masked_fill(ends, number)
-                traced_on = traced_on & ~mask
+    goes_on = torch.ones_like(traced.valid)
+    for number, met, inside, transmitted in traced.margins:
+        for cause, margin in (
+            (Status.MISSED, met),
+            (Status.VIGNETTED, inside),
+            (Status.TIR, transmitted),
+        ):
+            if margin is None:
+                continue
+            fails = goes_on & ~(margin > 0.0)
+            if cause == Status.VIGNETTED:
+                fails = fails & (status == Status.OK)
+            else:
+                goes_on = goes_on & (margin > 0.0)
+            status = status.masked_fill(fails, int(cause))
+            surface = surface.masked_fill(fails, number)
     return status, surface
 
 

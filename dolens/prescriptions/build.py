@@ -6,7 +6,7 @@ A prescription is a mapping::
     index_model: dfc            # dfc | do | paper
     stop: 1                     # number of the stop surface
     surfaces:
-      '1': {type: sphere, radius: 62.8, semi_diameter: 6.35, thickness: 4.0, material: 1.51680/64.17}
+      '1': {type: sphere, radius: 63, semi_diameter: 6.35, thickness: 4, material: 1.51680/64.17}
       '2': ...                  # the last surface has no thickness
     sensor: {distance: 96.0, diameter: 1.7664}
 

@@ -1,4 +1,10 @@
-"""What a surface is: parameters, and a few pure functions of them."""
+"""What a surface is: parameters, and a few pure functions of them.
+
+Whether a ray is valid is carried as margins: numbers that are positive where a condition holds.
+The minimum of all margins decides at the end.  Comparing and selecting by masks costs five times
+the arithmetic, so invalid rays are kept finite by clamps instead, at limits that no valid ray
+reaches; their gradient is cut off where the trace ends.
+"""
 
 import math
 from collections.abc import Mapping
@@ -14,6 +20,11 @@ Parameters = Mapping[str, Tensor]
 
 MAX_NEWTON_STEPS = 40
 
+# Smallest cosine that is divided by.  Its square is far above the smallest float32.
+GRAZING = 1e-9
+# A ray this many semi-diameters off the axis is invalid, and stays there.
+FAR = 1e3
+
 
 class PlaneRay(NamedTuple):
     """Rays where they cross the vertex plane z = 0: x, y in mm and direction cosines."""
@@ -25,73 +36,70 @@ class PlaneRay(NamedTuple):
     n: Tensor
 
 
-class Hit(NamedTuple):
-    """Distance from the vertex plane (mm), unit normal towards +z, and where it was met."""
+class Refraction(NamedTuple):
+    """Direction cosines behind a surface, and a margin that is positive without TIR."""
 
-    t: Tensor
-    nx: Tensor | float
-    ny: Tensor | float
-    nz: Tensor | float
-    met: Tensor
-
-
-def unit_normal(sx: Tensor, sy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The unit normal (-s_x, -s_y, 1)/√(1 + s_x² + s_y²) of a sag with these slopes."""
-    nz = torch.rsqrt(1.0 + sx * sx + sy * sy)
-    return -sx * nz, -sy * nz, nz
+    l: Tensor  # noqa: E741
+    m: Tensor
+    n: Tensor
+    transmitted: Tensor
 
 
-def newton(shape: "type[Surface]", p: Parameters, ray: PlaneRay, sense: float, scale: float) -> Hit:
-    """Solve sag(x + l·t, y + m·t) = n·t for t, with the derivative of the implicit function.
+def safe_sqrt(squared: Tensor) -> Tensor:
+    """Square root with a finite derivative everywhere; exact where its argument is positive."""
+    return torch.sqrt(squared.clamp(min=GRAZING * GRAZING))
 
-    The iteration runs outside the autograd graph.  One more step inside the graph leaves the
-    value where it is and has the derivative of the root, ∂t = -∂F/F_t with F = sag - n·t.
+
+def snell(
+    direction: tuple[Tensor, Tensor, Tensor],
+    normal: tuple[Tensor, Tensor, Tensor],
+    ratio: float | Tensor,
+    sense: float,
+) -> Refraction:
+    """Snell's law in vector form.
+
+    Args:
+        direction: cosines of unit vectors.
+        normal: unit vectors towards +z.
+        ratio: μ, index before over index after, in the order of the light's travel.
+        sense: s, +1 forward and -1 backward: the sign of direction · normal.
+
+    Returns:
+        d' = μ·d + (s·cos t - μ·cos i)·N with cos²t = 1 - μ²(1 - cos²i); `transmitted` is cos²t.
     """
-    x, y, l, m, n = ray  # noqa: E741
-    epsilon = torch.finfo(n.dtype).eps
-    with torch.no_grad():
-        t = shape.start(p, ray, sense)
-        for _ in range(MAX_NEWTON_STEPS):
-            step = _newton_step(shape, p, ray, t).clamp(-scale, scale)
-            t = t - step
-            # Newton converges quadratically: after a step of √ε the next is below rounding.
-            if bool((step.abs() <= math.sqrt(epsilon) * (t.abs() + scale)).all()):
-                break
-    step = _newton_step(shape, p, ray, t)
-    converged = step.detach().abs() <= 64.0 * math.sqrt(epsilon) * (t.abs() + scale)
-    t = t - torch.where(converged, step, torch.zeros_like(step))
-    sag, sx, sy, inside = shape.sag_and_gradient(p, x + l * t, y + m * t)
-    residual = (sag - n * t).detach().abs()
-    on_surface = residual <= 64.0 * epsilon * (t.detach().abs() + sag.detach().abs() + scale)
-    crosses = sense * (n - l * sx - m * sy) > 0.0
-    return Hit(t, *unit_normal(sx, sy), converged & on_surface & inside & crosses)
-
-
-def _newton_step(shape: "type[Surface]", p: Parameters, ray: PlaneRay, t: Tensor) -> Tensor:
-    x, y, l, m, n = ray  # noqa: E741
-    sag, sx, sy, _ = shape.sag_and_gradient(p, x + l * t, y + m * t)
-    slope = l * sx + m * sy - n
-    tangent = slope.abs() <= torch.finfo(slope.dtype).eps
-    return (sag - n * t) / torch.where(tangent, torch.ones_like(slope), slope)
+    l, m, n = direction  # noqa: E741
+    nx, ny, nz = normal
+    cosine = torch.addcmul(torch.addcmul(l * nx, m, ny), n, nz)
+    # Only rays that missed have |cos i| > 1; two keeps them finite and rounding unclipped.
+    cosine = cosine.clamp(-2.0, 2.0)
+    squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
+    along = sense * safe_sqrt(squared) - ratio * cosine
+    return Refraction(
+        torch.addcmul(ratio * l, along, nx),
+        torch.addcmul(ratio * m, along, ny),
+        torch.addcmul(ratio * n, along, nz),
+        squared.detach(),
+    )
 
 
 class Surface(nn.Module):
     """A refracting surface about its own vertex: state here, mathematics in its static methods.
 
-    A surface holds scalar parameters (`curvature`, `a4`, `x2y`, ...).  Its static methods take
+    A surface holds scalar parameters (`curvature`, `a4`, `x2y`, ...).  Its methods for light take
     them as a mapping, so that a trace can be given other values than the stored ones (scaled
     variables of an optimizer, a batch of perturbed lenses) without touching any state.
 
     A new shape is a subclass with `kind`, `parameter_names`, `sag_and_gradient`, and a better
-    `start` where there is one; `newton` does the rest.  A closed form overrides `intersect`.
+    `start` where there is one; Newton's iteration does the rest.  A shape with a closed form
+    overrides `intersect` and `normal`.
 
     Args:
         semi_diameter: mm, radius of the circular clear aperture.
         parameters: name → number; mm and inverse powers of mm.
+        dtype: precision of the parameters.
     """
 
     kind: ClassVar[str] = ""
-    refracts: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -112,11 +120,13 @@ class Surface(nn.Module):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Which of a prescription's keys are parameters of this shape; others are errors."""
-        raise NotImplementedError(f"{cls.__name__} does not say which parameters it has")
+        """Which parameters a surface with these keys in its prescription has."""
+        raise NotImplementedError
 
-    @staticmethod
-    def sag_and_gradient(p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    @classmethod
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Sag and its slopes.
 
         Args:
@@ -125,19 +135,30 @@ class Surface(nn.Module):
             y: mm.
 
         Returns:
-            sag (mm), ∂sag/∂x, ∂sag/∂y, and a mask of where the sag branch exists; outside it
-            the numbers are finite.
+            sag (mm), ∂sag/∂x, ∂sag/∂y, and a margin that is positive where the sag branch exists
+            (None: everywhere).  Where it does not, the numbers are finite.
         """
         raise NotImplementedError
 
-    @staticmethod
-    def start(p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
-        """First guess of the distance (mm) from the vertex plane along the ray; finite."""
-        return torch.zeros_like(ray.x * ray.n)
+    @classmethod
+    def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
+        """Curvature at the vertex (1/mm), the mean over azimuth."""
+        raise NotImplementedError
 
     @classmethod
-    def intersect(cls, p: Parameters, ray: PlaneRay, sense: float, scale: float) -> Hit:
-        """Meet the surface: Newton's iteration on the sag, unless the shape has a closed form.
+    def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
+        """First guess of the distance (mm) from the vertex plane along the ray; finite."""
+        return torch.zeros_like(ray.x)
+
+    @classmethod
+    def intersect(
+        cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
+    ) -> tuple[Tensor, Tensor | None]:
+        """Meet the surface.
+
+        Here: Newton's iteration for sag(x + l·t, y + m·t) = n·t.  It runs outside the autograd
+        graph; one more step inside the graph leaves the value where it is and has the derivative
+        of the implicit function, ∂t = -∂F/F_t with F = sag - n·t.
 
         Args:
             p: parameters.
@@ -146,15 +167,60 @@ class Surface(nn.Module):
             scale: mm, a length of the size of the aperture; it sets the tolerance near zero.
 
         Returns:
-            The distance, unit normal (towards +z) and mask.  A ray has met the surface when the
-            iteration converged onto the sag branch and crosses it in the direction of `sense`.
+            The distance t (mm) from the vertex plane, and a margin that is positive where the ray
+            meets the sag branch there and crosses it in the direction of `sense`.
         """
-        return newton(cls, p, ray, sense, scale)
+        epsilon = torch.finfo(ray.n.dtype).eps
+        with torch.no_grad():
+            t = cls.start(p, ray, sense)
+            for _ in range(MAX_NEWTON_STEPS):
+                step = _newton_step(cls, p, ray, t).clamp(-scale, scale)
+                t = t - step
+                # Newton converges quadratically: after a step of √ε the next is below rounding.
+                if bool((step.abs() <= math.sqrt(epsilon) * (t.abs() + scale)).all()):
+                    break
+        t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
+        with torch.no_grad():
+            # Read the residual off the final point: convergence is checked, never assumed.
+            x, y = torch.addcmul(ray.x, ray.l, t), torch.addcmul(ray.y, ray.m, t)
+            sag, sx, sy, exists = cls.sag_and_gradient(p, x, y)
+            z = ray.n * t
+            rounding = 64.0 * epsilon * (sag.abs() + t.abs() + scale)
+            margin = torch.minimum(
+                rounding - (sag - z).abs(), sense * (ray.n - ray.l * sx - ray.m * sy)
+            )
+            if exists is not None:
+                margin = torch.minimum(margin, exists)
+        return t, margin
 
-    @staticmethod
-    def paraxial_curvature(p: Parameters) -> Tensor:
-        """Curvature at the vertex (1/mm), the mean over azimuth."""
-        raise NotImplementedError
+    @classmethod
+    def normal(
+        cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Unit normal towards +z at a point of the surface: (-s_x, -s_y, 1)/√(1 + s_x² + s_y²)."""
+        _, sx, sy, _ = cls.sag_and_gradient(p, x, y)
+        nz = torch.rsqrt(torch.addcmul(torch.addcmul(torch.ones_like(sx), sx, sx), sy, sy))
+        return -sx * nz, -sy * nz, nz
+
+    @classmethod
+    def refract(
+        cls,
+        p: Parameters,
+        point: tuple[Tensor, Tensor, Tensor],
+        direction: tuple[Tensor, Tensor, Tensor],
+        ratio: float | Tensor,
+        sense: float,
+    ) -> Refraction:
+        """Bend rays at points (mm) of the surface; see `snell`."""
+        return snell(direction, cls.normal(p, *point), ratio, sense)
+
+
+def _newton_step(shape: type[Surface], p: Parameters, ray: PlaneRay, t: Tensor) -> Tensor:
+    x, y, l, m, n = ray  # noqa: E741
+    sag, sx, sy, _ = shape.sag_and_gradient(p, torch.addcmul(x, l, t), torch.addcmul(y, m, t))
+    slope = torch.addcmul(torch.addcmul(-n, l, sx), m, sy)
+    magnitude = slope.abs().clamp(min=GRAZING)
+    return torch.addcmul(sag, n, t, value=-1.0) / torch.copysign(magnitude, slope)
 
 
 @dataclass(frozen=True)

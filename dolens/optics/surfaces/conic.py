@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.base import Hit, Parameters, PlaneRay, Surface
+from dolens.optics.surfaces.base import GRAZING, Parameters, PlaneRay, Surface, safe_sqrt
 
 
 def conic_sag(c: Tensor, k: Tensor | float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -19,40 +19,41 @@ def conic_sag(c: Tensor, k: Tensor | float, r2: Tensor) -> tuple[Tensor, Tensor,
         r2: x² + y², mm².
 
     Returns:
-        sag (mm), ds/d(r²) = c/(2√(1 - (1+k)c²r²)) (1/mm), and where the branch exists.
+        sag (mm), ds/d(r²) = c/(2√(1 - (1+k)c²r²)) (1/mm), and a margin that is positive where
+        the branch exists.
     """
-    discriminant = 1.0 - (1.0 + k) * c * c * r2
-    inside = discriminant > 0.0
-    root = torch.sqrt(torch.where(inside, discriminant, torch.ones_like(discriminant)))
-    return c * r2 / (1.0 + root), 0.5 * c / root, inside
+    discriminant = 1.0 - ((1.0 + k) * c * c) * r2
+    root = safe_sqrt(discriminant)
+    return c * r2 / (1.0 + root), 0.5 * c / root, discriminant.detach()
 
 
-def conic_distance(
-    c: Tensor, k: Tensor | float, ray: PlaneRay, sense: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[Tensor, Tensor]:
     """Distance from the vertex plane to a conic, on the crossing in the direction of `sense`.
 
     Along the ray, A·t² - 2G·t + F = 0 with F = c(x² + y²), G = n - c(lx + my) and
     A = c(1 + k·n²).  At a root, direction · gradient = G - A·t = ±√D with D = G² - AF, so the
-    sign of the root is the sense of crossing.  t = F/(G + s√D) has no cancellation and holds for
-    planes; where s·G < 0 the other form (G - s√D)/A is the one without cancellation.
+    sign of the root is the sense of crossing.  t = F/(G + s√D) has no cancellation where
+    s·G > 0, and holds for planes; where s·G < 0 the other form, (G - s√D)/A, is the one without.
+
+    Args:
+        c: curvature, 1/mm.
+        a: A, of any shape that broadcasts.
+        ray: at the vertex plane.
+        sense: s.
 
     Returns:
-        t (mm), the root √D (1 where there is none), and the mask D > 0.
+        t (mm), and D as the margin that is positive where the conic is met.
     """
     x, y, l, m, n = ray  # noqa: E741
-    f = c * (x * x + y * y)
-    g = n - c * (l * x + m * y)
-    a = c * (1.0 + k * n * n)
+    f = c * torch.addcmul(x * x, y, y)
+    g = n - c * torch.addcmul(l * x, m, y)
     discriminant = g * g - a * f
-    met = discriminant > 0.0
-    root = torch.sqrt(torch.where(met, discriminant, torch.ones_like(discriminant)))
-    signed = sense * root
-    forward = sense * g > 0.0
-    denominator = torch.where(forward, g + signed, a)
-    safe = met & (denominator != 0.0)
-    denominator = torch.where(safe, denominator, torch.ones_like(denominator))
-    return torch.where(forward, f, g - signed) / denominator, root, safe
+    root = safe_sqrt(discriminant)
+    along = g if sense > 0.0 else -g
+    near = f / (along + root).clamp(min=GRAZING)
+    far = (along - root) / torch.where(a == 0.0, torch.ones_like(a), a)
+    t = torch.where(along > 0.0, near, far)
+    return (t if sense > 0.0 else -t), discriminant.detach()
 
 
 class Conic(Surface):
@@ -67,39 +68,51 @@ class Conic(Surface):
 
     def check_aperture(self) -> None:
         """The clear aperture ends where the sag does: (1+k)·c²·r² ≤ 1."""
-        c = float(self.curvature.detach())
-        conic = getattr(self, "conic", None)
-        alpha = (1.0 + (0.0 if conic is None else float(conic.detach()))) * c * c
+        stored = {name: float(value.detach()) for name, value in self.named_parameters()}
+        c = stored["curvature"]
+        alpha = (1.0 + stored.get("conic", 0.0)) * c * c
         if alpha * self.semi_diameter**2 > 1.0:
             raise InputError(
                 f"semi_diameter {self.semi_diameter:g} mm exceeds the surface, which ends at "
-                f"{1.0 / math.sqrt(alpha):g} mm (radius {1.0 / c:g} mm)"
+                f"{1.0 / math.sqrt(alpha):g} mm from the axis (radius {1.0 / c:g} mm)"
             )
 
-    @staticmethod
-    def conic_constant(p: Parameters) -> Tensor | float:
+    @classmethod
+    def conic_constant(cls, p: Parameters) -> Tensor | float:
         """The conic constant k."""
         return p["conic"]
 
     @classmethod
-    def sag_and_gradient(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Sag (S1) and slopes (S4): ∂s/∂x = 2x·ds/d(r²)."""
-        sag, slope, inside = conic_sag(p["curvature"], cls.conic_constant(p), x * x + y * y)
-        return sag, 2.0 * x * slope, 2.0 * y * slope, inside
+        sag, slope, exists = conic_sag(p["curvature"], cls.conic_constant(p), x * x + y * y)
+        return sag, 2.0 * x * slope, 2.0 * y * slope, exists
 
     @classmethod
-    def intersect(cls, p: Parameters, ray: PlaneRay, sense: float, scale: float) -> Hit:
-        """Closed form; the normal is (-cx, -cy, 1 - (1+k)cz) over its length."""
-        c, k = p["curvature"], cls.conic_constant(p)
-        t, _, met = conic_distance(c, k, ray, sense)
-        nx = -c * (ray.x + ray.l * t)
-        ny = -c * (ray.y + ray.m * t)
-        nz = 1.0 - (1.0 + k) * c * (ray.n * t)
-        inverse = torch.rsqrt(nx * nx + ny * ny + nz * nz)
-        return Hit(t, nx * inverse, ny * inverse, nz * inverse, met & (nz > 0.0))
+    def intersect(
+        cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
+    ) -> tuple[Tensor, Tensor | None]:
+        """Closed form; on the sag branch where 1 - (1+k)·c·z > 0."""
+        c, k = p["curvature"], p["conic"]
+        t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
+        branch = 1.0 - ((1.0 + k) * c).detach() * (ray.n * t).detach()
+        return t, torch.minimum(met, branch)
 
-    @staticmethod
-    def paraxial_curvature(p: Parameters) -> Tensor:
+    @classmethod
+    def normal(
+        cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(-cx, -cy, 1 - (1+k)cz) over its length."""
+        c, k = p["curvature"], p["conic"]
+        nx, ny, nz = -c * x, -c * y, 1.0 - ((1.0 + k) * c) * z
+        squared = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
+        inverse = torch.rsqrt(squared.clamp(min=GRAZING * GRAZING))
+        return nx * inverse, ny * inverse, nz * inverse
+
+    @classmethod
+    def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
         """The curvature c."""
         return p["curvature"]
 
@@ -114,15 +127,24 @@ class Sphere(Conic):
         """The curvature."""
         return ["curvature"]
 
-    @staticmethod
-    def conic_constant(p: Parameters) -> Tensor | float:
+    @classmethod
+    def conic_constant(cls, p: Parameters) -> Tensor | float:
         """Zero."""
         return 0.0
 
     @classmethod
-    def intersect(cls, p: Parameters, ray: PlaneRay, sense: float, scale: float) -> Hit:
-        """Closed form; (-cx, -cy, 1 - cz) is a unit vector on the sphere as it stands."""
+    def intersect(
+        cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
+    ) -> tuple[Tensor, Tensor | None]:
+        """Closed form; on the near half of the sphere where 1 - c·z > 0."""
         c = p["curvature"]
-        t, _, met = conic_distance(c, 0.0, ray, sense)
-        nz = 1.0 - c * (ray.n * t)
-        return Hit(t, -c * (ray.x + ray.l * t), -c * (ray.y + ray.m * t), nz, met & (nz > 0.0))
+        t, met = conic_distance(c, c, ray, sense)
+        return t, torch.minimum(met, 1.0 - c.detach() * (ray.n * t).detach())
+
+    @classmethod
+    def normal(
+        cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(-cx, -cy, 1 - cz): a unit vector on the sphere as it stands."""
+        c = p["curvature"]
+        return -c * x, -c * y, 1.0 - c * z

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.base import Hit, Parameters, PlaneRay, newton
+from dolens.optics.surfaces.base import Parameters, PlaneRay, Surface
 from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
 
 _POWER = re.compile(r"a([1-9]\d*)")
@@ -33,29 +33,40 @@ class EvenAsphere(Conic):
         return ["curvature", "conic", *(f"a{power}" for power in sorted(powers))]
 
     @classmethod
-    def sag_and_gradient(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Sag (S1) and slopes (S4), the polynomial by Horner's rule in r²."""
-        r2 = x * x + y * y
-        sag, slope, inside = conic_sag(p["curvature"], p["conic"], r2)
+        r2 = torch.addcmul(x * x, y, y)
+        sag, slope, exists = conic_sag(p["curvature"], p["conic"], r2)
         powers = sorted(int(name[1:]) // 2 for name in p if _POWER.fullmatch(name))
-        polynomial = torch.zeros_like(r2)
-        derivative = torch.zeros_like(r2)
-        for power in range(powers[-1] if powers else 0, 0, -1):
-            derivative = derivative * r2 + polynomial
-            polynomial = polynomial * r2
-            if power in powers:
-                polynomial = polynomial + p[f"a{2 * power}"]
-        # The loop ends with polynomial = Σ a·r^(2i-2) and its derivative in r².
-        slope = slope + polynomial + derivative * r2
-        return sag + polynomial * r2, 2.0 * x * slope, 2.0 * y * slope, inside
-
-    @staticmethod
-    def start(p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
-        """The conic's own intersection where there is one, else the vertex plane."""
-        t, _, met = conic_distance(p["curvature"], p["conic"], ray, sense)
-        return torch.where(met, t, torch.zeros_like(t))
+        if powers:
+            # Horner for Q = Σ a_2i·r^(2i-2) and Q', the derivative in r²; the sag adds r²·Q.
+            q, dq = torch.zeros_like(r2), torch.zeros_like(r2)
+            for power in range(powers[-1], 0, -1):
+                dq = torch.addcmul(q, dq, r2)
+                q = q * r2 if power not in powers else torch.addcmul(p[f"a{2 * power}"], q, r2)
+            sag = torch.addcmul(sag, q, r2)
+            slope = slope + torch.addcmul(q, dq, r2)
+        return sag, 2.0 * x * slope, 2.0 * y * slope, exists
 
     @classmethod
-    def intersect(cls, p: Parameters, ray: PlaneRay, sense: float, scale: float) -> Hit:
-        """Newton from the conic."""
-        return newton(cls, p, ray, sense, scale)
+    def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
+        """The conic's own intersection, or the vertex plane where that is out of reach."""
+        c, k = p["curvature"], p["conic"]
+        t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
+        return torch.where(met > 0.0, t, torch.zeros_like(t))
+
+    @classmethod
+    def intersect(
+        cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
+    ) -> tuple[Tensor, Tensor | None]:
+        """Newton's iteration from the conic."""
+        return Surface.intersect.__func__(cls, p, ray, sense, scale)
+
+    @classmethod
+    def normal(
+        cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """From the slopes."""
+        return Surface.normal.__func__(cls, p, x, y, z)

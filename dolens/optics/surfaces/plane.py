@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dolens.optics.surfaces.base import Hit, Parameters, PlaneRay, Surface
+from dolens.optics.surfaces.base import Parameters, PlaneRay, Refraction, Surface, safe_sqrt
 
 
 class Plane(Surface):
@@ -18,21 +18,39 @@ class Plane(Surface):
         """A plane has no parameters."""
         return []
 
-    @staticmethod
-    def sag_and_gradient(p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    @classmethod
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Zero sag and slopes, everywhere."""
         zero = torch.zeros_like(x + y)
-        return zero, zero, zero, torch.ones_like(zero, dtype=torch.bool)
+        return zero, zero, zero, None
 
     @classmethod
-    def intersect(cls, p: Parameters, ray: PlaneRay, sense: float, scale: float) -> Hit:
+    def intersect(
+        cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
+    ) -> tuple[Tensor, Tensor | None]:
         """The ray is there already."""
-        return Hit(torch.zeros_like(ray.n), 0.0, 0.0, 1.0, sense * ray.n > 0.0)
+        return torch.zeros_like(ray.n), None
 
-    @staticmethod
-    def paraxial_curvature(p: Parameters) -> Tensor:
+    @classmethod
+    def refract(
+        cls,
+        p: Parameters,
+        point: tuple[Tensor, Tensor, Tensor],
+        direction: tuple[Tensor, Tensor, Tensor],
+        ratio: float | Tensor,
+        sense: float,
+    ) -> Refraction:
+        """Snell's law about the axis: l' = μl, m' = μm, n' = s·√(1 - μ²(1 - n²))."""
+        l, m, n = direction  # noqa: E741
+        squared = (1.0 - ratio * ratio) + (ratio * ratio) * (n * n)
+        return Refraction(ratio * l, ratio * m, sense * safe_sqrt(squared), squared.detach())
+
+    @classmethod
+    def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
         """Zero."""
-        return torch.zeros(())
+        return 0.0
 
 
 class Aperture(Plane):

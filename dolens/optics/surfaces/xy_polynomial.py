@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dolens.optics.surfaces.base import Parameters, Surface
+from dolens.optics.surfaces.base import Parameters, Surface, safe_sqrt
 
 
 def monomial_powers(name: str) -> tuple[int, int] | None:
@@ -32,51 +32,51 @@ class XYPolynomial(Surface):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """The term b and the monomials that the prescription names."""
-        return ["b", *(str(key) for key in keys if monomial_powers(str(key)) is not None)]
+        """The monomials that the prescription names, and b where it is named."""
+        return [str(key) for key in keys if key == "b" or monomial_powers(str(key)) is not None]
 
-    @staticmethod
-    def sag_and_gradient(p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    @classmethod
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Sag and slopes of the branch through the vertex."""
         polynomial, px, py = _evaluate(p, x, y)
-        discriminant = 1.0 - 4.0 * p["b"] * polynomial
-        inside = discriminant > 0.0
-        root = torch.sqrt(torch.where(inside, discriminant, torch.ones_like(discriminant)))
-        return 2.0 * polynomial / (1.0 + root), px / root, py / root, inside
+        if "b" not in p:
+            return polynomial, px, py, None
+        discriminant = 1.0 - (4.0 * p["b"]) * polynomial
+        root = safe_sqrt(discriminant)
+        return 2.0 * polynomial / (1.0 + root), px / root, py / root, discriminant.detach()
 
-    @staticmethod
-    def paraxial_curvature(p: Parameters) -> Tensor:
+    @classmethod
+    def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
         """x2 + y2: the mean over azimuth of the curvature at the vertex."""
-        zero = torch.zeros_like(p["b"])
-        return p.get("x2", zero) + p.get("y2", zero)
+        return p.get("x2", 0.0) + p.get("y2", 0.0)
 
 
 def _evaluate(p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """P and its two derivatives, from tables of the powers of x and y."""
-    terms = [(powers, p[name]) for name in p if (powers := monomial_powers(name)) is not None]
-    degree = max((max(powers) for powers, _ in terms), default=0)
-    x_powers = _power_table(x, degree)
-    y_powers = _power_table(y, degree)
-    zero = torch.zeros_like(x * y)
+    """P, ∂P/∂x and ∂P/∂y; every power and product of powers is computed once."""
+    cache: dict[tuple[int, int], Tensor] = {(1, 0): x, (0, 1): y}
+
+    def monomial(i: int, j: int) -> Tensor:
+        if (i, j) not in cache:
+            if (i, j) == (0, 0):
+                cache[i, j] = torch.ones_like(x)
+            elif i > j:
+                cache[i, j] = monomial(i - 1, j) * x
+            else:
+                cache[i, j] = monomial(i, j - 1) * y
+        return cache[i, j]
+
+    zero = torch.zeros_like(x)
     value, dx, dy = zero, zero, zero
-    for (i, j), a in terms:
-        value = value + a * _product(x_powers[i], y_powers[j])
+    for name, a in p.items():
+        powers = monomial_powers(name)
+        if powers is None:
+            continue
+        i, j = powers
+        value = torch.addcmul(value, a, monomial(i, j))
         if i:
-            dx = dx + (i * a) * _product(x_powers[i - 1], y_powers[j])
+            dx = torch.addcmul(dx, a, monomial(i - 1, j), value=i)
         if j:
-            dy = dy + (j * a) * _product(x_powers[i], y_powers[j - 1])
+            dy = torch.addcmul(dy, a, monomial(i, j - 1), value=j)
     return value, dx, dy
-
-
-def _power_table(x: Tensor, degree: int) -> list[Tensor | None]:
-    """x⁰ (as None, a factor of one), x¹, x², ... x^degree."""
-    table: list[Tensor | None] = [None]
-    for _ in range(degree):
-        table.append(x if table[-1] is None else table[-1] * x)
-    return table
-
-
-def _product(a: Tensor | None, b: Tensor | None) -> Tensor | float:
-    if a is None:
-        return 1.0 if b is None else b
-    return a if b is None else a * b

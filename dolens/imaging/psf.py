@@ -1,0 +1,110 @@
+"""Geometric point spread functions, differentiable in the lens."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.imaging.sampling import regular_square, square_to_disc
+from dolens.imaging.scene import PlanarScene
+from dolens.imaging.sensor import Sensor
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import entrance_pupil
+from dolens.optics.rays import Components
+from dolens.optics.trace import trace_surfaces, trace_to_plane
+
+# The paraxial pupil is widened a little, so that the real one lies within it.
+_PUPIL_MARGIN = 1.02
+
+
+def axial_point_spread_functions(
+    lens: Lens,
+    scene: PlanarScene,
+    sensor: Sensor,
+    size: int = 65,
+    pupil_samples: int = 64,
+    values: Mapping[str, Tensor] | None = None,
+) -> Tensor:
+    """Point spread functions on the axis, at every depth and wavelength of a scene.
+
+    Rays from the axial point fill the entrance pupil and are traced to the sensor, where each
+    lands as a quadratic B-spline.  That spline is a pixel's box convolved with a texel's tent, so
+    the discrete convolution of a texture with the result is what `RayRenderer` renders, wherever
+    the field is small enough for one PSF.
+
+    Args:
+        lens: the lens.
+        scene: depths and wavelengths.
+        sensor: its pixel pitch.
+        size: pixels along each side, odd; the axis falls on the central pixel.
+        pupil_samples: strata along each side of the pupil.
+        values: lens parameters to use instead of the stored ones.
+
+    Returns:
+        (depths, wavelengths, size, size), upright like an image, each of unit sum less what lands
+        outside the window.  Differentiable in the lens's parameters and `values`.
+    """
+    if size < 3 or size % 2 == 0:
+        raise InputError(f"psf size must be odd and at least 3, not {size}")
+    system = lens.system(values)
+    scene.check(system)
+    u, v = regular_square(pupil_samples, system.dtype, system.device)
+    disc_x, disc_y = square_to_disc(u, v)
+    functions = []
+    for depth in scene.depths:
+        for wavelength in scene.wavelengths:
+            with torch.no_grad():
+                pupil = entrance_pupil(system, wavelength)
+                radius = 0.5 * _PUPIL_MARGIN * pupil.diameter
+            dx, dy = disc_x * radius, disc_y * radius
+            dz = (pupil.z + depth).expand(dx.shape)
+            n = dz / torch.sqrt(dx * dx + dy * dy + dz * dz)
+            zero = torch.zeros_like(n)
+            ray = Components(zero, zero, zero - depth, dx / dz * n, dy / dz * n, n)
+            traced = trace_surfaces(system, ray, wavelength)
+            traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
+            # A Lambertian point sends cos⁴ over the pupil plane, like a pixel does backwards.
+            weight = torch.where(traced.valid, n**4, zero)
+            total = weight.sum()
+            if not bool(total > 0.0):
+                raise InputError(f"no light from the axis at {depth:g} mm reaches the sensor")
+            columns = size // 2 - traced.ray.x / sensor.pixel_pitch
+            rows = size // 2 + traced.ray.y / sensor.pixel_pitch
+            functions.append(splat(rows, columns, weight / total, size))
+    return torch.stack(functions).reshape(len(scene.depths), len(scene.wavelengths), size, size)
+
+
+def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
+    """Sum weighted quadratic B-splines, centred on points, onto a grid of pixels.
+
+    Args:
+        rows: (N,), fractional pixels.
+        columns: (N,).
+        weight: (N,); zero leaves a point out, wherever it lies.
+        size: pixels along each side of the grid.
+
+    Returns:
+        (size, size).  Once continuously differentiable in rows and columns.  Points within a
+        pixel and a half of the edge lose what falls outside.
+    """
+    row_taps, row_weights = _spline_taps(rows)
+    column_taps, column_weights = _spline_taps(columns)
+    flat = torch.zeros(size * size, dtype=weight.dtype, device=weight.device)
+    for row, row_weight in zip(row_taps, row_weights, strict=True):
+        for column, column_weight in zip(column_taps, column_weights, strict=True):
+            inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
+            index = torch.where(inside, row * size + column, 0)
+            amount = torch.where(inside, weight * row_weight * column_weight, 0.0)
+            flat = flat.index_add(0, index, amount)
+    return flat.reshape(size, size)
+
+
+def _spline_taps(position: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """The three pixels under a quadratic B-spline at each position, and its values there."""
+    centre = torch.round(position.detach())
+    d = position - centre
+    weights = [0.5 * (0.5 - d) ** 2, 0.75 - d * d, 0.5 * (0.5 + d) ** 2]
+    # Far rays (only invalid ones are) must not overflow the integer index.
+    index = centre.clamp(-(2.0**30), 2.0**30).long()
+    return [index - 1, index, index + 1], weights

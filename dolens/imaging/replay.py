@@ -1,0 +1,56 @@
+"""Gradients of a long computation with the memory of a short one (adjoint back-propagation).
+
+The forward pass runs piece by piece without a graph.  The backward pass runs each piece again,
+with a graph this time, pushes the output's gradient through it at once and lets it go.  Memory is
+bounded by one piece; the price is one more forward pass.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+Piece = Callable[..., Tensor]
+
+
+def replay(piece: Piece, sizes: Sequence[int], tensors: Sequence[Tensor]) -> Tensor:
+    """Concatenate `piece(i, *tensors)` for i = 0, 1, ... along the last dimension.
+
+    Args:
+        piece: a pure function of its index and tensors; run twice it must give the same numbers.
+        sizes: length of each piece's last dimension.
+        tensors: what it depends on; those that require a gradient receive one.
+
+    Returns:
+        (..., Σ sizes).
+    """
+    return _Replay.apply(piece, tuple(sizes), *tensors)
+
+
+class _Replay(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, piece: Piece, sizes: tuple[int, ...], *tensors: Tensor) -> Tensor:  # noqa: ANN001
+        ctx.piece, ctx.sizes = piece, sizes
+        ctx.save_for_backward(*tensors)
+        return torch.cat([piece(i, *tensors) for i in range(len(sizes))], dim=-1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN001
+        needed = [i for i, needs in enumerate(ctx.needs_input_grad[2:]) if needs]
+        totals: list[Tensor | None] = [None] * len(ctx.saved_tensors)
+        for i, part in enumerate(gradient.split(ctx.sizes, dim=-1)):
+            with torch.enable_grad():
+                inputs = [t.detach() for t in ctx.saved_tensors]
+                for j in needed:
+                    inputs[j].requires_grad_()
+                output = ctx.piece(i, *inputs)
+            if not output.requires_grad:
+                continue
+            found = torch.autograd.grad(
+                output, [inputs[j] for j in needed], part, allow_unused=True
+            )
+            for j, g in zip(needed, found, strict=True):
+                if g is not None:
+                    totals[j] = g if totals[j] is None else totals[j] + g
+        return (None, None, *totals)

@@ -1,0 +1,104 @@
+"""Planar scenes: textured planes at a few depths, and what an ideal pinhole sees of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.imaging.sensor import Sensor
+from dolens.imaging.texture import bilinear
+from dolens.optics.paraxial import chief_ray_magnification
+from dolens.optics.system import OpticalSystem
+
+REFERENCE_WAVELENGTH = 587.5618
+
+
+@dataclass(frozen=True)
+class PlanarScene:
+    """A textured plane perpendicular to the axis, at one of several depths.
+
+    A texture is mapped so that one texel covers one pixel as a distortion-free pinhole of the
+    lens's own magnification sees it: the plane is scaled with its depth, and the pinhole image
+    of a texture is the texture's central part.  Texel and pixel centres coincide.
+
+    Attributes:
+        depths: mm in front of the first vertex.
+        wavelengths: nm, one for each of the texture's channels.
+    """
+
+    depths: tuple[float, ...]
+    wavelengths: tuple[float, ...]
+
+    def __init__(self, depths: Sequence[float], wavelengths: Sequence[float]) -> None:
+        object.__setattr__(self, "depths", tuple(float(d) for d in depths))
+        object.__setattr__(self, "wavelengths", tuple(float(w) for w in wavelengths))
+        if not self.depths or not self.wavelengths:
+            raise InputError("scene: depths (mm) and wavelengths (nm) must not be empty")
+        for wavelength in self.wavelengths:
+            if not 100.0 < wavelength < 20000.0:
+                raise InputError(
+                    f"scene: wavelength {wavelength:g} nm is not between 100 and 20000"
+                )
+
+    def check(self, system: OpticalSystem) -> None:
+        """Raise `InputError` where a depth is not in front of the whole lens."""
+        surface = system.surfaces[0]
+        edge = torch.tensor(surface.semi_diameter, dtype=torch.float64)
+        parameters = {name: p.detach().double() for name, p in surface.parameters.items()}
+        sag = surface.shape.sag_and_gradient(parameters, edge.cpu(), torch.zeros_like(edge))[0]
+        front = max(0.0, -float(sag))
+        for depth in self.depths:
+            if not depth > front:
+                raise InputError(
+                    f"scene: depth {depth:g} mm lies inside the lens; depths are mm in front of "
+                    f"the first vertex, and the lens's front edge is at {front:g}"
+                )
+
+    def labels(self) -> list[str]:
+        """Depths as metrics name them, in metres: `8m`, `4.5m`."""
+        return [f"{depth / 1000.0:g}m" for depth in self.depths]
+
+    @torch.no_grad()
+    def magnifications(self, system: OpticalSystem) -> list[float]:
+        """|image height / object height| of the paraxial chief ray, at each depth."""
+        return [
+            abs(float(chief_ray_magnification(system, REFERENCE_WAVELENGTH, depth)))
+            for depth in self.depths
+        ]
+
+
+def texture_coordinates(
+    x: Tensor, y: Tensor, magnification: float, sensor: Sensor, texture_size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Rows and columns of the texture at points (x, y) mm of the plane.
+
+    The plane is seen from the lens: columns grow with x, rows grow against y.
+    """
+    height, width = texture_size
+    scale = magnification / sensor.pixel_pitch
+    return 0.5 * (height - 1) - y * scale, 0.5 * (width - 1) + x * scale
+
+
+def pinhole_image(textures: Tensor, sensor: Sensor) -> Tensor:
+    """What a distortion-free pinhole of the lens's magnification sees: the ground truth.
+
+    Args:
+        textures: (..., H, W), as `PlanarScene` maps them.
+        sensor: its pixels; where H - height is odd, pixel centres fall between texels.
+
+    Returns:
+        (..., height, width): the textures' values at the pixel centres.
+    """
+    height, width = textures.shape[-2:]
+    top, left = (height - sensor.height) / 2.0, (width - sensor.width) / 2.0
+    if top >= 0 and left >= 0 and top.is_integer() and left.is_integer():
+        top, left = int(top), int(left)
+        return textures[..., top : top + sensor.height, left : left + sensor.width]
+    options = {"dtype": textures.dtype, "device": textures.device}
+    rows = torch.arange(sensor.height, **options) + top
+    columns = torch.arange(sensor.width, **options) + left
+    grid = torch.meshgrid(rows, columns, indexing="ij")
+    image = bilinear(textures.reshape(-1, height, width), *grid)
+    return image.reshape(*textures.shape[:-2], sensor.height, sensor.width)
