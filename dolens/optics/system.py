@@ -30,8 +30,16 @@ class OpticalSystem:
     stop: int
 
     def indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
-        """Indices before surface 1 and after each surface, at a wavelength in nm."""
-        return [material.index(wavelength) for material in self.materials]
+        """Indices before surface 1 and after each surface, at a wavelength in nm.
+
+        A tensor of wavelengths gives tensors in the lens's precision, so that the wavelengths'
+        own does not decide in which precision rays are traced.
+        """
+        if isinstance(wavelength, Tensor):
+            finer = torch.promote_types(wavelength.dtype, self.dtype)
+            wavelength = wavelength.to(device=self.device, dtype=finer)
+        indices = [material.index(wavelength) for material in self.materials]
+        return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in indices]
 
     @cached_property
     def vertices(self) -> list[Tensor]:
