@@ -1,0 +1,57 @@
+"""Indices against tests/reference/index.json, and what is said about materials that do not exist."""
+
+import pytest
+import torch
+
+from dolens import InputError
+from dolens.optics.materials import index_model, parse_material
+
+
+@pytest.mark.parametrize("name", ["dfc", "do", "paper"])
+def test_indices(reference, name):
+    # `paper` has the lines of `do` and air 1 (tests/reference/README.md).
+    data = reference("index.json")["data"]["do" if name == "paper" else name]
+    model = index_model(name)
+    assert model.lines == tuple(float(line) for line in data["lines_nm"])
+    assert model.air == (1.0 if name == "paper" else float(data["n_air"]))
+    assert len(data["materials"]) == 17
+    for glass, expected in data["materials"].items():
+        material = parse_material(glass, model)
+        assert material.a == pytest.approx(float(expected["A"]), rel=1e-15)
+        assert material.b == pytest.approx(float(expected["B_nm2"]), rel=1e-14)
+        for wavelength, index in expected["n"].items():
+            assert material.index(float(wavelength)) == pytest.approx(float(index), rel=1e-15)
+        nm = torch.tensor([float(w) for w in expected["n"]], dtype=torch.float64)
+        exact = torch.tensor([float(n) for n in expected["n"].values()], dtype=torch.float64)
+        assert ((material.index(nm) - exact).abs() / exact).max() <= 2.3e-16 * 2
+
+
+def test_media_without_dispersion():
+    assert parse_material("air", index_model("do")).index(500.0) == 1.000293
+    assert parse_material(" AIR ", index_model("dfc")).index(500.0) == 1.0
+    assert parse_material("occluder", index_model("do")).index(500.0) == 1.0
+
+
+@pytest.mark.parametrize("text", ["N-BK7", "1.5168", "1.5168/", "/64", "1.5168/64.17/2", ""])
+def test_unknown_material(text):
+    with pytest.raises(InputError, match=r"unknown material .*allowed: air, occluder, .*nd/Vd"):
+        parse_material(text, index_model("dfc"))
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"), [("aire", "air"), ("Arr", "air"), ("occluded", "occluder")]
+)
+def test_nearest_material(text, meant):
+    with pytest.raises(InputError, match=f"unknown material '{text}'; did you mean '{meant}'"):
+        parse_material(text, index_model("dfc"))
+
+
+@pytest.mark.parametrize("text", ["0.9/60", "1.5/0"])
+def test_impossible_glass(text):
+    with pytest.raises(InputError, match=f"material '{text}': nd must be at least 1 and Vd"):
+        parse_material(text, index_model("dfc"))
+
+
+def test_unknown_index_model():
+    with pytest.raises(InputError, match="index_model 'dcf' is unknown; allowed: dfc, do, paper"):
+        index_model("dcf")
