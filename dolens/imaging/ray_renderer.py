@@ -36,6 +36,8 @@ class RayRenderer:
         pupil_samples: strata along each side; rays a pixel are its square.
         chunk_rays: rays traced at a time; sets the memory, not the result's distribution.
         replay: recompute each chunk in the backward pass, so that memory stays bounded.
+        gradient_fraction: share of the chunks that the backward pass recomputes, drawn at random
+            for each seed; below 1 the gradient is an unbiased estimate, and the image is whole.
         pixel_area: sample over the pixel's area (a real pixel integrates), or at its centre.
     """
 
@@ -43,11 +45,16 @@ class RayRenderer:
     pupil_samples: int = 7
     chunk_rays: int = 65536
     replay: bool = True
+    gradient_fraction: float = 1.0
     pixel_area: bool = True
 
     def __post_init__(self) -> None:
         if self.pupil_samples < 1 or self.chunk_rays < 1:
             raise InputError("renderer: pupil_samples and chunk_rays must be at least 1")
+        if not 0.0 < self.gradient_fraction <= 1.0:
+            raise InputError("renderer: gradient_fraction must be above 0 and at most 1")
+        if self.gradient_fraction < 1.0 and not self.replay:
+            raise InputError("renderer: gradient_fraction below 1 needs replay")
 
     def rays_per_image(self, scene: PlanarScene) -> int:
         """Rays traced through the lens for one render, all wavelengths together."""
@@ -102,7 +109,10 @@ class RayRenderer:
 
         tensors = [textures.to(device=lens.device, dtype=lens.dtype), *parameters.values()]
         if self.replay:
-            flat = replay(piece, sizes, tensors)
+            count = max(1, round(self.gradient_fraction * len(sizes)))
+            generator = torch.Generator().manual_seed(seed % _SEED_RANGE)
+            replayed = torch.randperm(len(sizes), generator=generator)[:count].tolist()
+            flat = replay(piece, sizes, tensors, replayed)
         else:
             flat = torch.cat([piece(i, *tensors) for i in range(len(sizes))], dim=-1)
         return flat.unflatten(-1, (self.sensor.height, self.sensor.width))

@@ -37,7 +37,10 @@ class CropDataModule(lightning.LightningDataModule):
         crop_size: texels of the crop, one number for a square or (height, width).
         margin: texels added on each side, so that a renderer's blur finds no edge.
         batch_size: crops in a batch.
-        steps_per_epoch: batches in a training epoch.
+        steps_per_epoch: batches in a training epoch; None: as many as `iterations_per_photograph`
+            asks for.
+        iterations_per_photograph: crops of each training photograph in an epoch, where
+            steps_per_epoch is None.
         scale_range: (smallest, largest) photograph pixels per texel in training, drawn
             log-uniformly.
         evaluation_crops_per_photograph: crops of each validation and test photograph.
@@ -56,7 +59,8 @@ class CropDataModule(lightning.LightningDataModule):
         crop_size: int | Sequence[int] = 256,
         margin: int = 0,
         batch_size: int = 4,
-        steps_per_epoch: int = 100,
+        steps_per_epoch: int | None = 100,
+        iterations_per_photograph: int | None = None,
         scale_range: Sequence[float] = (1.0, 2.0),
         evaluation_crops_per_photograph: int = 4,
         evaluation_scale: float = 1.0,
@@ -69,7 +73,16 @@ class CropDataModule(lightning.LightningDataModule):
         self.crop_size = _size("data.crop_size", crop_size)
         self.margin = _count("data.margin", margin, 0)
         self.batch_size = _count("data.batch_size", batch_size, 1)
-        self.steps_per_epoch = _count("data.steps_per_epoch", steps_per_epoch, 1)
+        if (steps_per_epoch is None) == (iterations_per_photograph is None):
+            raise InputError(
+                "data: give steps_per_epoch or iterations_per_photograph, and null for the other"
+            )
+        self._steps_per_epoch = steps_per_epoch
+        if steps_per_epoch is not None:
+            _count("data.steps_per_epoch", steps_per_epoch, 1)
+        self._iterations_per_photograph = iterations_per_photograph
+        if iterations_per_photograph is not None:
+            _count("data.iterations_per_photograph", iterations_per_photograph, 1)
         self.scale_range = _range("data.scale_range", scale_range)
         self.evaluation_crops_per_photograph = _count(
             "data.evaluation_crops_per_photograph", evaluation_crops_per_photograph, 1
@@ -87,6 +100,14 @@ class CropDataModule(lightning.LightningDataModule):
     def item_size(self) -> tuple[int, int]:
         """(height, width) of an item in texels: the crop and its margins."""
         return self.crop_size[0] + 2 * self.margin, self.crop_size[1] + 2 * self.margin
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Batches in a whole training epoch; the last may go on into the next pass."""
+        if self._steps_per_epoch is not None:
+            return self._steps_per_epoch
+        crops = self._iterations_per_photograph * len(self.photographs("train"))
+        return -(-crops // self.batch_size)
 
     @property
     def samples_per_epoch(self) -> int:

@@ -1,0 +1,44 @@
+"""What a user is told when a run stops early."""
+
+import logging
+from pathlib import Path
+
+import lightning
+
+logger = logging.getLogger(__name__)
+
+
+class InterruptionNotice(lightning.Callback):
+    """Says where the last checkpoint is and how to resume, when a run is interrupted or fails.
+
+    Args:
+        folder: of the checkpoints.
+        command: what starts the same run again.
+    """
+
+    def __init__(self, folder: str | Path, command: str) -> None:
+        self.folder = Path(folder)
+        self.command = command
+
+    def on_exception(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        exception: BaseException,
+    ) -> None:
+        """Log one line."""
+        last = self.folder / "last.ckpt"
+        if last.exists():
+            logger.warning(
+                "Stopped at step %d (%s). Resume with: %s ckpt_path=%s",
+                trainer.global_step,
+                type(exception).__name__,
+                self.command,
+                last,
+            )
+        else:
+            logger.warning(
+                "Stopped at step %d (%s), before the first checkpoint.",
+                trainer.global_step,
+                type(exception).__name__,
+            )

@@ -1,0 +1,318 @@
+"""A camera as one Lightning module: lens, scene, renderer, noise, reconstruction and loss."""
+
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from dolens.errors import InputError
+from dolens.imaging.color import linear_to_srgb
+from dolens.imaging.psf import axial_point_spread_functions
+from dolens.imaging.ray_renderer import RayRenderer
+from dolens.imaging.scene import PlanarScene, pinhole_image
+from dolens.imaging.sensor import add_read_noise
+from dolens.optics.lens import Lens
+from dolens.optimize.variables import DesignVariables
+from dolens.reconstruction import (
+    Restoration,
+    RestorationLoss,
+    psnr_db,
+    structural_similarity,
+)
+
+# Streams of random numbers that must not meet: (what, stage) → an offset of the seed.
+_STREAMS = {"train": 0, "val": 1, "test": 2}
+_STREAM_STRIDE, _NOISE_OFFSET = 1 << 40, 1 << 39
+
+
+class CameraModule(lightning.LightningModule):
+    """End-to-end training of a camera on planar scenes at several depths.
+
+    A batch of textures is imaged at every depth, noise is added, and one network restores all the
+    images without being told the depth.  The loss reaches the network and the lens's variables.
+
+    All random numbers are functions of the seed and the step, so that a resumed run repeats an
+    uninterrupted one.
+
+    Args:
+        lens: the lens; its other parameters stay as they are.
+        experiment: name of the experiment; a checkpoint of another one is refused.
+        scene: depths and wavelengths.
+        renderer: makes the training images.
+        network: restores them.
+        loss: compares display-encoded images.
+        optimizer: parameter groups → optimizer.
+        learning_rates: `optics` and `network`.
+        scheduler: optimizer → scheduler, stepped once a training step; or None.
+        variables: settings of `DesignVariables`; empty or None trains the network alone.
+        evaluation_pupil_samples: `pupil_samples` of the renderer that makes the validation and test
+            images; by default the training renderer's own.
+        read_noise: standard deviation, of full scale in linear light.
+        psf_size: pixels along each side of the point spread functions.
+        psf_pupil_samples: their strata along each side of the pupil.
+        seed: of rendering and noise.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        experiment: str,
+        scene: PlanarScene,
+        renderer: RayRenderer,
+        network: Restoration,
+        loss: RestorationLoss,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        learning_rates: Mapping[str, float],
+        scheduler: Callable[..., Any] | None = None,
+        variables: Mapping[str, Mapping[str, Any] | None] | None = None,
+        evaluation_pupil_samples: int | None = None,
+        read_noise: float = 0.0,
+        psf_size: int = 65,
+        psf_pupil_samples: int = 48,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.lens = lens.requires_grad_(False)
+        self.variables = DesignVariables(lens, variables or {})
+        self.variables.write_to(self.lens)
+        self.network = network
+        self.loss = loss
+        self.experiment = experiment
+        self.scene = scene
+        self.renderer = renderer
+        self.evaluation_renderer = replace(
+            renderer, pupil_samples=evaluation_pupil_samples or renderer.pupil_samples
+        )
+        self.optimizer = optimizer
+        self.scheduler = scheduler
+        self.learning_rates = dict(learning_rates)
+        self.read_noise = read_noise
+        self.psf_size = psf_size
+        self.psf_pupil_samples = psf_pupil_samples
+        self.seed = seed
+        self.step_seconds: list[float] = []
+        self.optics_seconds: list[float] = []
+        self._evaluations: list[dict[str, Tensor]] = []
+        self._step_started = self._optics_started = 0.0
+        scene.check(lens.system())
+        missing = {"optics", "network"} - set(self.learning_rates)
+        if missing:
+            raise InputError(f"learning_rates: '{missing.pop()}' is missing (optics and network)")
+
+    # ---------------------------------------------------------------- imaging and restoration
+
+    def truth(self, textures: Tensor) -> Tensor:
+        """(B, 3, H, W), display-encoded: what a distortion-free pinhole sees."""
+        return linear_to_srgb(pinhole_image(textures, self.renderer.sensor))
+
+    def raw_images(
+        self, textures: Tensor, renderer: RayRenderer, seed: int, values: Mapping[str, Tensor]
+    ) -> Tensor:
+        """(B, depths, 3, H, W), linear light, with noise."""
+        image = renderer.render(self.lens, self.scene, textures, seed, values)
+        generator = torch.Generator(image.device).manual_seed(seed + _NOISE_OFFSET)
+        return add_read_noise(image, self.read_noise, generator)
+
+    def point_spread_functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
+        """(depths, 3, K, K) of the lens as it is, or None where the network asks for none."""
+        if not self.network.needs_point_spread_function:
+            return None
+        return axial_point_spread_functions(
+            self.lens,
+            self.scene,
+            self.renderer.sensor,
+            self.psf_size,
+            self.psf_pupil_samples,
+            values,
+        )
+
+    def restore(self, raw: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        """(B, depths, 3, H, W), display-encoded, of raw images of that shape."""
+        restored = self.network(raw.flatten(0, 1), self.point_spread_functions(values))
+        return restored.unflatten(0, raw.shape[:2])
+
+    # ---------------------------------------------------------------- training
+
+    def configure_optimizers(self) -> Any:
+        """One optimizer; the lens's variables and the network have learning rates of their own."""
+        groups = [
+            {
+                "params": list(self.network.parameters()),
+                "lr": self.learning_rates["network"],
+                "name": "network",
+            }
+        ]
+        if len(self.variables):
+            groups.append(
+                {
+                    "params": [self.variables.scaled],
+                    "lr": self.learning_rates["optics"],
+                    "name": "optics",
+                }
+            )
+        optimizer = self.optimizer(groups)
+        if self.scheduler is None:
+            return optimizer
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": self.scheduler(optimizer), "interval": "step"},
+        }
+
+    def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
+        """Start the step's clock."""
+        self._step_started = time.perf_counter()
+
+    def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
+        """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
+        started = time.perf_counter()
+        values = self.variables()
+        raw = self.raw_images(batch, self.renderer, self._seed("train", self.global_step), values)
+        self.optics_seconds.append(time.perf_counter() - started)
+        if raw.requires_grad:
+            # The image's gradient is the network's last; what comes after it is the lens's.
+            raw.register_hook(self._start_optics_backward)
+        restored = self.restore(raw, values)
+        truth = self.truth(batch)[:, None].expand_as(restored)
+        terms = self.loss(restored.flatten(0, 1), truth.flatten(0, 1).to(restored.dtype))
+        with torch.no_grad():
+            psnr = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1)).mean()
+        self.log("train/loss", terms["total"], prog_bar=True)
+        self.log("train/psnr_db", psnr, prog_bar=True)
+        for name, value in terms.items():
+            if name != "total":
+                self.log(f"train/{name}", value)
+        return terms["total"]
+
+    def on_after_backward(self) -> None:
+        """Close the optics' share of the backward pass."""
+        if self._optics_started:
+            self.optics_seconds[-1] += time.perf_counter() - self._optics_started
+            self._optics_started = 0.0
+
+    def on_train_batch_end(self, outputs: Any, batch: Tensor, batch_idx: int) -> None:
+        """Project the variables onto their bounds (S17), store them in the lens, log the cost."""
+        if len(self.variables):
+            self.variables.project()
+            self.variables.write_to(self.lens)
+        self.step_seconds.append(time.perf_counter() - self._step_started)
+        self.log("cost/step_s", self.step_seconds[-1])
+        self.log("cost/optics_s", self.optics_seconds[-1])
+        self.log("cost/network_s", self.step_seconds[-1] - self.optics_seconds[-1])
+        self.log("cost/rays", float(self.renderer.rays_per_image(self.scene)))
+        with torch.no_grad():
+            for name, value in self.variables().items():
+                self.log(f"variables/{name}", value.float())
+
+    def _start_optics_backward(self, gradient: Tensor) -> None:
+        self._optics_started = time.perf_counter()
+
+    def _seed(self, stage: str, index: int) -> int:
+        return (self.seed * len(_STREAMS) + _STREAMS[stage]) * _STREAM_STRIDE + index
+
+    # ---------------------------------------------------------------- evaluation
+
+    def evaluation_images(
+        self, batch: Tensor, stage: str, index: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Truth (B, 3, H, W), raw and restored (B, depths, 3, H, W), display-encoded.
+
+        The same stage and index give the same images of the same camera.
+        """
+        with torch.no_grad():
+            values = self.variables()
+            raw = self.raw_images(batch, self.evaluation_renderer, self._seed(stage, index), values)
+            restored = self.restore(raw, values)
+            return self.truth(batch), linear_to_srgb(raw), restored.clamp(0.0, 1.0)
+
+    def validation_step(self, batch: Tensor, batch_idx: int) -> None:
+        """Measure on the validation photographs."""
+        self._evaluate(batch, "val", batch_idx)
+
+    def test_step(self, batch: Tensor, batch_idx: int) -> None:
+        """Measure on the test photographs."""
+        self._evaluate(batch, "test", batch_idx)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the means."""
+        self._log_evaluations("val")
+
+    def on_test_epoch_end(self) -> None:
+        """Log the means."""
+        self._log_evaluations("test")
+
+    def _evaluate(self, batch: Tensor, stage: str, index: int) -> None:
+        truth, raw, restored = self.evaluation_images(batch, stage, index)
+        loss = self.loss(
+            restored.flatten(0, 1),
+            truth[:, None].expand_as(restored).flatten(0, 1).to(restored.dtype),
+        )
+        row = {"loss": loss["total"].expand(len(batch), len(self.scene.depths))}
+        for name, image in (("", restored), ("raw_", raw)):
+            row[f"{name}psnr_db"] = torch.stack(
+                [psnr_db(image[:, d], truth) for d in range(image.shape[1])], 1
+            )
+            row[f"{name}ssim"] = torch.stack(
+                [structural_similarity(image[:, d], truth) for d in range(image.shape[1])], 1
+            )
+        self._evaluations.append(row)
+
+    def _log_evaluations(self, stage: str) -> None:
+        rows, self._evaluations = self._evaluations, []
+        if not rows:
+            return
+        for name in rows[0]:
+            by_depth = torch.cat([row[name] for row in rows]).mean(dim=0).float()
+            headline = name in ("loss", "psnr_db")
+            self.log(f"{stage}/{name}", by_depth.mean(), prog_bar=headline)
+            if name != "loss":
+                for label, value in zip(self.scene.labels(), by_depth, strict=True):
+                    self.log(f"{stage}/{name}/{label}", value)
+                self.log(f"{stage}/{name}/worst", by_depth.min())
+
+    def summary(self) -> dict[str, float]:
+        """Numbers about the whole run, for metrics.json."""
+        numbers = {f"variables/{name}": float(v.detach()) for name, v in self.variables().items()}
+        numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
+        numbers["cost/rays"] = float(self.renderer.rays_per_image(self.scene))
+        if self.step_seconds:
+            numbers["cost/step_s"] = statistics.median(self.step_seconds)
+            numbers["cost/optics_s"] = statistics.median(self.optics_seconds)
+            numbers["cost/network_s"] = numbers["cost/step_s"] - numbers["cost/optics_s"]
+        return numbers
+
+    # ---------------------------------------------------------------- checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say whose checkpoint it is, in plain values."""
+        checkpoint["dolens"] = self._identity()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another experiment before any weight is loaded."""
+        found, own = checkpoint.get("dolens"), self._identity()
+        if not isinstance(found, dict):
+            raise InputError("ckpt_path: this file is no checkpoint of a dolens camera")
+        for key, value in own.items():
+            if found.get(key) != value:
+                raise InputError(
+                    f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
+                    f"{value!r}; resume with the experiment and settings that wrote it"
+                )
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "experiment": self.experiment,
+            "lens": self.lens.name,
+            "variables": list(self.variables.names),
+            "network": ", ".join(f"{n} {tuple(p.shape)}" for n, p in _shapes(self.network)),
+        }
+
+
+def _shapes(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    """The first and last parameters: enough to tell networks of other widths or kinds apart."""
+    parameters = list(module.named_parameters())
+    return iter([parameters[0], parameters[-1]]) if parameters else iter([])

@@ -1,0 +1,147 @@
+"""From a composed configuration to a finished run folder."""
+
+import logging
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from dolens.errors import InputError
+from dolens.prescriptions import lens_from_prescription, save_lens
+from experiments.callbacks.interruption import InterruptionNotice
+from experiments.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
+
+logger = logging.getLogger(__name__)
+
+# Arithmetic that configurations need: the number of steps of a whole training.
+OmegaConf.register_new_resolver("total_steps", lambda epochs, steps: epochs * steps, replace=True)
+
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def run(cfg: DictConfig) -> float:
+    """Train, test, and write the run folder; return the objective that the config names."""
+    started = time.perf_counter()
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    refuse_subprocess_ddp_in_sweep(cfg)
+    if cfg.threads:
+        torch.set_num_threads(cfg.threads)
+    # The basic launcher runs a sweep's jobs in one process: seed at each start.
+    lightning.seed_everything(cfg.seed, workers=True, verbose=False)
+    torch.set_float32_matmul_precision(cfg.matmul_precision)
+    lens = build_lens(cfg)
+    module = instantiate(cfg.module)(lens=lens)
+    data = instantiate(cfg.data)
+    callbacks = [instantiate(c) for c in (cfg.callbacks or {}).values() if c]
+    callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
+    loggers = [instantiate(entry) for entry in (cfg.logger or {}).values() if entry]
+    trainer: lightning.Trainer = instantiate(cfg.trainer, callbacks=callbacks, logger=loggers)
+    (folder / "lens").mkdir(exist_ok=True)
+    save_lens(lens, folder / "lens" / "initial.yaml")
+    device = str(trainer.strategy.root_device)
+    info = describe_run(cfg.seed, device, cfg.lens_dtype, sys.argv)
+    write_json(folder / "run.json", {**info, "status": "running"})
+    status = "failed"
+    try:
+        if cfg.train:
+            trainer.fit(
+                module, data, ckpt_path=checked_checkpoint(cfg.ckpt_path), weights_only=True
+            )
+        metrics: dict[str, Any] = dict(trainer.callback_metrics)
+        if cfg.test:
+            # The weights as the last step left them: every run is judged after the same work.
+            trainer.test(module, data, verbose=False)
+            metrics.update(trainer.callback_metrics)
+        status = "finished"
+    except KeyboardInterrupt:
+        status = "interrupted"
+        raise
+    except SystemExit:
+        status = "interrupted"
+        raise
+    finally:
+        save_lens(module.lens, folder / "lens" / "final.yaml")
+        write_json(folder / "run.json", {**info, "status": status})
+    metrics.update(getattr(module, "summary", dict)())
+    metrics["cost/wall_s"] = time.perf_counter() - started
+    metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
+    numbers = plain_metrics(metrics)
+    write_json(folder / "metrics.json", numbers)
+    for entry in loggers:
+        entry.log_hyperparams(hyperparameters(cfg), numbers)
+        entry.finalize("success")
+    logger.info("Run folder: %s", folder)
+    if cfg.objective not in numbers:
+        raise InputError(
+            f"objective: '{cfg.objective}' is not among the metrics ({', '.join(numbers)})"
+        )
+    logger.info("%s = %.4g", cfg.objective, numbers[cfg.objective])
+    return numbers[cfg.objective]
+
+
+def build_lens(cfg: DictConfig) -> Any:
+    """The lens of the configuration; prescriptions are plain data and instantiate nothing."""
+    if cfg.lens_dtype not in _DTYPES:
+        raise InputError(f"lens_dtype: '{cfg.lens_dtype}' is unknown; allowed: float32, float64")
+    prescription = OmegaConf.to_container(cfg.lens, resolve=True)
+    where = f"lens={HydraConfig.get().runtime.choices.get('lens')}"
+    return lens_from_prescription(prescription, _DTYPES[cfg.lens_dtype], where=where)
+
+
+def checked_checkpoint(path: str | None) -> str | None:
+    """The path, if it can be loaded safely.
+
+    Raises:
+        InputError: the file is missing or is no checkpoint of plain tensors and values.
+    """
+    if path is None:
+        return None
+    if not Path(path).is_file():
+        raise InputError(f"ckpt_path: {path} does not exist")
+    try:
+        torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"ckpt_path: {path} is not a safe checkpoint ({reason})") from None
+    return path
+
+
+def refuse_subprocess_ddp_in_sweep(cfg: DictConfig) -> None:
+    """Ranks started as subprocesses would train different samples of a sweep; refuse."""
+    multirun = HydraConfig.get().mode is not None and HydraConfig.get().mode.name == "MULTIRUN"
+    if multirun and "ddp" in str(cfg.trainer.get("strategy", "auto")):
+        raise InputError("trainer.strategy: ddp starts processes and cannot be swept with -m")
+
+
+def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration as flat plain values, for TensorBoard's HPARAMS tab."""
+    flat: dict[str, Any] = {}
+
+    def visit(node: Any, name: str) -> None:
+        if isinstance(node, dict):
+            for key, value in node.items():
+                visit(value, f"{name}.{key}" if name else str(key))
+        elif isinstance(node, bool | int | float | str):
+            flat[name] = node
+        else:
+            flat[name] = str(node)
+
+    for group in ("experiment", "seed", "lens_dtype", "learning_rates", "scene", "renderer"):
+        if group in cfg:
+            visit(OmegaConf.to_container(cfg, resolve=True)[group], group)
+    for group in ("network", "loss", "data", "variables", "read_noise"):
+        if group in cfg:
+            visit(OmegaConf.to_container(cfg, resolve=True)[group], group)
+    return flat
+
+
+def resume_command() -> str:
+    """The command that started this run, for a notice."""
+    return shlex.join(["python", *sys.argv])

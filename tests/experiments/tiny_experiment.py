@@ -1,0 +1,20 @@
+"""The default experiment at a size that trains in seconds; the path is the same."""
+
+TINY = [
+    "renderer.sensor.height=24",
+    "renderer.sensor.width=24",
+    "renderer.pupil_samples=2",
+    "module.evaluation_pupil_samples=2",
+    "module.psf_size=33",
+    "module.psf_pupil_samples=8",
+    "data.margin=16",
+    "data.evaluation_crops_per_photograph=1",
+    "data.steps_per_epoch=2",
+    "trainer.max_epochs=2",
+    "+trainer.limit_val_batches=1",
+    "+trainer.limit_test_batches=1",
+    "+trainer.enable_progress_bar=false",
+    "trainer.log_every_n_steps=1",
+    "loss.perceptual=none",
+]
+TINY_NETWORK = ["network.width=4", "network.depth=2"]
