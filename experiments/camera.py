@@ -53,6 +53,7 @@ class CameraModule(lightning.LightningModule):
         evaluation_pupil_samples: `pupil_samples` of the renderer that makes the validation and test
             images; by default the training renderer's own.
         read_noise: standard deviation, of full scale in linear light.
+        depth_norm: p of the power mean that joins the depths' losses; see `loss_over_depths`.
         psf_size: pixels along each side of the point spread functions.
         psf_pupil_samples: their strata along each side of the pupil.
         seed: of rendering and noise.
@@ -72,6 +73,7 @@ class CameraModule(lightning.LightningModule):
         variables: Mapping[str, Mapping[str, Any] | None] | None = None,
         evaluation_pupil_samples: int | None = None,
         read_noise: float = 0.0,
+        depth_norm: float = 1.0,
         psf_size: int = 65,
         psf_pupil_samples: int = 48,
         seed: int = 0,
@@ -92,6 +94,9 @@ class CameraModule(lightning.LightningModule):
         self.scheduler = scheduler
         self.learning_rates = dict(learning_rates)
         self.read_noise = read_noise
+        if not depth_norm >= 1.0:
+            raise InputError(f"depth_norm must be at least 1, not {depth_norm}")
+        self.depth_norm = depth_norm
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
         self.seed = seed
@@ -136,6 +141,20 @@ class CameraModule(lightning.LightningModule):
         restored = self.network(raw.flatten(0, 1), self.point_spread_functions(values))
         return restored.unflatten(0, raw.shape[:2])
 
+    def loss_over_depths(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:
+        """The loss and its terms, of images (B, depths, 3, H, W).
+
+        Terms are means over the depths.  The total is the power mean (Σ L_d^p / D)^(1/p) of the
+        depths' totals with p = `depth_norm`: at p = 1 their mean, and the larger p is, the more
+        the worst depth counts, which is what an extended depth of field is for.
+        """
+        rows = [self.loss(restored[:, d], truth[:, d]) for d in range(restored.shape[1])]
+        terms = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+        largest = terms["total"].detach().amax().clamp(min=torch.finfo(restored.dtype).tiny)
+        relative = (terms["total"] / largest) ** self.depth_norm
+        total = largest * relative.mean() ** (1.0 / self.depth_norm)
+        return {name: value.mean() for name, value in terms.items()} | {"total": total}
+
     # ---------------------------------------------------------------- training
 
     def configure_optimizers(self) -> Any:
@@ -178,7 +197,7 @@ class CameraModule(lightning.LightningModule):
             raw.register_hook(self._start_optics_backward)
         restored = self.restore(raw, values)
         truth = self.truth(batch)[:, None].expand_as(restored)
-        terms = self.loss(restored.flatten(0, 1), truth.flatten(0, 1).to(restored.dtype))
+        terms = self.loss_over_depths(restored, truth.to(restored.dtype))
         with torch.no_grad():
             psnr = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1)).mean()
         self.log("train/loss", terms["total"], prog_bar=True)
@@ -247,9 +266,8 @@ class CameraModule(lightning.LightningModule):
 
     def _evaluate(self, batch: Tensor, stage: str, index: int) -> None:
         truth, raw, restored = self.evaluation_images(batch, stage, index)
-        loss = self.loss(
-            restored.flatten(0, 1),
-            truth[:, None].expand_as(restored).flatten(0, 1).to(restored.dtype),
+        loss = self.loss_over_depths(
+            restored, truth[:, None].expand_as(restored).to(restored.dtype)
         )
         row = {"loss": loss["total"].expand(len(batch), len(self.scene.depths))}
         for name, image in (("", restored), ("raw_", raw)):

@@ -44,6 +44,8 @@ def run(cfg: DictConfig) -> float:
     loggers = [instantiate(entry) for entry in (cfg.logger or {}).values() if entry]
     trainer: lightning.Trainer = instantiate(cfg.trainer, callbacks=callbacks, logger=loggers)
     (folder / "lens").mkdir(exist_ok=True)
+    (folder / ".hydra").mkdir(exist_ok=True)
+    OmegaConf.save(cfg_without_hydra(cfg), folder / ".hydra" / "resolved.yaml", resolve=True)
     save_lens(lens, folder / "lens" / "initial.yaml")
     device = str(trainer.strategy.root_device)
     info = describe_run(cfg.seed, device, cfg.lens_dtype, sys.argv)
@@ -84,6 +86,11 @@ def run(cfg: DictConfig) -> float:
         )
     logger.info("%s = %.4g", cfg.objective, numbers[cfg.objective])
     return numbers[cfg.objective]
+
+
+def cfg_without_hydra(cfg: DictConfig) -> DictConfig:
+    """The configuration less Hydra's own node, which only some callers leave in it."""
+    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
 
 
 def build_lens(cfg: DictConfig) -> Any:
@@ -133,13 +140,11 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
         else:
             flat[name] = str(node)
 
-    for group in ("experiment", "seed", "lens_dtype", "learning_rates", "scene", "renderer"):
-        if group in cfg:
-            visit(OmegaConf.to_container(cfg, resolve=True)[group], group)
-    for group in ("network", "loss", "data", "variables", "read_noise"):
-        if group in cfg:
-            visit(OmegaConf.to_container(cfg, resolve=True)[group], group)
-    return flat
+    # What `module` holds refers to the other groups and would only repeat them.
+    left_out = ("hydra", "module", "lens", "callbacks", "logger", "trainer")
+    chosen = [key for key in cfg if key not in left_out]
+    visit(OmegaConf.to_container(OmegaConf.masked_copy(cfg, chosen), resolve=True), "")
+    return {"experiment": HydraConfig.get().runtime.choices.get("experiment"), **flat}
 
 
 def resume_command() -> str:

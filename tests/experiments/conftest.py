@@ -7,6 +7,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, open_dict
 
+
 @pytest.fixture
 def composed(root: Path, tmp_path: Path) -> Iterator[Callable[..., DictConfig]]:
     """Compose an experiment as train.py does, with its run folder under tmp_path."""

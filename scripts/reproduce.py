@@ -1,0 +1,57 @@
+"""Run an old run folder's experiment again, and compare the metrics.
+
+    python scripts/reproduce.py outputs/wavefront_coding/<date_time> [--into FOLDER]
+
+The overrides come from `.hydra/overrides.yaml`, the expected numbers from `metrics.json`.  When the
+code is not the commit that `run.json` names, the script says so and goes on.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def main() -> int:
+    """Return 0 when every metric but the costs is the same to 1e-6 relative."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="the run folder to repeat")
+    parser.add_argument("--into", type=Path, help="where the new run goes (default: beside it)")
+    arguments = parser.parse_args()
+    old = arguments.run.resolve()
+    for name in (".hydra/overrides.yaml", "run.json", "metrics.json"):
+        if not (old / name).is_file():
+            sys.exit(f"error: {old} is no finished run folder: {name} is missing")
+    into = (arguments.into or old.with_name(old.name + "_again")).resolve()
+    overrides = yaml.safe_load((old / ".hydra/overrides.yaml").read_text(encoding="utf-8"))
+    commit = json.loads((old / "run.json").read_text(encoding="utf-8"))["git"]["commit"]
+    here = subprocess.run(
+        ["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
+    ).stdout.strip()
+    if commit != here:
+        print(f"note: the run was made by commit {commit}, this is {here}")
+    command = [sys.executable, str(ROOT / "train.py"), *overrides, f"hydra.run.dir={into}"]
+    done = subprocess.run(command, cwd=ROOT, check=False)
+    if done.returncode:
+        return done.returncode
+    expected = json.loads((old / "metrics.json").read_text(encoding="utf-8"))
+    found = json.loads((into / "metrics.json").read_text(encoding="utf-8"))
+    differing = 0
+    for name, value in expected.items():
+        if name.startswith("cost/"):
+            continue
+        same = name in found and abs(found[name] - value) <= 1e-6 * abs(value)
+        differing += not same
+        if not same:
+            print(f"{name}: {value} then, {found.get(name)} now")
+    print("reproduced" if not differing else f"{differing} metrics differ")
+    return int(differing > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
