@@ -196,6 +196,8 @@ def _material(value: object, model: Any, place: str) -> Any:
 
 def _number(value: object, what: str, finite: bool = True) -> float:
     try:
+        if isinstance(value, bool):
+            raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise InputError(f"{what} must be a number, not {value!r}") from None
