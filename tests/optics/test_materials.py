@@ -1,4 +1,4 @@
-"""Indices against tests/reference/index.json, and what is said about materials that do not exist."""
+"""Indices against tests/reference/index.json, and what is said of unknown materials."""
 
 import pytest
 import torch

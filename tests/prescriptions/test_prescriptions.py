@@ -1,0 +1,239 @@
+"""Lens files: they load, they come back to the last bit, and bad ones say what is wrong."""
+
+import copy
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from dolens import InputError, load_lens, save_lens
+from dolens.prescriptions import lens_from_prescription, prescription_of
+
+LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))
+
+GOOD = {
+    "name": "Singlet",
+    "index_model": "dfc",
+    "stop": 1,
+    "surfaces": {
+        "1": {"type": "even_asphere", "radius": 20.0, "conic": -0.5, "a4": 1e-6,
+              "semi_diameter": 10, "thickness": 5.0, "material": "1.5168/64.17"},
+        "2": {"type": "sphere", "radius": -50.0, "semi_diameter": 10, "material": "air"},
+    },
+    "sensor": {"distance": 30.0, "diameter": 10.0},
+}  # fmt: skip
+
+
+def test_there_are_lenses():
+    assert {"asphere", "cooke_triplet", "wavefront_coding"} <= {p.stem for p in LENSES}
+
+
+@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
+def test_every_lens_comes_back_to_the_last_bit(path, dtype, tmp_path):
+    lens = load_lens(path, dtype)
+    generator = torch.Generator().manual_seed(11)
+    for changed in (False, True):
+        if changed:
+            # Numbers without a short decimal form, as an optimizer leaves them.
+            with torch.no_grad():
+                for p in lens.parameters():
+                    p *= 1.0 + 1e-3 * torch.rand((), generator=generator, dtype=dtype)
+        save_lens(lens, tmp_path / "lens.yaml")
+        again = load_lens(tmp_path / "lens.yaml", dtype)
+        before, after = dict(lens.named_parameters()), dict(again.named_parameters())
+        assert before.keys() == after.keys()
+        for name, p in before.items():
+            assert torch.equal(p, after[name]), name
+        assert [type(s) for s in again.surfaces.values()] == [
+            type(s) for s in lens.surfaces.values()
+        ]
+        assert [s.semi_diameter for s in again.surfaces.values()] == [
+            s.semi_diameter for s in lens.surfaces.values()
+        ]
+        for attribute in ("name", "stop", "index_model", "materials", "sensor_diameter"):
+            assert getattr(again, attribute) == getattr(lens, attribute)
+
+
+@pytest.mark.parametrize("model", ["dfc", "do", "paper"])
+def test_the_index_model_can_be_overridden(model, root, tmp_path):
+    lens = load_lens(root / "conf" / "lens" / "cooke_triplet.yaml", index_model=model)
+    save_lens(lens, tmp_path / "lens.yaml")
+    assert load_lens(tmp_path / "lens.yaml").materials == lens.materials
+    assert (lens.materials[0].a == 1.000293) == (model == "do")
+
+
+def test_any_curvature_survives(tmp_path):
+    """1/(1/c) loses a bit for some c; saving must not."""
+    generator = torch.Generator().manual_seed(5)
+    values = torch.rand(200, generator=generator, dtype=torch.float64) * 0.09 - 0.045
+    lens = lens_from_prescription(GOOD)
+    inexact = 0
+    for value in (*values, torch.zeros((), dtype=torch.float64)):
+        with torch.no_grad():
+            lens.surfaces["2"].curvature.copy_(value)
+        c = float(value)
+        inexact += c != 0.0 and 1.0 / (1.0 / c) != c
+        again = lens_from_prescription(prescription_of(lens))
+        assert float(again.surfaces["2"].curvature.detach()) == c
+    assert inexact > 0
+
+
+def test_a_saved_lens_is_plain_yaml(tmp_path):
+    save_lens(lens_from_prescription(GOOD), tmp_path / "lens.yaml")
+    data = yaml.safe_load((tmp_path / "lens.yaml").read_text())
+    assert data["surfaces"]["1"] == {**GOOD["surfaces"]["1"], "semi_diameter": 10.0}
+    assert data["sensor"] == GOOD["sensor"]
+
+
+def test_surface_numbers_may_be_written_as_numbers():
+    data = copy.deepcopy(GOOD)
+    data["surfaces"] = {int(n): row for n, row in reversed(data["surfaces"].items())}
+    lens = lens_from_prescription(data)
+    assert float(lens.surfaces["1"].curvature.detach()) == 0.05
+
+
+def changed(*path, to=None, remove=False):
+    data = copy.deepcopy(GOOD)
+    place = data
+    for key in path[:-1]:
+        place = place[key]
+    if remove:
+        del place[path[-1]]
+    else:
+        place[path[-1]] = to
+    return data
+
+
+S1 = ("surfaces", "1")
+BAD = {
+    "misspelt lens key": (changed("indexmodel", to="dfc"),
+                          "unknown key 'indexmodel'; did you mean 'index_model'?"),
+    "misspelt surface key": (changed(*S1, "thicknes", to=1),
+                             "surface 1: unknown key 'thicknes'; did you mean 'thickness'?"),
+    "misspelt sensor key": (changed("sensor", "distnace", to=1),
+                            "sensor: unknown key 'distnace'; did you mean 'distance'?"),
+    "code by name": (changed("_target_", to="os.system"), "unknown key '_target_'"),
+    "code by name in a surface": (changed(*S1, "_target_", to="os.system"),
+                                  "surface 1: unknown key '_target_'"),
+    "unknown material": (changed(*S1, "material", to="N-BK7"),
+                         "surface 1: unknown material 'N-BK7'"),
+    "near material": (changed("surfaces", "2", "material", to="aire"),
+                      "surface 2: unknown material 'aire'; did you mean 'air'?"),
+    "no material": (changed(*S1, "material", remove=True), "surface 1: 'material' is missing"),
+    "no thickness": (changed(*S1, "thickness", remove=True), "surface 1: 'thickness' is missing"),
+    "thickness after the last": (changed("surfaces", "2", "thickness", to=3.0),
+                                 "surface 2: the last surface has no 'thickness'"),
+    "thickness in words": (changed(*S1, "thickness", to="thin"),
+                           "surface 1: 'thickness' must be a number, not 'thin'"),
+    "infinite thickness": (changed(*S1, "thickness", to=float("inf")),
+                           "surface 1: 'thickness' must be a finite number"),
+    "infinite coefficient": (changed(*S1, "a4", to=float("inf")),
+                             "surface 1: 'a4' must be a finite number"),
+    "nan": (changed(*S1, "conic", to=float("nan")), "surface 1: 'conic' must be a finite number"),
+    "truth value": (changed(*S1, "thickness", to=True), "surface 1: 'thickness' must be a number"),
+    "aperture beyond the sphere": (changed("surfaces", "2", "semi_diameter", to=50.5),
+                                   "surface 2: semi_diameter 50.5 mm exceeds the surface"),
+    "no aperture": (changed(*S1, "semi_diameter", remove=True),
+                    "surface 1: 'semi_diameter' is missing"),
+    "negative aperture": (changed(*S1, "semi_diameter", to=-3),
+                          "surface 1: semi_diameter must be positive"),
+    "infinite aperture": (changed("surfaces", "2", "semi_diameter", to=float("inf")),
+                          "surface 2: 'semi_diameter' must be a finite number"),
+    "no radius": (changed(*S1, "radius", remove=True), "surface 1: 'radius' is missing"),
+    "radius zero": (changed(*S1, "radius", to=0), "surface 1: 'radius' is 0"),
+    "radius in words": (changed(*S1, "radius", to="big"),
+                        "surface 1: 'radius' must be a number, not 'big'"),
+    "radius nan": (changed(*S1, "radius", to=float("nan")), "surface 1: 'radius' must be"),
+    "radius and curvature": (changed(*S1, "curvature", to=0.05),
+                             "surface 1: give 'radius' or 'curvature', not both"),
+    "odd coefficient": (changed(*S1, "a5", to=1.0), "surface 1: 'a5': even aspheric"),
+    "unknown type": (changed(*S1, "type", to="asfere"), "surface 1: type 'asfere' is unknown"),
+    "conic of a sphere": (changed("surfaces", "2", "conic", to=1.0),
+                          "surface 2: unknown key 'conic'"),
+    "gap in numbering": (changed("surfaces", to={"1": GOOD["surfaces"]["1"],
+                                              "3": GOOD["surfaces"]["2"]}),
+                         "surface 2 is missing"),
+    "no surfaces": (changed("surfaces", to={}), "'surfaces' must map surface numbers"),
+    "surfaces as a list": (changed("surfaces", to=[GOOD["surfaces"]["1"]]),
+                           "'surfaces' must map surface numbers"),
+    "surface without rows": (changed(*S1, to=None), "surface 1: expected a mapping"),
+    "no sensor": (changed("sensor", remove=True), "'sensor.distance' is missing"),
+    "sensor without distance": (changed("sensor", to={"diameter": 3}),
+                                "'sensor.distance' is missing"),
+    "stop outside": (changed("stop", to=3), "stop must be a surface from 1 to 2, not 3"),
+    "half a stop": (changed("stop", to=1.5), "'stop' must be a whole number"),
+    "unknown index model": (changed("index_model", to="dcf"), "index_model 'dcf' is unknown"),
+    "a list": ([1, 2], "expected a mapping"),
+    "nothing": (None, "expected a mapping"),
+}  # fmt: skip
+
+
+def one_line(error, path):
+    message = str(error.value)
+    assert "\n" not in message
+    assert message.startswith(str(path))
+    return message
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_prescriptions(case, tmp_path):
+    data, said = BAD[case]
+    path = tmp_path / "bad.yaml"
+    path.write_text(yaml.safe_dump(data))
+    with pytest.raises(InputError, match=re.escape(said)) as error:
+        load_lens(path)
+    one_line(error, path)
+
+
+def test_the_good_prescription_is_good(tmp_path):
+    path = tmp_path / "good.yaml"
+    path.write_text(yaml.safe_dump(GOOD))
+    load_lens(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "surfaces: {'1': {type: sphere",
+        "a: b: c",
+        "\tname: tab",
+        "name: !!python/object/apply:os.system ['touch pwned']",
+        "name: !!python/object:dolens.Lens {}",
+        "name: !!python/name:os.system",
+        "- &a [*b]",
+    ],
+)
+def test_files_that_are_no_plain_yaml(text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match="is not valid YAML") as error:
+        load_lens(path)
+    one_line(error, path)
+    assert not (tmp_path / "pwned").exists()
+
+
+def test_a_file_that_is_no_text(tmp_path):
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match="is not valid YAML") as error:
+        load_lens(path)
+    one_line(error, path)
+
+
+def test_a_missing_file(tmp_path):
+    path = tmp_path / "none.yaml"
+    with pytest.raises(InputError, match=r"cannot be read \(No such file") as error:
+        load_lens(path)
+    one_line(error, path)
+
+
+def test_another_kind_of_file(tmp_path):
+    path = tmp_path / "lens.json"
+    path.write_text("{}")
+    with pytest.raises(InputError, match=r"\.yaml") as error:
+        load_lens(path)
+    one_line(error, path)

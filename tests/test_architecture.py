@@ -1,0 +1,69 @@
+"""The design's map, held by reading the imports."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = sorted(p for top in ("dolens", "experiments") for p in (ROOT / top).rglob("*.py"))
+# What each part may import from dolens; siblings of one tier only in one direction, without cycles.
+ALLOWED = {
+    "errors": set(),
+    "kernels": {"errors"},
+    "optics": {"errors", "kernels"},
+    "prescriptions": {"errors", "optics"},
+    "imaging": {"errors", "optics"},
+    "optimize": {"errors", "optics", "imaging"},
+    "reconstruction": {"errors", "optics", "imaging"},
+    "plotting": {"errors", "optics", "imaging", "optimize", "reconstruction"},
+}
+
+
+def imports(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module
+
+
+def calls(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call):
+            yield node, ast.unparse(node.func)
+
+
+def name(path):
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in FILES if "dolens" in p.relative_to(ROOT).parts], ids=name
+)
+def test_imports_of_the_library(path):
+    part = path.relative_to(ROOT / "dolens").parts[0].removesuffix(".py")
+    for module in imports(path):
+        top, *rest = module.split(".")
+        assert top not in {"hydra", "omegaconf", "lightning", "pytorch_lightning", "experiments"}
+        if top == "dolens" and part != "__init__":
+            assert rest, "import from the part, not from the whole"
+            assert rest[0] in ALLOWED[part] | {part}, module
+
+
+@pytest.mark.parametrize("path", FILES, ids=name)
+def test_nothing_prints_or_runs_text(path):
+    for node, called in calls(path):
+        assert called not in {"print", "exec", "eval", "compile"}, node.lineno
+        if called == "torch.load":
+            safe = {k.arg: k.value for k in node.keywords}.get("weights_only")
+            assert isinstance(safe, ast.Constant) and safe.value is True, node.lineno
+
+
+def test_constraints_are_exact_versions():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    assert len(lines) > 10
+    for line in lines:
+        assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+_-]+", line), line
