@@ -17,7 +17,7 @@ ALLOWED = {
     "imaging": {"errors", "optics"},
     "optimize": {"errors", "optics", "imaging"},
     "reconstruction": {"errors", "optics", "imaging"},
-    "plotting": {"errors", "optics", "imaging", "optimize", "reconstruction"},
+    "plotting": {"errors", "optics", "imaging"},
 }
 
 

@@ -10,6 +10,21 @@ from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 
 
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """YAML's safe loader, which also refuses a key written twice: the first would be lost."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        seen = set()
+        scalars = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for key_node in scalars:
+            key = self.construct_object(key_node, deep=True)
+            if key in seen:
+                line = key_node.start_mark.line + 1
+                raise yaml.YAMLError(f"key '{key}' is given twice, again in line {line}")
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
 def load_lens(
     path: str | Path, dtype: torch.dtype = torch.float64, index_model: str | None = None
 ) -> Lens:
@@ -28,7 +43,8 @@ def load_lens(
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise InputError(f"{path}: lens files end in .yaml or .yml")
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        # A subclass of the safe loader: it builds plain values only.
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -204,6 +204,7 @@ def test_the_good_prescription_is_good(tmp_path):
         "name: !!python/object:dolens.Lens {}",
         "name: !!python/name:os.system",
         "- &a [*b]",
+        "name: once\nname: twice",
     ],
 )
 def test_files_that_are_no_plain_yaml(text, tmp_path, monkeypatch):

@@ -1,0 +1,317 @@
+"""A lens in section, as its designer draws it."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import entrance_pupil, first_order
+from dolens.optics.rays import Components
+from dolens.optics.surfaces.xy_polynomial import XYPolynomial
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import trace_surfaces, trace_to_plane
+from dolens.plotting.style import SMALL, TITLE, colours, open_axes
+
+Profile = tuple[np.ndarray, np.ndarray]
+
+_SAMPLES = 201
+# A ray on the rim is clipped: the outermost ones run just inside.
+_PUPIL_FILL = 0.995
+# Rays start this far in front of the lens, in units of the distance from lens to sensor.
+_LEAD = 0.1
+# A sag below this share of the height of the drawing cannot be seen.
+_VISIBLE = 0.02
+_GLASS = "#D9E8F2"
+_EDGE = "#2B3A42"
+_WIDTH = 9.0
+
+
+@torch.no_grad()
+def layout_figure(
+    lens: Lens,
+    wavelength: float = 587.5618,
+    fields_deg: Sequence[float] = (0.0,),
+    rays: int = 7,
+    object_distance: float | None = None,
+    title: str | None = None,
+    values: Mapping[str, Tensor] | None = None,
+) -> Figure:
+    """The section of a lens in the y-z plane, with fans of rays.
+
+    Rays are aimed at points spread evenly over the paraxial entrance pupil; those that a surface
+    misses, reflects totally or clips are not drawn.  Artists carry gids: `ray`, `surface 3`,
+    `glass 3` (the element behind surface 3), `stop`, `sensor`, `axis`.
+
+    XY polynomials whose sag is too small to be seen get axes of their own below, in µm.
+
+    Args:
+        lens: the lens.
+        wavelength: nm.
+        fields_deg: angles of the chief rays in object space, from the axis towards +y, degrees.
+        rays: rays a field.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        title: None for the lens's name and focal length.
+        values: lens parameters to use instead of the stored ones, as `Lens.system` takes them.
+
+    Returns:
+        A figure of equal scale in y and z, in mm.
+
+    Raises:
+        InputError: there are no fields or rays, a field is not within ±90°, or the object is not
+            in front of the entrance pupil and the lens.
+    """
+    _check(fields_deg, rays)
+    system = lens.system(values)
+    profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
+    sensor_z = float(system.vertices[-1])
+    front = min(float(z.min()) for z, _ in profiles)
+    start = front - _LEAD * (sensor_z - min(front, 0.0))
+    fans = [
+        trace_fan(system, wavelength, field, rays, object_distance, start) for field in fields_deg
+    ]
+    height = max(float(np.abs(y).max()) for _, y in profiles)
+    height = max(height, 0.5 * (lens.sensor_diameter or 0.0))
+
+    plates = [
+        number
+        for number, surface in enumerate(system.surfaces, 1)
+        if issubclass(surface.shape, XYPolynomial)
+        and np.ptp(profiles[number - 1][0]) < _VISIBLE * 2.0 * height
+    ]
+    reach = max([height, *(float(np.abs(fan[..., 1]).max()) for fan in fans if len(fan))])
+    shape = (2.2 * reach) / (sensor_z - start)
+    drawn = min(max(_WIDTH * shape, 1.3), 6.0) + 0.9
+    figure = Figure(figsize=(_WIDTH, drawn + (1.9 if plates else 0.0)), layout="constrained")
+    if plates:
+        grid = figure.add_gridspec(2, 1, height_ratios=(drawn, 1.9))
+        axes = figure.add_subplot(grid[0])
+        below = grid[1].subgridspec(1, max(2, len(plates)))
+        for column, number in enumerate(plates):
+            _draw_departure(figure.add_subplot(below[column]), system, number)
+    else:
+        axes = figure.add_subplot()
+
+    _draw_axis(axes, start, sensor_z)
+    _draw_glass(axes, system, profiles)
+    _draw_rays(axes, fans, fields_deg)
+    _draw_stop(axes, system.stop, profiles, height)
+    half = 0.5 * lens.sensor_diameter if lens.sensor_diameter else reach
+    axes.plot(
+        [sensor_z, sensor_z], [-half, half], color="black", linewidth=2.5, gid="sensor", zorder=4
+    )
+    axes.set_aspect("equal")
+    axes.set_xlabel("z (mm)", fontsize=SMALL + 1)
+    axes.set_ylabel("y (mm)", fontsize=SMALL + 1)
+    open_axes(axes)
+    axes.set_title(_title(lens, system, wavelength) if title is None else title, fontsize=TITLE)
+    return figure
+
+
+def surface_profile(system: OpticalSystem, number: int) -> Profile:
+    """The section of a surface with the y-z plane, over its clear aperture.
+
+    Args:
+        system: the lens.
+        number: of the surface, from 1.
+
+    Returns:
+        z and y in mm, (samples,), from -semi_diameter to +semi_diameter; shorter where the sag
+        branch ends before the aperture does.
+    """
+    semi_diameter = system.surfaces[number - 1].semi_diameter
+    y = torch.linspace(-semi_diameter, semi_diameter, _SAMPLES, dtype=torch.float64)
+    sag, exists = _sag(system, number, torch.zeros_like(y), y)
+    z = sag + float(system.vertices[number - 1])
+    return z[exists].numpy(), y[exists].numpy()
+
+
+def trace_fan(
+    system: OpticalSystem,
+    wavelength: float,
+    field_deg: float,
+    rays: int,
+    object_distance: float | None,
+    start: float,
+) -> np.ndarray:
+    """A meridional fan from an object point, over the entrance pupil, to the sensor.
+
+    Args:
+        system: the lens.
+        wavelength: nm.
+        field_deg: the angle of the chief ray in object space, degrees.
+        rays: how many; one is the chief ray.
+        object_distance: mm in front of the first vertex, or None for infinity.
+        start: z in mm where the first point of every ray lies, or at the object if that is nearer.
+
+    Returns:
+        (valid rays, surfaces + 2, 3), mm: start, every surface, sensor.
+    """
+    pupil = entrance_pupil(system, wavelength)
+    slope = math.tan(math.radians(field_deg))
+    spread = torch.linspace(-1.0, 1.0, rays) if rays > 1 else torch.zeros(1)
+    spread = spread.to(system.sensor_distance)
+    aim = 0.5 * _PUPIL_FILL * pupil.diameter * spread
+    if object_distance is None:
+        slopes = torch.full_like(aim, slope)
+    else:
+        to_pupil = pupil.z + object_distance
+        if not (object_distance > 0.0 and float(to_pupil) > 0.0):
+            raise InputError(
+                f"layout: object_distance {object_distance:g} mm must be positive, and in front "
+                f"of the entrance pupil at z = {float(pupil.z):g} mm"
+            )
+        slopes = slope + aim / to_pupil
+        start = max(start, -object_distance)
+    y = aim + slopes * (start - pupil.z)
+    n = torch.rsqrt(1.0 + slopes * slopes)
+    zero = torch.zeros_like(y)
+    ray = Components(zero, y, zero + start, zero, slopes * n, n)
+    traced = trace_surfaces(system, ray, wavelength, record=True)
+    traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
+    points = [ray[:3], *traced.points, traced.ray[:3]]
+    path = torch.stack([torch.stack(point, -1) for point in points], 1)
+    return path[traced.valid].double().cpu().numpy()
+
+
+def _check(fields_deg: Sequence[float], rays: int) -> None:
+    if rays < 1 or not fields_deg:
+        raise InputError(f"layout: at least one field and one ray, not {len(fields_deg)}, {rays}")
+    for field in fields_deg:
+        if not abs(field) < 90.0:
+            raise InputError(f"layout: fields must be within ±90 degrees, not {field:g}")
+
+
+def _sag(system: OpticalSystem, number: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Sag in mm in double precision, and where it exists."""
+    surface = system.surfaces[number - 1]
+    parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
+    sag, _, _, exists = surface.shape.sag_and_gradient(parameters, x, y)
+    return sag, torch.ones_like(sag, dtype=torch.bool) if exists is None else exists >= 0.0
+
+
+def _title(lens: Lens, system: OpticalSystem, wavelength: float) -> str:
+    efl = float(first_order(system, wavelength).efl)
+    optics = f"f = {efl:.4g} mm at {wavelength:.4g} nm" if math.isfinite(efl) else "afocal"
+    return f"{lens.name}: {optics}" if lens.name else optics
+
+
+def _draw_axis(axes: Axes, start: float, sensor_z: float) -> None:
+    axes.plot(
+        [start, sensor_z + 0.03 * (sensor_z - start)],
+        [0.0, 0.0],
+        color="0.55",
+        linewidth=0.7,
+        dashes=(12, 3, 2, 3),
+        gid="axis",
+        zorder=1,
+    )
+
+
+def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) -> None:
+    """Fill and outline every element; surfaces that bound no glass (stops) have no curve."""
+    bounding: set[int] = set()
+    for number in range(1, len(profiles)):
+        if _is_glass(system, number):
+            bounding |= {number, number + 1}
+            top, bottom = (_edge(profiles[number - 1], profiles[number], end) for end in (-1, 0))
+            front, back = (np.stack(p, -1) for p in profiles[number - 1 : number + 1])
+            outline = np.concatenate([front, top[1:-1], back[::-1], bottom[1:-1][::-1]])
+            gid = f"glass {number}"
+            axes.add_patch(Polygon(outline, facecolor=_GLASS, edgecolor="none", gid=gid, zorder=0))
+            for edge in (top, bottom):
+                axes.plot(*edge.T, color=_EDGE, linewidth=0.9, gid="edge", zorder=2)
+    for number, (z, y) in enumerate(profiles, 1):
+        refracts = system.materials[number - 1] != system.materials[number]
+        if number in bounding or (refracts and number != system.stop):
+            axes.plot(z, y, color=_EDGE, linewidth=1.0, gid=f"surface {number}", zorder=2)
+
+
+def _is_glass(system: OpticalSystem, number: int) -> bool:
+    return system.materials[number].name not in ("air", "occluder")
+
+
+def _edge(front: Profile, back: Profile, end: int) -> np.ndarray:
+    """The ground edge of an element on one side (end -1: +y, 0: -y), (corners, 2) as z, y.
+
+    A flat from the smaller surface outwards, then a cylinder; a straight line where the flat
+    would cut through the other surface.
+    """
+    a = np.array([front[0][end], front[1][end]])
+    b = np.array([back[0][end], back[1][end]])
+    corner = np.array([a[0], b[1]]) if abs(a[1]) < abs(b[1]) else np.array([b[0], a[1]])
+    outer, inner = (back, front) if abs(a[1]) < abs(b[1]) else (front, back)
+    beyond = np.abs(outer[1]) >= abs(inner[1][end])
+    gap = (outer[0][beyond] - corner[0]) * (1.0 if outer is back else -1.0)
+    return np.stack([a, b]) if gap.min(initial=np.inf) < 0.0 else np.stack([a, corner, b])
+
+
+def _draw_rays(axes: Axes, fans: Sequence[np.ndarray], fields_deg: Sequence[float]) -> None:
+    handles = []
+    for fan, field, colour in zip(fans, fields_deg, colours(len(fans)), strict=True):
+        for path in fan:
+            axes.plot(path[:, 2], path[:, 1], color=colour, linewidth=0.7, gid="ray", zorder=3)
+        label = f"{field:g}°" if len(fan) else f"{field:g}° (no ray passes)"
+        handles.append(Line2D([], [], color=colour, linewidth=1.2, label=label))
+    if len(fans) > 1 or not len(fans[0]):
+        axes.legend(
+            handles=handles,
+            loc="center left",
+            bbox_to_anchor=(1.0, 0.5),
+            frameon=False,
+            fontsize=SMALL,
+            title="field",
+            title_fontsize=SMALL,
+        )
+
+
+def _draw_stop(axes: Axes, stop: int, profiles: Sequence[Profile], height: float) -> None:
+    """Bars outside the stop's rim, with a tick along the axis at the rim."""
+    z, y = profiles[stop - 1]
+    tick = 0.04 * height
+    for end, side in ((-1, 1.0), (0, -1.0)):
+        bar = [y[end], y[end] + side * 0.25 * height]
+        axes.plot(
+            [z[end], z[end]],
+            bar,
+            color="black",
+            linewidth=2.0,
+            solid_capstyle="butt",
+            gid="stop",
+            zorder=4,
+        )
+        axes.plot(
+            [z[end] - tick, z[end] + tick],
+            [y[end], y[end]],
+            color="black",
+            linewidth=1.2,
+            gid="stop tick",
+            zorder=4,
+        )
+
+
+def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
+    """h(x, 0) and h(0, y) of a surface, in µm."""
+    semi_diameter = system.surfaces[number - 1].semi_diameter
+    t = torch.linspace(-semi_diameter, semi_diameter, _SAMPLES, dtype=torch.float64)
+    zero = torch.zeros_like(t)
+    # The curves of x³ + y³ coincide: a thin one is drawn over a thick one.
+    for label, x, y, style in (
+        ("h(x, 0)", t, zero, {"color": "#56B4E9", "linewidth": 3.0}),
+        ("h(0, y)", zero, t, {"color": "#D55E00", "linewidth": 1.2, "linestyle": "--"}),
+    ):
+        sag, exists = _sag(system, number, x, y)
+        axes.plot(t[exists], 1e3 * sag[exists], label=label, **style)
+    axes.set_xlabel("x, y (mm)", fontsize=SMALL + 1)
+    axes.set_ylabel("sag (µm)", fontsize=SMALL + 1)
+    axes.set_title(f"surface {number}", fontsize=SMALL + 1)
+    axes.grid(True, color="0.9", linewidth=0.6)
+    axes.legend(frameon=False, fontsize=SMALL)
+    open_axes(axes)
