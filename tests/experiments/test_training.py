@@ -80,6 +80,20 @@ def test_a_run_leaves_the_whole_run_folder(composed, tmp_path):
     assert all(math.isfinite(value) for value in metrics.values())
 
 
+def test_the_last_checkpoint_is_the_end_of_the_run_whichever_was_best(composed, tmp_path):
+    run(composed(*WAVEFRONT_CODING, "callbacks.best.mode=min", "test=false"))
+    run(composed(*WAVEFRONT_CODING, "test=false", folder="other"))
+    for folder in ("run", "other"):
+        last = torch.load(tmp_path / folder / "checkpoints" / "last.ckpt", weights_only=True)
+        assert last["global_step"] == 4
+    best = [
+        torch.load(tmp_path / folder / "checkpoints" / "best.ckpt", weights_only=True)
+        for folder in ("run", "other")
+    ]
+    # Of the two opposite criteria, one at least has its best before the end.
+    assert min(b["global_step"] for b in best) == 2
+
+
 def test_training_moves_the_plate_and_the_final_prescription_holds_it(composed, tmp_path):
     run(composed(*WAVEFRONT_CODING))
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -108,7 +122,7 @@ def test_bounds_hold_by_projection(composed, tmp_path):
 @pytest.mark.parametrize("stop_after", [1, 3])
 def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path, stop_after):
     # `stop_after` 1 and 3 are in the middle of an epoch of two steps.
-    steps = f"+callbacks.checkpoint.every_n_train_steps={stop_after}"
+    steps = f"+callbacks.last.every_n_train_steps={stop_after}"
     run(composed(*WAVEFRONT_CODING, "test=false", folder="whole"))
     # Stopped by hand after some steps: the schedule is the whole run's.
     part = composed(
@@ -116,7 +130,6 @@ def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path,
         "test=false",
         steps,
         f"+trainer.max_steps={stop_after}",
-        "callbacks.checkpoint.monitor=null",
         folder="part",
     )
     run(part)
