@@ -23,8 +23,9 @@ from dolens.plotting.style import SMALL, TITLE, colours, open_axes
 Profile = tuple[np.ndarray, np.ndarray]
 
 _SAMPLES = 201
-# A ray on the rim is clipped: the outermost ones run just inside.
-_PUPIL_FILL = 0.995
+# The real beam is looked for over this many paraxial pupil radii, because pupils have aberrations.
+_SEARCH = 1.5
+_TRIALS = 601
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.1
 # A sag below this share of the height of the drawing cannot be seen.
@@ -46,9 +47,12 @@ def layout_figure(
 ) -> Figure:
     """The section of a lens in the y-z plane, with fans of rays.
 
-    Rays are aimed at points spread evenly over the paraxial entrance pupil; those that a surface
-    misses, reflects totally or clips are not drawn.  Artists carry gids: `ray`, `surface 3`,
-    `glass 3` (the element behind surface 3), `stop`, `sensor`, `axis`.
+    Rays are aimed at the paraxial entrance pupil, spread evenly over the part of its plane whose
+    rays reach the sensor, so that the outermost graze the apertures that limit the beam.  Rays
+    that miss a surface, are reflected totally or clipped are not drawn.
+
+    Artists carry gids: `ray`, `surface 3`, `glass 3` (the element behind surface 3), `edge`,
+    `stop`, `stop tick`, `sensor`, `axis`.
 
     XY polynomials whose sag is too small to be seen get axes of their own below, in µm.
 
@@ -56,7 +60,7 @@ def layout_figure(
         lens: the lens.
         wavelength: nm.
         fields_deg: angles of the chief rays in object space, from the axis towards +y, degrees.
-        rays: rays a field.
+        rays: rays a field; one alone is the chief ray.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         title: None for the lens's name and focal length.
         values: lens parameters to use instead of the stored ones, as `Lens.system` takes them.
@@ -87,19 +91,23 @@ def layout_figure(
         and np.ptp(profiles[number - 1][0]) < _VISIBLE * 2.0 * height
     ]
     reach = max([height, *(float(np.abs(fan[..., 1]).max()) for fan in fans if len(fan))])
-    shape = (2.2 * reach) / (sensor_z - start)
-    drawn = min(max(_WIDTH * shape, 1.3), 6.0) + 0.9
+    z_low, z_high = start - 0.04 * (sensor_z - start), sensor_z + 0.04 * (sensor_z - start)
+    half_height = 1.06 * max(reach, _stop_bar(system.stop, profiles, height))
+    # Inches that axes and legend take beside the drawing, so that equal scales leave no gaps.
+    legend = 0.8 if len(fans) > 1 else 0.0
+    drawn = (_WIDTH - 0.75 - legend) * 2.0 * half_height / (z_high - z_low)
+    drawn = min(max(drawn, 1.0), 6.2) + 0.85
     figure = Figure(figsize=(_WIDTH, drawn + (1.9 if plates else 0.0)), layout="constrained")
     if plates:
         grid = figure.add_gridspec(2, 1, height_ratios=(drawn, 1.9))
         axes = figure.add_subplot(grid[0])
-        below = grid[1].subgridspec(1, max(2, len(plates)))
+        below = grid[1].subgridspec(1, len(plates))
         for column, number in enumerate(plates):
             _draw_departure(figure.add_subplot(below[column]), system, number)
     else:
         axes = figure.add_subplot()
 
-    _draw_axis(axes, start, sensor_z)
+    _draw_axis(axes, z_low, z_high)
     _draw_glass(axes, system, profiles)
     _draw_rays(axes, fans, fields_deg)
     _draw_stop(axes, system.stop, profiles, height)
@@ -107,7 +115,7 @@ def layout_figure(
     axes.plot(
         [sensor_z, sensor_z], [-half, half], color="black", linewidth=2.5, gid="sensor", zorder=4
     )
-    axes.set_aspect("equal")
+    axes.set(aspect="equal", xlim=(z_low, z_high), ylim=(-half_height, half_height))
     axes.set_xlabel("z (mm)", fontsize=SMALL + 1)
     axes.set_ylabel("y (mm)", fontsize=SMALL + 1)
     open_axes(axes)
@@ -147,7 +155,7 @@ def trace_fan(
         system: the lens.
         wavelength: nm.
         field_deg: the angle of the chief ray in object space, degrees.
-        rays: how many; one is the chief ray.
+        rays: how many; one alone is the chief ray.
         object_distance: mm in front of the first vertex, or None for infinity.
         start: z in mm where the first point of every ray lies, or at the object if that is nearer.
 
@@ -155,30 +163,42 @@ def trace_fan(
         (valid rays, surfaces + 2, 3), mm: start, every surface, sensor.
     """
     pupil = entrance_pupil(system, wavelength)
-    slope = math.tan(math.radians(field_deg))
-    spread = torch.linspace(-1.0, 1.0, rays) if rays > 1 else torch.zeros(1)
-    spread = spread.to(system.sensor_distance)
-    aim = 0.5 * _PUPIL_FILL * pupil.diameter * spread
-    if object_distance is None:
-        slopes = torch.full_like(aim, slope)
-    else:
-        to_pupil = pupil.z + object_distance
-        if not (object_distance > 0.0 and float(to_pupil) > 0.0):
+    if object_distance is not None:
+        if not (object_distance > 0.0 and object_distance + float(pupil.z) > 0.0):
             raise InputError(
                 f"layout: object_distance {object_distance:g} mm must be positive, and in front "
                 f"of the entrance pupil at z = {float(pupil.z):g} mm"
             )
-        slopes = slope + aim / to_pupil
         start = max(start, -object_distance)
-    y = aim + slopes * (start - pupil.z)
-    n = torch.rsqrt(1.0 + slopes * slopes)
-    zero = torch.zeros_like(y)
-    ray = Components(zero, y, zero + start, zero, slopes * n, n)
-    traced = trace_surfaces(system, ray, wavelength, record=True)
-    traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
-    points = [ray[:3], *traced.points, traced.ray[:3]]
-    path = torch.stack([torch.stack(point, -1) for point in points], 1)
-    return path[traced.valid].double().cpu().numpy()
+    slope = math.tan(math.radians(field_deg))
+
+    def trace(aim: Tensor) -> tuple[Tensor, Tensor]:
+        """Heights in the pupil's plane, (N,), to (N, points, 3) and validity, (N,)."""
+        if object_distance is None:
+            slopes = torch.full_like(aim, slope)
+        else:
+            slopes = slope + aim / (pupil.z + object_distance)
+        y = aim + slopes * (start - pupil.z)
+        n = torch.rsqrt(1.0 + slopes * slopes)
+        zero = torch.zeros_like(y)
+        ray = Components(zero, y, zero + start, zero, slopes * n, n)
+        traced = trace_surfaces(system, ray, wavelength, record=True)
+        traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
+        points = [ray[:3], *traced.points, traced.ray[:3]]
+        return torch.stack([torch.stack(point, -1) for point in points], 1), traced.valid
+
+    if rays == 1:
+        aims = torch.zeros_like(pupil.z).reshape(1)
+    else:
+        reach = 0.5 * _SEARCH * pupil.diameter
+        trials = torch.linspace(-1.0, 1.0, _TRIALS).to(reach) * reach
+        passing = trials[trace(trials)[1]]
+        if not len(passing):
+            return np.zeros((0, len(system.surfaces) + 2, 3))
+        share = torch.linspace(0.0, 1.0, rays).to(reach)
+        aims = passing[0] * (1.0 - share) + passing[-1] * share
+    path, valid = trace(aims)
+    return path[valid].double().cpu().numpy()
 
 
 def _check(fields_deg: Sequence[float], rays: int) -> None:
@@ -203,9 +223,9 @@ def _title(lens: Lens, system: OpticalSystem, wavelength: float) -> str:
     return f"{lens.name}: {optics}" if lens.name else optics
 
 
-def _draw_axis(axes: Axes, start: float, sensor_z: float) -> None:
+def _draw_axis(axes: Axes, z_low: float, z_high: float) -> None:
     axes.plot(
-        [start, sensor_z + 0.03 * (sensor_z - start)],
+        [z_low, z_high],
         [0.0, 0.0],
         color="0.55",
         linewidth=0.7,
@@ -272,12 +292,18 @@ def _draw_rays(axes: Axes, fans: Sequence[np.ndarray], fields_deg: Sequence[floa
         )
 
 
+def _stop_bar(stop: int, profiles: Sequence[Profile], height: float) -> float:
+    """How far from the axis the stop's bars end, mm."""
+    return float(np.abs(profiles[stop - 1][1]).max()) + 0.2 * height
+
+
 def _draw_stop(axes: Axes, stop: int, profiles: Sequence[Profile], height: float) -> None:
     """Bars outside the stop's rim, with a tick along the axis at the rim."""
     z, y = profiles[stop - 1]
-    tick = 0.04 * height
+    tick = 0.025 * height
+    end_of_bar = _stop_bar(stop, profiles, height)
     for end, side in ((-1, 1.0), (0, -1.0)):
-        bar = [y[end], y[end] + side * 0.25 * height]
+        bar = [y[end], side * end_of_bar]
         axes.plot(
             [z[end], z[end]],
             bar,
@@ -311,7 +337,7 @@ def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
         axes.plot(t[exists], 1e3 * sag[exists], label=label, **style)
     axes.set_xlabel("x, y (mm)", fontsize=SMALL + 1)
     axes.set_ylabel("sag (µm)", fontsize=SMALL + 1)
-    axes.set_title(f"surface {number}", fontsize=SMALL + 1)
+    axes.set_title(f"Sag of surface {number}", fontsize=SMALL + 1)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.legend(frameon=False, fontsize=SMALL)
     open_axes(axes)

@@ -58,7 +58,7 @@ def test_a_vignetting_lens_darkens_as_much_as_it_stops(triplet):
         image = RayRenderer(tall, 24, chunk_rays=200_000).render(triplet, scene, white, seed=1)
         corner = 0.5 * float(image[..., :5, :].mean() + image[..., -5:, :].mean())
         expected = passes(image_height / magnification) / passes(0.0)
-        # The pupil's aberration moves the beam within the paraxial disc; see the docstring.
+        # The disc is the axial beam's: pupil aberration off axis is what the tolerance is for.
         assert corner == pytest.approx(expected, rel=0.06)
 
 
@@ -97,8 +97,8 @@ def test_a_render_is_the_texture_convolved_with_the_psf(wavefront_coding, plate)
     lens, scene = wavefront_coding(plate), PlanarScene(DEPTHS, LINES)
     sensor, margin = Sensor(12, 12, 0.0069), 34
     texture = smooth_texture(12 + 2 * margin)
-    image = RayRenderer(sensor, 40, chunk_rays=300_000).render(lens, scene, texture, seed=3)
-    psf = axial_point_spread_functions(lens, scene, sensor, 61, 200)
+    image = RayRenderer(sensor, 40, chunk_rays=100_000).render(lens, scene, texture, seed=3)
+    psf = axial_point_spread_functions(lens, scene, sensor, 61, 120)
     for d in range(len(DEPTHS)):
         # conv2d correlates; a convolution flips the kernel.
         flipped = psf[d].flip(-1, -2)[:, None]
@@ -106,30 +106,32 @@ def test_a_render_is_the_texture_convolved_with_the_psf(wavefront_coding, plate)
         top = margin - 30
         expected = full[..., top : top + 12, top : top + 12]
         error = image[:, d] - expected
-        # 1600 stratified samples a pixel leave well under 1e-3 of noise.
+        # 1600 stratified samples a pixel leave 1.6e-3 of noise.
         assert float(error.square().mean().sqrt()) < 2e-3
         assert float(error.abs().max()) < 1e-2
 
 
 @pytest.mark.parametrize("depth", DEPTHS)
 def test_the_truth_is_registered_to_a_small_fraction_of_a_pixel(wavefront_coding, depth):
-    # A ramp shifted by δ pixels changes by δ·slope: the offset of a rendered ramp from the
-    # pinhole's is the shift itself, at the centre and in the corner of the full 256×256 sensor.
+    # The full 256×256 sensor's field in 8×8 blocks of 32 pixels.  A ramp shifted by δ changes by
+    # δ·slope, so a rendered ramp's offset from the pinhole's is the shift itself.
     lens, scene = wavefront_coding(), PlanarScene([depth], LINES)
-    sensor = Sensor(256, 256, 0.0069)
-    size = 256 + 64
-    ramp = torch.arange(size, dtype=torch.float64) / size
+    block = 32
+    sensor = Sensor(256 // block, 256 // block, 0.0069 * block)
+    size = sensor.width + 2
+    ramp = torch.arange(size, dtype=torch.float64)
     for columns in (True, False):
         texture = (ramp[None, :] if columns else ramp[:, None]).expand(1, 3, size, size)
         truth = pinhole_image(texture, sensor)
-        renderer = RayRenderer(sensor, 2, pixel_area=False)
+        renderer = RayRenderer(sensor, 24, pixel_area=False)
         image = renderer.render(lens, scene, texture, seed=2)[:, 0]
-        shift = (image - truth) * size
-        centre = shift[0, :, 112:144, 112:144].mean(dim=(1, 2))
-        corner = shift[0, :, :32, :32].mean(dim=(1, 2))
-        assert float(centre.abs().max()) < 0.02
-        assert abs(float(corner[1])) < 0.05  # green, the wavelength that defines the scale
-        assert float(corner.abs().max()) < 0.25  # red and blue: the lens's lateral colour
+        # Shading (here cos⁴ and a rare stopped ray) is no shift: divide it out.
+        white = renderer.render(lens, scene, torch.ones_like(texture), seed=2)[:, 0]
+        shift = ((image / white) - truth)[0] * block  # pixels
+        assert float(shift[:, 3:5, 3:5].mean((1, 2)).abs().max()) < 0.01
+        # Green defines the scale; red and blue have the lens's lateral colour.
+        assert float(shift[1].abs().max()) < 0.05
+        assert float(shift.abs().max()) < 0.1
 
 
 def test_channels_must_match_the_wavelengths(wavefront_coding):

@@ -85,9 +85,9 @@ def test_the_backward_pass_needs_the_memory_of_one_chunk(wavefront_coding):
 
 
 def test_a_fraction_of_the_chunks_estimates_the_gradient_without_bias(wavefront_coding):
-    lens, scene = wavefront_coding(1.3e-5), PlanarScene((8000.0,), LINES)
+    lens, scene = wavefront_coding(1.3e-5), PlanarScene((8000.0,), LINES[:1])
     texture = torch.rand(
-        1, 3, 32, 32, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+        1, 1, 32, 32, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
     )
 
     def gradient(fraction, seed):
@@ -96,7 +96,7 @@ def test_a_fraction_of_the_chunks_estimates_the_gradient_without_bias(wavefront_
         image = renderer.render(lens, scene, texture, seed, {"surfaces.5.x3": x3})
         return float(torch.autograd.grad(image.square().sum(), x3)[0])
 
-    pairs = [(gradient(0.5, seed), gradient(1.0, seed)) for seed in range(40)]
+    pairs = [(gradient(0.5, seed), gradient(1.0, seed)) for seed in range(20)]
     difference = torch.tensor([a - b for a, b in pairs])
     standard_error = float(difference.std()) / len(pairs) ** 0.5
     assert standard_error > 0

@@ -11,7 +11,7 @@ from dolens.imaging.texture import bilinear
 
 def test_bilinear_lookup_is_the_formula():
     texture = torch.rand(1, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    row, column = torch.tensor([[1.3]]).double(), torch.tensor([[2.6]]).double()
+    row, column = (torch.tensor([[value]], dtype=torch.float64) for value in (1.3, 2.6))
     t = texture[0]
     expected = 0.7 * (0.4 * t[1, 2] + 0.6 * t[1, 3]) + 0.3 * (0.4 * t[2, 2] + 0.6 * t[2, 3])
     assert float(bilinear(texture, row, column)) == pytest.approx(float(expected), abs=1e-14)
