@@ -11,6 +11,7 @@ import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
+from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError
@@ -77,7 +78,9 @@ def run(cfg: DictConfig) -> float:
     numbers = plain_metrics(metrics)
     write_json(folder / "metrics.json", numbers)
     for entry in loggers:
-        entry.log_hyperparams(hyperparameters(cfg), numbers)
+        # Once, at the end and with the metrics, or TensorBoard's HPARAMS tab stays empty.
+        if isinstance(entry, TensorBoardLogger):
+            entry.log_hyperparams(hyperparameters(cfg), numbers)
         entry.finalize("success")
     logger.info("Run folder: %s", folder)
     if cfg.objective not in numbers:

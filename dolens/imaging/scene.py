@@ -46,8 +46,8 @@ class PlanarScene:
         """Raise `InputError` where a depth is not in front of the whole lens."""
         surface = system.surfaces[0]
         edge = torch.tensor(surface.semi_diameter, dtype=torch.float64)
-        parameters = {name: p.detach().double() for name, p in surface.parameters.items()}
-        sag = surface.shape.sag_and_gradient(parameters, edge.cpu(), torch.zeros_like(edge))[0]
+        parameters = {name: p.detach().cpu().double() for name, p in surface.parameters.items()}
+        sag = surface.shape.sag_and_gradient(parameters, edge, torch.zeros_like(edge))[0]
         front = max(0.0, -float(sag))
         for depth in self.depths:
             if not depth > front:

@@ -1,5 +1,6 @@
 """Pictures of a camera while it trains and when it has been tested."""
 
+import copy
 from pathlib import Path
 
 import lightning
@@ -102,7 +103,9 @@ def camera_figures(module: CameraModule, textures: Tensor, stage: str) -> dict[s
             psfs.cpu(), labels, module.renderer.sensor.pixel_pitch, "Point spread functions"
         ),
         "layout": layout_figure(
-            module.lens, object_distance=module.scene.depths[0], title=module.lens.name
+            copy.deepcopy(module.lens).cpu(),
+            object_distance=module.scene.depths[0],
+            title=module.lens.name,
         ),
     }
 
