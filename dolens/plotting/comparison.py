@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.plotting.style import SMALL, TITLE
+from dolens.plotting.style import SMALL
 
 # Inches: a picture is shown about one to one at 120 dpi, unless that is tiny or huge.
 _SMALLEST, _LARGEST = 1.7, 3.2
@@ -52,7 +52,7 @@ def comparison_figure(
     grid = figure.add_gridspec(2, depths + 1)
     axes = figure.add_subplot(grid[:, 0])
     _show(axes, truth)
-    axes.set_title("truth", fontsize=TITLE)
+    axes.set_title("truth", fontsize=SMALL)
     for row, (name, stack) in enumerate(images.items()):
         for column, (image, label) in enumerate(zip(stack, labels, strict=True)):
             axes = figure.add_subplot(grid[row, column + 1])

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from dolens.errors import InputError
 from dolens.plotting.style import SMALL, TITLE, colours, open_axes
@@ -37,6 +38,8 @@ def curves_figure(
             raise InputError(f"series '{label}': {len(x)} values of x and {len(y)} of y")
         marker = "o" if len(x) <= _FEW else None
         axes.plot(x, y, label=label, color=colour, linewidth=1.4, marker=marker, markersize=3.5)
+    if all(float(value).is_integer() for x, _ in series.values() for value in x):
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if logy:
         axes.set_yscale("log", nonpositive="mask")
     axes.set_xlabel(xlabel, fontsize=SMALL + 1)

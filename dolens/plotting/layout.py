@@ -70,7 +70,7 @@ def layout_figure(
 
     Raises:
         InputError: there are no fields or rays, a field is not within ±90°, or the object is not
-            in front of the entrance pupil and the lens.
+            in front of the entrance pupil and the first vertex.
     """
     _check(fields_deg, rays)
     system = lens.system(values)
@@ -94,7 +94,7 @@ def layout_figure(
     z_low, z_high = start - 0.04 * (sensor_z - start), sensor_z + 0.04 * (sensor_z - start)
     half_height = 1.06 * max(reach, _stop_bar(system.stop, profiles, height))
     # Inches that axes and legend take beside the drawing, so that equal scales leave no gaps.
-    legend = 0.8 if len(fans) > 1 else 0.0
+    legend = 0.8 if len(fans) > 1 or not len(fans[0]) else 0.0
     drawn = (_WIDTH - 0.75 - legend) * 2.0 * half_height / (z_high - z_low)
     drawn = min(max(drawn, 1.0), 6.2) + 0.85
     figure = Figure(figsize=(_WIDTH, drawn + (1.9 if plates else 0.0)), layout="constrained")

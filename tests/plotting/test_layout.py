@@ -1,0 +1,206 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.colors import same_color
+
+from dolens.errors import InputError
+from dolens.optics.rays import Rays
+from dolens.plotting import layout_figure
+from dolens.prescriptions import lens_from_prescription, load_lens
+
+LENSES = [
+    "asphere",
+    "asphere_optimized",
+    "cooke_triplet",
+    "large_fov_doublet",
+    "nikon",
+    "nikon_optimized",
+    "wavefront_coding",
+]
+
+
+@pytest.fixture
+def lens(root):
+    return lambda name: load_lens(root / "conf" / "lens" / f"{name}.yaml")
+
+
+def drawn(figure, gid):
+    return [np.stack(line.get_data(), -1) for line in lines(figure, gid)]
+
+
+def lines(figure, gid):
+    return [line for line in figure.axes[0].get_lines() if line.get_gid() == gid]
+
+
+def glass(figure):
+    return {patch.get_gid(): patch.get_path() for patch in figure.axes[0].patches}
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_every_lens_is_drawn_to_its_rims_with_its_rays(lens, name):
+    one = lens(name)
+    figure = layout_figure(one, rays=5)
+    system = one.system()
+    for number, surface in enumerate(system.surfaces, 1):
+        curves = drawn(figure, f"surface {number}")
+        assert len(curves) == (surface.shape.kind != "aperture")
+        for curve in curves:
+            height = surface.semi_diameter
+            np.testing.assert_allclose(curve[[0, -1], 1], [-height, height], rtol=1e-12)
+            middle = float(system.vertices[number - 1].detach())
+            assert curve[len(curve) // 2, 0] == pytest.approx(middle, abs=1e-12)
+    assert len(drawn(figure, "ray")) == 5
+    x_limits, y_limits = figure.axes[0].get_xlim(), figure.axes[0].get_ylim()
+    for line in figure.axes[0].get_lines():
+        z, y = line.get_data()
+        assert x_limits[0] <= min(z) and max(z) <= x_limits[1]
+        assert y_limits[0] <= min(y) and max(y) <= y_limits[1]
+    assert figure.axes[0].get_aspect() == 1.0
+
+
+def test_a_curve_is_the_sag_of_its_sphere(lens):
+    curve = drawn(layout_figure(lens("cooke_triplet")), "surface 1")[0]
+    radius = 22.014
+    sag = radius - np.sqrt(radius**2 - curve[:, 1] ** 2)
+    np.testing.assert_allclose(curve[:, 0], sag, atol=1e-12)
+
+
+def test_the_sensor_is_where_and_as_high_as_the_prescription_says(lens):
+    (sensor,) = drawn(layout_figure(lens("cooke_triplet")), "sensor")
+    z = 3.259 + 6.008 + 1.000 + 4.750 + 2.952 + 42.208
+    np.testing.assert_allclose(sensor, [[z, -36.346 / 2], [z, 36.346 / 2]])
+
+
+def test_values_replace_stored_parameters(lens):
+    one = lens("cooke_triplet")
+    moved = layout_figure(one, values={"sensor_distance": torch.tensor(40.0).double()})
+    (sensor,) = drawn(moved, "sensor")
+    assert sensor[0, 0] == pytest.approx(57.969)
+    assert all(path[-1, 0] == pytest.approx(57.969) for path in drawn(moved, "ray"))
+
+
+def test_stop_bars_begin_at_the_rim_of_the_stop(lens):
+    bars = drawn(layout_figure(lens("large_fov_doublet")), "stop")
+    assert len(bars) == 2
+    for bar, side in zip(bars, (1, -1), strict=True):
+        assert bar[0, 1] == pytest.approx(side * 5.233)
+        assert side * bar[1, 1] > 5.233 + 1.0
+        np.testing.assert_allclose(bar[:, 0], 5.0 + 2.006 + 9.063)
+
+
+@pytest.mark.parametrize("distance", [None, 500.0])
+def test_drawn_rays_are_valid_rays_of_the_field(lens, distance):
+    one = lens("cooke_triplet")
+    figure = layout_figure(one, fields_deg=(12.0,), rays=6, object_distance=distance)
+    paths = torch.as_tensor(np.stack(drawn(figure, "ray")))
+    assert paths.shape == (6, 8, 2)
+    step = paths[:, 1] - paths[:, 0]
+    direction = torch.nn.functional.normalize(
+        torch.stack([torch.zeros(6), step[:, 1], step[:, 0]], -1), dim=-1
+    )
+    position = torch.stack([torch.zeros(6), paths[:, 0, 1], paths[:, 0, 0]], -1)
+    traced = one.trace(Rays(position, direction), record=True)
+    assert traced.valid.all()
+    expected = torch.cat([traced.points.transpose(0, 1), traced.position[:, None]], 1)
+    torch.testing.assert_close(paths[:, 1:, 1], expected[..., 1], rtol=0, atol=1e-9)
+    torch.testing.assert_close(paths[:, 1:, 0], expected[..., 2], rtol=0, atol=1e-9)
+    slopes = step[:, 1] / step[:, 0]
+    if distance is None:
+        expected_slope = torch.full_like(slopes, math.tan(math.radians(12.0)))
+        torch.testing.assert_close(slopes, expected_slope)
+    else:
+        pupil = float(one.first_order().entrance_pupil.z.detach())
+        height = -(distance + pupil) * math.tan(math.radians(12.0))
+        at_object = paths[:, 0, 1] + slopes * (-distance - paths[:, 0, 0])
+        torch.testing.assert_close(at_object, torch.full_like(slopes, height))
+
+
+def test_the_outermost_axial_rays_graze_the_stop(lens):
+    heights = [path[4, 1] for path in drawn(layout_figure(lens("cooke_triplet")), "ray")]
+    assert max(heights) == pytest.approx(3.86, rel=0.01)
+    assert min(heights) == pytest.approx(-3.86, rel=0.01)
+    assert max(heights) < 3.86
+
+
+def test_a_single_ray_is_the_chief_ray(lens):
+    figure = layout_figure(lens("large_fov_doublet"), fields_deg=(5.0,), rays=1)
+    (path,) = drawn(figure, "ray")
+    assert abs(path[4, 1]) < 0.1  # through the stop's centre, but for aberrations of the pupil
+
+
+def test_fields_have_colours_and_a_blocked_one_says_so(lens):
+    figure = layout_figure(lens("cooke_triplet"), fields_deg=(0.0, 10.0, 75.0), rays=3)
+    rays = lines(figure, "ray")
+    assert len(rays) == 6
+    assert not same_color(rays[0].get_color(), rays[3].get_color())
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert labels == ["0°", "10°", "75° (no ray passes)"]
+
+
+def test_only_glass_is_filled_and_cemented_elements_share_their_interface(lens):
+    figure = layout_figure(lens("large_fov_doublet"))
+    elements = glass(figure)
+    assert set(elements) == {"glass 1", "glass 2"}
+    assert len(drawn(figure, "surface 2")) == 1
+    z_first, z_gap = 2.5, 11.0  # on the axis: within glass 1, and between surface 3 and the stop
+    assert elements["glass 1"].contains_point((z_first, 0.0))
+    assert not any(path.contains_point((z_gap, 0.0)) for path in elements.values())
+
+
+def test_edges_close_unequal_rims_by_a_flat_and_a_cylinder(lens):
+    figure = layout_figure(lens("nikon"))
+    edge = drawn(figure, "edge")[0]
+    front, back = (drawn(figure, f"surface {number}")[0] for number in (1, 2))
+    np.testing.assert_allclose(edge, [front[-1], [back[-1, 0], front[-1, 1]], back[-1]])
+
+
+def test_an_edge_does_not_cut_through_the_other_surface():
+    ball = {
+        "stop": 1,
+        "surfaces": {
+            "1": {"radius": 10.0, "semi_diameter": 4.0, "thickness": 2.0, "material": "1.5/60"},
+            "2": {"radius": -10.0, "semi_diameter": 5.0, "material": "air"},
+        },
+        "sensor": {"distance": 10.0},
+    }
+    # The flat outside surface 1, at z = 0.83, would meet surface 2, which is at 0.66 on its rim.
+    edge = drawn(layout_figure(lens_from_prescription(ball)), "edge")[0]
+    assert edge.shape == (2, 2)
+
+
+def test_a_plate_too_flat_to_see_has_its_sag_in_micrometres(lens):
+    coefficient = torch.tensor(1.3e-5, dtype=torch.float64)
+    values = {"surfaces.5.x3": coefficient, "surfaces.5.y3": 2 * coefficient}
+    figure = layout_figure(lens("wavefront_coding"), values=values)
+    assert len(figure.axes) == 2
+    for line, factor in zip(figure.axes[1].get_lines(), (1, 2), strict=True):
+        t, sag = line.get_data()
+        np.testing.assert_allclose(sag, 1e3 * factor * 1.3e-5 * t**3, atol=1e-12)
+        assert t[-1] == pytest.approx(6.35)
+    assert len(layout_figure(lens("asphere")).axes) == 1
+
+
+def test_the_lens_and_its_gradients_are_left_alone(lens):
+    one = lens("wavefront_coding")
+    before = [parameter.detach().clone() for parameter in one.parameters()]
+    layout_figure(one)
+    for parameter, old in zip(one.parameters(), before, strict=True):
+        assert parameter.requires_grad and parameter.grad is None
+        assert torch.equal(parameter, old)
+
+
+def test_a_single_precision_lens_is_drawn_too(root):
+    path = root / "conf" / "lens" / "nikon.yaml"
+    assert len(drawn(layout_figure(load_lens(path, dtype=torch.float32), rays=4), "ray")) == 4
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"rays": 0}, {"fields_deg": ()}, {"fields_deg": (90.0,)}, {"object_distance": -5.0}],
+    ids=str,
+)
+def test_what_cannot_be_drawn_is_refused(lens, wrong):
+    with pytest.raises(InputError, match="layout"):
+        layout_figure(lens("asphere"), **wrong)
