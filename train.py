@@ -15,7 +15,17 @@ from experiments.training import run
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(cfg: DictConfig) -> float:
     """Run the composed experiment and return its objective."""
-    return run(cfg)
+    try:
+        return run(cfg)
+    except (InputError, HydraException, OmegaConfBaseException) as error:
+        # Hydra reports a class that could not be made; the reason is what the user can mend.
+        # Exiting here, within the job, keeps Hydra from adding lines of its own.
+        sys.exit(one_line(error.__cause__ if isinstance(error.__cause__, InputError) else error))
+
+
+def one_line(error: BaseException) -> str:
+    """The message of a user's mistake, on one line."""
+    return "error: " + " ".join(str(error).split())
 
 
 if __name__ == "__main__":
@@ -23,6 +33,5 @@ if __name__ == "__main__":
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     try:
         main()
-    except (InputError, HydraException, OmegaConfBaseException) as error:
-        cause = error.__cause__ if isinstance(error.__cause__, InputError) else error
-        sys.exit("error: " + " ".join(str(cause).split()))
+    except (HydraException, OmegaConfBaseException) as error:
+        sys.exit(one_line(error))

@@ -32,6 +32,8 @@ def run(cfg: DictConfig) -> float:
     started = time.perf_counter()
     folder = Path(HydraConfig.get().runtime.output_dir)
     refuse_subprocess_ddp_in_sweep(cfg)
+    if str(cfg.objective).startswith("test/") and not cfg.test:
+        raise InputError(f"objective: '{cfg.objective}' needs test=true, or name another metric")
     if cfg.threads:
         torch.set_num_threads(cfg.threads)
     # The basic launcher runs a sweep's jobs in one process: seed at each start.
@@ -63,10 +65,7 @@ def run(cfg: DictConfig) -> float:
             trainer.test(module, data, verbose=False)
             metrics.update(trainer.callback_metrics)
         status = "finished"
-    except KeyboardInterrupt:
-        status = "interrupted"
-        raise
-    except SystemExit:
+    except (KeyboardInterrupt, SystemExit):  # Lightning turns Ctrl-C into an exit
         status = "interrupted"
         raise
     finally:

@@ -67,3 +67,19 @@ def test_constraints_are_exact_versions():
     assert len(lines) > 10
     for line in lines:
         assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+_-]+", line), line
+
+
+def test_ci_runs_the_readme_s_own_test_command():
+    readme = (ROOT / "README.md").read_text()
+    commands = [
+        line.strip() for line in readme.splitlines() if line.startswith("    python3 -m venv")
+    ]
+    assert len(commands) == 2
+    assert commands[1] in (ROOT / ".ci" / "run").read_text()
+
+
+def test_no_file_names_a_registry_or_a_machine_s_path():
+    for path in [*FILES, *ROOT.glob("conf/**/*.yaml"), *ROOT.glob("*.*"), ROOT / ".ci" / "run"]:
+        if path.is_file():
+            text = path.read_text()
+            assert not re.search(r"pypi\.org|pythonhosted|/root/|/work/", text), path

@@ -21,6 +21,7 @@ from dolens.errors import InputError
 from experiments.training import run
 
 EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experiment").glob("*.yaml"))
+UNTESTED = ["test=false", "objective=train/loss"]
 WAVEFRONT_CODING = ["experiment=wavefront_coding", *TINY, *TINY_NETWORK]
 
 
@@ -81,8 +82,8 @@ def test_a_run_leaves_the_whole_run_folder(composed, tmp_path):
 
 
 def test_the_last_checkpoint_is_the_end_of_the_run_whichever_was_best(composed, tmp_path):
-    run(composed(*WAVEFRONT_CODING, "callbacks.best.mode=min", "test=false"))
-    run(composed(*WAVEFRONT_CODING, "test=false", folder="other"))
+    run(composed(*WAVEFRONT_CODING, "callbacks.best.mode=min", *UNTESTED))
+    run(composed(*WAVEFRONT_CODING, *UNTESTED, folder="other"))
     for folder in ("run", "other"):
         last = torch.load(tmp_path / folder / "checkpoints" / "last.ckpt", weights_only=True)
         assert last["global_step"] == 4
@@ -123,11 +124,11 @@ def test_bounds_hold_by_projection(composed, tmp_path):
 def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path, stop_after):
     # `stop_after` 1 and 3 are in the middle of an epoch of two steps.
     steps = f"+callbacks.last.every_n_train_steps={stop_after}"
-    run(composed(*WAVEFRONT_CODING, "test=false", folder="whole"))
+    run(composed(*WAVEFRONT_CODING, *UNTESTED, folder="whole"))
     # Stopped by hand after some steps: the schedule is the whole run's.
     part = composed(
         *WAVEFRONT_CODING,
-        "test=false",
+        *UNTESTED,
         steps,
         f"+trainer.max_steps={stop_after}",
         folder="part",
@@ -135,7 +136,7 @@ def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path,
     run(part)
     resumed = composed(
         *WAVEFRONT_CODING,
-        "test=false",
+        *UNTESTED,
         f"ckpt_path={tmp_path / 'part' / 'checkpoints' / 'last.ckpt'}",
         folder="resumed",
     )
@@ -208,7 +209,7 @@ def test_a_sweep_leaves_a_folder_for_each_job(root, tmp_path):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     losses = []
-    for job, weight in (("0", "0"), ("1", "1e-4")):
+    for job, weight in (("0", "0"), ("1", "0.0001")):
         assert json.loads((tmp_path / job / "run.json").read_text())["status"] == "finished"
         assert f"loss.tv_weight={weight}" in (tmp_path / job / ".hydra/overrides.yaml").read_text()
         assert (tmp_path / job / "log.txt").exists()
@@ -254,7 +255,8 @@ BAD_INPUT = {
     ),
     "depth inside the lens": (["scene.depths=[8000,-1]"], "depth -1 mm lies inside the lens"),
     "code in a prescription": (["+lens.surfaces.1._target_=os.system"], "unknown key '_target_'"),
-    "unknown objective": (["lens_dtype=float16"], "allowed: float32, float64"),
+    "objective without its test": (["test=false"], "needs test=true"),
+    "unknown precision": (["lens_dtype=float16"], "allowed: float32, float64"),
     "missing checkpoint": (["ckpt_path=nowhere.ckpt"], "nowhere.ckpt does not exist"),
     "unknown perceptual loss": (["loss.perceptual=vgg"], "auto, vgg16, none"),
     "missing weights": (
@@ -289,7 +291,7 @@ def test_an_empty_image_folder_is_named(composed, tmp_path):
 
 
 def test_a_checkpoint_of_another_experiment_is_refused(composed, tmp_path):
-    run(composed(*WAVEFRONT_CODING, "test=false", "trainer.max_epochs=1", folder="first"))
+    run(composed(*WAVEFRONT_CODING, *UNTESTED, "trainer.max_epochs=1", folder="first"))
     checkpoint = tmp_path / "first" / "checkpoints" / "last.ckpt"
     with pytest.raises(InputError, match="experiment is 'wavefront_coding'"):
         run(
