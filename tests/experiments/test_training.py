@@ -232,13 +232,18 @@ def test_ctrl_c_keeps_the_last_checkpoint_and_says_how_to_resume(root, tmp_path)
         text=True,
         cwd=root,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        # A test run in the background of a shell ignores Ctrl-C, and its children would too.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     last = tmp_path / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 200
-    while not last.exists() and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=120)
+    try:
+        while not last.exists() and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=120)
+    finally:
+        process.kill()
     assert process.returncode != 0
     assert re.search(r"Resume with: python .*train\.py .*ckpt_path=.*last\.ckpt", output), output
     assert json.loads((tmp_path / "run.json").read_text())["status"] == "interrupted"
