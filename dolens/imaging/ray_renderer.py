@@ -24,7 +24,7 @@ _SEED_FACTOR, _PIECE_FACTOR, _SEED_RANGE = 1_000_000_007, 998_244_353, 2**63 - 1
 
 @dataclass(frozen=True)
 class RayRenderer:
-    """Monte Carlo rendering with stratified, jittered samples of every pixel and the pupil.
+    """Monte Carlo rendering: jittered points of each pixel, a stratified sampling of the pupil.
 
     Each pixel sends `pupil_samples`² rays: one from a random point of the pixel through a random
     point of each stratum of the exit pupil.  All wavelengths share the samples.  The irradiance
