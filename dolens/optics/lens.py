@@ -117,7 +117,7 @@ class Lens(nn.Module):
         for number, surface in self.surfaces.items():
             parameters = {
                 name: values.pop(f"surfaces.{number}.{name}", value)
-                for name, value in surface.named_parameters()
+                for name, value in (*surface.named_parameters(), *surface.named_buffers())
             }
             surfaces.append(SurfaceState(type(surface), parameters, surface.semi_diameter))
         thicknesses = [

@@ -100,8 +100,8 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
     rows: dict[str, dict[str, Any]] = {}
     for (number, surface), material in zip(lens.surfaces.items(), lens.materials[1:], strict=True):
         row: dict[str, Any] = {"type": surface.kind}
-        for key, value in surface.named_parameters():
-            number_value = float(value.detach())
+        for key, value in (*surface.named_parameters(), *surface.named_buffers()):
+            number_value = value.detach().tolist()
             if key == "curvature":
                 row["radius"] = _radius(number_value)
                 if 1.0 / row["radius"] != number_value:
@@ -141,7 +141,7 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     try:
         names = shape.parameter_names(row)
         _check_keys(row, (*_SURFACE_KEYS, *names), place)
-        values = {key: _number(row.get(key, 0.0), f"'{key}'") for key in names}
+        values = {key: _numbers(row.get(key, 0.0), f"'{key}'") for key in names}
         if "curvature" in names:
             values["curvature"] = _curvature(row)
         elif not math.isinf(_number(row.get("radius", math.inf), "'radius'")):
@@ -204,6 +204,13 @@ def _number(value: object, what: str, finite: bool = True) -> float:
     if math.isnan(number) or (finite and math.isinf(number) and "radius" not in what):
         raise InputError(f"{what} must be a finite number, not {value!r}")
     return number
+
+
+def _numbers(value: object, what: str) -> Any:
+    """A number, or rows of numbers nested as they are written."""
+    if isinstance(value, list | tuple):
+        return [_numbers(entry, what) for entry in value]
+    return _number(value, what)
 
 
 def _integer(value: object, what: str) -> int:

@@ -9,7 +9,7 @@ reaches; their gradient is cut off where the trace ends.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -85,9 +85,9 @@ def snell(
 class Surface(nn.Module):
     """A refracting surface about its own vertex: state here, mathematics in its static methods.
 
-    A surface holds scalar parameters (`curvature`, `a4`, `x2y`, ...).  Its methods for light take
-    them as a mapping, so that a trace can be given other values than the stored ones (scaled
-    variables of an optimizer, a batch of perturbed lenses) without touching any state.
+    A surface holds parameters, most of them scalars (`curvature`, `a4`, `x2y`, ...).  Its methods
+    for light take them as a mapping, so that a trace can be given other values than the stored
+    ones (scaled variables of an optimizer, a batch of perturbed lenses) without touching any state.
 
     A new shape is a subclass with `kind`, `parameter_names`, `sag_and_gradient`, and a better
     `start` where there is one; Newton's iteration does the rest.  A shape with a closed form
@@ -95,16 +95,21 @@ class Surface(nn.Module):
 
     Args:
         semi_diameter: mm, radius of the circular clear aperture.
-        parameters: name → number; mm and inverse powers of mm.
+        parameters: name → number, or array of numbers; mm and inverse powers of mm.
         dtype: precision of the parameters.
+
+    Attributes:
+        kind: the `type` of a prescription.
+        constants: names among the parameters that no optimizer varies (knots); they are buffers.
     """
 
     kind: ClassVar[str] = ""
+    constants: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
         semi_diameter: float,
-        parameters: Mapping[str, float],
+        parameters: Mapping[str, Any],
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
@@ -112,7 +117,11 @@ class Surface(nn.Module):
         if not self.semi_diameter > 0.0:
             raise InputError(f"semi_diameter must be positive, not {semi_diameter}")
         for name, value in parameters.items():
-            self.register_parameter(name, nn.Parameter(torch.tensor(float(value), dtype=dtype)))
+            tensor = torch.tensor(value, dtype=dtype)
+            if name in self.constants:
+                self.register_buffer(name, tensor)
+            else:
+                self.register_parameter(name, nn.Parameter(tensor))
         self.check_aperture()
 
     def check_aperture(self) -> None:
