@@ -62,8 +62,10 @@ def trace_surfaces(
     sense: float = 1.0,
     path_length: bool = False,
     record: bool = False,
+    first: int = 1,
+    last: int | None = None,
 ) -> Trace:
-    """Trace rays through every surface, in the order that light in this sense meets them.
+    """Trace rays through surfaces `first` to `last`, in the order that light meets them.
 
     Args:
         system: the lens.
@@ -72,21 +74,23 @@ def trace_surfaces(
         sense: +1 from the object towards the sensor, -1 from the sensor towards the object.
         path_length: whether to sum n·t.
         record: whether to keep the intersections.
+        first: number of the first surface, from 1, as the prescription counts in either sense.
+        last: number of the last surface; None: of the lens.
 
     Returns:
         The rays on the last surface met, travelling in the medium behind it.
     """
     indices = system.indices(wavelength)
     vertices = system.vertices
-    count = len(system.surfaces)
-    order = range(count) if sense > 0 else range(count - 1, -1, -1)
+    numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
     margins: list[Margins] = []
     points: list[tuple[Tensor, Tensor, Tensor]] = []
     x, y, z, l, m, n = ray  # noqa: E741
     # z is kept relative to the vertex at hand: float32 then errs by the sag's rounding only.
     origin: Tensor | float = 0.0
-    for i in order:
+    for number in numbers if sense > 0 else reversed(numbers):
+        i = number - 1
         surface = system.surfaces[i]
         shape, parameters = surface.shape, surface.parameters
         before, after = (indices[i], indices[i + 1]) if sense > 0 else (indices[i + 1], indices[i])
@@ -110,7 +114,7 @@ def trace_surfaces(
             l, m, n, transmitted = shape.refract(  # noqa: E741
                 parameters, (x, y, z), (l, m, n), before / after, sense
             )
-        margins.append(Margins(i + 1, met, inside, transmitted))
+        margins.append(Margins(number, met, inside, transmitted))
     ray = Components(x, y, z + origin, l, m, n)
     return Trace(ray, _all_positive(margins), margins, path, points)
 
