@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.materials import Material
 from dolens.optics.paraxial import FirstOrder, first_order
 from dolens.optics.rays import Components, Rays, TracedRays
@@ -38,6 +39,7 @@ class Lens(nn.Module):
         name: for titles and messages.
         sensor_diameter: mm, the image circle the prescription gives; not tested by a trace.
         dtype: precision of the parameters, and of the rays.
+        elements: name → group of surfaces with a pose of its own.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Lens(nn.Module):
         name: str = "",
         sensor_diameter: float | None = None,
         dtype: torch.dtype = torch.float64,
+        elements: Mapping[str, Element] | None = None,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -73,6 +76,11 @@ class Lens(nn.Module):
         self.thicknesses = nn.ParameterDict()
         for number, gap in enumerate(thicknesses, 1):
             self.thicknesses[str(number)] = nn.Parameter(torch.tensor(float(gap), dtype=dtype))
+        try:
+            check_elements(elements or {}, count)
+        except InputError as error:
+            raise InputError(f"lens '{name}': {error}") from None
+        self.elements = nn.ModuleDict(dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.to(dtype)
 
@@ -119,14 +127,25 @@ class Lens(nn.Module):
                 name: values.pop(f"surfaces.{number}.{name}", value)
                 for name, value in (*surface.named_parameters(), *surface.named_buffers())
             }
-            surfaces.append(SurfaceState(type(surface), parameters, surface.semi_diameter))
+            surfaces.append(SurfaceState(type(surface), parameters, surface.aperture))
         thicknesses = [
             values.pop(f"thicknesses.{number}", gap) for number, gap in self.thicknesses.items()
+        ]
+        elements = [
+            ElementState(
+                element.first,
+                element.last,
+                {n: values.pop(f"elements.{name}.{n}", v) for n, v in element.named_parameters()},
+                element.pivot,
+            )
+            for name, element in self.elements.items()
         ]
         sensor_distance = values.pop("sensor_distance", self.sensor_distance)
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
-        return OpticalSystem(surfaces, thicknesses, sensor_distance, self.materials, self.stop)
+        return OpticalSystem(
+            surfaces, thicknesses, sensor_distance, self.materials, self.stop, elements
+        )
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""

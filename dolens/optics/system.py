@@ -7,13 +7,14 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.materials import Material
 from dolens.optics.surfaces.base import SurfaceState
 
 
 @dataclass(frozen=True)
 class OpticalSystem:
-    """A centred sequence of surfaces and a sensor plane.
+    """A sequence of surfaces and a sensor plane, centred but for the poses of its elements.
 
     Attributes:
         surfaces: in the order that light meets them.
@@ -21,6 +22,7 @@ class OpticalSystem:
         sensor_distance: from the last vertex to the sensor plane, mm.
         materials: before surface 1 and after each surface.
         stop: number of the stop surface, from 1.
+        elements: groups of surfaces with a pose of their own.
     """
 
     surfaces: Sequence[SurfaceState]
@@ -28,6 +30,7 @@ class OpticalSystem:
     sensor_distance: Tensor
     materials: Sequence[Material]
     stop: int
+    elements: Sequence[ElementState] = ()
 
     def indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
         """Indices before surface 1 and after each surface, at a wavelength in nm.
@@ -43,11 +46,16 @@ class OpticalSystem:
 
     @cached_property
     def vertices(self) -> list[Tensor]:
-        """z of every vertex, then of the sensor, in mm; the first vertex is at 0."""
+        """z of every vertex as designed, then of the sensor, in mm; the first is at 0."""
         positions = [torch.zeros_like(self.sensor_distance)]
         for gap in (*self.thicknesses, self.sensor_distance):
             positions.append(positions[-1] + gap)
         return positions
+
+    @cached_property
+    def axes(self) -> list[Axes]:
+        """Where every surface is, with the poses of the elements that carry it."""
+        return surface_axes(self.elements, self.vertices, len(self.surfaces))
 
     @property
     def dtype(self) -> torch.dtype:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.optics.elements import LENS_AXES, change_axes, to_lens_axes
 from dolens.optics.rays import Components, Status
 from dolens.optics.surfaces.base import FAR, GRAZING, PlaneRay
 from dolens.optics.system import OpticalSystem
@@ -81,47 +82,48 @@ def trace_surfaces(
         The rays on the last surface met, travelling in the medium behind it.
     """
     indices = system.indices(wavelength)
-    vertices = system.vertices
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
     margins: list[Margins] = []
     points: list[tuple[Tensor, Tensor, Tensor]] = []
-    x, y, z, l, m, n = ray  # noqa: E741
-    # z is kept relative to the vertex at hand: float32 then errs by the sag's rounding only.
-    origin: Tensor | float = 0.0
+    # Positions count from the vertex at hand: float32 then errs by the sag's rounding only.
+    axes = LENS_AXES
     for number in numbers if sense > 0 else reversed(numbers):
         i = number - 1
         surface = system.surfaces[i]
         shape, parameters = surface.shape, surface.parameters
         before, after = (indices[i], indices[i + 1]) if sense > 0 else (indices[i + 1], indices[i])
-        here = Components(x, y, z + (origin - vertices[i]), l, m, n)
-        origin = vertices[i]
+        here, carried = change_axes(ray, axes, system.axes[i])
+        axes = system.axes[i]
         to_plane, towards = distance_to_plane(here, 0.0, sense)
         limit = FAR * surface.semi_diameter
-        x = torch.addcmul(x, to_plane, l).clamp(-limit, limit)
-        y = torch.addcmul(y, to_plane, m).clamp(-limit, limit)
+        l, m, n = here[3:]  # noqa: E741
+        x = torch.addcmul(here.x, to_plane, l).clamp(-limit, limit)
+        y = torch.addcmul(here.y, to_plane, m).clamp(-limit, limit)
         t, met = shape.intersect(parameters, PlaneRay(x, y, l, m, n), sense, surface.semi_diameter)
         met = towards if met is None else torch.minimum(towards, met)
         t = t.clamp(-limit, limit)
         x, y, z = torch.addcmul(x, t, l), torch.addcmul(y, t, m), t * n
-        inside = surface.semi_diameter**2 - torch.addcmul(x * x, y, y).detach()
+        inside = surface.aperture.margin(x, y)
         if path is not None:
-            path = path + before * (to_plane + t)
+            path = path + before * (to_plane + t if carried is None else carried + to_plane + t)
         if record:
-            points.append((x, y, z + vertices[i]))
+            points.append(to_lens_axes(Components(x, y, z, l, m, n), axes)[:3])
         transmitted = None
         if system.materials[i] != system.materials[i + 1]:
             l, m, n, transmitted = shape.refract(  # noqa: E741
                 parameters, (x, y, z), (l, m, n), before / after, sense
             )
         margins.append(Margins(number, met, inside, transmitted))
-    ray = Components(x, y, z + origin, l, m, n)
-    return Trace(ray, _all_positive(margins), margins, path, points)
+        ray = Components(x, y, z, l, m, n)
+    return Trace(to_lens_axes(ray, axes), _all_positive(margins, ray.n), margins, path, points)
 
 
-def _all_positive(margins: list[Margins]) -> Tensor:
-    """Where every margin is positive; a NaN is not."""
+def _all_positive(margins: list[Margins], like: Tensor) -> Tensor:
+    """Where every margin is positive; a NaN is not.  True for rays that met no surface."""
     kept = [m for row in margins for m in row[1:] if m is not None]
+    if not kept:
+        return torch.ones_like(like, dtype=torch.bool)
     return reduce(torch.minimum, kept) > 0.0
 
 

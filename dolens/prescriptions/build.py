@@ -8,15 +8,16 @@ A prescription is a mapping::
     surfaces:
       '1': {type: sphere, radius: 63, semi_diameter: 6.35, thickness: 4, material: 1.51680/64.17}
       '2': ...                  # the last surface has no thickness
+    elements:                   # optional, see poses.py; rectangular apertures: see apertures.py
+      '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
     sensor: {distance: 96.0, diameter: 1.7664}
 
 Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface.
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -26,9 +27,28 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
 from dolens.optics.surfaces import SURFACES, Surface
+from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
+from dolens.prescriptions.checks import (
+    as_integer,
+    as_number,
+    as_numbers,
+    check_keys,
+    did_you_mean,
+    require_mapping,
+)
+from dolens.prescriptions.poses import element_rows, elements_from
 
-_LENS_KEYS = ("name", "source", "index_model", "stop", "object_material", "surfaces", "sensor")
-_SURFACE_KEYS = ("type", "radius", "semi_diameter", "thickness", "material", "note")
+_LENS_KEYS = (
+    "name",
+    "source",
+    "index_model",
+    "stop",
+    "object_material",
+    "surfaces",
+    "elements",
+    "sensor",
+)
+_SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
 
 
@@ -49,8 +69,8 @@ def lens_from_prescription(
     Raises:
         InputError: one line that names `where`, the surface and the key.
     """
-    _require_mapping(prescription, where)
-    _check_keys(prescription, _LENS_KEYS, where)
+    require_mapping(prescription, where)
+    check_keys(prescription, _LENS_KEYS, where)
     name = str(prescription.get("name", where))
     try:
         model = find_index_model(index_model or str(prescription.get("index_model", "dfc")))
@@ -60,7 +80,7 @@ def lens_from_prescription(
     sensor = prescription.get("sensor")
     if not isinstance(sensor, Mapping) or "distance" not in sensor:
         raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
-    _check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
+    check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
     surfaces, thicknesses = [], []
     materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
     for number, row in enumerate(rows, 1):
@@ -70,7 +90,7 @@ def lens_from_prescription(
         if number < len(rows):
             if row.get("thickness") is None:
                 raise InputError(f"{place}: 'thickness' is missing (mm to surface {number + 1})")
-            thicknesses.append(_number(row["thickness"], f"{place}: 'thickness'"))
+            thicknesses.append(as_number(row["thickness"], f"{place}: 'thickness'"))
         elif row.get("thickness") is not None:
             raise InputError(
                 f"{place}: the last surface has no 'thickness'; its gap is 'sensor.distance'"
@@ -80,16 +100,18 @@ def lens_from_prescription(
         return Lens(
             surfaces,
             thicknesses,
-            _number(sensor["distance"], f"{where}: 'sensor.distance'"),
+            as_number(sensor["distance"], f"{where}: 'sensor.distance'"),
             materials,
-            _integer(prescription.get("stop", 1), f"{where}: 'stop'"),
+            as_integer(prescription.get("stop", 1), f"{where}: 'stop'"),
             model.name,
             name,
-            None if diameter is None else _number(diameter, f"{where}: 'sensor.diameter'"),
+            None if diameter is None else as_number(diameter, f"{where}: 'sensor.diameter'"),
             dtype,
+            elements_from(prescription.get("elements"), dtype, where),
         )
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+        message = str(error)
+        raise InputError(message if message.startswith(where) else f"{where}: {message}") from None
 
 
 def prescription_of(lens: Lens) -> dict[str, Any]:
@@ -110,7 +132,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
                     row["curvature"] = number_value
             else:
                 row[key] = number_value
-        row["semi_diameter"] = surface.semi_diameter
+        row |= aperture_rows(surface.aperture)
         if number in lens.thicknesses:
             row["thickness"] = float(lens.thicknesses[number].detach())
         row["material"] = material.name
@@ -124,6 +146,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         "stop": lens.stop,
         "object_material": lens.materials[0].name,
         "surfaces": rows,
+        **({"elements": element_rows(lens.elements)} if len(lens.elements) else {}),
         "sensor": sensor,
     }
 
@@ -132,22 +155,19 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     kind = str(row.get("type", "sphere"))
     if kind not in SURFACES:
         raise InputError(
-            f"{place}: type '{kind}' is unknown{_near(kind, SURFACES)} "
+            f"{place}: type '{kind}' is unknown{did_you_mean(kind, SURFACES)} "
             f"(allowed: {', '.join(SURFACES)})"
         )
     shape = SURFACES[kind]
-    if row.get("semi_diameter") is None:
-        raise InputError(f"{place}: 'semi_diameter' is missing (mm)")
     try:
         names = shape.parameter_names(row)
-        _check_keys(row, (*_SURFACE_KEYS, *names), place)
-        values = {key: _numbers(row.get(key, 0.0), f"'{key}'") for key in names}
+        check_keys(row, (*_SURFACE_KEYS, *names), place)
+        values = {key: as_numbers(row.get(key, 0.0), f"'{key}'") for key in names}
         if "curvature" in names:
             values["curvature"] = _curvature(row)
-        elif not math.isinf(_number(row.get("radius", math.inf), "'radius'")):
+        elif not math.isinf(as_number(row.get("radius", math.inf), "'radius'")):
             raise InputError(f"a surface of type '{kind}' has no 'radius'")
-        semi_diameter = _number(row["semi_diameter"], "'semi_diameter'")
-        return shape(semi_diameter, values, dtype)
+        return shape(clear_aperture(row, place), values, dtype)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None
@@ -157,10 +177,10 @@ def _curvature(row: Mapping[str, Any]) -> float:
     if row.get("curvature") is not None and row.get("radius") is not None:
         raise InputError("give 'radius' or 'curvature', not both")
     if row.get("curvature") is not None:
-        return _number(row["curvature"], "'curvature'")
+        return as_number(row["curvature"], "'curvature'")
     if row.get("radius") is None:
         raise InputError("'radius' is missing (mm; .inf for a plane)")
-    radius = _number(row["radius"], "'radius'", finite=False)
+    radius = as_number(row["radius"], "'radius'", finite=False)
     if radius == 0.0:
         raise InputError("'radius' is 0; write .inf for a plane")
     return 1.0 / radius
@@ -181,7 +201,7 @@ def _rows(prescription: Mapping[str, Any], where: str) -> list[Mapping[str, Any]
                 f"{where}: surface {number} is missing; surfaces are numbered 1 to {len(rows)} "
                 f"without gaps, not {', '.join(rows)}"
             )
-        _require_mapping(rows[str(number)], f"{where}: surface {number}")
+        require_mapping(rows[str(number)], f"{where}: surface {number}")
     return [rows[str(number)] for number in range(1, len(rows) + 1)]
 
 
@@ -192,49 +212,3 @@ def _material(value: object, model: Any, place: str) -> Any:
         return parse_material(str(value), model)
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
-
-
-def _number(value: object, what: str, finite: bool = True) -> float:
-    try:
-        if isinstance(value, bool):
-            raise TypeError
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise InputError(f"{what} must be a number, not {value!r}") from None
-    if math.isnan(number) or (finite and math.isinf(number) and "radius" not in what):
-        raise InputError(f"{what} must be a finite number, not {value!r}")
-    return number
-
-
-def _numbers(value: object, what: str) -> Any:
-    """A number, or rows of numbers nested as they are written."""
-    if isinstance(value, list | tuple):
-        return [_numbers(entry, what) for entry in value]
-    return _number(value, what)
-
-
-def _integer(value: object, what: str) -> int:
-    number = _number(value, what)
-    if number != int(number):
-        raise InputError(f"{what} must be a whole number, not {value!r}")
-    return int(number)
-
-
-def _require_mapping(value: object, where: str) -> None:
-    if not isinstance(value, Mapping):
-        raise InputError(f"{where}: expected a mapping of keys to values, not {value!r}")
-
-
-def _check_keys(mapping: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
-    allowed = list(allowed)
-    for key in mapping:
-        if str(key) not in allowed:
-            raise InputError(
-                f"{where}: unknown key '{key}'{_near(str(key), allowed)} "
-                f"(allowed: {', '.join(allowed)})"
-            )
-
-
-def _near(word: str, allowed: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word, list(allowed), n=1)
-    return f"; did you mean '{near[0]}'?" if near else ""

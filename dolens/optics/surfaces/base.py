@@ -6,7 +6,6 @@ the arithmetic, so invalid rays are kept finite by clamps instead, at limits tha
 reaches; their gradient is cut off where the trace ends.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -14,11 +13,10 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optics.surfaces.newton import find_root
 
 Parameters = Mapping[str, Tensor]
-
-MAX_NEWTON_STEPS = 40
 
 # Smallest cosine that is divided by.  Its square is far above the smallest float32.
 GRAZING = 1e-9
@@ -94,7 +92,7 @@ class Surface(nn.Module):
     overrides `intersect` and `normal`.
 
     Args:
-        semi_diameter: mm, radius of the circular clear aperture.
+        aperture: the clear aperture; a number is the semi-diameter of a circle, mm.
         parameters: name → number, or array of numbers; mm and inverse powers of mm.
         dtype: precision of the parameters.
 
@@ -108,14 +106,14 @@ class Surface(nn.Module):
 
     def __init__(
         self,
-        semi_diameter: float,
+        aperture: ClearAperture | float,
         parameters: Mapping[str, Any],
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
-        self.semi_diameter = float(semi_diameter)
-        if not self.semi_diameter > 0.0:
-            raise InputError(f"semi_diameter must be positive, not {semi_diameter}")
+        if not isinstance(aperture, ClearAperture):
+            aperture = ClearAperture(Circle(float(aperture)))
+        self.aperture = aperture
         for name, value in parameters.items():
             tensor = torch.tensor(value, dtype=dtype)
             if name in self.constants:
@@ -123,6 +121,11 @@ class Surface(nn.Module):
             else:
                 self.register_parameter(name, nn.Parameter(tensor))
         self.check_aperture()
+
+    @property
+    def semi_diameter(self) -> float:
+        """Distance of the clear aperture's farthest point from the vertex, mm."""
+        return self.aperture.edge.reach
 
     def check_aperture(self) -> None:
         """Raise `InputError` where the clear aperture reaches beyond the surface's sag branch."""
@@ -165,9 +168,10 @@ class Surface(nn.Module):
     ) -> tuple[Tensor, Tensor | None]:
         """Meet the surface.
 
-        Here: Newton's iteration for sag(x + l·t, y + m·t) = n·t.  It runs outside the autograd
-        graph; one more step inside the graph leaves the value where it is and has the derivative
-        of the implicit function, ∂t = -∂F/F_t with F = sag - n·t.
+        Here: Newton's iteration for F = sag(x + l·t, y + m·t) - n·t = 0, outside any graph.  Each
+        further step, inside the graph, leaves the value where it is and doubles the order of the
+        derivatives that are those of the implicit function: one step gives ∂t = -∂F/F_t, the
+        second makes second derivatives right.
 
         Args:
             p: parameters.
@@ -180,15 +184,15 @@ class Surface(nn.Module):
             meets the sag branch there and crosses it in the direction of `sense`.
         """
         epsilon = torch.finfo(ray.n.dtype).eps
+
+        def step(values: Parameters, rays: tuple[Tensor, ...], t: Tensor) -> Tensor:
+            return _newton_step(cls, values, PlaneRay(*rays), t)
+
         with torch.no_grad():
-            t = cls.start(p, ray, sense)
-            for _ in range(MAX_NEWTON_STEPS):
-                step = _newton_step(cls, p, ray, t).clamp(-scale, scale)
-                t = t - step
-                # Newton converges quadratically: after a step of √ε the next is below rounding.
-                if bool((step.abs() <= math.sqrt(epsilon) * (t.abs() + scale)).all()):
-                    break
-        t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
+            start = cls.start(p, ray, sense)
+        t = find_root(step, p, start, ray, scale)
+        for _ in range(2 if torch.is_grad_enabled() else 1):
+            t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
         with torch.no_grad():
             # Read the residual off the final point: convergence is checked, never assumed.
             x, y = torch.addcmul(ray.x, ray.l, t), torch.addcmul(ray.y, ray.m, t)
@@ -239,9 +243,14 @@ class SurfaceState:
     Attributes:
         shape: the `Surface` subclass, used as a namespace of pure functions.
         parameters: name → tensor.
-        semi_diameter: mm.
+        aperture: what light passes.
     """
 
     shape: type[Surface]
     parameters: Parameters
-    semi_diameter: float
+    aperture: ClearAperture
+
+    @property
+    def semi_diameter(self) -> float:
+        """Distance of the clear aperture's farthest point from the vertex, mm."""
+        return self.aperture.edge.reach

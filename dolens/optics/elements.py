@@ -1,0 +1,224 @@
+"""Elements: groups of neighbouring surfaces that move as one rigid body, and surfaces' axes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from dolens.errors import InputError
+from dolens.optics.rays import Components
+
+# Smallest cosine to the axis that is divided by when a ray is carried to a tilted element.
+_GRAZING = 1e-9
+
+TILTS = ("tilt_x", "tilt_y", "tilt_z")
+DISPLACEMENTS = ("decenter_x", "decenter_y", "shift_z")
+POSE = (*TILTS, *DISPLACEMENTS)
+
+
+class Element(nn.Module):
+    """State of an element: which surfaces it holds, and its pose.
+
+    The pose moves a point p of the lens as designed to c + R·(p - c) + d: a rotation
+    R = Rx·Ry·Rz (right-handed, z first) about the pivot c, then a displacement d.
+
+    Args:
+        first: number of its first surface.
+        last: number of its last surface.
+        pose: any of `tilt_x`, `tilt_y`, `tilt_z` (radians), `decenter_x`, `decenter_y`, `shift_z`
+            (mm); the others are zero.
+        pivot: mm, from the vertex of its first surface as designed.
+        dtype: precision of the parameters.
+
+    Raises:
+        InputError: no surface, or a pose of another name.
+    """
+
+    def __init__(
+        self,
+        first: int,
+        last: int,
+        pose: Mapping[str, float] | None = None,
+        pivot: Sequence[float] = (0.0, 0.0, 0.0),
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        if not 1 <= first <= last:
+            raise InputError(f"an element's surfaces run from its first to its last: {first, last}")
+        pose = dict(pose or {})
+        unknown = set(pose) - set(POSE)
+        if unknown:
+            raise InputError(f"unknown pose '{unknown.pop()}' (allowed: {', '.join(POSE)})")
+        self.first, self.last = first, last
+        x, y, z = (float(value) for value in pivot)
+        self.pivot = (x, y, z)
+        for name in POSE:
+            value = torch.tensor(float(pose.get(name, 0.0)), dtype=dtype)
+            self.register_parameter(name, nn.Parameter(value))
+
+
+@dataclass(frozen=True)
+class ElementState:
+    """An element as pure functions see it; see `Element`."""
+
+    first: int
+    last: int
+    parameters: Mapping[str, Tensor]
+    pivot: tuple[float, float, float]
+
+
+class Axes(NamedTuple):
+    """Where a surface is: a point p of its own axes lies at origin + rotation·p in the lens's.
+
+    Attributes:
+        elements: indices of the elements that carry it, innermost first.
+        z: of the vertex as designed, mm.
+        rotation: (3, 3), or None where nothing carries the surface.
+        origin: the vertex, (3,), mm, or None: (0, 0, z).
+    """
+
+    elements: tuple[int, ...]
+    z: Tensor | float
+    rotation: Tensor | None = None
+    origin: Tensor | None = None
+
+
+LENS_AXES = Axes((), 0.0)
+
+
+def check_elements(elements: Mapping[str, Element], surfaces: int) -> None:
+    """Raise `InputError` where an element leaves the lens, or two overlap without nesting."""
+    for name, a in elements.items():
+        if a.last > surfaces:
+            raise InputError(
+                f"element {name}: surface {a.last} is not in the lens, which has {surfaces}"
+            )
+        for other, b in elements.items():
+            if other == name or a.last < b.first or b.last < a.first:
+                continue
+            same = (a.first, a.last) == (b.first, b.last)
+            nested = (a.first <= b.first and b.last <= a.last) or (
+                b.first <= a.first and a.last <= b.last
+            )
+            if same or not nested:
+                raise InputError(
+                    f"elements {name} (surfaces {a.first} to {a.last}) and {other} ({b.first} to "
+                    f"{b.last}) overlap; one may lie inside another"
+                )
+
+
+def rotation_matrix(tilt_x: Tensor, tilt_y: Tensor, tilt_z: Tensor) -> Tensor:
+    """Rx·Ry·Rz, (3, 3), right-handed, angles in radians."""
+    cx, sx = torch.cos(tilt_x), torch.sin(tilt_x)
+    cy, sy = torch.cos(tilt_y), torch.sin(tilt_y)
+    cz, sz = torch.cos(tilt_z), torch.sin(tilt_z)
+    rows = [
+        (cy * cz, -cy * sz, sy),
+        (cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy),
+        (sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy),
+    ]
+    return torch.stack([torch.stack(row) for row in rows])
+
+
+def surface_axes(
+    elements: Sequence[ElementState], vertices: Sequence[Tensor], surfaces: int
+) -> list[Axes]:
+    """The axes of every surface.
+
+    Args:
+        elements: where they nest, the inner one moves within the outer one.
+        vertices: z of every vertex as designed, mm.
+        surfaces: how many.
+    """
+    inner_first = sorted(
+        range(len(elements)), key=lambda e: (elements[e].last - elements[e].first, e)
+    )
+    motions = {e: _motion(elements[e], vertices) for e in inner_first}
+    axes = []
+    for number in range(1, surfaces + 1):
+        z = vertices[number - 1]
+        carried = tuple(e for e in inner_first if elements[e].first <= number <= elements[e].last)
+        if not carried:
+            axes.append(Axes((), z))
+            continue
+        zero = torch.zeros_like(z)
+        origin = torch.stack([zero, zero, z])
+        rotation = None
+        for e in carried:
+            turn, pivot, displacement = motions[e]
+            origin = pivot + turn @ (origin - pivot) + displacement
+            rotation = turn if rotation is None else turn @ rotation
+        axes.append(Axes(carried, z, rotation, origin))
+    return axes
+
+
+def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Tensor | None]:
+    """Rays in the axes of one surface, seen from those of the next.
+
+    Within one element, and between surfaces that nothing carries, only z changes.  Otherwise the
+    rays are first carried along their line to the level of the next vertex: turning a point that
+    is metres away would lose in float32 what the lens needs.
+
+    Args:
+        ray: mm, in the axes `now`.
+        now: where the rays are.
+        then: where they go.
+
+    Returns:
+        The rays in the axes `then`, and the distance (mm) that they were carried, or None.
+    """
+    x, y, z, l, m, n = ray  # noqa: E741
+    if now.elements == then.elements:
+        return Components(x, y, z + (now.z - then.z), l, m, n), None
+    like = then.rotation if now.rotation is None else now.rotation
+    step = _origin(then, like) - _origin(now, like)
+    if now.rotation is not None:
+        step = now.rotation.mT @ step
+    # The distance of a ray that crosses at grazing incidence is finite and means nothing.
+    cosine = torch.where(n < 0.0, n.clamp(max=-_GRAZING), n.clamp(min=_GRAZING))
+    distance = (step[2] - z) / cosine
+    near = (torch.addcmul(x - step[0], distance, l), torch.addcmul(y - step[1], distance, m))
+    # Now (near, 0) counts from the next vertex, still along the axes `now`.
+    turn = now.rotation if then.rotation is None else then.rotation.mT
+    if now.rotation is not None and then.rotation is not None:
+        turn = then.rotation.mT @ now.rotation
+    position = _turn(turn, near[0], near[1], torch.zeros_like(near[0]))
+    return Components(*position, *_turn(turn, l, m, n)), distance
+
+
+def to_lens_axes(ray: Components, axes: Axes) -> Components:
+    """Rays in a surface's axes, seen from the lens's."""
+    x, y, z, l, m, n = ray  # noqa: E741
+    if axes.rotation is None:
+        return Components(x, y, z + axes.z, l, m, n)
+    position = _turn(axes.rotation, x, y, z)
+    origin = axes.origin
+    return Components(
+        *(p + o for p, o in zip(position, origin.unbind(), strict=True)),
+        *_turn(axes.rotation, l, m, n),
+    )
+
+
+def _motion(element: ElementState, vertices: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotation, pivot and displacement of one element."""
+    p = element.parameters
+    z = vertices[element.first - 1]
+    x, y, along = element.pivot
+    pivot = torch.stack([torch.full_like(z, x), torch.full_like(z, y), z + along])
+    displacement = torch.stack([p[name] for name in DISPLACEMENTS])
+    return rotation_matrix(*(p[name] for name in TILTS)), pivot, displacement
+
+
+def _origin(axes: Axes, like: Tensor) -> Tensor:
+    if axes.origin is not None:
+        return axes.origin
+    z = torch.as_tensor(axes.z, dtype=like.dtype, device=like.device)
+    zero = torch.zeros_like(z)
+    return torch.stack([zero, zero, z])
+
+
+def _turn(r: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    a, b, c = (torch.addcmul(torch.addcmul(r[i, 0] * x, r[i, 1], y), r[i, 2], z) for i in range(3))
+    return a, b, c

@@ -1,0 +1,77 @@
+"""What of a surface light passes: circles and rectangles, with obscurations."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A circle about the vertex; lengths in mm."""
+
+    semi_diameter: float
+
+    def margin(self, x: Tensor, y: Tensor) -> Tensor:
+        """Positive strictly inside: ρ² - r², mm²."""
+        return self.semi_diameter**2 - torch.addcmul(x * x, y, y)
+
+    @property
+    def reach(self) -> float:
+        """Distance of its farthest point from the vertex, mm."""
+        return self.semi_diameter
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangle about the vertex, its sides along the surface's x and y; lengths in mm."""
+
+    half_width_x: float
+    half_width_y: float
+
+    def margin(self, x: Tensor, y: Tensor) -> Tensor:
+        """Positive strictly inside: the distance to the nearest side, mm."""
+        return torch.minimum(self.half_width_x - x.abs(), self.half_width_y - y.abs())
+
+    @property
+    def reach(self) -> float:
+        """Distance of its corners from the vertex, mm."""
+        return math.hypot(self.half_width_x, self.half_width_y)
+
+
+Outline = Circle | Rectangle
+
+
+@dataclass(frozen=True)
+class ClearAperture:
+    """Light passes strictly inside `edge`, and strictly outside `obscuration` where there is one.
+
+    Attributes:
+        edge: the outer limit.
+        obscuration: what is blocked in the middle, as in a telescope; or None.
+    """
+
+    edge: Outline
+    obscuration: Outline | None = None
+
+    def __post_init__(self) -> None:
+        for outline in (self.edge, self.obscuration):
+            for name, value in vars(outline).items() if outline else ():
+                if not 0.0 < value < math.inf:
+                    raise InputError(f"{name} must be positive and finite, not {value}")
+        if self.obscuration is not None and self.obscuration.reach >= self.edge.reach:
+            raise InputError(
+                f"the obscuration reaches {self.obscuration.reach:g} mm from the vertex, the "
+                f"aperture only {self.edge.reach:g}"
+            )
+
+    def margin(self, x: Tensor, y: Tensor) -> Tensor:
+        """A number that is positive where light passes; no gradient."""
+        x, y = x.detach(), y.detach()
+        inside = self.edge.margin(x, y)
+        if self.obscuration is None:
+            return inside
+        return torch.minimum(inside, -self.obscuration.margin(x, y))

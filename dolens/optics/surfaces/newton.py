@@ -1,0 +1,110 @@
+"""Newton's iteration to a surface, outside any graph and under every torch.func transform."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+MAX_STEPS = 40
+
+Step = Callable[[Mapping[str, Tensor], tuple[Tensor, ...], Tensor], Tensor]
+
+
+class _Root(torch.autograd.Function):
+    """The iteration as one operation.
+
+    Its loop ends when all rays have converged, a decision that `vmap` cannot trace; here a batch
+    becomes one more leading dimension, and one loop serves it all.  The result has no derivative:
+    the caller's own steps inside the graph give it.
+    """
+
+    @staticmethod
+    def forward(step: Step, names: tuple[str, ...], scale: float, *tensors: Tensor) -> Tensor:
+        start, *ray = tensors[:6]
+        values = dict(zip(names, tensors[6:], strict=True))
+        epsilon = torch.finfo(start.dtype).eps
+        t = start.clone()
+        for _ in range(MAX_STEPS):
+            change = step(values, tuple(ray), t).clamp(-scale, scale)
+            t = t - change
+            # Newton converges quadratically: after a step of √ε the next is below rounding.
+            if bool((change.abs() <= math.sqrt(epsilon) * (t.abs() + scale)).all()):
+                break
+        return t
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+        ctx.inputs = len(inputs)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[None, ...]:
+        return (None,) * ctx.inputs
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> None:
+        return None
+
+    @staticmethod
+    def vmap(
+        info: Any,
+        in_dims: tuple[Any, ...],
+        step: Step,
+        names: tuple[str, ...],
+        scale: float,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, int]:
+        dims = in_dims[3:]
+        size = info.batch_size
+        moved = [
+            t.movedim(d, 0) if d is not None else t for t, d in zip(tensors, dims, strict=True)
+        ]
+        batched = [d is not None for d in dims]
+        if any(b and t.dim() > 1 for t, b in zip(moved[6:], batched[6:], strict=True)):
+            # Arrays (coefficients) differ from lens to lens: their lookup is a lens's own.
+            rows = [
+                _Root.apply(
+                    step,
+                    names,
+                    scale,
+                    *(t[i] if b else t for t, b in zip(moved, batched, strict=True)),
+                )
+                for i in range(size)
+            ]
+            return torch.stack(rows), 0
+        rank = max(t.dim() - b for t, b in zip(moved[:6], batched[:6], strict=True))
+        ready = []
+        for t, b in zip(moved, batched, strict=True):
+            if b:
+                t = t.reshape(size, *(1,) * (rank - t.dim() + 1), *t.shape[1:])
+            ready.append(t)
+        shape = torch.broadcast_shapes((size,), *(t.shape[:1] for t in ready[:6] if t.dim() > rank))
+        full = torch.broadcast_shapes(*(t.shape for t in ready[:6]), (*shape, *(1,) * rank))
+        ready[0] = ready[0].expand(full)
+        return _Root.apply(step, names, scale, *ready), 0
+
+
+def find_root(
+    step: Step,
+    parameters: Mapping[str, Tensor],
+    start: Tensor,
+    ray: tuple[Tensor, ...],
+    scale: float,
+) -> Tensor:
+    """Iterate t ← t - step(parameters, ray, t) until no ray moves; no gradient.
+
+    Args:
+        step: Newton's step F/F_t, elementwise in the rays.
+        parameters: name → tensor, as `step` takes them.
+        start: first guess, mm.
+        ray: five tensors that broadcast with `start`.
+        scale: mm; no step is longer, and it sets the tolerance near zero.
+
+    Returns:
+        t, mm.  The caller checks the residual: a ray that has not converged is not marked here.
+    """
+    names = tuple(parameters)
+    tensors = (start, *ray, *parameters.values())
+    return _Root.apply(step, names, scale, *(tensor.detach() for tensor in tensors))
