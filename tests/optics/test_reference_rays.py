@@ -1,15 +1,18 @@
-"""Every ray of tests/reference/rays (28 digits, two independent programs) for centred lenses."""
+"""Every ray of tests/reference/rays (28 digits, two independent programs)."""
 
 import pytest
 import torch
+import yaml
 
-from dolens import Rays, Status, load_lens
+from dolens import Rays, Status
+from dolens.prescriptions import lens_from_prescription
 
 FILES = {
     "rays_asphere_initial__dfc.json": ("asphere", {}),
     "rays_largefov__dfc.json": ("large_fov_doublet", {}),
     "rays_triplet__dfc.json": ("cooke_triplet", {}),
     "rays_triplet__do.json": ("cooke_triplet", {}),
+    "rays_triplet_misaligned_e1_tilt.json": ("cooke_triplet", {}),
     "rays_wfc_cubic_1e-4__dfc.json": (
         "wavefront_coding",
         {"surfaces.5.x3": 1e-4, "surfaces.5.y3": 1e-4},
@@ -26,17 +29,29 @@ def numbers(rows):
 @pytest.fixture(scope="module", params=FILES, ids=lambda f: f[5:-5])
 def reference_bundle(request, reference):
     data = reference(f"rays/{request.param}")
-    assert "pose" not in data
     return request.param, data
 
 
 def make_lens(root, name, data, dtype):
     lens_name, values = FILES[name]
-    lens = load_lens(root / "conf" / "lens" / f"{lens_name}.yaml", dtype, data["index_model"])
+    text = (root / "conf" / "lens" / f"{lens_name}.yaml").read_text(encoding="utf-8")
+    prescription = yaml.safe_load(text) | {"elements": written_elements(data)}
+    lens = lens_from_prescription(prescription, dtype, data["index_model"])
     with torch.no_grad():
         for parameter, value in values.items():
             dict(lens.named_parameters())[parameter].fill_(value)
     return lens
+
+
+def written_elements(data):
+    """The reference's poses as a prescription writes them."""
+    elements = {}
+    for name, pose in data.get("pose", {"elements": {}})["elements"].items():
+        tilts = zip(("tilt_x", "tilt_y", "tilt_z"), pose["theta_deg"], strict=True)
+        shifts = zip(("decenter_x", "decenter_y", "shift_z"), pose["shift"], strict=True)
+        elements[name] = {"surfaces": pose["surfaces"]}
+        elements[name] |= {key: float(value) for key, value in (*tilts, *shifts)}
+    return elements
 
 
 def launch(rays):
