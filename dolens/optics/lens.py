@@ -16,10 +16,12 @@ from dolens.optics.surfaces.base import Surface, SurfaceState
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import (
     Trace,
+    distance_to_plane,
     first_failure,
     stop_gradient_where_invalid,
     trace_surfaces,
     trace_to_plane,
+    transfer,
 )
 
 
@@ -151,45 +153,83 @@ class Lens(nn.Module):
         """The same as `trace`."""
         return self.trace(rays)
 
-    def trace(self, rays: Rays, record: bool = False) -> TracedRays:
+    def trace(
+        self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
+    ) -> TracedRays:
         """Trace rays from the object through every surface to the sensor plane.
 
         Args:
-            rays: travelling towards +z; they may start anywhere, and are first moved along their
-                own line to the vertex plane of surface 1.
+            rays: travelling towards +z in the medium before surface `first`; they may start
+                anywhere, and are first moved along their own line to that surface.  Rays in double
+                precision are moved in double precision, whatever the lens's.
             record: whether to keep the intersection with every surface.
+            first: number of the first surface that they meet.
+            last: number of the last; given, the trace ends there, in the medium behind it.
         """
         system = self.system()
-        ray = self._components(rays)
-        traced = trace_surfaces(system, ray, rays.wavelength, 1.0, path_length=True, record=record)
-        traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, 1.0)
-        return _result(traced)
+        self._check_range(first, last)
+        ray, before = self._components(rays, system, first, 1.0)
+        traced = trace_surfaces(
+            system, ray, rays.wavelength, 1.0, True, record, first=first, last=last
+        )
+        if last is None:
+            traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, 1.0)
+        return _result(traced, before)
 
-    def sensor_to_scene(self, rays: Rays, record: bool = False) -> TracedRays:
+    def sensor_to_scene(
+        self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
+    ) -> TracedRays:
         """Trace rays backwards, from the sensor's side through every surface into object space.
 
         Args:
-            rays: travelling towards -z.
+            rays: travelling towards -z in the medium behind surface `last`.
             record: whether to keep the intersection with every surface, last surface first.
+            first: number of the surface where the trace ends.
+            last: number of the surface that they meet first; None: the lens's last.
 
         Returns:
-            The rays on surface 1, travelling towards -z in the medium before it.
+            The rays on surface `first`, travelling towards -z in the medium before it.
         """
         system = self.system()
-        ray = self._components(rays)
-        return _result(
-            trace_surfaces(system, ray, rays.wavelength, -1.0, path_length=True, record=record)
+        self._check_range(first, last)
+        ray, before = self._components(rays, system, last or len(self.surfaces), -1.0)
+        traced = trace_surfaces(
+            system, ray, rays.wavelength, -1.0, True, record, first=first, last=last
         )
+        return _result(traced, before)
 
     def first_order(self, wavelength: float | Tensor = 587.5618) -> FirstOrder:
         """EFL, BFD, pupils and F-number at a wavelength in nm."""
         return first_order(self.system(), wavelength)
 
-    def _components(self, rays: Rays) -> Components:
-        return Components(*(c.to(device=self.device, dtype=self.dtype) for c in rays.components()))
+    def _check_range(self, first: int, last: int | None) -> None:
+        count = len(self.surfaces)
+        if not 1 <= first <= (count if last is None else last) <= count:
+            raise InputError(
+                f"lens '{self.name}': surfaces {first} to {last} are no range of 1 to {count}"
+            )
+
+    def _components(
+        self, rays: Rays, system: OpticalSystem, number: int, sense: float
+    ) -> tuple[Components, Tensor | None]:
+        """Rays in the lens's precision, and the optical path to where they were moved, or None.
+
+        Rays of a finer precision than the lens's are moved to the first vertex that they meet
+        before they lose it: a source at 10 km would come out 0.1 mm off.
+        """
+        ray = Components(*(c.to(device=self.device) for c in rays.components()))
+        finer = torch.promote_types(ray.x.dtype, self.dtype)
+        if finer == self.dtype:
+            return Components(*(c.to(self.dtype) for c in ray)), None
+        distance, _ = distance_to_plane(ray, system.vertices[number - 1].to(finer), sense)
+        indices = system.indices(rays.wavelength)
+        index = indices[number - 1 if sense > 0.0 else number]
+        moved = Components(*(c.to(self.dtype) for c in transfer(ray, distance)))
+        return moved, (index * distance).to(self.dtype)
 
 
-def _result(traced: Trace) -> TracedRays:
+def _result(traced: Trace, path_before: Tensor | None) -> TracedRays:
+    path = traced.path_length if path_before is None else traced.path_length + path_before
     status, surface = first_failure(traced)
     kept = [stop_gradient_where_invalid(c, traced.valid) for c in traced.ray]
     points = None
@@ -206,6 +246,6 @@ def _result(traced: Trace) -> TracedRays:
         valid=traced.valid,
         status=status,
         surface=surface,
-        path_length=stop_gradient_where_invalid(traced.path_length, traced.valid),
+        path_length=stop_gradient_where_invalid(path, traced.valid),
         points=points,
     )

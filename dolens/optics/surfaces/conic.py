@@ -71,7 +71,9 @@ class Conic(Surface):
         stored = {name: float(value.detach()) for name, value in self.named_parameters()}
         c = stored["curvature"]
         alpha = (1.0 + stored.get("conic", 0.0)) * c * c
-        if alpha * self.semi_diameter**2 > 1.0:
+        # A whole hemisphere is allowed, and 1/R has rounded.
+        rounding = 4.0 * torch.finfo(self.curvature.dtype).eps
+        if alpha * self.semi_diameter**2 > 1.0 + rounding:
             raise InputError(
                 f"semi_diameter {self.semi_diameter:g} mm exceeds the surface, which ends at "
                 f"{1.0 / math.sqrt(alpha):g} mm from the axis (radius {1.0 / c:g} mm)"

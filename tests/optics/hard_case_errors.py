@@ -1,0 +1,96 @@
+"""What dolens makes of a hard case, against 80 digits."""
+
+from dataclasses import dataclass
+
+import torch
+
+from dolens import Rays
+from dolens.prescriptions import lens_from_prescription
+from tests.optics import exact
+
+WAVELENGTH = 587.5618
+# One number that gradients are taken of: x + y/2 on the sensor.
+WEIGHTS = (1.0, 0.5)
+TINY = exact.mp.mpf(10) ** -30
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Largest over a case's rays.
+
+    Attributes:
+        value: of a sensor coordinate, mm.
+        gradient: of a derivative, relative to it (to the largest one where it is zero by symmetry).
+        value_roundings: the same in units of what one rounding of the inputs does.
+        gradient_roundings: likewise.
+    """
+
+    value: float
+    gradient: float
+    value_roundings: float
+    gradient_roundings: float
+
+
+def measure(case, dtype):
+    """Trace the rays of a case, and compare values and gradients of all parameters."""
+    lens = lens_from_prescription(case.prescription(), dtype)
+    stored = exact.values_of(lens)
+    rows = [_one_ray(lens, stored, *ray, dtype) for ray in case.rays]
+    return Errors(*(max(column) for column in zip(*rows, strict=True)))
+
+
+def traced(lens, origin, direction, dtype):
+    """The ray as the precision holds it, and its trace."""
+    origin, direction = (
+        torch.tensor(v, dtype=torch.float64).to(dtype) for v in (origin, direction)
+    )
+    return origin, direction, lens.trace(Rays(origin, direction, WAVELENGTH))
+
+
+def _one_ray(lens, stored, origin, direction, dtype):
+    origin, direction, hit = traced(lens, origin, direction, dtype)
+    axes = ("o0", "o1", "o2", "d0", "d1", "d2")
+    numbers = [exact.mp.mpf(v) for v in (*origin.tolist(), *direction.tolist())]
+    inputs = stored | dict(zip(axes, numbers, strict=True))
+
+    def point(values):
+        ray = [values[name] for name in axes]
+        parameters = {n: v for n, v in values.items() if n not in axes}
+        status, _, p, _ = exact.trace(lens, parameters, ray[:3], ray[3:], WAVELENGTH)
+        assert status == exact.OK, "the case must pass"
+        return p
+
+    def weighted(values):
+        p = point(values)
+        return WEIGHTS[0] * p[0] + WEIGHTS[1] * p[1]
+
+    def gradients(values):
+        fixed = {n: v for n, v in values.items() if n in axes}
+        parameters = {n: v for n, v in values.items() if n not in axes}
+        found = exact.derivatives(lambda some: weighted(some | fixed), parameters)
+        return [found[name] for name in stored]
+
+    assert bool(hit.valid), "the ray must pass"
+    epsilon = torch.finfo(dtype).eps
+    expected = list(point(inputs))[:2]
+    errors = [abs(v - e) for v, e in zip(hit.position.tolist()[:2], expected, strict=True)]
+    moves = exact.sensitivity(lambda v: list(point(v))[:2], inputs)
+    total = WEIGHTS[0] * hit.position[0] + WEIGHTS[1] * hit.position[1]
+    found = torch.autograd.grad(total, list(lens.parameters()), allow_unused=True)
+    slopes = gradients(inputs)
+    largest = max(abs(s) for s in slopes)
+    slope_moves = exact.sensitivity(gradients, inputs, draws=2)
+    relative, roundings = [], []
+    for gradient, slope, move in zip(found, slopes, slope_moves, strict=True):
+        error = abs((0.0 if gradient is None else float(gradient)) - slope)
+        if abs(slope) <= TINY * largest:
+            # Zero by symmetry: what is left is rounding of terms as large as the other slopes.
+            slope = move = largest or 1
+        relative.append(float(error / abs(slope)))
+        roundings.append(float(error / (epsilon * move)))
+    return (
+        float(max(errors)),
+        max(relative),
+        float(max(e / (epsilon * max(m, TINY)) for e, m in zip(errors, moves, strict=True))),
+        max(roundings),
+    )

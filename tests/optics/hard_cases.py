@@ -1,0 +1,190 @@
+"""Cases that break ray tracers, each stated as optics: a lens, a ray, and what must come of it."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+GLASS = "1.5168/64.17"
+AXIAL = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class HardCase:
+    """A lens, rays (origin, direction) that pass, and rays that end (…, status, surface)."""
+
+    surfaces: list[dict[str, Any]]
+    rays: list[tuple[Any, Any]] = field(default_factory=list)
+    ends: list[tuple[Any, Any, str, int]] = field(default_factory=list)
+    sensor: float = 10.0
+    elements: dict[str, Any] = field(default_factory=dict)
+    object_material: str = "air"
+
+    def prescription(self):
+        """As `lens_from_prescription` takes it."""
+        return {
+            "object_material": self.object_material,
+            "surfaces": {str(i): row for i, row in enumerate(self.surfaces, 1)},
+            "elements": self.elements,
+            "sensor": {"distance": self.sensor},
+        }
+
+
+def towards(origin, target):
+    """Unit vector from one point to another."""
+    step = [t - o for o, t in zip(origin, target, strict=True)]
+    length = math.sqrt(math.fsum(s * s for s in step))
+    return tuple(s / length for s in step)
+
+
+def at_angle(degrees, azimuth=0.0):
+    """Unit vector at an angle to the axis."""
+    a, b = math.radians(degrees), math.radians(azimuth)
+    return (math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), math.cos(a))
+
+
+def surface(kind="sphere", **row):
+    """One row of a prescription."""
+    return {"type": kind, "semi_diameter": 10.0, "material": GLASS} | row
+
+
+def singlet(scale=1.0):
+    """A biconvex lens of 20 mm, or scaled."""
+    return [
+        surface(radius=30.0 * scale, semi_diameter=9.0 * scale, thickness=5.0 * scale),
+        surface(radius=-40.0 * scale, semi_diameter=9.0 * scale, material="air"),
+    ]
+
+
+def ball(radius):
+    """A ball lens, clear to 0.999 of its radius."""
+    return [
+        surface(radius=radius, semi_diameter=0.999 * radius, thickness=2.0 * radius),
+        surface(radius=-radius, semi_diameter=0.999 * radius, material="air"),
+    ]
+
+
+def from_points(*sources, target=(2.0, -3.0, 0.0)):
+    """A ray from each source to one point."""
+    return [(source, towards(source, target)) for source in sources]
+
+
+# sin i = (1 ∓ 1e-6)/n inside glass of n(587.5618 nm) = 1.5168, on a plane exit face.
+CRITICAL = math.asin(1.0 / 1.5168)
+BELOW = math.degrees(math.asin(math.sin(CRITICAL) * (1.0 - 1e-6)))
+ABOVE = math.degrees(math.asin(math.sin(CRITICAL) * (1.0 + 1e-6)))
+
+ASPHERE = {"curvature": 0.08, "conic": -1.2, "a4": -1e-4, "a6": 2e-6, "a8": -1e-8, "a10": 5e-11}
+
+CASES: dict[str, HardCase] = {
+    "near-tangent incidence on a sphere": HardCase(
+        [surface(radius=10.0, semi_diameter=9.9999999)],
+        rays=[((9.99999, 0.0, -5.0), AXIAL), ((6.0, 7.999, -5.0), AXIAL)],
+        sensor=20.0,
+    ),
+    "grazing incidence on a sphere, 89.9°": HardCase(
+        [surface(radius=1000.0, semi_diameter=100.0)],
+        rays=[((-20.0, 0.0, 0.0), at_angle(89.9)), ((-1.0, 2.0, 0.5), at_angle(89.0, 30.0))],
+    ),
+    "hemisphere near its edge": HardCase(
+        [surface(radius=-10.0, semi_diameter=10.0)],
+        rays=[((9.999, 0.0, -20.0), AXIAL), ((0.0, -9.9, -20.0), at_angle(1.0, 90.0))],
+        ends=[((10.5, 0.0, -20.0), AXIAL, "missed", 1)],
+    ),
+    "ball lens": HardCase(
+        ball(5.0),
+        rays=[((4.5, 0.0, -10.0), AXIAL), ((1.0, 4.0, -10.0), AXIAL),
+              ((0.0, 0.0, -10.0), at_angle(14.0, 60.0))],
+        ends=[((5.1, 0.0, -10.0), AXIAL, "missed", 1)],
+    ),
+    "ball lens from a point on its own surface": HardCase(
+        ball(5.0), rays=[((3.0, 0.0, 1.0), AXIAL), ((0.0, 0.0, 0.0), at_angle(30.0))]
+    ),
+    "paraboloid, κ = -1": HardCase(
+        [surface("conic", radius=8.0, conic=-1.0)],
+        rays=[((9.0, 0.0, -5.0), AXIAL), ((-3.0, 4.0, -5.0), at_angle(40.0, 20.0))],
+    ),
+    "a ray along a paraboloid's axis direction, A = 0": HardCase(
+        [surface("conic", radius=-8.0, conic=-1.0)], rays=[((6.0, -5.0, 0.0), AXIAL)]
+    ),
+    "hyperboloid, κ = -5": HardCase(
+        [surface("conic", radius=10.0, conic=-5.0, semi_diameter=30.0)],
+        rays=[((20.0, 0.0, -5.0), AXIAL), ((-10.0, 5.0, -5.0), at_angle(30.0, 70.0))],
+        sensor=40.0,
+    ),
+    "G < 0 on a hyperboloid: F/(G + √D) cancels": HardCase(
+        [surface("conic", radius=10.0, conic=-5.0, semi_diameter=80.0)],
+        rays=[((10.0, 0.0, 0.0), at_angle(60.0)), ((12.0, -3.0, 0.0), at_angle(58.0))],
+        sensor=80.0,
+    ),
+    "oblate ellipsoid, κ = 3": HardCase(
+        [surface("conic", radius=20.0, conic=3.0, semi_diameter=9.99)],
+        rays=[((9.98, 0.0, -5.0), AXIAL), ((-5.0, 8.0, -5.0), at_angle(5.0))],
+        sensor=20.0,
+    ),
+    "a plane whose curvature can move, c = 0": HardCase(
+        [surface(radius=math.inf)],
+        rays=[((3.0, -4.0, -5.0), at_angle(25.0, 40.0)), ((0.0, 0.0, 0.0), AXIAL)],
+    ),
+    "curvature about to change sign, R = 1e12": HardCase(
+        [surface(radius=1e12, thickness=2.0), surface(radius=-1e12, material="air")], rays=[
+            ((3.0, -4.0, -5.0), at_angle(25.0, 40.0))]
+    ),
+    "curvature of a kilometre": HardCase(
+        [surface(radius=1e6, thickness=2.0), surface(radius=-1e6, material="air")], rays=[
+            ((3.0, -4.0, -5.0), at_angle(25.0, 40.0))]
+    ),
+    "strong asphere far off axis": HardCase(
+        [surface("even_asphere", semi_diameter=9.0, **ASPHERE)],
+        rays=[((8.5, 0.0, -5.0), AXIAL), ((-5.0, 3.0, -5.0), at_angle(20.0, 100.0))],
+    ),
+    "asphere at 65°": HardCase(
+        [surface("even_asphere", semi_diameter=9.0, **ASPHERE)],
+        rays=[((-14.0, 0.0, -5.0), at_angle(65.0)), ((0.0, -12.0, -5.0), at_angle(65.0, 90.0))],
+        sensor=20.0,
+    ),
+    "XY polynomial with b·z²": HardCase(
+        [surface("xy_polynomial", semi_diameter=8.0, x2=0.02, y2=0.015, xy=1e-3, x3=2e-4, x2y=-1e-4,
+                 y4=1e-5, b=0.05)],
+        rays=[((5.0, 3.0, -2.0), at_angle(20.0, 30.0)), ((-4.0, 6.0, -2.0), AXIAL)],
+    ),
+    "a millionth below total reflection": HardCase(
+        [surface(radius=math.inf, semi_diameter=50.0, material="air")],
+        rays=[((-1.0, 0.0, -0.5), at_angle(BELOW))],
+        ends=[((-1.0, 0.0, -0.5), at_angle(ABOVE), "tir", 1)],
+        object_material=GLASS,
+    ),
+    "object at 1 mm": HardCase(singlet(), from_points((0.0, 0.5, -1.0)), sensor=40.0),
+    "object at 1 m": HardCase(singlet(), from_points((30.0, -20.0, -1e3)), sensor=40.0),
+    "object at 10 m": HardCase(singlet(), from_points((300.0, -200.0, -1e4)), sensor=40.0),
+    "object at 10 km": HardCase(singlet(), from_points((3e5, -2e5, -1e7)), sensor=40.0),
+    "a lens of micrometres": HardCase(
+        singlet(1e-4), from_points((0.0, 1e-4, -5e-3), target=(2e-4, -3e-4, 0.0)), sensor=4e-3
+    ),
+    "a lens of metres": HardCase(
+        singlet(1e3), from_points((0.0, 1e3, -5e5), target=(2e3, -3e3, 0.0)), sensor=4e4
+    ),
+    "elements tilted by 30°": HardCase(
+        [surface(radius=30.0, semi_diameter=9.0, thickness=5.0),
+         surface(radius=-40.0, semi_diameter=9.0, thickness=12.0, material="air"),
+         surface("even_asphere", semi_diameter=9.0, curvature=0.02, conic=-1.0, a4=1e-5,
+                 thickness=4.0),
+         surface("plane", semi_diameter=9.0, material="air")],
+        rays=[((1.0, -2.0, -30.0), at_angle(3.0, 50.0)), ((-3.0, 1.0, -8.0), AXIAL)],
+        elements={"1": {"surfaces": [1, 2], "tilt_x": 30.0, "tilt_y": -10.0, "pivot": [0, 0, 2.5]},
+                  "2": {"surfaces": [3, 4], "tilt_y": 30.0, "tilt_z": 45.0, "decenter_x": 1.0}},
+        sensor=30.0,
+    ),
+    "rays that start beyond the surface": HardCase(
+        singlet(), rays=[((1.0, 2.0, 30.0), AXIAL), ((-2.0, 0.5, 4.0), at_angle(10.0))], sensor=40.0
+    ),
+    "a surface that every ray misses": HardCase(
+        [surface(radius=5.0, semi_diameter=4.99)],
+        ends=[((6.0, 0.0, -5.0), AXIAL, "missed", 1),
+              ((0.0, -1.0, -5.0), at_angle(70.0), "missed", 1),
+              ((0.0, 0.0, -5.0), (0.0, 0.0, -1.0), "missed", 1),
+              ((0.0, 0.0, -5.0), (1.0, 0.0, 0.0), "missed", 1)],
+    ),
+    "a clipped ray goes on": HardCase(
+        singlet(), rays=[], ends=[((9.5, 0.0, -5.0), AXIAL, "vignetted", 1)], sensor=40.0
+    ),
+}  # fmt: skip
