@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.optics.materials import Material
+from dolens.optics.materials import Medium
 from dolens.optics.paraxial import FirstOrder, first_order
 from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.surfaces.base import Surface, SurfaceState
@@ -45,7 +45,7 @@ class Lens(nn.Module):
         surfaces: Sequence[Surface],
         thicknesses: Sequence[float],
         sensor_distance: float,
-        materials: Sequence[Material],
+        materials: Sequence[Medium],
         stop: int,
         index_model: str = "dfc",
         name: str = "",
