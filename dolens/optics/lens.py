@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.elements import Element, ElementState, check_elements
-from dolens.optics.materials import Material
+from dolens.optics.materials import Medium
 from dolens.optics.paraxial import FirstOrder, first_order
 from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.surfaces.base import Surface, SurfaceState
@@ -49,7 +49,7 @@ class Lens(nn.Module):
         surfaces: Sequence[Surface],
         thicknesses: Sequence[float],
         sensor_distance: float,
-        materials: Sequence[Material],
+        materials: Sequence[Medium],
         stop: int,
         index_model: str = "dfc",
         name: str = "",

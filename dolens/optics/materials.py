@@ -1,6 +1,5 @@
-"""Refractive indices from nd and Vd, in the three index models of the reference material."""
+"""Media as a prescription names them: air, a constant index, nd and Vd, or a catalogue glass."""
 
-import difflib
 import math
 import re
 from dataclasses import dataclass
@@ -8,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.glass_catalog import Glass, find_glass
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,13 @@ INDEX_MODELS = {
     "paper": IndexModel("paper", (656.3, 589.3, 486.1), 1.0, 1.0),
 }
 
+# Wavelengths of the Fraunhofer lines that nd and Vd are defined on, nm.
+LINE_C, LINE_D, LINE_F = INDEX_MODELS["dfc"].lines
+
 _GLASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s*")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
+# No optical medium is denser; the bound also catches a wavelength or a glass code.
+_HIGHEST_INDEX = 10.0
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,11 @@ class Material:
         return self.a + self.b / (wavelength * wavelength)
 
 
+# What light may travel through: hashable, equal when it is the same medium, and with a name that a
+# prescription reads back as the same.
+Medium = Material | Glass
+
+
 def index_model(name: str) -> IndexModel:
     """The index model of that name; raises `InputError` naming the allowed ones."""
     if name not in INDEX_MODELS:
@@ -62,35 +73,55 @@ def index_model(name: str) -> IndexModel:
     return INDEX_MODELS[name]
 
 
-def parse_material(text: str, model: IndexModel) -> Material:
+def parse_material(text: str, model: IndexModel) -> Medium:
     """Read a material as a prescription writes it.
 
     Args:
-        text: `air`, `occluder`, or glass as nd/Vd, for example `1.5168/64.17`.
-        model: which lines nd and Vd stand for, and the index of air.
+        text: `air`; `occluder`; a number, the same index at every wavelength; glass as nd/Vd, for
+            example `1.5168/64.17`; or a catalogue glass, for example `N-BK7` or `SCHOTT:N-BK7`
+            (see `find_glass`).  Case is ignored.
+        model: which lines nd and Vd stand for, and the index of air.  A constant index and nd/Vd
+            are taken as written; a catalogue glass is relative to air (see `Glass`).
 
     Returns:
-        The material with B = (nd - 1)/Vd / (1/λF² - 1/λC²) and A = nd - B/λd².
+        The medium; of nd/Vd the one with B = (nd - 1)/Vd / (1/λF² - 1/λC²) and A = nd - B/λd².
 
     Raises:
-        InputError: the text is none of these, or nd < 1, or Vd is not positive.
+        InputError: the text is none of these, or names glasses of several makers, or the number
+            is not from 1 to 10, or nd < 1, or Vd is not positive.
     """
     name = str(text).strip()
     if name.lower() == "air":
         return Material("air", model.air)
     if name.lower() == "occluder":
         return Material("occluder", model.occluder)
+    if _NUMBER.fullmatch(name):
+        return _constant(name)
     match = _GLASS.fullmatch(name)
     if match is None:
-        near = difflib.get_close_matches(name.lower(), ["air", "occluder"], n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
-        raise InputError(
-            f"unknown material '{name}'{hint} "
-            "(allowed: air, occluder, or glass as nd/Vd, for example 1.5168/64.17)"
-        )
+        return find_glass(name, model.air)
     nd, vd = float(match[1]), float(match[2])
     if nd < 1.0 or vd <= 0.0 or not math.isfinite(nd * vd):
         raise InputError(f"material '{name}': nd must be at least 1 and Vd positive")
     line_c, line_d, line_f = model.lines
     b = (nd - 1.0) / vd / (1.0 / line_f**2 - 1.0 / line_c**2)
     return Material(name, nd - b / line_d**2, b)
+
+
+def index_d(medium: Medium) -> float:
+    """nd: the index at the d line of helium, 587.5618 nm."""
+    return float(medium.index(LINE_D))
+
+
+def abbe_number(medium: Medium) -> float:
+    """Vd = (nd - 1)/(nF - nC) at 587.5618, 486.1327 and 656.2725 nm; inf without dispersion."""
+    dispersion = float(medium.index(LINE_F)) - float(medium.index(LINE_C))
+    return math.inf if dispersion == 0.0 else (index_d(medium) - 1.0) / dispersion
+
+
+def _constant(text: str) -> Material:
+    index = float(text)
+    if not 1.0 <= index <= _HIGHEST_INDEX:
+        raise InputError(f"material '{text}': a constant index must be from 1 to 10")
+    # Written one way, so that 1.5 and 1.50 are the same medium.
+    return Material(repr(index), index)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.elements import Axes, ElementState, surface_axes
-from dolens.optics.materials import Material
+from dolens.optics.materials import Medium
 from dolens.optics.surfaces.base import SurfaceState
 
 
@@ -28,7 +28,7 @@ class OpticalSystem:
     surfaces: Sequence[SurfaceState]
     thicknesses: Sequence[Tensor]
     sensor_distance: Tensor
-    materials: Sequence[Material]
+    materials: Sequence[Medium]
     stop: int
     elements: Sequence[ElementState] = ()
 
@@ -41,8 +41,10 @@ class OpticalSystem:
         if isinstance(wavelength, Tensor):
             finer = torch.promote_types(wavelength.dtype, self.dtype)
             wavelength = wavelength.to(device=self.device, dtype=finer)
-        indices = [material.index(wavelength) for material in self.materials]
-        return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in indices]
+        # Each medium once: air comes between all the others.
+        indices = {medium: medium.index(wavelength) for medium in dict.fromkeys(self.materials)}
+        ordered = [indices[medium] for medium in self.materials]
+        return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in ordered]
 
     @cached_property
     def vertices(self) -> list[Tensor]:

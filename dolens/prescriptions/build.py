@@ -12,7 +12,8 @@ A prescription is a mapping::
       '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
     sensor: {distance: 96.0, diameter: 1.7664}
 
-Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface.
+Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
+`occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 

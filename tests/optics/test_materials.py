@@ -1,10 +1,12 @@
 """Indices against tests/reference/index.json, and what is said of unknown materials."""
 
+import math
+
 import pytest
 import torch
 
 from dolens import InputError
-from dolens.optics.materials import index_model, parse_material
+from dolens.optics.materials import abbe_number, index_d, index_model, parse_material
 
 
 @pytest.mark.parametrize("name", ["dfc", "do", "paper"])
@@ -32,7 +34,7 @@ def test_media_without_dispersion():
     assert parse_material("occluder", index_model("do")).index(500.0) == 1.0
 
 
-@pytest.mark.parametrize("text", ["N-BK7", "1.5168", "1.5168/", "/64", "1.5168/64.17/2", ""])
+@pytest.mark.parametrize("text", ["plexiglas", "1.5168/", "/64", "1.5168/64.17/2", "nan", ""])
 def test_unknown_material(text):
     with pytest.raises(InputError, match=r"unknown material .*allowed: air, occluder, .*nd/Vd"):
         parse_material(text, index_model("dfc"))
@@ -50,6 +52,31 @@ def test_nearest_material(text, meant):
 def test_impossible_glass(text):
     with pytest.raises(InputError, match=f"material '{text}': nd must be at least 1 and Vd"):
         parse_material(text, index_model("dfc"))
+
+
+@pytest.mark.parametrize("model", ["dfc", "do", "paper"])
+def test_a_number_is_the_index_at_every_wavelength(model):
+    medium = parse_material(1.5, index_model(model))
+    assert medium.index(200.0) == medium.index(5000.0) == 1.5
+    for same in ("1.5", " 1.50 ", "15e-1"):
+        assert parse_material(same, index_model(model)) == medium
+    assert parse_material(medium.name, index_model(model)) == medium
+    assert parse_material("1.5001", index_model(model)) != medium
+
+
+@pytest.mark.parametrize("text", ["0.9", "-1.5", "0", "5165", "550.0", "1e999"])
+def test_impossible_index(text):
+    with pytest.raises(InputError, match=f"material '{text}': a constant index must be from 1"):
+        parse_material(text, index_model("dfc"))
+
+
+@pytest.mark.parametrize(("nd", "vd"), [(1.5168, 64.17), (1.80518, 25.43), (1.43875, 94.93)])
+def test_index_and_abbe_number_come_back(nd, vd):
+    """`dfc` stands on the very lines that nd and Vd are defined on."""
+    glass = parse_material(f"{nd}/{vd}", index_model("dfc"))
+    assert index_d(glass) == pytest.approx(nd, rel=1e-15)
+    assert abbe_number(glass) == pytest.approx(vd, rel=1e-12)
+    assert abbe_number(parse_material("air", index_model("dfc"))) == math.inf
 
 
 def test_unknown_index_model():
