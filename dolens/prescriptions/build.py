@@ -10,7 +10,8 @@ A prescription is a mapping::
       '2': ...                  # the last surface has no thickness
     sensor: {distance: 96.0, diameter: 1.7664}
 
-Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface.
+Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface.  Some
+shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -141,7 +142,11 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     try:
         names = shape.parameter_names(row)
         _check_keys(row, (*_SURFACE_KEYS, *names), place)
-        values = {key: _numbers(row.get(key, 0.0), f"'{key}'") for key in names}
+        values = {
+            key: (_numbers if key in shape.arrays else _number)(row.get(key, 0.0), f"'{key}'")
+            for key in names
+            if key in row or key not in shape.optional
+        }
         if "curvature" in names:
             values["curvature"] = _curvature(row)
         elif not math.isinf(_number(row.get("radius", math.inf), "'radius'")):

@@ -82,6 +82,19 @@ def snell(
     )
 
 
+def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
+    """A new tensor of a number, nested lists of numbers, or an array.
+
+    Raises:
+        InputError: entries that are no numbers, or rows of unequal length.
+    """
+    try:
+        # By way of lists, arrays of any library and memory order are read alike.
+        return torch.tensor(value.tolist() if hasattr(value, "tolist") else value, dtype=dtype)
+    except (TypeError, ValueError):
+        raise InputError(f"'{name}' must be numbers, in rows of equal length") from None
+
+
 class Surface(nn.Module):
     """A refracting surface about its own vertex: state here, mathematics in its static methods.
 
@@ -101,10 +114,14 @@ class Surface(nn.Module):
     Attributes:
         kind: the `type` of a prescription.
         constants: names among the parameters that no optimizer varies (knots); they are buffers.
+        arrays: names that a prescription gives as lists; every other is one number.
+        optional: names that a prescription may leave out; every other is then zero.
     """
 
     kind: ClassVar[str] = ""
     constants: ClassVar[tuple[str, ...]] = ()
+    arrays: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -117,7 +134,7 @@ class Surface(nn.Module):
         if not self.semi_diameter > 0.0:
             raise InputError(f"semi_diameter must be positive, not {semi_diameter}")
         for name, value in parameters.items():
-            tensor = torch.tensor(value, dtype=dtype)
+            tensor = tensor_of(value, name, dtype)
             if name in self.constants:
                 self.register_buffer(name, tensor)
             else:
