@@ -15,6 +15,7 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil, first_order
 from dolens.optics.rays import Components
+from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces, trace_to_plane
@@ -87,7 +88,7 @@ def layout_figure(
     plates = [
         number
         for number, surface in enumerate(system.surfaces, 1)
-        if issubclass(surface.shape, XYPolynomial)
+        if issubclass(surface.shape, (XYPolynomial, BSpline))
         and np.ptp(profiles[number - 1][0]) < _VISIBLE * 2.0 * height
     ]
     reach = max([height, *(float(np.abs(fan[..., 1]).max()) for fan in fans if len(fan))])

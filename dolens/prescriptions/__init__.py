@@ -2,5 +2,12 @@
 
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.files import load_lens, save_lens
+from dolens.prescriptions.spline_fit import fit_b_spline
 
-__all__ = ["lens_from_prescription", "load_lens", "prescription_of", "save_lens"]
+__all__ = [
+    "fit_b_spline",
+    "lens_from_prescription",
+    "load_lens",
+    "prescription_of",
+    "save_lens",
+]

@@ -14,6 +14,7 @@ A prescription is a mapping::
 
 Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
 `occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -163,7 +164,11 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     try:
         names = shape.parameter_names(row)
         check_keys(row, (*_SURFACE_KEYS, *names), place)
-        values = {key: as_numbers(row.get(key, 0.0), f"'{key}'") for key in names}
+        values = {
+            key: (as_numbers if key in shape.arrays else as_number)(row.get(key, 0.0), f"'{key}'")
+            for key in names
+            if key in row or key not in shape.optional
+        }
         if "curvature" in names:
             values["curvature"] = _curvature(row)
         elif not math.isinf(as_number(row.get("radius", math.inf), "'radius'")):

@@ -182,6 +182,25 @@ def test_a_plate_too_flat_to_see_has_its_sag_in_micrometres(lens):
     assert len(layout_figure(lens("asphere")).axes) == 1
 
 
+def test_a_flat_spline_plate_has_its_sag_in_micrometres():
+    """1 µm of tilt across 10 mm."""
+    tilt = [[1e-3 * i / 3 for i in range(4)]] * 4
+    plate = {
+        "surfaces": {
+            "1": {"type": "b_spline", "coefficients": tilt, "half_width": 5, "semi_diameter": 5,
+                  "thickness": 2.0, "material": "1.5/60"},
+            "2": {"type": "sphere", "radius": -30.0, "semi_diameter": 5, "material": "air"},
+        },
+        "sensor": {"distance": 60.0},
+    }  # fmt: skip
+    figure = layout_figure(lens_from_prescription(plate, torch.float32))
+    (along_x, _) = figure.axes[1].get_lines()
+    t, sag = along_x.get_data()
+    np.testing.assert_allclose(sag, 0.5 + 0.1 * t, atol=1e-6)
+    assert t[0] == pytest.approx(-5.0)
+    assert t[-1] == pytest.approx(5.0)
+
+
 def test_the_lens_and_its_gradients_are_left_alone(lens):
     one = lens("wavefront_coding")
     before = [parameter.detach().clone() for parameter in one.parameters()]

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from dolens.errors import InputError
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 
@@ -80,6 +81,19 @@ def snell(
     )
 
 
+def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
+    """A new tensor of a number, nested lists of numbers, or an array.
+
+    Raises:
+        InputError: entries that are no numbers, or rows of unequal length.
+    """
+    try:
+        # By way of lists, arrays of any library and memory order are read alike.
+        return torch.tensor(value.tolist() if hasattr(value, "tolist") else value, dtype=dtype)
+    except (TypeError, ValueError):
+        raise InputError(f"'{name}' must be numbers, in rows of equal length") from None
+
+
 class Surface(nn.Module):
     """A refracting surface about its own vertex: state here, mathematics in its static methods.
 
@@ -99,10 +113,14 @@ class Surface(nn.Module):
     Attributes:
         kind: the `type` of a prescription.
         constants: names among the parameters that no optimizer varies (knots); they are buffers.
+        arrays: names that a prescription gives as lists; every other is one number.
+        optional: names that a prescription may leave out; every other is then zero.
     """
 
     kind: ClassVar[str] = ""
     constants: ClassVar[tuple[str, ...]] = ()
+    arrays: ClassVar[tuple[str, ...]] = ()
+    optional: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -115,7 +133,7 @@ class Surface(nn.Module):
             aperture = ClearAperture(Circle(float(aperture)))
         self.aperture = aperture
         for name, value in parameters.items():
-            tensor = torch.tensor(value, dtype=dtype)
+            tensor = tensor_of(value, name, dtype)
             if name in self.constants:
                 self.register_buffer(name, tensor)
             else:

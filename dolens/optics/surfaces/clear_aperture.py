@@ -24,6 +24,11 @@ class Circle:
         """Distance of its farthest point from the vertex, mm."""
         return self.semi_diameter
 
+    @property
+    def extent(self) -> tuple[float, float]:
+        """How far it reaches along x and along y, mm."""
+        return self.semi_diameter, self.semi_diameter
+
 
 @dataclass(frozen=True)
 class Rectangle:
@@ -40,6 +45,11 @@ class Rectangle:
     def reach(self) -> float:
         """Distance of its corners from the vertex, mm."""
         return math.hypot(self.half_width_x, self.half_width_y)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """How far it reaches along x and along y, mm."""
+        return self.half_width_x, self.half_width_y
 
 
 Outline = Circle | Rectangle
