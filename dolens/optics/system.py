@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -46,7 +45,7 @@ class OpticalSystem:
         ordered = [indices[medium] for medium in self.materials]
         return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in ordered]
 
-    @cached_property
+    @property
     def vertices(self) -> list[Tensor]:
         """z of every vertex as designed, then of the sensor, in mm; the first is at 0."""
         positions = [torch.zeros_like(self.sensor_distance)]
@@ -54,7 +53,7 @@ class OpticalSystem:
             positions.append(positions[-1] + gap)
         return positions
 
-    @cached_property
+    @property
     def axes(self) -> list[Axes]:
         """Where every surface is, with the poses of the elements that carry it."""
         return surface_axes(self.elements, self.vertices, len(self.surfaces))

@@ -81,7 +81,7 @@ def trace_surfaces(
     Returns:
         The rays on the last surface met, travelling in the medium behind it.
     """
-    indices = system.indices(wavelength)
+    indices, places = system.indices(wavelength), system.axes
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
     margins: list[Margins] = []
@@ -93,8 +93,8 @@ def trace_surfaces(
         surface = system.surfaces[i]
         shape, parameters = surface.shape, surface.parameters
         before, after = (indices[i], indices[i + 1]) if sense > 0 else (indices[i + 1], indices[i])
-        here, carried = change_axes(ray, axes, system.axes[i])
-        axes = system.axes[i]
+        here, carried = change_axes(ray, axes, places[i])
+        axes = places[i]
         to_plane, towards = distance_to_plane(here, 0.0, sense)
         limit = FAR * surface.semi_diameter
         l, m, n = here[3:]  # noqa: E741

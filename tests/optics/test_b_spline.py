@@ -488,7 +488,7 @@ BAD = {
     "words": ({"coefficients": "flat", "half_width": 5.0}, "'coefficients' must be numbers"),
     "no width": ({"coefficients": FOUR, "half_width": 0.0}, "half width must be a positive number"),
     "too narrow": ({"coefficients": FOUR, "half_width": 3.9},
-                   "the aperture reaches 4 mm and exceeds the surface, whose knots 'knots_x' end at x = -3.9"),
+                   "the aperture reaches 4 mm and exceeds the surface, whose knots 'knots_x' end"),
     "unknown name": ({"coefficients": FOUR, "half_width": 5.0, "curvature": 0.1},
                      "a b_spline has no parameter 'curvature'"),
 }  # fmt: skip

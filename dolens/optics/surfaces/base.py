@@ -207,7 +207,7 @@ class Surface(nn.Module):
             return _newton_step(cls, values, PlaneRay(*rays), t)
 
         with torch.no_grad():
-            start = cls.start(p, ray, sense)
+            start = cls.start(p, ray, sense).clamp(-FAR * scale, FAR * scale)
         t = find_root(step, p, start, ray, scale)
         for _ in range(2 if torch.is_grad_enabled() else 1):
             t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)

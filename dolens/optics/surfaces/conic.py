@@ -9,6 +9,8 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.surfaces.base import GRAZING, Parameters, PlaneRay, Surface, safe_sqrt
 
+_FLAT = 1e-15  # 1/mm
+
 
 def conic_sag(c: Tensor, k: Tensor | float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sag of a conic, s = c·r²/(1 + √(1 - (1+k)c²r²)).
@@ -51,7 +53,8 @@ def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[T
     root = safe_sqrt(discriminant)
     along = g if sense > 0.0 else -g
     near = f / (along + root).clamp(min=GRAZING)
-    far = (along - root) / torch.where(a == 0.0, torch.ones_like(a), a)
+    # Where A is this small the far root is out of any lens's reach, and 1/A² out of float32's.
+    far = (along - root) / torch.where(a.abs() < _FLAT, torch.ones_like(a), a)
     t = torch.where(along > 0.0, near, far)
     return (t if sense > 0.0 else -t), discriminant.detach()
 
