@@ -32,7 +32,7 @@ MAX_TURN = 0.4
 MIN_STEP = 1e-3
 MAX_EVALUATIONS = 150
 # How near to its point on the stop, in semi-diameters, a ray on the way must come.
-NEAR = 1e-3
+NEAR = 1e-2
 # Residual of an aimed ray, in units of rounding at the stop or, seen from there, at the front.
 ROUNDING = 512.0
 
@@ -124,6 +124,8 @@ def aim(
     if isinstance(wavelength, Tensor):
         shape = (*torch.broadcast_shapes(shape[:-1], wavelength.shape), 2)
     tangents, target = tangents.expand(shape), target.expand(shape)
+    # The system computes its vertices once and keeps them: let it be inside the graph.
+    _ = system.vertices
     problem = _Problem(system, wavelength, near, tangents.detach(), target.detach())
     with torch.no_grad():
         q, slopes, found = _follow(problem)
