@@ -116,7 +116,8 @@ def aim(
 
     Returns:
         Rays of the common leading shape.  They have the gradient of the solution with respect to
-        the lens, the field and the pupil point.
+        the lens, the field and the pupil point, in forward and in reverse mode; the search ends
+        when every ray has ended, so that it cannot be mapped over lenses by `vmap`.
     """
     tangents, near = field_tangents(field, object_distance)
     target = pupil * system.surfaces[system.stop - 1].semi_diameter

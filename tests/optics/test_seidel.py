@@ -1,5 +1,6 @@
 """Seidel sums against closed forms, theorems, and the small-aperture limit of real rays."""
 
+import itertools
 import math
 
 import pytest
@@ -95,8 +96,8 @@ def test_a_plate_in_a_diverging_beam():
 def test_surfaces_that_image_an_axial_point_perfectly():
     """Cartesian ovals: an ellipsoid into glass (k = -1/n²), a hyperboloid out of it (k = -n²)."""
     into = lens_of([({"type": "conic", "radius": 20.0, "conic": -1 / N**2}, 0.0, GLASS)])
-    out_of = lens_of([({"type": "plane"}, 3.0, GLASS),
-                      ({"type": "conic", "radius": -20.0, "conic": -(N**2)}, 0.0, "air")])  # fmt: skip
+    hyperboloid = {"type": "conic", "radius": -20.0, "conic": -(N**2)}
+    out_of = lens_of([({"type": "plane"}, 3.0, GLASS), (hyperboloid, 0.0, "air")])
     for lens in (into, out_of):
         sums = lens.seidel(2.0)
         assert abs(float(sums.total.spherical.detach())) < 1e-16
@@ -273,7 +274,7 @@ def test_third_order_is_the_limit_of_real_rays(root, name):
     size = expected.abs().max()
     coarse, middle, fine = (real(lens, field, distance, 0.1 / 2**k) for k in range(3))
     errors = [float((found - expected).abs().max() / size) for found in (coarse, middle, fine)]
-    for larger, smaller in zip(errors, errors[1:], strict=False):
+    for larger, smaller in itertools.pairwise(errors):
         assert 3.5 < larger / smaller < 4.5
     # Without the term in scale²: what is left falls as its fourth power.
     limit = (4.0 * fine - middle) / 3.0
