@@ -8,10 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.aiming import AimedRays, aim
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.materials import Medium
-from dolens.optics.paraxial import FirstOrder, first_order
+from dolens.optics.paraxial import FirstOrder, first_order, vergence
+from dolens.optics.paraxial_rays import ParaxialRays, paraxial_rays
 from dolens.optics.rays import Components, Rays, TracedRays
+from dolens.optics.seidel import Seidel, seidel
 from dolens.optics.surfaces.base import Surface, SurfaceState
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import (
@@ -30,6 +33,10 @@ class Lens(nn.Module):
 
     Parameters are named as users write them: `surfaces.1.curvature`, `surfaces.5.x2y`,
     `thicknesses.3`, `sensor_distance`.
+
+    Fields are angles in degrees, (x, y) for a ray along (tan x, tan y, 1), when the object is at
+    infinity (`object_distance` None or `inf`); with a finite `object_distance`, mm in front of the
+    first vertex, they are points of the object in mm.
 
     Args:
         surfaces: in the order that light meets them; the first vertex is at z = 0.
@@ -198,9 +205,100 @@ class Lens(nn.Module):
         )
         return _result(traced, before)
 
-    def first_order(self, wavelength: float | Tensor = 587.5618) -> FirstOrder:
-        """EFL, BFD, pupils and F-number at a wavelength in nm."""
-        return first_order(self.system(), wavelength)
+    def first_order(
+        self, wavelength: float | Tensor = 587.5618, object_distance: float | Tensor | None = None
+    ) -> FirstOrder:
+        """EFL, cardinal points, pupils, F-number, magnification at a wavelength in nm."""
+        return first_order(self.system(), wavelength, object_distance)
+
+    def paraxial_rays(
+        self,
+        field: float | Tensor,
+        wavelength: float | Tensor = 587.5618,
+        object_distance: float | Tensor | None = None,
+    ) -> ParaxialRays:
+        """Paraxial marginal and chief ray at every surface, and Lagrange's invariant.
+
+        Args:
+            field: along y, degrees or mm.
+            wavelength: nm.
+            object_distance: mm, or None for infinity.
+        """
+        field = self._field(field, object_distance)
+        return paraxial_rays(self.system(), wavelength, field, object_distance)
+
+    def seidel(
+        self,
+        field: float | Tensor,
+        wavelength: float | Tensor = 587.5618,
+        object_distance: float | Tensor | None = None,
+        color: tuple[float, float] = (486.1327, 656.2725),
+    ) -> Seidel:
+        """Seidel sums in mm of wave aberration, surface by surface; `.total` is the lens's.
+
+        Args:
+            field: edge of the field, degrees or mm.
+            wavelength: nm.
+            object_distance: mm, or None for infinity.
+            color: shorter and longer wavelength of the chromatic sums, nm.
+        """
+        field = self._field(field, object_distance)
+        return seidel(self.system(), wavelength, field, object_distance, color)
+
+    def aim(
+        self,
+        field: Sequence[float] | Tensor,
+        pupil: Sequence[float] | Tensor,
+        wavelength: float | Tensor = 587.5618,
+        object_distance: float | Tensor | None = None,
+    ) -> AimedRays:
+        """Real rays that cross the stop at given points; see `dolens.optics.aiming`.
+
+        Args:
+            field: (..., 2), degrees or mm.
+            pupil: (..., 2), x and y on the stop over its semi-diameter.
+            wavelength: nm, a number or (...).
+            object_distance: mm, or None for infinity.
+        """
+        options = {"dtype": self.dtype, "device": self.device}
+        field = self._field(field, object_distance)
+        pupil = torch.as_tensor(pupil, **options)
+        for what, values in (("field", field), ("pupil", pupil)):
+            if values.shape[-1:] != (2,):
+                raise InputError(f"{what} must be x and y, (..., 2), not {tuple(values.shape)}")
+        return aim(self.system(), field, pupil, wavelength, object_distance)
+
+    def chief_ray(
+        self,
+        field: Sequence[float] | Tensor,
+        wavelength: float | Tensor = 587.5618,
+        object_distance: float | Tensor | None = None,
+    ) -> AimedRays:
+        """The real ray of a field, (..., 2), through the centre of the stop; see `aim`."""
+        return self.aim(field, (0.0, 0.0), wavelength, object_distance)
+
+    def marginal_rays(
+        self,
+        field: Sequence[float] | Tensor,
+        wavelength: float | Tensor = 587.5618,
+        object_distance: float | Tensor | None = None,
+    ) -> AimedRays:
+        """Real rays of a field, (..., 2), to the stop's edge: upper, lower, sagittal, (..., 3).
+
+        They cross it at +y, -y and +x; `wavelength` broadcasts with (..., 3).
+        """
+        field = torch.as_tensor(field, dtype=self.dtype, device=self.device)[..., None, :]
+        edge = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0))
+        return self.aim(field, edge, wavelength, object_distance)
+
+    def _field(
+        self, field: float | Sequence[float] | Tensor, object_distance: float | Tensor | None
+    ) -> Tensor:
+        """Radians for an object at infinity, mm for a finite one."""
+        field = torch.as_tensor(field, dtype=self.dtype, device=self.device)
+        near = torch.as_tensor(vergence(object_distance), dtype=self.dtype, device=self.device)
+        near = near[..., None] if near.ndim else near
+        return torch.where(near == 0.0, torch.deg2rad(field), field)
 
     def _check_range(self, first: int, last: int | None) -> None:
         count = len(self.surfaces)

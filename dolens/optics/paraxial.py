@@ -1,11 +1,19 @@
-"""First-order optics: focal length, focus, pupils.  Everything is differentiable."""
+"""First-order optics: focal length, cardinal points, pupils.  Everything is differentiable.
 
+What lies at infinity (the foci of an afocal lens, the pupil of a telecentric one) is `inf` and
+carries a zero gradient, so that one infinite quantity leaves the gradients of the others alone.
+Only a power that is exactly zero counts: a telescope whose power is a rounding error has an EFL of
+1e15 mm or so.  A constraint that must cross zero is better put on `power`.
+"""
+
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.optics.system import OpticalSystem
 
 
@@ -18,16 +26,30 @@ class Pupil(NamedTuple):
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """First-order properties at one wavelength, mm.
+    """First-order properties at one wavelength, mm; z is measured from the first vertex.
+
+    With the reduced matrix [[A, B], [C, D]] from the first vertex to the last, and n and n' the
+    indices of the object's and the sensor's medium:
 
     Attributes:
-        efl: effective focal length, -1/power of the reduced matrix (n·u), positive if converging.
-        bfd: from the last vertex to the rear focus.
-        focus: z of the rear focus, from the first vertex.
+        efl: effective focal length, 1/power; positive if converging.  The rear focal length is
+            n'·efl, the front one n·efl.
+        bfd: from the last vertex to the rear focus, n'A/power.
+        focus: z of the rear focus.
         entrance_pupil: the stop seen from the object.
         exit_pupil: the stop seen from the sensor.
         f_number: efl / entrance pupil diameter.
-        image_index: index of the medium at the sensor.
+        image_index: n'.
+        power: -C, 1/mm; zero of an afocal lens.
+        ffd: from the first vertex to the front focus, -nD/power; negative in front of the lens.
+        front_principal: z of the front principal plane, n(1 - D)/power.
+        rear_principal: z of the rear principal plane, last vertex + n'(A - 1)/power.
+        front_nodal: z of the front nodal point, (n' - nD)/power.
+        rear_nodal: z of the rear nodal point, last vertex + (n'A - n)/power.
+        image: z of the image of the axial object point; the focus for an object at infinity.
+        magnification: image height over object height; 0 for an object at infinity.
+        working_f_number: 1/(2n'|u'|) with u' the slope of the paraxial marginal ray behind the
+            lens, negative if diverging; the F-number for an object at infinity.
     """
 
     efl: Tensor
@@ -37,6 +59,15 @@ class FirstOrder:
     exit_pupil: Pupil
     f_number: Tensor
     image_index: Tensor
+    power: Tensor
+    ffd: Tensor
+    front_principal: Tensor
+    rear_principal: Tensor
+    front_nodal: Tensor
+    rear_nodal: Tensor
+    image: Tensor
+    magnification: Tensor
+    working_f_number: Tensor
 
 
 def surface_matrix(
@@ -60,19 +91,47 @@ def surface_matrix(
     return matrix
 
 
-def entrance_pupil(system: OpticalSystem, wavelength: float | Tensor) -> Pupil:
-    """Image of the stop through the surfaces before it."""
-    indices = system.indices(wavelength)
+def matrix_to_stop(system: OpticalSystem, wavelength: float | Tensor) -> Tensor:
+    """Paraxial matrix on (y, n·u) from just before the first vertex to just before the stop."""
     stop = system.stop
     # The stop's own refraction belongs to the light behind it.
     matrix = surface_matrix(system, wavelength, 1, stop - 1)
-    if stop > 1:
-        gap = system.thicknesses[stop - 2] / indices[stop - 1]
-        matrix = _matrix(1.0, gap, 0.0, 1.0, matrix) @ matrix
+    if stop == 1:
+        return matrix
+    gap = system.thicknesses[stop - 2] / system.indices(wavelength)[stop - 1]
+    return _matrix(1.0, gap, 0.0, 1.0, matrix) @ matrix
+
+
+def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """numerator / denominator; `inf`, with zero gradient, where the denominator is zero."""
+    zero = denominator == 0.0
+    quotient = numerator / torch.where(zero, torch.ones_like(denominator), denominator)
+    return torch.where(zero, torch.full_like(quotient, math.inf), quotient)
+
+
+def vergence(object_distance: float | Tensor | None) -> float | Tensor:
+    """One over the object's distance in front of the first vertex, 1/mm; 0 for None or infinity.
+
+    Raises:
+        InputError: the distance is a number that is not positive.
+    """
+    if object_distance is None:
+        return 0.0
+    if not isinstance(object_distance, Tensor) and not object_distance > 0.0:
+        raise InputError(
+            f"object_distance must be positive (mm in front of the first vertex), or None for an "
+            f"object at infinity, not {object_distance}"
+        )
+    return 1.0 / object_distance
+
+
+def entrance_pupil(system: OpticalSystem, wavelength: float | Tensor) -> Pupil:
+    """Image of the stop through the surfaces before it."""
+    matrix = matrix_to_stop(system, wavelength)
     # A ray with y = 0 on the stop crosses the axis where the object space sees the stop.
     a, b = matrix[0, 0], matrix[0, 1]
-    z = b / a * indices[0]
-    return Pupil(z, 2.0 * system.surfaces[stop - 1].semi_diameter / a.abs())
+    diameter = 2.0 * system.surfaces[system.stop - 1].semi_diameter
+    return Pupil(ratio(b * system.indices(wavelength)[0], a), _over(diameter, a.abs()))
 
 
 def exit_pupil(system: OpticalSystem, wavelength: float | Tensor) -> Pupil:
@@ -82,31 +141,52 @@ def exit_pupil(system: OpticalSystem, wavelength: float | Tensor) -> Pupil:
     b, d = matrix[0, 1], matrix[1, 1]
     n = system.indices(wavelength)[-1]
     # From the axis at the stop: height b and slope d/n at the last vertex, per unit of n·u.
-    z = system.vertices[count - 1] - b / d * n
-    return Pupil(z, 2.0 * system.surfaces[stop - 1].semi_diameter / d.abs())
+    diameter = 2.0 * system.surfaces[stop - 1].semi_diameter
+    return Pupil(system.vertices[count - 1] + ratio(-b * n, d), _over(diameter, d.abs()))
 
 
-def first_order(system: OpticalSystem, wavelength: float | Tensor) -> FirstOrder:
+def first_order(
+    system: OpticalSystem,
+    wavelength: float | Tensor,
+    object_distance: float | Tensor | None = None,
+) -> FirstOrder:
     """First-order properties of a centred lens.
 
     Args:
         system: the lens.
         wavelength: nm.
+        object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
     """
     count = len(system.surfaces)
     matrix = surface_matrix(system, wavelength, 1, count)
-    n = system.indices(wavelength)[-1]
-    efl = -1.0 / matrix[1, 0]
-    bfd = -n * matrix[0, 0] / matrix[1, 0]
-    pupil = entrance_pupil(system, wavelength)
+    (a, b), (c, d) = matrix[0].unbind(), matrix[1].unbind()
+    indices = system.indices(wavelength)
+    before, behind = indices[0], indices[-1]
+    power = -c
+    last = system.vertices[count - 1]
+    bfd = ratio(behind * a, power)
+    to_stop = matrix_to_stop(system, wavelength)
+    near = before * vergence(object_distance)
+    # Per unit of height at the first vertex, the axial ray's height at the stop and n'u' behind.
+    at_stop, leaving = to_stop[0, 0] + to_stop[0, 1] * near, c + d * near
+    radius = system.surfaces[system.stop - 1].semi_diameter
     return FirstOrder(
-        efl=efl,
+        efl=_over(1.0, power),
         bfd=bfd,
-        focus=system.vertices[count - 1] + bfd,
-        entrance_pupil=pupil,
+        focus=last + bfd,
+        entrance_pupil=entrance_pupil(system, wavelength),
         exit_pupil=exit_pupil(system, wavelength),
-        f_number=efl / pupil.diameter,
-        image_index=torch.as_tensor(n, dtype=system.dtype, device=system.device),
+        f_number=ratio(to_stop[0, 0].abs(), 2.0 * radius * power),
+        image_index=torch.as_tensor(behind, dtype=system.dtype, device=system.device),
+        power=power,
+        ffd=ratio(-before * d, power),
+        front_principal=ratio(before * (1.0 - d), power),
+        rear_principal=last + ratio(behind * (a - 1.0), power),
+        front_nodal=ratio(behind - before * d, power),
+        rear_nodal=last + ratio(behind * a - before, power),
+        image=last + ratio(-behind * (a + b * near), leaving),
+        magnification=ratio(near * torch.ones_like(leaving), leaving),
+        working_f_number=ratio(at_stop.abs(), -2.0 * radius * leaving),
     )
 
 
@@ -147,6 +227,10 @@ def _object_to_last_vertex(
     indices = system.indices(wavelength)
     matrix = surface_matrix(system, wavelength, 1, len(system.surfaces))
     return matrix @ _matrix(1.0, depth / indices[0], 0.0, 1.0, matrix), indices[-1]
+
+
+def _over(numerator: float, denominator: Tensor) -> Tensor:
+    return ratio(torch.full_like(denominator, numerator), denominator)
 
 
 def _matrix(

@@ -6,7 +6,8 @@ the arithmetic, so invalid rays are kept finite by clamps instead, at limits tha
 reaches; their gradient is cut off where the trace ends.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -176,6 +177,26 @@ class Surface(nn.Module):
         raise NotImplementedError
 
     @classmethod
+    def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
+        """Coefficient G (1/mm³) of r⁴ in the sag beyond the osculating sphere, c·r²/2 + c³·r⁴/8.
+
+        Here: from derivatives of the slopes at the vertex, for any sag.  Along an azimuth the
+        fourth derivative is 24 times the r⁴ coefficient.  Of a surface without rotational symmetry
+        G is the average over azimuth, which three azimuths 60° apart give exactly, since a quartic
+        form has harmonics 0, 2 and 4 only.
+        """
+        like = next(iter(p.values()))
+        azimuth = torch.arange(3, dtype=like.dtype, device=like.device) * (math.pi / 3.0)
+        cosine, sine = torch.cos(azimuth), torch.sin(azimuth)
+
+        def slope(r: Tensor) -> Tensor:
+            _, sx, sy, _ = cls.sag_and_gradient(p, r * cosine, r * sine)
+            return sx * cosine + sy * sine
+
+        fourth = _derivative(_derivative(_derivative(slope)))(torch.zeros_like(azimuth))
+        return fourth.mean() / 24.0 - cls.paraxial_curvature(p) ** 3 / 8.0
+
+    @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
         """First guess of the distance (mm) from the vertex plane along the ray; finite."""
         return torch.zeros_like(ray.x)
@@ -244,6 +265,11 @@ class Surface(nn.Module):
     ) -> Refraction:
         """Bend rays at points (mm) of the surface; see `snell`."""
         return snell(direction, cls.normal(p, *point), ratio, sense)
+
+
+def _derivative(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """Derivative of an elementwise function, in forward mode: it may be nested."""
+    return lambda r: torch.func.jvp(function, (r,), (torch.ones_like(r),))[1]
 
 
 def _newton_step(shape: type[Surface], p: Parameters, ray: PlaneRay, t: Tensor) -> Tensor:

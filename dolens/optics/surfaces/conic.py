@@ -121,6 +121,11 @@ class Conic(Surface):
         """The curvature c."""
         return p["curvature"]
 
+    @classmethod
+    def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
+        """k·c³/8."""
+        return cls.conic_constant(p) * p["curvature"] ** 3 / 8.0
+
 
 class Sphere(Conic):
     """A sphere of curvature c = 1/R (1/mm); c = 0 is a plane whose curvature can move."""

@@ -51,6 +51,11 @@ class EvenAsphere(Conic):
         return sag, 2.0 * x * slope, 2.0 * y * slope, exists
 
     @classmethod
+    def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
+        """k·c³/8 + a4."""
+        return Conic.fourth_order_departure.__func__(cls, p) + p.get("a4", 0.0)
+
+    @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
         """The conic's own intersection, or the vertex plane where that is out of reach."""
         c, k = p["curvature"], p["conic"]

@@ -52,6 +52,11 @@ class Plane(Surface):
         """Zero."""
         return 0.0
 
+    @classmethod
+    def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
+        """Zero."""
+        return 0.0
+
 
 class Aperture(Plane):
     """A plane stop: it clips, and does not refract (except behind an `occluder` medium)."""

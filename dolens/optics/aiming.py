@@ -1,0 +1,280 @@
+"""Real rays aimed at the stop.
+
+A ray of a given field is fixed by where it crosses the plane through the first vertex that is
+perpendicular to the line from the object point to that vertex.  This plane faces a wide field as
+squarely as a narrow one, however far the entrance pupil wanders, and for an object at infinity it
+is a wavefront.  Aiming asks for the point q of that plane whose ray meets the stop at p·R, with p
+the relative stop coordinates and R the stop's semi-diameter: F(q) = 0, two equations.
+
+It follows the solution along a homotopy: at t the field angle is t times the one asked for, and so
+is the point on the stop.  At t = 0 the axis is the solution, or nearly.  Each step is predicted
+along the tangent, dq/dt = -J⁻¹ ∂F/∂t with J = ∂F/∂q from forward-mode derivatives of the trace, and
+corrected by Newton's iteration.  Corrections that do not halve F, or that lose the ray, send it
+back to the last solution with a quarter of the step: this is what damps Newton's iteration, and
+what keeps it on the branch that starts at the axis.  All of it runs outside the autograd graph; one
+more Newton step inside leaves the value where it is and has the implicit function's derivative.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.optics.paraxial import vergence
+from dolens.optics.rays import Components, Rays
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import Trace, stop_gradient_where_invalid, trace_surfaces
+
+# Largest turn of the field in one step, rad, and the smallest part of the way that is still tried.
+MAX_TURN = 0.4
+MIN_STEP = 1e-3
+MAX_EVALUATIONS = 150
+# How near to its point on the stop, in semi-diameters, a ray on the way must come.
+NEAR = 1e-2
+# Residual of an aimed ray, in units of rounding at the stop or, seen from there, at the front.
+ROUNDING = 512.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AimedRays(Rays):
+    """Rays that cross the stop where they were asked to.
+
+    They start on the plane through the first vertex perpendicular to the line from the object point
+    to that vertex: a wavefront of an object at infinity.  From a finite object point, n times the
+    distance to it is to be added to path lengths.
+
+    Attributes:
+        converged: (...), bool: the ray reaches the stop through the surfaces before it, and meets
+            it at the point asked for.  Apertures are not tested.  A ray that is not converged
+            starts at the first vertex towards -z, so that a trace finds it MISSED at surface 1, and
+            carries no gradient.
+    """
+
+    converged: Tensor
+
+
+def field_tangents(
+    field: Tensor, object_distance: float | Tensor | None = None
+) -> tuple[Tensor, float | Tensor]:
+    """Slopes (tan x, tan y) of the line from the object point to the first vertex.
+
+    Args:
+        field: (..., 2), angles in radians for an object at infinity; else the object point's x and
+            y in mm.
+        object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
+
+    Returns:
+        The slopes (..., 2), and 1/object_distance (1/mm).
+    """
+    near = vergence(object_distance)
+    if isinstance(near, Tensor):
+        near = near.to(field)
+        return torch.where(near[..., None] == 0.0, field.tan(), -field * near[..., None]), near
+    return (field.tan() if near == 0.0 else -field * near), near
+
+
+def launch(tangents: Tensor, near: float | Tensor, q: Tensor) -> Components:
+    """Rays of a field through points of the plane that faces it.
+
+    Args:
+        tangents: (..., 2), slopes of the line from the object point to the first vertex.
+        near: 1/object distance, 1/mm; 0 for an object at infinity.
+        q: (..., 2), mm, in the plane through the first vertex perpendicular to that line; its axes
+            are the lens's x and y, turned with z the shortest way into the line.
+    """
+    (tx, ty), (qx, qy) = tangents.unbind(-1), q.unbind(-1)
+    n = torch.rsqrt(1.0 + tx * tx + ty * ty)
+    l, m = tx * n, ty * n  # noqa: E741
+    along = (l * qx + m * qy) / (1.0 + n)
+    x, y, z = qx - l * along, qy - m * along, -(l * qx + m * qy)
+    # The object point lies a distance n·near before the plane, so far ones lose no digits.
+    w = n * near
+    inverse = torch.rsqrt(1.0 + w * w * (qx * qx + qy * qy))
+    direction = ((l + w * x) * inverse, (m + w * y) * inverse, (n + w * z) * inverse)
+    return Components(*torch.broadcast_tensors(x, y, z, *direction))
+
+
+def aim(
+    system: OpticalSystem,
+    field: Tensor,
+    pupil: Tensor,
+    wavelength: float | Tensor,
+    object_distance: float | Tensor | None = None,
+) -> AimedRays:
+    """Rays of a field that cross the stop surface at given points.
+
+    Args:
+        system: the lens.
+        field: (..., 2): angles (x, y) in radians for an object at infinity, whose rays have
+            direction (tan x, tan y, 1) normalised; else the object point's x and y in mm.
+        pupil: (..., 2), where the rays cross the stop surface, x and y in the lens's axes over the
+            stop's semi-diameter; in the unit disc.
+        wavelength: nm, a number or (...).
+        object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
+
+    Returns:
+        Rays of the common leading shape.  They have the gradient of the solution with respect to
+        the lens, the field and the pupil point, in forward and in reverse mode; the search ends
+        when every ray has ended, so that it cannot be mapped over lenses by `vmap`.
+    """
+    tangents, near = field_tangents(field, object_distance)
+    target = pupil * system.surfaces[system.stop - 1].semi_diameter
+    shape = torch.broadcast_shapes(tangents.shape, target.shape)
+    if isinstance(wavelength, Tensor):
+        shape = (*torch.broadcast_shapes(shape[:-1], wavelength.shape), 2)
+    tangents, target = tangents.expand(shape), target.expand(shape)
+    # The system computes its vertices once and keeps them: let it be inside the graph.
+    _ = system.vertices
+    problem = _Problem(system, wavelength, near, tangents.detach(), target.detach())
+    with torch.no_grad():
+        q, slopes, found = _follow(problem)
+    residual, reached = _miss(system, wavelength, near, tangents, target, q)
+    with torch.no_grad():
+        front = slopes.abs().amax((-2, -1)) * system.surfaces[0].semi_diameter
+        rounding = torch.finfo(system.dtype).eps * (front + problem.scale)
+        converged = found & reached & (residual.abs().amax(-1) <= ROUNDING * rounding)
+    q = q - _solve(slopes, residual)
+    ray = launch(tangents, near, q)
+    position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
+    kept = converged[..., None]
+    backwards = direction.new_tensor((0.0, 0.0, -1.0))
+    return AimedRays(
+        stop_gradient_where_invalid(torch.where(kept, position, 0.0 * position.detach()), kept),
+        torch.where(kept, direction, backwards),
+        wavelength,
+        converged=converged,
+    )
+
+
+class _Problem(NamedTuple):
+    """What does not change along the homotopy."""
+
+    system: OpticalSystem
+    wavelength: float | Tensor
+    near: float | Tensor
+    tangents: Tensor
+    target: Tensor
+
+    @property
+    def scale(self) -> float:
+        return self.system.surfaces[self.system.stop - 1].semi_diameter
+
+
+class _Evaluation(NamedTuple):
+    """F (..., 2), ∂F/∂q (..., 2, 2), ∂F/∂t (..., 2), and whether the ray reaches the stop."""
+
+    residual: Tensor
+    slopes: Tensor
+    rate: Tensor
+    reached: Tensor
+
+
+def _follow(problem: _Problem) -> tuple[Tensor, Tensor, Tensor]:
+    """Follow q from the axis to the field and pupil points asked for, every ray at its own pace.
+
+    Returns:
+        q and ∂F/∂q there, and whether the last correction was so small that the next is below
+        rounding.  q is zero and ∂F/∂q the identity where it was not.
+    """
+    tangents = problem.tangents
+    q = torch.zeros_like(tangents)
+    t = torch.zeros_like(tangents[..., 0])
+    angle = torch.atan(tangents.norm(dim=-1))
+    longest = (MAX_TURN / angle.clamp(min=MAX_TURN)).clamp(max=1.0)
+    step, start, start_t, rate = longest, q, t, torch.zeros_like(q)
+    # Newton's corrections must halve F; the first F after a prediction, within the stop.
+    allowed = torch.full_like(t, math.inf)
+    settled = math.sqrt(torch.finfo(t.dtype).eps)
+    done, failed = torch.zeros_like(t, dtype=torch.bool), torch.zeros_like(t, dtype=torch.bool)
+    for _ in range(MAX_EVALUATIONS):
+        here = _evaluate(problem, q, t)
+        size = here.residual.norm(dim=-1) / problem.scale
+        corrected = q - _solve(here.slopes, here.residual)
+        good = here.reached & (size <= allowed) & torch.isfinite(corrected).all(-1)
+        active = ~(done | failed)
+        there = t >= 1.0
+        arrived = active & good & there & (size <= settled)
+        onward = active & good & ~there & (size <= NEAR)
+        back = active & ~good
+
+        start = torch.where(onward[..., None], corrected, start)
+        start_t = torch.where(onward, t, start_t)
+        rate = torch.where(onward[..., None], -_solve(here.slopes, here.rate), rate)
+        step = torch.where(onward, torch.minimum(2.0 * step, longest), step)
+        step = torch.where(back, 0.25 * step, step)
+        failed = failed | (back & ((step < MIN_STEP * longest) | (start_t == t)))
+        done = done | arrived
+
+        next_t = torch.clamp(start_t + step, max=1.0)
+        predicted = start + (next_t - start_t)[..., None] * rate
+        jump = onward | back
+        q = torch.where(
+            jump[..., None], predicted, torch.where((active & good)[..., None], corrected, q)
+        )
+        t = torch.where(jump, next_t, t)
+        allowed = torch.where(jump, torch.ones_like(t), torch.where(active, 0.5 * size, allowed))
+        if bool((done | failed).all()):
+            break
+    q = torch.where(done[..., None], q, 0.0)
+    slopes = _evaluate(problem, q, torch.ones_like(t)).slopes
+    return q, torch.where(done[..., None, None], slopes, torch.eye(2).to(slopes)), done
+
+
+def _evaluate(problem: _Problem, q: Tensor, t: Tensor) -> _Evaluation:
+    """F and its derivatives, by one trace of three copies of the rays with one tangent each."""
+    system, wavelength, near, tangents, target = problem
+    tangent = tangents.norm(dim=-1)
+    angle = torch.atan(tangent)
+    azimuth = tangents / tangent.clamp(min=torch.finfo(q.dtype).tiny)[..., None]
+
+    def miss(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        turned = torch.tan(t * angle)[..., None] * azimuth
+        return _miss(system, wavelength, near, turned, t[..., None] * target, q)
+
+    basis = torch.eye(3, dtype=q.dtype, device=q.device)
+    ones = (1,) * t.ndim
+    tangent_q = basis[:, :2].reshape(3, *ones, 2).expand(3, *q.shape).contiguous()
+    tangent_t = basis[:, 2].reshape(3, *ones).expand(3, *t.shape).contiguous()
+    copies = (q.expand(3, *q.shape).contiguous(), t.expand(3, *t.shape).contiguous())
+    residual, slopes, reached = torch.func.jvp(miss, copies, (tangent_q, tangent_t), has_aux=True)
+    return _Evaluation(
+        residual[0].detach(),
+        torch.stack((slopes[0], slopes[1]), -1).detach(),
+        slopes[2].detach(),
+        reached[0],
+    )
+
+
+def _miss(
+    system: OpticalSystem,
+    wavelength: float | Tensor,
+    near: float | Tensor,
+    tangents: Tensor,
+    target: Tensor,
+    q: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """By how much (mm) rays miss their points on the stop surface, and whether they reach it."""
+    ray = launch(tangents, near, q)
+    traced = trace_surfaces(system, ray, wavelength, 1.0, first=1, last=system.stop)
+    return torch.stack((traced.ray.x, traced.ray.y), -1) - target, _reaches(traced)
+
+
+def _reaches(traced: Trace) -> Tensor:
+    """Where a ray meets every surface and is transmitted, inside its aperture or not."""
+    reached = torch.ones_like(traced.valid)
+    for _, met, _, transmitted in traced.margins:
+        for margin in (met, transmitted):
+            if margin is not None:
+                reached = reached & (margin > 0.0)
+    return reached
+
+
+def _solve(matrix: Tensor, vector: Tensor) -> Tensor:
+    """2×2 systems by Cramer's rule; of a singular one, a number that is never used."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    x, y = vector.unbind(-1)
+    determinant = a * d - b * c
+    determinant = torch.where(determinant == 0.0, torch.ones_like(determinant), determinant)
+    return torch.stack((d * x - b * y, a * y - c * x), -1) / determinant[..., None]
