@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.fields import Fields
 from dolens.optics.materials import Material
 from dolens.optics.paraxial import FirstOrder, first_order
 from dolens.optics.rays import Components, Rays, TracedRays
@@ -38,6 +39,10 @@ class Lens(nn.Module):
         name: for titles and messages.
         sensor_diameter: mm, the image circle the prescription gives; not tested by a trace.
         dtype: precision of the parameters, and of the rays.
+        wavelengths: nm, that the prescription is meant for; a trace takes its rays' own.
+        reference_wavelength: nm, one of them; the first unless it is given.
+        fields: field points that the prescription is meant for.
+        object_distance: mm from the object to the first vertex; None is infinity.
     """
 
     def __init__(
@@ -51,6 +56,10 @@ class Lens(nn.Module):
         name: str = "",
         sensor_diameter: float | None = None,
         dtype: torch.dtype = torch.float64,
+        wavelengths: Sequence[float] | None = None,
+        reference_wavelength: float | None = None,
+        fields: Fields | None = None,
+        object_distance: float | None = None,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -65,6 +74,12 @@ class Lens(nn.Module):
         self.stop = stop
         self.index_model = index_model
         self.sensor_diameter = sensor_diameter
+        self.wavelengths = None if wavelengths is None else tuple(wavelengths)
+        if reference_wavelength is None and self.wavelengths:
+            reference_wavelength = self.wavelengths[0]
+        self.reference_wavelength = reference_wavelength
+        self.fields = fields
+        self.object_distance = object_distance
         self.materials = tuple(materials)
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}

@@ -11,12 +11,13 @@ A prescription is a mapping::
     sensor: {distance: 96.0, diameter: 1.7664}
 
 Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface.
+What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
+that the stop is closed to (see `dolens.prescriptions.conditions`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -26,8 +27,22 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
 from dolens.optics.surfaces import SURFACES, Surface
+from dolens.prescriptions.checks import check_keys as _check_keys
+from dolens.prescriptions.checks import integer as _integer
+from dolens.prescriptions.checks import near as _near
+from dolens.prescriptions.checks import number as _number
+from dolens.prescriptions.checks import numbers as _numbers
+from dolens.prescriptions.checks import require_mapping as _require_mapping
+from dolens.prescriptions.conditions import (
+    CONDITION_KEYS,
+    close_stop,
+    conditions,
+    conditions_of,
+    stop_row,
+)
 
 _LENS_KEYS = ("name", "source", "index_model", "stop", "object_material", "surfaces", "sensor")
+_LENS_KEYS = (*_LENS_KEYS, *CONDITION_KEYS)
 _SURFACE_KEYS = ("type", "radius", "semi_diameter", "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
 
@@ -61,11 +76,12 @@ def lens_from_prescription(
     if not isinstance(sensor, Mapping) or "distance" not in sensor:
         raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
     _check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
+    used_with = conditions(prescription, where)
     surfaces, thicknesses = [], []
     materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
     for number, row in enumerate(rows, 1):
         place = f"{where}: surface {number}"
-        surfaces.append(_surface(row, place, dtype))
+        surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
         materials.append(_material(row.get("material"), model, place))
         if number < len(rows):
             if row.get("thickness") is None:
@@ -77,7 +93,7 @@ def lens_from_prescription(
             )
     diameter = sensor.get("diameter")
     try:
-        return Lens(
+        lens = Lens(
             surfaces,
             thicknesses,
             _number(sensor["distance"], f"{where}: 'sensor.distance'"),
@@ -87,7 +103,9 @@ def lens_from_prescription(
             name,
             None if diameter is None else _number(diameter, f"{where}: 'sensor.diameter'"),
             dtype,
+            **used_with,
         )
+        return close_stop(lens, prescription)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
@@ -123,6 +141,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         "index_model": lens.index_model,
         "stop": lens.stop,
         "object_material": lens.materials[0].name,
+        **conditions_of(lens),
         "surfaces": rows,
         "sensor": sensor,
     }
@@ -192,49 +211,3 @@ def _material(value: object, model: Any, place: str) -> Any:
         return parse_material(str(value), model)
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
-
-
-def _number(value: object, what: str, finite: bool = True) -> float:
-    try:
-        if isinstance(value, bool):
-            raise TypeError
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise InputError(f"{what} must be a number, not {value!r}") from None
-    if math.isnan(number) or (finite and math.isinf(number) and "radius" not in what):
-        raise InputError(f"{what} must be a finite number, not {value!r}")
-    return number
-
-
-def _numbers(value: object, what: str) -> Any:
-    """A number, or rows of numbers nested as they are written."""
-    if isinstance(value, list | tuple):
-        return [_numbers(entry, what) for entry in value]
-    return _number(value, what)
-
-
-def _integer(value: object, what: str) -> int:
-    number = _number(value, what)
-    if number != int(number):
-        raise InputError(f"{what} must be a whole number, not {value!r}")
-    return int(number)
-
-
-def _require_mapping(value: object, where: str) -> None:
-    if not isinstance(value, Mapping):
-        raise InputError(f"{where}: expected a mapping of keys to values, not {value!r}")
-
-
-def _check_keys(mapping: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
-    allowed = list(allowed)
-    for key in mapping:
-        if str(key) not in allowed:
-            raise InputError(
-                f"{where}: unknown key '{key}'{_near(str(key), allowed)} "
-                f"(allowed: {', '.join(allowed)})"
-            )
-
-
-def _near(word: str, allowed: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word, list(allowed), n=1)
-    return f"; did you mean '{near[0]}'?" if near else ""
