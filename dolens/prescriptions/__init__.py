@@ -1,6 +1,12 @@
 """How a lens is written down."""
 
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.files import load_lens, save_lens
+from dolens.prescriptions.files import load_lens, load_prescription, save_lens
 
-__all__ = ["lens_from_prescription", "load_lens", "prescription_of", "save_lens"]
+__all__ = [
+    "lens_from_prescription",
+    "load_lens",
+    "load_prescription",
+    "prescription_of",
+    "save_lens",
+]

@@ -41,8 +41,10 @@ from dolens.prescriptions.conditions import (
     stop_row,
 )
 
-_LENS_KEYS = ("name", "source", "index_model", "stop", "object_material", "surfaces", "sensor")
-_LENS_KEYS = (*_LENS_KEYS, *CONDITION_KEYS)
+_LENS_KEYS = (
+    *("name", "source", "index_model", "stop", "object_material", "surfaces", "sensor"),
+    *CONDITION_KEYS,
+)
 _SURFACE_KEYS = ("type", "radius", "semi_diameter", "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
 

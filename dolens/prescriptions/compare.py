@@ -56,7 +56,7 @@ def _flat(prescription: Mapping[str, Any], medium: Callable[[str], str]) -> dict
                 )
         elif key == "sensor":
             flat.update(((key, k), _plain(v)) for k, v in value.items() if v is not None)
-        elif value is not None and value not in ({}, []):
+        elif value is not None and value not in ({}, [], ""):
             flat[(key,)] = _plain(value)
     if ("wavelengths",) in flat:
         flat.setdefault(("reference_wavelength",), flat[("wavelengths",)][0])
@@ -84,6 +84,6 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(entry) for key, entry in value.items()}
     # YAML 1.1 reads 1e-6, without a point, as text; so does the builder of a lens read it.
     try:
-        return float(str(value))
-    except ValueError:
+        return number(str(value), "")
+    except InputError:
         return str(value)

@@ -26,7 +26,7 @@ def scaled(text: str, factor: Fraction, place: str) -> float:
     """The double nearest to the decimal number times an exact factor (a change of units)."""
     value = number_in_text(text, place)
     # Zero and exponents out of range ended above: the exact fraction below stays small.
-    return value if value == 0.0 or factor == 1 else float(Fraction(text) * factor)
+    return value if value == 0.0 or factor == 1 else _nearest(Fraction(text) * factor, place)
 
 
 def shifted(value: float, places: int) -> str:
@@ -45,7 +45,14 @@ def curvature_in_text(text: str, place: str) -> float | None:
     digits = Decimal(text).normalize().as_tuple().digits
     if radius == 0.0 or len(digits) <= _DIGITS_OF_A_DOUBLE:
         return None
-    return float(1 / Fraction(text))
+    return _nearest(1 / Fraction(text), place)
+
+
+def _nearest(exact: Fraction, place: str) -> float:
+    try:
+        return float(exact)
+    except OverflowError:
+        raise InputError(f"{place} is out of the range of double precision") from None
 
 
 def radius_of(curvature: float) -> float | None:

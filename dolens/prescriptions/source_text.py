@@ -150,6 +150,8 @@ def _header(line: str, place: str) -> dict[str, Any]:
     for n, shape in shapes.items():
         require_mapping(shape, f"{place}: surface {n}")
         check_keys(shape, ("type", "parameters"), f"{place}: surface {n}")
+        if not isinstance(shape.get("parameters", []), list):
+            raise InputError(f"{place}: surface {n}: 'parameters' must be a list of names")
     return header
 
 
@@ -157,9 +159,7 @@ def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], st
     """Letter, distance and diameter, and medium of a row."""
     letter = words[0]
     if letter not in ("O", "S", "A", "X", "I"):
-        raise InputError(
-            f"{place}: row type '{letter}' cannot be read (allowed: O, S, A, X and I)"
-        )
+        raise InputError(f"{place}: row type '{letter}' cannot be read (allowed: O, S, A, X and I)")
     if len(words) < 5:
         raise InputError(f"{place}: a row has at least the columns '{_COLUMNS}'")
     if len(words) > 5 and letter in "OAI":
