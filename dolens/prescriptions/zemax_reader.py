@@ -4,11 +4,13 @@ Held: sequential systems of STANDARD and EVENASPH surfaces, glass by model (nd, 
 circular apertures, fields as angles or object heights, wavelengths, and UNIT MM, CM, IN or METER.
 Everything else that bends rays is an error that says so.
 
-Surfaces keep their numbers.  Only planes before the image that neither refract nor clip are left
-out, and their gaps added to the sensor's distance.  A CLAP clips, so it gives the semi-diameter;
-else DIAM does.  In Zemax a DIAM without CLAP or FLAP draws and does not clip: here it clips.
-A missing or zero DIAM is an error, because ENPD and FNUM size the beam of the axis alone and its
-semi-diameters would vignette the fields.
+CURV 0, without a decimal point, is a plane; Zemax itself writes 0.0, and that is a curvature
+that an optimizer may change.  Surfaces keep their numbers.  Only planes before the image that
+neither refract nor clip are left out, and their gaps added to the sensor's distance.
+
+A CLAP clips, so it gives the semi-diameter; else DIAM does.  In Zemax a DIAM without CLAP or FLAP
+draws and does not clip: here it clips.  A missing or zero DIAM is an error, because ENPD and FNUM
+size the beam of the axis alone, and its semi-diameters would vignette the fields.
 ENPD and FNUM close the stop (see `dolens.prescriptions.conditions`), which then needs no DIAM.
 Vignetting factors, weights, ray aiming, temperature and coatings are not read.
 """
@@ -141,10 +143,10 @@ def _row(block: Block, before: str, factor: Fraction, place: str) -> dict[str, A
         row = {"type": "conic", **_curvature(curvature), "conic": conic}
     elif curvature == 0.0 and "STOP" in block and material == before:
         row = {"type": "aperture"}
-    elif "CURV" in block:
-        row |= _curvature(curvature)
-    else:
+    elif _arguments(block, "CURV", "0")[0] == "0":
         row = {"type": "plane"}
+    else:
+        row |= _curvature(curvature)
     comment = " ".join(line.text for line in block.get("COMM", []))
     return row | {"material": material} | ({"note": comment} if comment else {})
 

@@ -111,8 +111,8 @@ def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
 def _surface(row: Mapping[str, Any], place: str) -> list[str]:
     """A surface's block but for its number, stop and distance.
 
-    Whether CURV and CONI are written tells a plane from a sphere without curvature, and a sphere
-    from a conic with constant 0; Zemax reads what is missing as 0.
+    Zemax writes a curvature of zero as 0.0, so CURV 0 can mean a plane, and a sphere whose
+    curvature happens to be 0 stays one.  CONI is written for conics and aspheres alone.
     """
     kind = str(row.get("type", "sphere"))
     if kind not in _TYPES:
@@ -122,7 +122,9 @@ def _surface(row: Mapping[str, Any], place: str) -> list[str]:
     lines = [f"  TYPE {'EVENASPH' if kind == 'even_asphere' else 'STANDARD'}"]
     if row.get("note"):
         lines.append(f"  COMM {row['note']}")
-    if kind not in ("plane", "aperture"):
+    if kind in ("plane", "aperture"):
+        lines.append("  CURV 0")
+    else:
         lines.append(f'  CURV {_curvature(row, place)!r} 0 0 0 0 ""')
     if kind in ("conic", "even_asphere"):
         lines.append(f"  CONI {_text(row.get('conic', 0.0), place)}")
