@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, aim
 from dolens.optics.elements import Element, ElementState, check_elements
+from dolens.optics.fields import Fields
 from dolens.optics.materials import Medium
 from dolens.optics.paraxial import FirstOrder, first_order, vergence
 from dolens.optics.paraxial_rays import ParaxialRays, paraxial_rays
@@ -49,6 +50,10 @@ class Lens(nn.Module):
         sensor_diameter: mm, the image circle the prescription gives; not tested by a trace.
         dtype: precision of the parameters, and of the rays.
         elements: name → group of surfaces with a pose of its own.
+        wavelengths: nm, that the prescription is meant for; a trace takes its rays' own.
+        reference_wavelength: nm, one of them; the first unless it is given.
+        fields: field points that the prescription is meant for.
+        object_distance: mm from the object to the first vertex; None is infinity.
     """
 
     def __init__(
@@ -63,6 +68,10 @@ class Lens(nn.Module):
         sensor_diameter: float | None = None,
         dtype: torch.dtype = torch.float64,
         elements: Mapping[str, Element] | None = None,
+        wavelengths: Sequence[float] | None = None,
+        reference_wavelength: float | None = None,
+        fields: Fields | None = None,
+        object_distance: float | None = None,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -77,6 +86,12 @@ class Lens(nn.Module):
         self.stop = stop
         self.index_model = index_model
         self.sensor_diameter = sensor_diameter
+        self.wavelengths = None if wavelengths is None else tuple(wavelengths)
+        if reference_wavelength is None and self.wavelengths:
+            reference_wavelength = self.wavelengths[0]
+        self.reference_wavelength = reference_wavelength
+        self.fields = fields
+        self.object_distance = object_distance
         self.materials = tuple(materials)
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}

@@ -1,13 +1,14 @@
 """How a lens is written down."""
 
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.files import load_lens, save_lens
+from dolens.prescriptions.files import load_lens, load_prescription, save_lens
 from dolens.prescriptions.spline_fit import fit_b_spline
 
 __all__ = [
     "fit_b_spline",
     "lens_from_prescription",
     "load_lens",
+    "load_prescription",
     "prescription_of",
     "save_lens",
 ]

@@ -15,6 +15,8 @@ A prescription is a mapping::
 Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
 `occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
+What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
+that the stop is closed to (see `dolens.prescriptions.conditions`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -38,6 +40,13 @@ from dolens.prescriptions.checks import (
     did_you_mean,
     require_mapping,
 )
+from dolens.prescriptions.conditions import (
+    CONDITION_KEYS,
+    close_stop,
+    conditions,
+    conditions_of,
+    stop_row,
+)
 from dolens.prescriptions.poses import element_rows, elements_from
 
 _LENS_KEYS = (
@@ -49,6 +58,7 @@ _LENS_KEYS = (
     "surfaces",
     "elements",
     "sensor",
+    *CONDITION_KEYS,
 )
 _SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
@@ -83,11 +93,12 @@ def lens_from_prescription(
     if not isinstance(sensor, Mapping) or "distance" not in sensor:
         raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
     check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
+    used_with = conditions(prescription, where)
     surfaces, thicknesses = [], []
     materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
     for number, row in enumerate(rows, 1):
         place = f"{where}: surface {number}"
-        surfaces.append(_surface(row, place, dtype))
+        surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
         materials.append(_material(row.get("material"), model, place))
         if number < len(rows):
             if row.get("thickness") is None:
@@ -99,7 +110,7 @@ def lens_from_prescription(
             )
     diameter = sensor.get("diameter")
     try:
-        return Lens(
+        lens = Lens(
             surfaces,
             thicknesses,
             as_number(sensor["distance"], f"{where}: 'sensor.distance'"),
@@ -110,7 +121,9 @@ def lens_from_prescription(
             None if diameter is None else as_number(diameter, f"{where}: 'sensor.diameter'"),
             dtype,
             elements_from(prescription.get("elements"), dtype, where),
+            **used_with,
         )
+        return close_stop(lens, prescription)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(where) else f"{where}: {message}") from None
@@ -147,6 +160,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         "index_model": lens.index_model,
         "stop": lens.stop,
         "object_material": lens.materials[0].name,
+        **conditions_of(lens),
         "surfaces": rows,
         **({"elements": element_rows(lens.elements)} if len(lens.elements) else {}),
         "sensor": sensor,

@@ -21,6 +21,14 @@ def as_number(value: object, what: str, finite: bool = True) -> float:
     return number
 
 
+def as_positive(value: object, what: str) -> float:
+    """A finite number above zero."""
+    found = as_number(value, what)
+    if found <= 0.0:
+        raise InputError(f"{what} must be positive, not {value!r}")
+    return found
+
+
 def as_numbers(value: object, what: str) -> Any:
     """A number, or rows of numbers nested as they are written."""
     if isinstance(value, list | tuple):

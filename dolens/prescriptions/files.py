@@ -1,6 +1,7 @@
 """Reading and writing lens files."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
@@ -8,6 +9,12 @@ import yaml
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
+from dolens.prescriptions.source_text import prescription_from_source_text, source_text_of
+from dolens.prescriptions.zemax import decode_zemax, encode_zemax
+from dolens.prescriptions.zemax_reader import prescription_from_zemax
+from dolens.prescriptions.zemax_writer import zemax_of
+
+_SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
@@ -25,37 +32,76 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def load_prescription(path: str | Path) -> Any:
+    """Read a lens file as plain data.
+
+    Args:
+        path: a file in YAML (.yaml, .yml), the source's format (.txt) or Zemax's (.zmx).
+
+    Raises:
+        InputError: the file is missing, of another kind, or not valid; the message is one line
+            that names the file, and the line, surface and key where there is one.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if suffix == ".zmx":
+        return prescription_from_zemax(decode_zemax(data, str(path)), str(path))
+    kind = "text" if suffix == ".txt" else "YAML"
+    try:
+        text = data.decode("utf-8")
+        if suffix == ".txt":
+            return prescription_from_source_text(text, str(path))
+        # A subclass of the safe loader: it builds plain values only.
+        return yaml.load(text, Loader=_UniqueKeyLoader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: is not valid {kind} ({reason})") from None
+
+
 def load_lens(
     path: str | Path, dtype: torch.dtype = torch.float64, index_model: str | None = None
 ) -> Lens:
-    """Read a lens from a YAML prescription (see `dolens.prescriptions.build`).
+    """Read a lens from a prescription in YAML, the source's `.txt` or Zemax's `.zmx`.
 
     Args:
-        path: the file.
+        path: the file; its suffix says which format it is in.
         dtype: precision of the lens.
         index_model: dfc, do or paper, instead of the file's own.
 
     Raises:
-        InputError: the file is missing, is no YAML, or is no prescription; the message is one
-            line that names the file, and the surface and key where there is one.
+        InputError: the file is missing, not valid, or no prescription; the message is one line
+            that names the file, and the surface and key where there is one.
     """
-    path = Path(path)
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        raise InputError(f"{path}: lens files end in .yaml or .yml")
-    try:
-        # A subclass of the safe loader: it builds plain values only.
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: is not valid YAML ({reason})") from None
-    return lens_from_prescription(data, dtype, index_model, str(path))
+    return lens_from_prescription(load_prescription(path), dtype, index_model, str(path))
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:
-    """Write a lens as YAML; reading it back gives the same parameters to the last bit."""
-    text = yaml.safe_dump(
-        prescription_of(lens), sort_keys=False, default_flow_style=None, width=200
-    )
-    Path(path).write_text(text, encoding="utf-8")
+    """Write a lens in the format that the suffix names (.yaml, .yml, .txt or .zmx).
+
+    Reading it back gives the same parameters to the last bit.
+
+    Raises:
+        InputError: the format cannot hold the lens; the message names the surface and key.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    prescription = prescription_of(lens)
+    if suffix == ".zmx":
+        data = encode_zemax(zemax_of(prescription, str(path)))
+    elif suffix == ".txt":
+        data = source_text_of(prescription, str(path)).encode()
+    else:
+        text = yaml.safe_dump(prescription, sort_keys=False, default_flow_style=None, width=200)
+        data = text.encode()
+    path.write_bytes(data)
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise InputError(f"{path}: lens files end in {', '.join(_SUFFIXES)}")
+    return suffix

@@ -27,7 +27,9 @@ GOOD = {
 
 
 def test_there_are_lenses():
-    assert {"asphere", "cooke_triplet", "wavefront_coding"} <= {p.stem for p in LENSES}
+    assert {"asphere", "cooke_triplet", "wavefront_coding", "double_gauss"} <= {
+        p.stem for p in LENSES
+    }
 
 
 @pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
@@ -53,7 +55,10 @@ def test_every_lens_comes_back_to_the_last_bit(path, dtype, tmp_path):
         assert [s.semi_diameter for s in again.surfaces.values()] == [
             s.semi_diameter for s in lens.surfaces.values()
         ]
-        for attribute in ("name", "stop", "index_model", "materials", "sensor_diameter"):
+        for attribute in (
+            *("name", "stop", "index_model", "materials", "sensor_diameter"),
+            *("wavelengths", "reference_wavelength", "fields", "object_distance"),
+        ):
             assert getattr(again, attribute) == getattr(lens, attribute)
 
 

@@ -1,0 +1,89 @@
+"""Whether a lens file holds a prescription: what was written is read again and compared."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.prescriptions.checks import as_number
+
+_DEFAULTS = {"index_model": "dfc", "stop": 1, "object_material": "air"}
+
+
+def require_same(
+    wanted: Mapping[str, Any],
+    found: Mapping[str, Any],
+    kind: str,
+    where: str,
+    medium: Callable[[str], str] = str,
+    assumed: tuple[str, ...] = (),
+) -> None:
+    """Refuse to write a prescription that its file would not give back.
+
+    Numbers must agree to the last bit, a radius through its curvature.  A key that the format's
+    writer does not know is missing from what comes back, so it is refused here and never lost.
+
+    Args:
+        wanted: the prescription to be written.
+        found: the same, read again from what would be written.
+        kind: what messages call the format, for example `.zmx`.
+        where: what messages call the prescription.
+        medium: names that mean the same medium in this format become one.
+        assumed: keys that the format never leaves out; allowed to appear where none was wanted.
+
+    Raises:
+        InputError: one line that names the surface and key which the format cannot hold.
+    """
+    before, after = _flat(wanted, medium), _flat(found, medium)
+    for key, value in before.items():
+        if key not in after or after[key] != value:
+            back = f" (it would come back as {after[key]!r})" if key in after else ""
+            shown = "" if isinstance(value, list | dict) else f" {value!r}"
+            place = "".join(f"{part}: " for part in key[:-1])
+            raise InputError(f"{where}: {place}a {kind} file cannot hold '{key[-1]}'{shown}{back}")
+    for key in after:
+        if key not in before and key[0] not in assumed:
+            place = "".join(f"{part}: " for part in key[:-1])
+            raise InputError(f"{where}: {place}a {kind} file always has '{key[-1]}'; give it")
+
+
+def _flat(prescription: Mapping[str, Any], medium: Callable[[str], str]) -> dict[tuple, Any]:
+    flat: dict[tuple, Any] = {(key,): value for key, value in _DEFAULTS.items()}
+    for key, value in prescription.items():
+        if key == "surfaces":
+            for n, row in value.items():
+                flat.update(
+                    ((f"surface {n}", k), v) for k, v in _row({"type": "sphere"} | {**row}).items()
+                )
+        elif key == "sensor":
+            flat.update(((key, k), _plain(v)) for k, v in value.items() if v is not None)
+        elif value is not None and value not in ({}, [], ""):
+            flat[(key,)] = _plain(value)
+    if ("wavelengths",) in flat:
+        flat.setdefault(("reference_wavelength",), flat[("wavelengths",)][0])
+    return {k: medium(v) if "material" in k[-1] else v for k, v in flat.items()}
+
+
+def _row(row: Mapping[str, Any]) -> dict[str, Any]:
+    plain = {key: _plain(value) for key, value in row.items() if value is not None}
+    if "radius" in plain:
+        radius = as_number(plain.pop("radius"), "'radius'", finite=False)
+        if plain["type"] not in ("plane", "aperture"):
+            plain["curvature"] = 1.0 / radius
+    return plain
+
+
+def _plain(value: Any) -> Any:
+    """Numbers as floats, so that 25 and 25.0 are the same; rows as lists."""
+    if isinstance(value, bool) or value is None:
+        return value
+    if isinstance(value, int | float):
+        return float(value)
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    # YAML 1.1 reads 1e-6, without a point, as text; so does the builder of a lens read it.
+    try:
+        return as_number(str(value), "")
+    except InputError:
+        return str(value)

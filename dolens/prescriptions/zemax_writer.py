@@ -1,0 +1,173 @@
+"""From a prescription to the text of a Zemax `.zmx` file."""
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.prescriptions.checks import as_integer, as_number
+from dolens.prescriptions.compare import require_same
+from dolens.prescriptions.decimals import shifted
+from dolens.prescriptions.zemax_reader import prescription_from_zemax
+
+_TYPES = ("plane", "aperture", "sphere", "conic", "even_asphere")
+_PAIR = re.compile(r"\s*([\d.]+)\s*/\s*([\d.]+)\s*")
+_D_LINE = 587.5618
+_POWER = re.compile(r"a(\d+)")
+
+
+def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
+    """Write a prescription as the text of a `.zmx` file (see `encode_zemax`).
+
+    Every semi-diameter is written as a circular aperture, since it clips, and the system's
+    aperture floats by the stop.  Zemax cannot do without a wavelength and a field: where the
+    prescription has none, the d line and the axis are written.  A catalogue's name goes into GCAT.
+    `occluder` is written as air, which it is in the index models that a file can hold.
+
+    Raises:
+        InputError: one line that names the surface and key which the format cannot hold.
+    """
+    model = str(prescription.get("index_model", "dfc"))
+    if model != "dfc":
+        raise InputError(
+            f"{where}: a .zmx file cannot hold index_model '{model}' (allowed: dfc; its nd and Vd "
+            "are those of the lines C, d, F, and its air has index 1)"
+        )
+    surfaces = {str(n): row for n, row in prescription["surfaces"].items()}
+    sensor = prescription["sensor"]
+    stop = as_integer(prescription.get("stop", 1), f"{where}: 'stop'")
+    lines = _system(prescription, surfaces, where)
+    distance = prescription.get("object_distance")
+    lines += [
+        "SURF 0",
+        "  TYPE STANDARD",
+        "  CURV 0.0",
+        *_glass(prescription.get("object_material", "air"), where),
+        f"  DISZ {'INFINITY' if distance is None else _text(distance, where)}",
+        '  DIAM 0 0 0 0 1 ""',
+    ]
+    for n, row in surfaces.items():
+        place = f"{where}: surface {n}"
+        gap = row.get("thickness", sensor["distance"])
+        lines += [f"SURF {n}", *(["  STOP"] if str(stop) == n else [])]
+        lines += _surface(row, place)
+        lines.append(f"  DISZ {_text(gap, place)}")
+    diameter = as_number(sensor.get("diameter") or 0.0, f"{where}: 'sensor.diameter'")
+    lines += [
+        f"SURF {len(surfaces) + 1}",
+        "  TYPE STANDARD",
+        "  CURV 0.0",
+        "  DISZ 0",
+        f'  DIAM {diameter / 2.0!r} {int(diameter > 0.0)} 0 0 1 ""',
+    ]
+    text = "\n".join((*lines, ""))
+    found = prescription_from_zemax(text, where)
+    require_same(prescription, found, ".zmx", where, _medium, _ALWAYS)
+    return text
+
+
+_ALWAYS = ("wavelengths", "reference_wavelength", "fields")
+
+
+def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where: str) -> list[str]:
+    waves = prescription.get("wavelengths") or [_D_LINE]
+    waves = [as_number(wave, f"{where}: 'wavelengths'") for wave in waves]
+    reference = float(prescription.get("reference_wavelength") or waves[0])
+    if reference not in waves:
+        raise InputError(f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths'")
+    kind, points = next(iter((prescription.get("fields") or {"angles": [[0.0, 0.0]]}).items()))
+    x, y = ([_text(point[axis], f"{where}: fields") for point in points] for axis in (0, 1))
+    materials = [str(row.get("material")) for row in surfaces.values()]
+    catalogues = sorted({name.partition(":")[0] for name in materials if ":" in name})
+    notes = str(prescription.get("source") or "").splitlines()
+    return [
+        "VERS 170912 299 0",
+        "MODE SEQ",
+        f"NAME {prescription.get('name', '')}".rstrip(),
+        *(f"NOTE 0 {note}" for note in notes),
+        "UNIT MM X W X CM MR CPMM",
+        *_pupil(prescription, where),
+        "ENVD 20 1 0",
+        "GFAC 0 0",
+        *([f"GCAT {' '.join(catalogues)}"] if catalogues else []),
+        f"FTYP {int(kind == 'heights')} 0 {len(points)} {len(waves)} 0 0 0",
+        f"XFLN {' '.join(x)}",
+        f"YFLN {' '.join(y)}",
+        f"FWGN {' '.join('1' for _ in points)}",
+        *(f"WAVM {i} {shifted(wave, -3)} 1" for i, wave in enumerate(waves, 1)),
+        f"PWAV {waves.index(reference) + 1}",
+    ]
+
+
+def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
+    if prescription.get("entrance_pupil_diameter") is not None:
+        return [f"ENPD {_text(prescription['entrance_pupil_diameter'], where)}"]
+    if prescription.get("f_number") is not None:
+        return [f"FNUM {_text(prescription['f_number'], where)} 0"]
+    return ["FLOA"]
+
+
+def _surface(row: Mapping[str, Any], place: str) -> list[str]:
+    """A surface's block but for its number, stop and distance.
+
+    Zemax writes a curvature of zero as 0.0, so CURV 0 can mean a plane, and a sphere whose
+    curvature happens to be 0 stays one.  CONI is written for conics and aspheres alone.
+    """
+    kind = str(row.get("type", "sphere"))
+    if kind not in _TYPES:
+        raise InputError(
+            f"{place}: a .zmx file cannot hold type '{kind}' (allowed: {', '.join(_TYPES)})"
+        )
+    lines = [f"  TYPE {'EVENASPH' if kind == 'even_asphere' else 'STANDARD'}"]
+    if row.get("note"):
+        lines.append(f"  COMM {row['note']}")
+    if kind in ("plane", "aperture"):
+        lines.append("  CURV 0")
+    else:
+        lines.append(f'  CURV {_curvature(row, place)!r} 0 0 0 0 ""')
+    if kind in ("conic", "even_asphere"):
+        lines.append(f"  CONI {_text(row.get('conic', 0.0), place)}")
+    for key in row:
+        power = _POWER.fullmatch(key)
+        if power and kind == "even_asphere":
+            n = int(power[1])
+            if n % 2 or not 4 <= n <= 16:
+                raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a4 to a16)")
+            lines.append(f"  PARM {n // 2} {_text(row[key], place)}")
+    lines += _glass(row.get("material"), place)
+    if row.get("semi_diameter") is not None:
+        semi_diameter = _text(row["semi_diameter"], place)
+        lines += [f'  DIAM {semi_diameter} 1 0 0 1 ""', f"  CLAP 0 {semi_diameter} 0"]
+    return lines
+
+
+def _curvature(row: Mapping[str, Any], place: str) -> float:
+    if row.get("curvature") is not None:
+        return as_number(row["curvature"], f"{place}: 'curvature'")
+    radius = as_number(row.get("radius", math.inf), f"{place}: 'radius'", finite=False)
+    if radius == 0.0:
+        raise InputError(f"{place}: 'radius' is 0; write .inf for a plane")
+    return 1.0 / radius
+
+
+def _glass(material: object, place: str) -> list[str]:
+    name = _medium(str(material))
+    if name == "air":
+        return []
+    pair = _PAIR.fullmatch(name)
+    if pair:
+        return [f"  GLAS ___BLANK 1 0 {pair[1]} {pair[2]} 0 0 0 0 0 0"]
+    if len(name.split()) != 1:
+        raise InputError(f"{place}: a .zmx file cannot hold material '{material}'")
+    return [f"  GLAS {name} 0 0 1.5 40 0 0 0 0 0 0"]
+
+
+def _medium(name: str) -> str:
+    """A medium as the format tells it apart: air is air, and a catalogue is not the glass's."""
+    word = name.rpartition(":")[2].strip()
+    return "air" if word.lower() in ("air", "occluder") else word
+
+
+def _text(value: object, place: str) -> str:
+    return repr(as_number(value, place))

@@ -1,0 +1,261 @@
+"""Every format gives back what it was given, to the last bit, or says what it cannot hold."""
+
+import copy
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dolens import InputError, load_lens, save_lens
+from dolens.prescriptions import lens_from_prescription, prescription_of
+from dolens.prescriptions.source_text import prescription_from_source_text, source_text_of
+from dolens.prescriptions.zemax import decode_zemax, encode_zemax
+from dolens.prescriptions.zemax_reader import prescription_from_zemax
+from dolens.prescriptions.zemax_writer import zemax_of
+
+LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))
+# What a .zmx file cannot hold, and which surface says so.
+NOT_IN_ZEMAX = {"wavefront_coding": "surface 5: a .zmx file cannot hold type 'xy_polynomial'"}
+FORMATS = {
+    ".txt": lambda data: prescription_from_source_text(source_text_of(data)),
+    ".zmx": lambda data: prescription_from_zemax(decode_zemax(encode_zemax(zemax_of(data)))),
+    ".yaml": lambda data: yaml.safe_load(yaml.safe_dump(data)),
+}
+
+
+def require_equal(found, wanted):
+    before, after = dict(wanted.named_parameters()), dict(found.named_parameters())
+    assert before.keys() == after.keys()
+    for name, p in before.items():
+        assert torch.equal(p, after[name]), name
+    for n, surface in wanted.surfaces.items():
+        assert type(found.surfaces[n]) is type(surface)
+        assert found.surfaces[n].semi_diameter == surface.semi_diameter
+    assert [(m.a, m.b) for m in found.materials] == [(m.a, m.b) for m in wanted.materials]
+    for key in ("name", "stop", "index_model", "sensor_diameter", "object_distance"):
+        assert getattr(found, key) == getattr(wanted, key)
+    for key in ("wavelengths", "reference_wavelength", "fields"):
+        # Zemax cannot do without these: see test_zemax_always_has_a_field_and_a_wavelength.
+        if getattr(wanted, key) is not None:
+            assert getattr(found, key) == getattr(wanted, key)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
+@pytest.mark.parametrize("path", LENSES, ids=lambda p: p.stem)
+def test_every_lens_through_every_format(path, dtype, suffix, tmp_path):
+    lens = load_lens(path, dtype)
+    generator = torch.Generator().manual_seed(2)
+    for changed in (False, True):
+        if changed:
+            # Numbers without a short decimal form, as an optimizer leaves them.
+            with torch.no_grad():
+                for p in lens.parameters():
+                    p *= 1.0 + 1e-3 * torch.rand((), generator=generator, dtype=dtype)
+        if suffix == ".zmx" and path.stem in NOT_IN_ZEMAX:
+            with pytest.raises(InputError, match=NOT_IN_ZEMAX[path.stem]):
+                save_lens(lens, tmp_path / "lens.zmx")
+            assert not (tmp_path / "lens.zmx").exists()
+            continue
+        save_lens(lens, tmp_path / f"lens{suffix}")
+        require_equal(load_lens(tmp_path / f"lens{suffix}", dtype), lens)
+
+
+def test_the_tables_of_the_supplement_read_the_same_in_every_format(root):
+    """Numbers come back as they are printed: 22.014 and not 22.014000000000003."""
+    data = yaml.safe_load((root / "conf/lens/nikon.yaml").read_text())
+    for suffix in (".txt", ".zmx"):
+        rows = FORMATS[suffix](data)["surfaces"]
+        for n, row in data["surfaces"].items():
+            for key in row.keys() - {"type", "material"}:
+                assert rows[n][key] == row[key], (suffix, n, key)
+
+
+finite = st.floats(-1e3, 1e3, allow_subnormal=False)
+glass = st.builds("{:.6f}/{:.4f}".format, st.floats(1.3, 2.1), st.floats(15.0, 100.0))
+medium = st.one_of(st.just("air"), glass)
+coefficient = st.floats(-1e-4, 1e-4, allow_subnormal=False)
+
+
+@st.composite
+def surfaces(draw, kinds):
+    kind = draw(st.sampled_from(kinds))
+    semi_diameter = draw(st.floats(1e-3, 9.0))
+    row = {"type": kind, "semi_diameter": semi_diameter, "material": draw(medium)}
+    if kind in ("sphere", "conic", "even_asphere"):
+        if draw(st.booleans()):
+            row["radius"] = draw(st.sampled_from([12.5, -31.7, 1e5, math.inf]))
+        else:
+            row["curvature"] = draw(st.floats(-0.1, 0.1).filter(lambda c: abs(c) > 1e-290 or not c))
+    if kind in ("conic", "even_asphere"):
+        row["conic"] = draw(st.floats(-10.0, 0.0, allow_subnormal=False))
+    if kind == "even_asphere":
+        row |= draw(st.dictionaries(st.sampled_from(["a4", "a6", "a8", "a12", "a16"]), coefficient))
+    if kind == "xy_polynomial":
+        names = ["x", "y", "x2", "xy", "y2", "x3", "x2y", "xy2", "y3", "b"]
+        row |= draw(st.dictionaries(st.sampled_from(names), coefficient))
+    return row
+
+
+@st.composite
+def prescriptions(draw, kinds, models):
+    rows = draw(st.lists(surfaces(kinds), min_size=1, max_size=6))
+    for row in rows[:-1]:
+        row["thickness"] = draw(finite)
+    stop = draw(st.integers(1, len(rows)))
+    data = {
+        "name": draw(st.text("Aa é–µ1.", min_size=1, max_size=12).map(str.strip).filter(bool)),
+        "index_model": draw(st.sampled_from(models)),
+        "stop": stop,
+        "object_material": draw(medium),
+        "surfaces": {str(n): row for n, row in enumerate(rows, 1)},
+        "sensor": {"distance": draw(finite)},
+    }
+    if draw(st.booleans()):
+        data["sensor"]["diameter"] = draw(st.floats(1e-3, 1e3))
+    if draw(st.booleans()):
+        data["object_distance"] = draw(finite)
+        heights = st.tuples(finite, finite).map(list)
+        data["fields"] = {"heights": draw(st.lists(heights, min_size=1, max_size=4))}
+    if draw(st.booleans()):
+        waves = draw(st.lists(st.floats(200.0, 2000.0), min_size=1, max_size=4))
+        data |= {"wavelengths": waves, "reference_wavelength": draw(st.sampled_from(waves))}
+    return data
+
+
+ROTATIONAL = ["plane", "sphere", "conic", "even_asphere"]
+relaxed = settings(
+    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)
+
+
+@relaxed
+@given(prescriptions([*ROTATIONAL, "aperture", "xy_polynomial"], ["dfc", "do", "paper"]))
+def test_any_lens_through_the_source_s_format(data):
+    require_equal(
+        lens_from_prescription(FORMATS[".txt"](data)), lens_from_prescription(copy.deepcopy(data))
+    )
+
+
+@relaxed
+@given(prescriptions(ROTATIONAL, ["dfc"]))
+def test_any_lens_through_zemax(data):
+    media = [data["object_material"], *(row["material"] for row in data["surfaces"].values())]
+    flat = [
+        row["type"] == "plane"
+        or (
+            row["type"] == "sphere" and (row.get("radius") == math.inf or row.get("curvature") == 0)
+        )
+        for row in data["surfaces"].values()
+    ]
+    n = data["stop"] - 1
+    if flat[n] and media[n] == media[n + 1]:
+        # Zemax has no other way to write an aperture.
+        with pytest.raises(InputError, match=rf"surface {n + 1}: a .zmx file cannot hold"):
+            zemax_of(data)
+        data["surfaces"][str(n + 1)] = {
+            key: value
+            for key, value in data["surfaces"][str(n + 1)].items()
+            if key not in ("radius", "curvature")
+        } | {"type": "aperture"}
+    require_equal(lens_from_prescription(FORMATS[".zmx"](data)), lens_from_prescription(data))
+
+
+SINGLET = {
+    "name": "Singlet",
+    "index_model": "dfc",
+    "stop": 1,
+    "surfaces": {
+        "1": {"type": "even_asphere", "radius": 20.0, "conic": -0.5, "a4": 1e-6,
+              "semi_diameter": 10, "thickness": 5.0, "material": "1.5168/64.17"},
+        "2": {"type": "sphere", "radius": -50.0, "semi_diameter": 10, "material": "air"},
+    },
+    "sensor": {"distance": 30.0, "diameter": 10.0},
+}  # fmt: skip
+
+
+def with_row(n="1", **keys):
+    data = copy.deepcopy(SINGLET)
+    row = data["surfaces"][n] | keys
+    data["surfaces"][n] = {key: value for key, value in row.items() if value is not None}
+    return data
+
+
+CANNOT = {
+    "unknown type": ((".txt", ".zmx"), with_row(type="b_spline", coefficients=[1.0]),
+                     "surface 1: a {} file cannot hold type 'b_spline' (allowed: "),
+    "unknown surface key": ((".txt", ".zmx"), with_row(aperture={"rectangle": [1, 2]}),
+                            "surface 1: a {} file cannot hold 'aperture'"),
+    "elements": ((".txt", ".zmx"), {**SINGLET, "elements": {"1": {"tilt_x": 1.0}}},
+                 "a {} file cannot hold 'elements'"),
+    "sensor key": ((".txt", ".zmx"), {**SINGLET, "sensor": {"distance": 1, "tilt_x": 0.1}},
+                   "sensor: a {} file cannot hold 'tilt_x' 0.1"),
+    "title of two lines": ((".txt",), {**SINGLET, "name": "a\ntype"}, "lens: "),
+    "name of two lines": ((".zmx",), {**SINGLET, "name": "a\nb"},
+                          "a .zmx file cannot hold 'name' 'a\\nb' (it would come back as 'a')"),
+    "remark": ((".txt",), with_row(note="front"), "surface 1: a .txt file cannot hold 'note'"),
+    "catalogue glass": ((".txt",), with_row(material="N-BK7"),
+                        "surface 1: a .txt file cannot hold material 'N-BK7'"),
+    "unknown glass": ((".txt",), with_row(material="SCHOTT:X"), "surface 1: material 'SCHOTT:X'"),
+    "glass in two words": ((".zmx",), with_row(material="BK 7"),
+                           "surface 1: a .zmx file cannot hold material 'BK 7'"),
+    "index model": ((".zmx",), {**SINGLET, "index_model": "do"},
+                    "a .zmx file cannot hold index_model 'do' (allowed: dfc"),
+    "high power": ((".zmx",), with_row(a18=1e-20),
+                   "surface 1: a .zmx file cannot hold 'a18' (allowed: a4 to a16)"),
+    "high monomial": ((".txt",), with_row("2", type="xy_polynomial", radius=None, x4=1e-5),
+                      "surface 2: a .txt file cannot hold 'x4' 1e-05"),
+    "second aperture": ((".zmx",), with_row("2", type="aperture", radius=None),
+                        "surface 2: a .zmx file cannot hold 'type' 'aperture'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CANNOT)
+def test_what_a_format_cannot_hold(case):
+    suffixes, data, said = CANNOT[case]
+    for suffix in suffixes:
+        with pytest.raises(InputError) as error:
+            FORMATS[suffix](data)
+        message = str(error.value)
+        assert message.startswith("lens: ")
+        assert said.format(suffix) in message
+        assert "\n" not in message
+
+
+def test_what_zemax_keeps_beside_the_surfaces():
+    data = with_row(note="front", material="SCHOTT:N-BK7") | {
+        "source": "US 1,234,567\nexample 2",
+        "f_number": 2.8,
+        "fields": {"angles": [[0.0, 0.0], [0.1, -3.3]]},
+        "wavelengths": [486.1327, 587.5618],
+        "reference_wavelength": 587.5618,
+    }
+    del data["surfaces"]["1"]["semi_diameter"]
+    text = zemax_of(data)
+    assert "\nGCAT SCHOTT\n" in text
+    found = prescription_from_zemax(text)
+    assert found["surfaces"]["1"] == data["surfaces"]["1"] | {"material": "N-BK7"}
+    for key in ("source", "f_number", "fields", "wavelengths", "reference_wavelength"):
+        assert found[key] == data[key]
+
+
+def test_zemax_always_has_a_field_and_a_wavelength():
+    found = FORMATS[".zmx"](SINGLET)
+    assert found["fields"] == {"angles": [[0.0, 0.0]]}
+    assert found["wavelengths"] == [587.5618]
+
+
+def test_text_beyond_ascii_is_written_as_utf_16():
+    assert encode_zemax("NAME Gauss\n") == b"NAME Gauss\r\n"
+    assert encode_zemax("NAME Gauß\n")[:4] == b"\xff\xfeN\0"
+
+
+def test_an_unknown_suffix_is_refused(tmp_path):
+    lens = lens_from_prescription(SINGLET)
+    with pytest.raises(InputError, match=r"lens files end in \.yaml, \.yml, \.txt, \.zmx"):
+        save_lens(lens, tmp_path / "lens.json")
+    assert prescription_of(lens)["name"] == "Singlet"
