@@ -56,7 +56,7 @@ def source_material(name: str, place: str) -> str:
     known = _MEDIA | SOURCE_GLASSES
     if word not in known and not _PAIR.fullmatch(word):
         raise InputError(
-            f"{place}: material '{name}' is unknown{did_you_mean(word, known)} (allowed: nd/Vd such "
-            "as 1.5168/64.17, air, occluder, vacuum, or a glass in the source's own table)"
+            f"{place}: material '{name}' is unknown{did_you_mean(word, known)} (allowed: nd/Vd, "
+            "such as 1.5168/64.17, air, occluder, vacuum, or a glass in the source's own table)"
         )
     return known.get(word, word)

@@ -7,6 +7,7 @@ from dolens.errors import InputError
 from dolens.imaging.psf import axial_point_spread_functions, splat
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 
 LINES = (656.2725, 587.5618, 486.1327)
 SENSOR = Sensor(64, 64, 0.0069)
@@ -52,7 +53,7 @@ def test_the_blur_of_the_plain_lens_is_the_geometric_disc(wavefront_coding):
     from dolens.optics.paraxial import exit_pupil, image_distance
 
     lens = wavefront_coding()
-    lens.surfaces["1"].semi_diameter = 1.0
+    lens.surfaces["1"].aperture = ClearAperture(Circle(1.0))
     sensor = Sensor(64, 64, 0.001)
     system = lens.system()
     image_z = float(image_distance(system, 587.5618, 8000.0))

@@ -74,10 +74,11 @@ def snell(
     cosine = cosine.clamp(-2.0, 2.0)
     squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
     along = sense * safe_sqrt(squared) - ratio * cosine
+    # Rays that missed have no unit normal; a direction that grew would overflow float32 later.
     return Refraction(
-        torch.addcmul(ratio * l, along, nx),
-        torch.addcmul(ratio * m, along, ny),
-        torch.addcmul(ratio * n, along, nz),
+        torch.addcmul(ratio * l, along, nx).clamp(-2.0, 2.0),
+        torch.addcmul(ratio * m, along, ny).clamp(-2.0, 2.0),
+        torch.addcmul(ratio * n, along, nz).clamp(-2.0, 2.0),
         squared.detach(),
     )
 
