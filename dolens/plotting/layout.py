@@ -13,20 +13,22 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.paraxial import entrance_pupil, first_order
-from dolens.optics.rays import Components
+from dolens.optics.paraxial import first_order
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import trace_surfaces, trace_to_plane
+from dolens.plotting.section import (
+    SAMPLES,
+    Profile,
+    axis_angle,
+    element_edges,
+    obscuration_profile,
+    sag_of,
+    surface_profile,
+    trace_fan,
+)
 from dolens.plotting.style import SMALL, TITLE, colours, open_axes
 
-Profile = tuple[np.ndarray, np.ndarray]
-
-_SAMPLES = 201
-# The real beam is looked for over this many paraxial pupil radii, because pupils have aberrations.
-_SEARCH = 1.5
-_TRIALS = 601
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.1
 # A sag below this share of the height of the drawing cannot be seen.
@@ -52,8 +54,10 @@ def layout_figure(
     rays reach the sensor, so that the outermost graze the apertures that limit the beam.  Rays
     that miss a surface, are reflected totally or clipped are not drawn.
 
+    Elements with a pose are cut where they stand; rays that leave the plane x = 0 are seen along x.
+
     Artists carry gids: `ray`, `surface 3`, `glass 3` (the element behind surface 3), `edge`,
-    `stop`, `stop tick`, `sensor`, `axis`.
+    `stop`, `stop tick`, `obscuration`, `sensor`, `axis`.
 
     XY polynomials whose sag is too small to be seen get axes of their own below, in µm.
 
@@ -77,19 +81,19 @@ def layout_figure(
     system = lens.system(values)
     profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
     sensor_z = float(system.vertices[-1])
-    front = min(float(z.min()) for z, _ in profiles)
+    front = min((float(z.min()) for z, _ in profiles if len(z)), default=0.0)
     start = front - _LEAD * (sensor_z - min(front, 0.0))
     fans = [
         trace_fan(system, wavelength, field, rays, object_distance, start) for field in fields_deg
     ]
-    height = max(float(np.abs(y).max()) for _, y in profiles)
+    height = max((float(np.abs(y).max()) for _, y in profiles if len(y)), default=1.0)
     height = max(height, 0.5 * (lens.sensor_diameter or 0.0))
 
     plates = [
         number
         for number, surface in enumerate(system.surfaces, 1)
         if issubclass(surface.shape, (XYPolynomial, BSpline))
-        and np.ptp(profiles[number - 1][0]) < _VISIBLE * 2.0 * height
+        and _depth(system, number) < _VISIBLE * 2.0 * height
     ]
     reach = max([height, *(float(np.abs(fan[..., 1]).max()) for fan in fans if len(fan))])
     z_low, z_high = start - 0.04 * (sensor_z - start), sensor_z + 0.04 * (sensor_z - start)
@@ -111,7 +115,8 @@ def layout_figure(
     _draw_axis(axes, z_low, z_high)
     _draw_glass(axes, system, profiles)
     _draw_rays(axes, fans, fields_deg)
-    _draw_stop(axes, system.stop, profiles, height)
+    _draw_stop(axes, system, profiles, height)
+    _draw_obscurations(axes, system)
     half = 0.5 * lens.sensor_diameter if lens.sensor_diameter else reach
     axes.plot(
         [sensor_z, sensor_z], [-half, half], color="black", linewidth=2.5, gid="sensor", zorder=4
@@ -124,98 +129,12 @@ def layout_figure(
     return figure
 
 
-def surface_profile(system: OpticalSystem, number: int) -> Profile:
-    """The section of a surface with the y-z plane, over its clear aperture.
-
-    Args:
-        system: the lens.
-        number: of the surface, from 1.
-
-    Returns:
-        z and y in mm, (samples,), from -semi_diameter to +semi_diameter; shorter where the sag
-        branch ends before the aperture does.
-    """
-    semi_diameter = system.surfaces[number - 1].semi_diameter
-    y = torch.linspace(-semi_diameter, semi_diameter, _SAMPLES, dtype=torch.float64)
-    sag, exists = _sag(system, number, torch.zeros_like(y), y)
-    z = sag + float(system.vertices[number - 1])
-    return z[exists].numpy(), y[exists].numpy()
-
-
-def trace_fan(
-    system: OpticalSystem,
-    wavelength: float,
-    field_deg: float,
-    rays: int,
-    object_distance: float | None,
-    start: float,
-) -> np.ndarray:
-    """A meridional fan from an object point, over the entrance pupil, to the sensor.
-
-    Args:
-        system: the lens.
-        wavelength: nm.
-        field_deg: the angle of the chief ray in object space, degrees.
-        rays: how many; one alone is the chief ray.
-        object_distance: mm in front of the first vertex, or None for infinity.
-        start: z in mm where the first point of every ray lies, or at the object if that is nearer.
-
-    Returns:
-        (valid rays, surfaces + 2, 3), mm: start, every surface, sensor.
-    """
-    pupil = entrance_pupil(system, wavelength)
-    if object_distance is not None:
-        if not (object_distance > 0.0 and object_distance + float(pupil.z) > 0.0):
-            raise InputError(
-                f"layout: object_distance {object_distance:g} mm must be positive, and in front "
-                f"of the entrance pupil at z = {float(pupil.z):g} mm"
-            )
-        start = max(start, -object_distance)
-    slope = math.tan(math.radians(field_deg))
-
-    def trace(aim: Tensor) -> tuple[Tensor, Tensor]:
-        """Heights in the pupil's plane, (N,), to (N, points, 3) and validity, (N,)."""
-        if object_distance is None:
-            slopes = torch.full_like(aim, slope)
-        else:
-            slopes = slope + aim / (pupil.z + object_distance)
-        y = aim + slopes * (start - pupil.z)
-        n = torch.rsqrt(1.0 + slopes * slopes)
-        zero = torch.zeros_like(y)
-        ray = Components(zero, y, zero + start, zero, slopes * n, n)
-        traced = trace_surfaces(system, ray, wavelength, record=True)
-        traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
-        points = [ray[:3], *traced.points, traced.ray[:3]]
-        return torch.stack([torch.stack(point, -1) for point in points], 1), traced.valid
-
-    if rays == 1:
-        aims = torch.zeros_like(pupil.z).reshape(1)
-    else:
-        reach = 0.5 * _SEARCH * pupil.diameter
-        trials = torch.linspace(-1.0, 1.0, _TRIALS).to(reach) * reach
-        passing = trials[trace(trials)[1]]
-        if not len(passing):
-            return np.zeros((0, len(system.surfaces) + 2, 3))
-        share = torch.linspace(0.0, 1.0, rays).to(reach)
-        aims = passing[0] * (1.0 - share) + passing[-1] * share
-    path, valid = trace(aims)
-    return path[valid].double().cpu().numpy()
-
-
 def _check(fields_deg: Sequence[float], rays: int) -> None:
     if rays < 1 or not fields_deg:
         raise InputError(f"layout: at least one field and one ray, not {len(fields_deg)}, {rays}")
     for field in fields_deg:
         if not abs(field) < 90.0:
             raise InputError(f"layout: fields must be within ±90 degrees, not {field:g}")
-
-
-def _sag(system: OpticalSystem, number: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Sag in mm in double precision, and where it exists."""
-    surface = system.surfaces[number - 1]
-    parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
-    sag, _, _, exists = surface.shape.sag_and_gradient(parameters, x, y)
-    return sag, torch.ones_like(sag, dtype=torch.bool) if exists is None else exists >= 0.0
 
 
 def _title(lens: Lens, system: OpticalSystem, wavelength: float) -> str:
@@ -242,7 +161,10 @@ def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) 
     for number in range(1, len(profiles)):
         if _is_glass(system, number):
             bounding |= {number, number + 1}
-            top, bottom = (_edge(profiles[number - 1], profiles[number], end) for end in (-1, 0))
+            faces = profiles[number - 1], profiles[number]
+            if not (len(faces[0][0]) and len(faces[1][0])):
+                continue
+            top, bottom = element_edges(system, number, *faces)
             front, back = (np.stack(p, -1) for p in profiles[number - 1 : number + 1])
             outline = np.concatenate([front, top[1:-1], back[::-1], bottom[1:-1][::-1]])
             gid = f"glass {number}"
@@ -257,21 +179,6 @@ def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) 
 
 def _is_glass(system: OpticalSystem, number: int) -> bool:
     return system.materials[number].name not in ("air", "occluder")
-
-
-def _edge(front: Profile, back: Profile, end: int) -> np.ndarray:
-    """The ground edge of an element on one side (end -1: +y, 0: -y), (corners, 2) as z, y.
-
-    A flat from the smaller surface outwards, then a cylinder; a straight line where the flat
-    would cut through the other surface.
-    """
-    a = np.array([front[0][end], front[1][end]])
-    b = np.array([back[0][end], back[1][end]])
-    corner = np.array([a[0], b[1]]) if abs(a[1]) < abs(b[1]) else np.array([b[0], a[1]])
-    outer, inner = (back, front) if abs(a[1]) < abs(b[1]) else (front, back)
-    beyond = np.abs(outer[1]) >= abs(inner[1][end])
-    gap = (outer[0][beyond] - corner[0]) * (1.0 if outer is back else -1.0)
-    return np.stack([a, b]) if gap.min(initial=np.inf) < 0.0 else np.stack([a, corner, b])
 
 
 def _draw_rays(axes: Axes, fans: Sequence[np.ndarray], fields_deg: Sequence[float]) -> None:
@@ -295,46 +202,56 @@ def _draw_rays(axes: Axes, fans: Sequence[np.ndarray], fields_deg: Sequence[floa
 
 def _stop_bar(stop: int, profiles: Sequence[Profile], height: float) -> float:
     """How far from the axis the stop's bars end, mm."""
-    return float(np.abs(profiles[stop - 1][1]).max()) + 0.2 * height
+    y = profiles[stop - 1][1]
+    return (float(np.abs(y).max()) if len(y) else 0.0) + 0.2 * height
 
 
-def _draw_stop(axes: Axes, stop: int, profiles: Sequence[Profile], height: float) -> None:
-    """Bars outside the stop's rim, with a tick along the axis at the rim."""
-    z, y = profiles[stop - 1]
-    tick = 0.025 * height
-    end_of_bar = _stop_bar(stop, profiles, height)
+def _draw_stop(
+    axes: Axes, system: OpticalSystem, profiles: Sequence[Profile], height: float
+) -> None:
+    """Bars outside the stop's rim, in its own plane, with a tick along its axis at the rim."""
+    z, y = profiles[system.stop - 1]
+    if not len(z):
+        return
+    angle = axis_angle(system, system.stop)
+    along = np.array([math.cos(angle), math.sin(angle)])
+    outwards = np.array([-along[1], along[0]])
+    tick = 0.025 * height * along
+    length = _stop_bar(system.stop, profiles, height) - float(np.abs(y).max())
     for end, side in ((-1, 1.0), (0, -1.0)):
-        bar = [y[end], side * end_of_bar]
-        axes.plot(
-            [z[end], z[end]],
-            bar,
-            color="black",
-            linewidth=2.0,
-            solid_capstyle="butt",
-            gid="stop",
-            zorder=4,
-        )
-        axes.plot(
-            [z[end] - tick, z[end] + tick],
-            [y[end], y[end]],
-            color="black",
-            linewidth=1.2,
-            gid="stop tick",
-            zorder=4,
-        )
+        rim = np.array([z[end], y[end]])
+        bar = np.stack([rim, rim + side * length * outwards]).T
+        axes.plot(*bar, color="black", linewidth=2.0, solid_capstyle="butt", gid="stop", zorder=4)
+        ends = np.stack([rim - tick, rim + tick]).T
+        axes.plot(*ends, color="black", linewidth=1.2, gid="stop tick", zorder=4)
+
+
+def _draw_obscurations(axes: Axes, system: OpticalSystem) -> None:
+    for number in range(1, len(system.surfaces) + 1):
+        profile = obscuration_profile(system, number)
+        if profile is not None and len(profile[0]):
+            axes.plot(*profile, color="black", linewidth=2.5, gid="obscuration", zorder=4)
+
+
+def _depth(system: OpticalSystem, number: int) -> float:
+    """Largest difference of sag along y, mm, in the surface's own axes."""
+    reach = system.surfaces[number - 1].semi_diameter
+    y = torch.linspace(-reach, reach, SAMPLES, dtype=torch.float64)
+    sag, _, _, exists = sag_of(system, number, torch.zeros_like(y), y)
+    return float(np.ptp(sag[exists].numpy()))
 
 
 def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
     """h(x, 0) and h(0, y) of a surface, in µm."""
     semi_diameter = system.surfaces[number - 1].semi_diameter
-    t = torch.linspace(-semi_diameter, semi_diameter, _SAMPLES, dtype=torch.float64)
+    t = torch.linspace(-semi_diameter, semi_diameter, SAMPLES, dtype=torch.float64)
     zero = torch.zeros_like(t)
     # The curves of x³ + y³ coincide: a thin one is drawn over a thick one.
     for label, x, y, style in (
         ("h(x, 0)", t, zero, {"color": "#56B4E9", "linewidth": 3.0}),
         ("h(0, y)", zero, t, {"color": "#D55E00", "linewidth": 1.2, "linestyle": "--"}),
     ):
-        sag, exists = _sag(system, number, x, y)
+        sag, _, _, exists = sag_of(system, number, x, y)
         axes.plot(t[exists], 1e3 * sag[exists], label=label, **style)
     axes.set_xlabel("x, y (mm)", fontsize=SMALL + 1)
     axes.set_ylabel("sag (µm)", fontsize=SMALL + 1)

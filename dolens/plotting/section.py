@@ -1,0 +1,208 @@
+"""What a layout draws: surfaces cut by the meridional plane, edges of elements, fans of rays."""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.paraxial import entrance_pupil
+from dolens.optics.rays import Components
+from dolens.optics.surfaces.clear_aperture import Outline
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import trace_surfaces, trace_to_plane
+
+Profile = tuple[np.ndarray, np.ndarray]
+
+SAMPLES = 201
+# The real beam is looked for over this many paraxial pupil radii, because pupils have aberrations.
+_SEARCH = 1.5
+_TRIALS = 601
+_BISECTIONS = 60
+_NEWTON_STEPS = 20
+
+
+def surface_profile(system: OpticalSystem, number: int) -> Profile:
+    """The curve in which the plane x = 0 cuts a surface, over its clear aperture.
+
+    Args:
+        system: the lens; elements with any pose.
+        number: of the surface, from 1.
+
+    Returns:
+        z and y in mm, (samples,), from the lower rim to the upper one; shorter where the sag
+        branch ends before the aperture does, empty where the plane passes by the surface.
+    """
+    return _cut(system, number, system.surfaces[number - 1].aperture.edge)
+
+
+def obscuration_profile(system: OpticalSystem, number: int) -> Profile | None:
+    """The same over the surface's obscuration; None where it has none."""
+    obscuration = system.surfaces[number - 1].aperture.obscuration
+    return None if obscuration is None else _cut(system, number, obscuration)
+
+
+def _cut(system: OpticalSystem, number: int, outline: Outline) -> Profile:
+    rotation, origin = _place(system, number)
+    # In the surface's axes the plane is a·p + o = 0, with a the lens's x seen from the surface.
+    ax, ay, az = rotation[0]
+    offset = origin[0]
+    across = torch.hypot(ax, ay)
+    if float(across) < 1e-9:
+        raise InputError(f"layout: surface {number} faces along x and has no meridional section")
+    ux, uy = ax / across, ay / across
+    # Along the cut, y of the lens grows.
+    sign = 1.0 if float(rotation[1, 1] * ux - rotation[1, 0] * uy) >= 0.0 else -1.0
+    vx, vy = -sign * uy, sign * ux
+
+    def point(q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Points of the cut at q along it: x, y, sag in the surface's axes, and where it exists."""
+        w = (-offset / across).expand_as(q)
+        for _ in range(_NEWTON_STEPS if float(az.abs()) > 0.0 else 1):
+            x, y = vx * q + ux * w, vy * q + uy * w
+            sag, sx, sy, exists = sag_of(system, number, x, y)
+            slope = across + az * (sx * ux + sy * uy)
+            w = w - (across * w + offset + az * sag) / torch.where(slope == 0.0, across, slope)
+        x, y = vx * q + ux * w, vy * q + uy * w
+        sag, _, _, exists = sag_of(system, number, x, y)
+        return x, y, sag, exists
+
+    def inside(q: Tensor) -> Tensor:
+        x, y, _, _ = point(q)
+        return outline.margin(x, y) >= 0.0
+
+    middle = torch.zeros(1, dtype=torch.float64)
+    if not bool(inside(middle)):
+        return np.zeros(0), np.zeros(0)
+    # The rims: the last point inside on either side.
+    near = torch.zeros(2, dtype=torch.float64)
+    far = 1.5 * outline.reach * torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    for _ in range(_BISECTIONS):
+        half = 0.5 * (near + far)
+        kept = inside(half)
+        near, far = torch.where(kept, half, near), torch.where(kept, far, half)
+    share = torch.linspace(0.0, 1.0, SAMPLES, dtype=torch.float64)
+    x, y, sag, exists = point(near[0] * (1.0 - share) + near[1] * share)
+    points = torch.stack([x, y, sag]).T[exists] @ rotation.T + origin
+    return points[:, 2].numpy(), points[:, 1].numpy()
+
+
+def sag_of(
+    system: OpticalSystem, number: int, x: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sag (mm) and slopes in double precision, and where they exist."""
+    surface = system.surfaces[number - 1]
+    parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
+    sag, sx, sy, exists = surface.shape.sag_and_gradient(parameters, x, y)
+    exists = torch.ones_like(sag, dtype=torch.bool) if exists is None else exists >= 0.0
+    return sag, sx, sy, exists
+
+
+def axis_angle(system: OpticalSystem, number: int) -> float:
+    """Angle (radians) from z towards y of a surface's axis, seen along x."""
+    rotation, _ = _place(system, number)
+    return math.atan2(float(rotation[1, 2]), float(rotation[2, 2]))
+
+
+def element_edges(
+    system: OpticalSystem, number: int, front: Profile, back: Profile
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ground edges, upper and lower, of the glass behind a surface, (corners, 2) as z, y.
+
+    They run along the axis of the element that carries both faces.
+    """
+    together = system.axes[number - 1].elements == system.axes[number].elements
+    angle = axis_angle(system, number) if together else 0.0
+    turned = [_turn(face, -angle) for face in (front, back)]
+    upper, lower = (_edge(*turned, end) for end in (-1, 0))
+    return tuple(np.stack(_turn(tuple(edge.T), angle), -1) for edge in (upper, lower))
+
+
+def _turn(profile: Profile, angle: float) -> Profile:
+    z, y = profile
+    c, s = math.cos(angle), math.sin(angle)
+    return c * z - s * y, s * z + c * y
+
+
+def _place(system: OpticalSystem, number: int) -> tuple[Tensor, Tensor]:
+    axes = system.axes[number - 1]
+    if axes.rotation is None:
+        z = float(axes.z)
+        return torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, z], dtype=torch.float64)
+    return axes.rotation.detach().double().cpu(), axes.origin.detach().double().cpu()
+
+
+def _edge(front: Profile, back: Profile, end: int) -> np.ndarray:
+    """The ground edge of an element on one side (end -1: +y, 0: -y), (corners, 2) as z, y.
+
+    A flat from the smaller surface outwards, then a cylinder; a straight line where the flat
+    would cut through the other surface.
+    """
+    a = np.array([front[0][end], front[1][end]])
+    b = np.array([back[0][end], back[1][end]])
+    corner = np.array([a[0], b[1]]) if abs(a[1]) < abs(b[1]) else np.array([b[0], a[1]])
+    outer, inner = (back, front) if abs(a[1]) < abs(b[1]) else (front, back)
+    beyond = np.abs(outer[1]) >= abs(inner[1][end])
+    gap = (outer[0][beyond] - corner[0]) * (1.0 if outer is back else -1.0)
+    return np.stack([a, b]) if gap.min(initial=np.inf) < 0.0 else np.stack([a, corner, b])
+
+
+def trace_fan(
+    system: OpticalSystem,
+    wavelength: float,
+    field_deg: float,
+    rays: int,
+    object_distance: float | None,
+    start: float,
+) -> np.ndarray:
+    """A meridional fan from an object point, over the entrance pupil, to the sensor.
+
+    Args:
+        system: the lens.
+        wavelength: nm.
+        field_deg: the angle of the chief ray in object space, degrees.
+        rays: how many; one alone is the chief ray.
+        object_distance: mm in front of the first vertex, or None for infinity.
+        start: z in mm where the first point of every ray lies, or at the object if that is nearer.
+
+    Returns:
+        (valid rays, surfaces + 2, 3), mm: start, every surface, sensor.
+    """
+    pupil = entrance_pupil(system, wavelength)
+    if object_distance is not None:
+        if not (object_distance > 0.0 and object_distance + float(pupil.z) > 0.0):
+            raise InputError(
+                f"layout: object_distance {object_distance:g} mm must be positive, and in front "
+                f"of the entrance pupil at z = {float(pupil.z):g} mm"
+            )
+        start = max(start, -object_distance)
+    slope = math.tan(math.radians(field_deg))
+
+    def trace(aim: Tensor) -> tuple[Tensor, Tensor]:
+        """Heights in the pupil's plane, (N,), to (N, points, 3) and validity, (N,)."""
+        if object_distance is None:
+            slopes = torch.full_like(aim, slope)
+        else:
+            slopes = slope + aim / (pupil.z + object_distance)
+        y = aim + slopes * (start - pupil.z)
+        n = torch.rsqrt(1.0 + slopes * slopes)
+        zero = torch.zeros_like(y)
+        ray = Components(zero, y, zero + start, zero, slopes * n, n)
+        traced = trace_surfaces(system, ray, wavelength, record=True)
+        traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
+        points = [ray[:3], *traced.points, traced.ray[:3]]
+        return torch.stack([torch.stack(point, -1) for point in points], 1), traced.valid
+
+    if rays == 1:
+        aims = torch.zeros_like(pupil.z).reshape(1)
+    else:
+        reach = 0.5 * _SEARCH * pupil.diameter
+        trials = torch.linspace(-1.0, 1.0, _TRIALS).to(reach) * reach
+        passing = trials[trace(trials)[1]]
+        if not len(passing):
+            return np.zeros((0, len(system.surfaces) + 2, 3))
+        share = torch.linspace(0.0, 1.0, rays).to(reach)
+        aims = passing[0] * (1.0 - share) + passing[-1] * share
+    path, valid = trace(aims)
+    return path[valid].double().cpu().numpy()
