@@ -224,8 +224,8 @@ class CameraModule(lightning.LightningModule):
         self.log("cost/network_s", self.step_seconds[-1] - self.optics_seconds[-1])
         self.log("cost/rays", float(self.renderer.rays_per_image(self.scene)))
         with torch.no_grad():
-            for name, value in self.variables().items():
-                self.log(f"variables/{name}", value.float())
+            for name, value in self._variable_numbers().items():
+                self.log(f"variables/{name}", value)
 
     def _start_optics_backward(self, gradient: Tensor) -> None:
         self._optics_started = time.perf_counter()
@@ -294,13 +294,24 @@ class CameraModule(lightning.LightningModule):
 
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
-        numbers = {f"variables/{name}": float(v.detach()) for name, v in self.variables().items()}
+        numbers = {f"variables/{n}": float(v) for n, v in self._variable_numbers().items()}
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.renderer.rays_per_image(self.scene))
         if self.step_seconds:
             numbers["cost/step_s"] = statistics.median(self.step_seconds)
             numbers["cost/optics_s"] = statistics.median(self.optics_seconds)
             numbers["cost/network_s"] = numbers["cost/step_s"] - numbers["cost/optics_s"]
+        return numbers
+
+    @torch.no_grad()
+    def _variable_numbers(self) -> dict[str, Tensor]:
+        """The variables as metrics: a number as it is, an array by its root mean square."""
+        numbers = {}
+        for name, value in self.variables().items():
+            if value.dim() == 0:
+                numbers[name] = value.float()
+            else:
+                numbers[f"{name}/rms"] = value.float().square().mean().sqrt()
         return numbers
 
     # ---------------------------------------------------------------- checkpoints

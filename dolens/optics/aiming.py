@@ -22,6 +22,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.optics.elements import from_lens_axes
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
@@ -109,8 +110,8 @@ def aim(
         system: the lens.
         field: (..., 2): angles (x, y) in radians for an object at infinity, whose rays have
             direction (tan x, tan y, 1) normalised; else the object point's x and y in mm.
-        pupil: (..., 2), where the rays cross the stop surface, x and y in the lens's axes over the
-            stop's semi-diameter; in the unit disc.
+        pupil: (..., 2), where the rays cross the stop surface, x and y in its own axes over its
+            semi-diameter; in the unit disc.
         wavelength: nm, a number or (...).
         object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
 
@@ -125,8 +126,6 @@ def aim(
     if isinstance(wavelength, Tensor):
         shape = (*torch.broadcast_shapes(shape[:-1], wavelength.shape), 2)
     tangents, target = tangents.expand(shape), target.expand(shape)
-    # The system computes its vertices once and keeps them: let it be inside the graph.
-    _ = system.vertices
     problem = _Problem(system, wavelength, near, tangents.detach(), target.detach())
     with torch.no_grad():
         q, slopes, found = _follow(problem)
@@ -258,7 +257,8 @@ def _miss(
     """By how much (mm) rays miss their points on the stop surface, and whether they reach it."""
     ray = launch(tangents, near, q)
     traced = trace_surfaces(system, ray, wavelength, 1.0, first=1, last=system.stop)
-    return torch.stack((traced.ray.x, traced.ray.y), -1) - target, _reaches(traced)
+    landed = from_lens_axes(traced.ray, system.axes[system.stop - 1])
+    return torch.stack((landed.x, landed.y), -1) - target, _reaches(traced)
 
 
 def _reaches(traced: Trace) -> Tensor:

@@ -201,6 +201,16 @@ def to_lens_axes(ray: Components, axes: Axes) -> Components:
     )
 
 
+def from_lens_axes(ray: Components, axes: Axes) -> Components:
+    """Rays in the lens's axes, seen from a surface's; the inverse of `to_lens_axes`."""
+    x, y, z, l, m, n = ray  # noqa: E741
+    if axes.rotation is None:
+        return Components(x, y, z - axes.z, l, m, n)
+    turn = axes.rotation.mT
+    ox, oy, oz = axes.origin.unbind()
+    return Components(*_turn(turn, x - ox, y - oy, z - oz), *_turn(turn, l, m, n))
+
+
 def _motion(element: ElementState, vertices: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Rotation, pivot and displacement of one element."""
     p = element.parameters

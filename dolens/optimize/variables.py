@@ -16,6 +16,9 @@ _KEYS = ("scale", "initial", "lower", "upper")
 class DesignVariables(nn.Module):
     """Chosen lens parameters θ, held as u = θ/scale so that optimizers see numbers near one.
 
+    A parameter that is an array (the coefficients of a B-spline) counts as many variables, with
+    one scale and the same bounds for all its elements.
+
     Args:
         lens: where the parameters live; it is not changed.
         variables: name or pattern → settings: `scale` (default 1), `initial` (default: the
@@ -29,6 +32,7 @@ class DesignVariables(nn.Module):
     def __init__(self, lens: Lens, variables: Mapping[str, Mapping[str, Any] | None]) -> None:
         super().__init__()
         self.names: list[str] = []
+        self._shapes: list[torch.Size] = []
         scaled, scale, lower, upper = [], [], [], []
         for pattern, settings in variables.items():
             settings = dict(settings or {})
@@ -41,21 +45,24 @@ class DesignVariables(nn.Module):
                 if name in self.names:
                     raise InputError(f"variable '{name}' is named twice (by '{pattern}' too)")
                 s = _setting(settings, "scale", 1.0, pattern)
-                start = _setting(settings, "initial", float(parameter.detach()), pattern)
+                own = parameter.detach().double().flatten().tolist()
+                starts = [_setting(settings, "initial", value, pattern) for value in own]
                 low = _setting(settings, "lower", -math.inf, pattern)
                 high = _setting(settings, "upper", math.inf, pattern)
                 if not s > 0.0:
                     raise InputError(f"variable '{name}': scale must be positive, not {s:g}")
-                if not low <= start <= high:
-                    raise InputError(
-                        f"variable '{name}': initial value {start:g} is outside its bounds "
-                        f"[{low:g}, {high:g}]"
-                    )
+                for start in starts:
+                    if not low <= start <= high:
+                        raise InputError(
+                            f"variable '{name}': initial value {start:g} is outside its bounds "
+                            f"[{low:g}, {high:g}]"
+                        )
                 self.names.append(name)
-                scaled.append(start / s)
-                scale.append(s)
-                lower.append(low / s)
-                upper.append(high / s)
+                self._shapes.append(parameter.shape)
+                scaled += [start / s for start in starts]
+                scale += [s] * len(starts)
+                lower += [low / s] * len(starts)
+                upper += [high / s] * len(starts)
         options = {"dtype": lens.dtype, "device": lens.device}
         self.scaled = nn.Parameter(torch.tensor(scaled, **options))
         self.register_buffer("scale", torch.tensor(scale, **options))
@@ -63,11 +70,16 @@ class DesignVariables(nn.Module):
         self.register_buffer("upper", torch.tensor(upper, **options))
 
     def __len__(self) -> int:
+        """How many parameters; an array is one."""
         return len(self.names)
 
     def forward(self) -> dict[str, Tensor]:
         """The parameters θ = scale·u by name, to be traced with instead of the stored ones."""
-        return dict(zip(self.names, (self.scale * self.scaled).unbind(), strict=True))
+        parts = (self.scale * self.scaled).split([shape.numel() for shape in self._shapes])
+        return {
+            name: part.reshape(shape)
+            for name, part, shape in zip(self.names, parts, self._shapes, strict=True)
+        }
 
     @torch.no_grad()
     def project(self) -> None:

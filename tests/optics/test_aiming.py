@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+import yaml
 
 from dolens import InputError, Status, load_lens
 from dolens.optics.aiming import aim, launch
@@ -338,3 +339,30 @@ def test_forward_mode_and_reverse_mode_agree(root):
     reverse = torch.func.jacrev(height)(value)
     assert forward.abs().max() > 1e-3
     assert (forward - reverse).abs().max() < 1e-12 * forward.abs().max()
+
+
+def test_rays_are_aimed_at_the_stop_where_its_element_has_put_it(root):
+    """The point asked for counts in the stop's own axes, tilted and decentred with it."""
+    text = (root / "conf/lens/cooke_triplet.yaml").read_text(encoding="utf-8")
+    pose = {"surfaces": [3, 4], "decenter_x": 0.4, "decenter_y": -0.3}
+    pose |= {"tilt_x": 4.0, "tilt_y": -3.0}
+    lens = lens_from_prescription(yaml.safe_load(text) | {"elements": {"middle": pose}})
+    assert lens.stop == 4
+    pupil = torch.tensor([[0.0, 0.0], [0.5, 0.0], [-0.3, 0.6]], dtype=torch.float64)
+    rays = lens.aim([2.0, 7.0], pupil)
+    assert rays.converged.all()
+    points = lens.trace(rays, record=True).points[3]
+    axes = lens.system().axes[3]
+    own = (points - axes.origin) @ axes.rotation
+    radius = lens.surfaces["4"].semi_diameter
+    assert (own[:, :2] - pupil * radius).abs().max() < 1e-12 * radius
+    assert (points[0, :2] - torch.tensor([0.4, -0.3]).double()).norm() > 0.01  # turned with z
+    shift = dict(lens.named_parameters())["elements.middle.decenter_y"]
+    (gradient,) = torch.autograd.grad(rays.position[0, 1], shift)
+    start = []
+    for h in (-1e-4, 1e-4):
+        with torch.no_grad():
+            shift += h
+            start.append(float(lens.aim([2.0, 7.0], pupil).position[0, 1]))
+            shift -= h
+    assert float(gradient) == pytest.approx((start[1] - start[0]) / 2e-4, rel=1e-6)

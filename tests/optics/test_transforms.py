@@ -2,9 +2,11 @@
 
 import pytest
 import torch
+import yaml
 from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vmap
 
 from dolens import Rays
+from dolens.prescriptions import lens_from_prescription
 
 EVERY = ["surfaces.*", "thicknesses.*", "sensor_distance"]
 
@@ -103,11 +105,40 @@ def test_double_backward_through_the_rays(bent_lens, bundle):
     assert torch.autograd.gradgradcheck(path, inputs, atol=1e-6, rtol=1e-4)
 
 
+def test_a_batch_of_freeforms(bundle):
+    """Coefficients are arrays: each lens of the batch looks up its own."""
+    row = [-0.01 * (3 * (i - 2.4) ** 2 + i) for i in range(6)]
+    spline = {
+        "type": "b_spline",
+        "half_width": 10.0,
+        "semi_diameter": 9.0,
+        "material": "air",
+        "coefficients": [[h - 0.02 * (j - 3.1) ** 2 for h in row] for j in range(7)],
+    }
+    front = {"radius": 40.0, "semi_diameter": 9.0, "thickness": 5.0, "material": "1.5168/64.17"}
+    lens = lens_from_prescription(
+        {"surfaces": {"1": front, "2": spline}, "sensor": {"distance": 45.0}}
+    )  # fmt: skip
+    rays = bundle(lens)
+    name = "surfaces.2.coefficients"
+    stored = lens.variables([name])[name].detach()
+
+    def points(coefficients):
+        return functional_call(lens, {name: coefficients}, (rays,)).position[..., :2]
+
+    assert lens.trace(rays).valid.all()
+    several = stored * torch.tensor([0.9, 1.0, 1.1]).double()[:, None, None]
+    together = vmap(points)(several)
+    for alone, found in zip(several, together, strict=True):
+        assert (points(alone) - found).abs().max() < 1e-13
+    forward, reverse = jacfwd(points)(stored), jacrev(points)(stored)
+    assert (forward - reverse).abs().max() < 1e-12 * forward.abs().max()
+    assert int((forward.abs().amax(dim=(0, 1)) > 0).sum()) >= 16
+    inputs = stored.clone().requires_grad_()
+    assert torch.autograd.gradgradcheck(points, inputs, atol=1e-6, rtol=1e-4)
+
+
 def test_poses_under_every_transform(root):
-    import yaml
-
-    from dolens.prescriptions import lens_from_prescription
-
     text = (root / "conf/lens/cooke_triplet.yaml").read_text(encoding="utf-8")
     elements = {"1": {"surfaces": [1, 2], "tilt_x": 0.5}, "2": {"surfaces": [3, 4], "shift_z": 0.1}}
     lens = lens_from_prescription(yaml.safe_load(text) | {"elements": elements})

@@ -7,6 +7,7 @@ import torch
 
 from dolens import InputError, load_lens
 from dolens.optimize import DesignVariables
+from dolens.prescriptions import lens_from_prescription
 
 X3, Y3 = "surfaces.5.x3", "surfaces.5.y3"
 
@@ -85,3 +86,32 @@ def test_writing_to_a_lens_and_state(lens):
     other.load_state_dict(variables.state_dict())
     for name, value in variables().items():
         assert torch.equal(other()[name], value)
+
+
+def test_an_array_is_one_variable_with_many_elements():
+    heights = [[0.01 * (i + j) for i in range(5)] for j in range(4)]
+    freeform = lens_from_prescription(
+        {
+            "surfaces": {
+                "1": {"type": "b_spline", "coefficients": heights, "half_width": 3.0,
+                      "semi_diameter": 2.5, "material": "1.5168/64.17"},
+            },
+            "sensor": {"distance": 10.0},
+        }
+    )  # fmt: skip
+    name = "surfaces.1.coefficients"
+    variables = DesignVariables(
+        freeform, {"sensor_distance": None, name: {"scale": 0.01, "upper": 0.05}}
+    )
+    assert (len(variables), variables.scaled.numel()) == (2, 21)
+    assert torch.allclose(variables()[name], torch.tensor(heights, dtype=torch.float64))
+    with torch.no_grad():
+        variables.scaled[1:] += 1.0
+    variables.project()
+    expected = (torch.tensor(heights, dtype=torch.float64) + 0.01).clamp(max=0.05)
+    assert torch.allclose(variables()[name], expected, rtol=1e-14)
+    variables.write_to(freeform)
+    assert torch.allclose(freeform.surfaces["1"].coefficients, expected, rtol=1e-14)
+    # The rays see the values, not the stored coefficients, and send their gradient back.
+    system = freeform.system(variables())
+    assert system.surfaces[0].parameters["coefficients"].grad_fn is not None
