@@ -10,20 +10,9 @@ import yaml
 
 from dolens import InputError, load_lens, save_lens
 from dolens.prescriptions import lens_from_prescription, prescription_of
+from tests.prescriptions.samples import SINGLET
 
 LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))
-
-GOOD = {
-    "name": "Singlet",
-    "index_model": "dfc",
-    "stop": 1,
-    "surfaces": {
-        "1": {"type": "even_asphere", "radius": 20.0, "conic": -0.5, "a4": 1e-6,
-              "semi_diameter": 10, "thickness": 5.0, "material": "1.5168/64.17"},
-        "2": {"type": "sphere", "radius": -50.0, "semi_diameter": 10, "material": "air"},
-    },
-    "sensor": {"distance": 30.0, "diameter": 10.0},
-}  # fmt: skip
 
 
 def test_there_are_lenses():
@@ -74,7 +63,7 @@ def test_any_curvature_survives(tmp_path):
     """1/(1/c) loses a bit for some c; saving must not."""
     generator = torch.Generator().manual_seed(5)
     values = torch.rand(200, generator=generator, dtype=torch.float64) * 0.09 - 0.045
-    lens = lens_from_prescription(GOOD)
+    lens = lens_from_prescription(SINGLET)
     inexact = 0
     for value in (*values, torch.zeros((), dtype=torch.float64)):
         with torch.no_grad():
@@ -87,21 +76,21 @@ def test_any_curvature_survives(tmp_path):
 
 
 def test_a_saved_lens_is_plain_yaml(tmp_path):
-    save_lens(lens_from_prescription(GOOD), tmp_path / "lens.yaml")
+    save_lens(lens_from_prescription(SINGLET), tmp_path / "lens.yaml")
     data = yaml.safe_load((tmp_path / "lens.yaml").read_text())
-    assert data["surfaces"]["1"] == {**GOOD["surfaces"]["1"], "semi_diameter": 10.0}
-    assert data["sensor"] == GOOD["sensor"]
+    assert data["surfaces"]["1"] == {**SINGLET["surfaces"]["1"], "semi_diameter": 10.0}
+    assert data["sensor"] == SINGLET["sensor"]
 
 
 def test_surface_numbers_may_be_written_as_numbers():
-    data = copy.deepcopy(GOOD)
+    data = copy.deepcopy(SINGLET)
     data["surfaces"] = {int(n): row for n, row in reversed(data["surfaces"].items())}
     lens = lens_from_prescription(data)
     assert float(lens.surfaces["1"].curvature.detach()) == 0.05
 
 
 def changed(*path, to=None, remove=False):
-    data = copy.deepcopy(GOOD)
+    data = copy.deepcopy(SINGLET)
     place = data
     for key in path[:-1]:
         place = place[key]
@@ -160,11 +149,11 @@ BAD = {
     "unknown type": (changed(*S1, "type", to="asfere"), "surface 1: type 'asfere' is unknown"),
     "conic of a sphere": (changed("surfaces", "2", "conic", to=1.0),
                           "surface 2: unknown key 'conic'"),
-    "gap in numbering": (changed("surfaces", to={"1": GOOD["surfaces"]["1"],
-                                              "3": GOOD["surfaces"]["2"]}),
+    "gap in numbering": (changed("surfaces", to={"1": SINGLET["surfaces"]["1"],
+                                              "3": SINGLET["surfaces"]["2"]}),
                          "surface 2 is missing"),
     "no surfaces": (changed("surfaces", to={}), "'surfaces' must map surface numbers"),
-    "surfaces as a list": (changed("surfaces", to=[GOOD["surfaces"]["1"]]),
+    "surfaces as a list": (changed("surfaces", to=[SINGLET["surfaces"]["1"]]),
                            "'surfaces' must map surface numbers"),
     "surface without rows": (changed(*S1, to=None), "surface 1: expected a mapping"),
     "no sensor": (changed("sensor", remove=True), "'sensor.distance' is missing"),
@@ -197,7 +186,7 @@ def test_bad_prescriptions(case, tmp_path):
 
 def test_the_good_prescription_is_good(tmp_path):
     path = tmp_path / "good.yaml"
-    path.write_text(yaml.safe_dump(GOOD))
+    path.write_text(yaml.safe_dump(SINGLET))
     load_lens(path)
 
 

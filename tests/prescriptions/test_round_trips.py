@@ -16,6 +16,7 @@ from dolens.prescriptions.source_text import prescription_from_source_text, sour
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
+from tests.prescriptions.samples import SINGLET
 
 LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))
 # What a .zmx file cannot hold, and which surface says so.
@@ -163,19 +164,6 @@ def test_any_lens_through_zemax(data):
             if key not in ("radius", "curvature")
         } | {"type": "aperture"}
     require_equal(lens_from_prescription(FORMATS[".zmx"](data)), lens_from_prescription(data))
-
-
-SINGLET = {
-    "name": "Singlet",
-    "index_model": "dfc",
-    "stop": 1,
-    "surfaces": {
-        "1": {"type": "even_asphere", "radius": 20.0, "conic": -0.5, "a4": 1e-6,
-              "semi_diameter": 10, "thickness": 5.0, "material": "1.5168/64.17"},
-        "2": {"type": "sphere", "radius": -50.0, "semi_diameter": 10, "material": "air"},
-    },
-    "sensor": {"distance": 30.0, "diameter": 10.0},
-}  # fmt: skip
 
 
 def with_row(n="1", **keys):
