@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from dolens.plotting.section import (
     surface_profile,
     trace_fan,
 )
-from dolens.plotting.style import SMALL, TITLE, colours, open_axes
+from dolens.plotting.style import SMALL, TITLE, colours, open_axes, spectral_colour
 
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.1
@@ -41,14 +42,14 @@ _WIDTH = 9.0
 @torch.no_grad()
 def layout_figure(
     lens: Lens,
-    wavelength: float = 587.5618,
+    wavelength: float | Sequence[float] = 587.5618,
     fields_deg: Sequence[float] = (0.0,),
     rays: int = 7,
     object_distance: float | None = None,
     title: str | None = None,
     values: Mapping[str, Tensor] | None = None,
 ) -> Figure:
-    """The section of a lens in the y-z plane, with fans of rays.
+    """The section of a lens in the y-z plane, with fans of rays, coloured by field or wavelength.
 
     Rays are aimed at the paraxial entrance pupil, spread evenly over the part of its plane whose
     rays reach the sensor, so that the outermost graze the apertures that limit the beam.  Rays
@@ -63,7 +64,7 @@ def layout_figure(
 
     Args:
         lens: the lens.
-        wavelength: nm.
+        wavelength: nm; several colour the rays by wavelength, one alone by field.
         fields_deg: angles of the chief rays in object space, from the axis towards +y, degrees.
         rays: rays a field; one alone is the chief ray.
         object_distance: mm in front of the first vertex; None for an object at infinity.
@@ -77,14 +78,17 @@ def layout_figure(
         InputError: there are no fields or rays, a field is not within ±90°, or the object is not
             in front of the entrance pupil and the first vertex.
     """
-    _check(fields_deg, rays)
+    lines = [wavelength] if isinstance(wavelength, int | float) else list(wavelength)
+    _check(fields_deg, rays, lines)
     system = lens.system(values)
     profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
     sensor_z = float(system.vertices[-1])
     front = min((float(z.min()) for z, _ in profiles if len(z)), default=0.0)
     start = front - _LEAD * (sensor_z - min(front, 0.0))
     fans = [
-        trace_fan(system, wavelength, field, rays, object_distance, start) for field in fields_deg
+        Fan(field, line, trace_fan(system, line, field, rays, object_distance, start))
+        for field in fields_deg
+        for line in lines
     ]
     height = max((float(np.abs(y).max()) for _, y in profiles if len(y)), default=1.0)
     height = max(height, 0.5 * (lens.sensor_diameter or 0.0))
@@ -95,11 +99,13 @@ def layout_figure(
         if issubclass(surface.shape, (XYPolynomial, BSpline))
         and _depth(system, number) < _VISIBLE * 2.0 * height
     ]
-    reach = max([height, *(float(np.abs(fan[..., 1]).max()) for fan in fans if len(fan))])
+    reach = max(
+        [height, *(float(np.abs(fan.paths[..., 1]).max()) for fan in fans if len(fan.paths))]
+    )
     z_low, z_high = start - 0.04 * (sensor_z - start), sensor_z + 0.04 * (sensor_z - start)
     half_height = 1.06 * max(reach, _stop_bar(system.stop, profiles, height))
     # Inches that axes and legend take beside the drawing, so that equal scales leave no gaps.
-    legend = 0.8 if len(fans) > 1 or not len(fans[0]) else 0.0
+    legend = 0.8 if len(fans) > 1 or not len(fans[0].paths) else 0.0
     drawn = (_WIDTH - 0.75 - legend) * 2.0 * half_height / (z_high - z_low)
     drawn = min(max(drawn, 1.0), 6.2) + 0.85
     figure = Figure(figsize=(_WIDTH, drawn + (1.9 if plates else 0.0)), layout="constrained")
@@ -114,7 +120,7 @@ def layout_figure(
 
     _draw_axis(axes, z_low, z_high)
     _draw_glass(axes, system, profiles)
-    _draw_rays(axes, fans, fields_deg)
+    _draw_rays(axes, fans)
     _draw_stop(axes, system, profiles, height)
     _draw_obscurations(axes, system)
     half = 0.5 * lens.sensor_diameter if lens.sensor_diameter else reach
@@ -125,11 +131,21 @@ def layout_figure(
     axes.set_xlabel("z (mm)", fontsize=SMALL + 1)
     axes.set_ylabel("y (mm)", fontsize=SMALL + 1)
     open_axes(axes)
-    axes.set_title(_title(lens, system, wavelength) if title is None else title, fontsize=TITLE)
+    axes.set_title(_title(lens, system, lines[0]) if title is None else title, fontsize=TITLE)
     return figure
 
 
-def _check(fields_deg: Sequence[float], rays: int) -> None:
+class Fan(NamedTuple):
+    """Rays of one field (degrees) and wavelength (nm): (rays, points, 3) in mm."""
+
+    field: float
+    wavelength: float
+    paths: np.ndarray
+
+
+def _check(fields_deg: Sequence[float], rays: int, lines: Sequence[float]) -> None:
+    if not lines:
+        raise InputError("layout: at least one wavelength, not none")
     if rays < 1 or not fields_deg:
         raise InputError(f"layout: at least one field and one ray, not {len(fields_deg)}, {rays}")
     for field in fields_deg:
@@ -181,23 +197,42 @@ def _is_glass(system: OpticalSystem, number: int) -> bool:
     return system.materials[number].name not in ("air", "occluder")
 
 
-def _draw_rays(axes: Axes, fans: Sequence[np.ndarray], fields_deg: Sequence[float]) -> None:
-    handles = []
-    for fan, field, colour in zip(fans, fields_deg, colours(len(fans)), strict=True):
-        for path in fan:
-            axes.plot(path[:, 2], path[:, 1], color=colour, linewidth=0.7, gid="ray", zorder=3)
-        label = f"{field:g}°" if len(fan) else f"{field:g}° (no ray passes)"
-        handles.append(Line2D([], [], color=colour, linewidth=1.2, label=label))
-    if len(fans) > 1 or not len(fans[0]):
-        axes.legend(
-            handles=handles,
-            loc="center left",
-            bbox_to_anchor=(1.0, 0.5),
-            frameon=False,
-            fontsize=SMALL,
-            title="field",
-            title_fontsize=SMALL,
+def _draw_rays(axes: Axes, fans: Sequence[Fan]) -> None:
+    lines = sorted({fan.wavelength for fan in fans})
+    by_wavelength = len(lines) > 1
+    keys = lines if by_wavelength else list(dict.fromkeys(fan.field for fan in fans))
+    shades = [spectral_colour(line) for line in lines] if by_wavelength else colours(len(keys))
+    colour_of = dict(zip(keys, shades, strict=True))
+    passing = dict.fromkeys(keys, False)
+    for fan in fans:
+        key = fan.wavelength if by_wavelength else fan.field
+        passing[key] |= len(fan.paths) > 0
+        for path in fan.paths:
+            axes.plot(
+                path[:, 2], path[:, 1], color=colour_of[key], linewidth=0.7, gid="ray", zorder=3
+            )
+    if len(keys) == 1 and passing[keys[0]]:
+        return
+    unit = " nm" if by_wavelength else "°"
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=colour_of[key],
+            linewidth=1.2,
+            label=f"{key:g}{unit}" if passing[key] else f"{key:g}{unit} (no ray passes)",
         )
+        for key in keys
+    ]
+    axes.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        frameon=False,
+        fontsize=SMALL,
+        title="wavelength" if by_wavelength else "field",
+        title_fontsize=SMALL,
+    )
 
 
 def _stop_bar(stop: int, profiles: Sequence[Profile], height: float) -> float:

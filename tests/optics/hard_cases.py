@@ -184,6 +184,11 @@ CASES: dict[str, HardCase] = {
               ((0.0, 0.0, -5.0), (0.0, 0.0, -1.0), "missed", 1),
               ((0.0, 0.0, -5.0), (1.0, 0.0, 0.0), "missed", 1)],
     ),
+    "an asphere that a ray never meets: Newton must not settle": HardCase(
+        [surface("even_asphere", semi_diameter=9.0, **ASPHERE)],
+        ends=[((-20.0, 0.0, -5.0), at_angle(80.0), "missed", 1),
+              ((0.0, 30.0, -5.0), at_angle(45.0, 90.0), "missed", 1)],
+    ),
     "a clipped ray goes on": HardCase(
         singlet(), rays=[], ends=[((9.5, 0.0, -5.0), AXIAL, "vignetted", 1)], sensor=40.0
     ),

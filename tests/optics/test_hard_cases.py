@@ -5,6 +5,7 @@ import torch
 
 from dolens import Rays, Status
 from dolens.prescriptions import lens_from_prescription
+from tests.optics import exact
 from tests.optics.hard_case_errors import WAVELENGTH, measure, traced
 from tests.optics.hard_cases import AXIAL, CASES, from_points, singlet, surface
 
@@ -35,6 +36,11 @@ def test_rays_that_end_say_where_and_why_and_poison_nothing(name, dtype):
         _, _, hit = traced(lens, origin, direction, dtype)
         found = (Status(int(hit.status)).name.lower(), int(hit.surface), bool(hit.valid))
         assert found == (status, number, False)
+        ray = [[exact.mp.mpf(v) for v in vector] for vector in (origin, direction)]
+        assert exact.trace(lens, exact.values_of(lens), *ray, WAVELENGTH)[:2] == (
+            int(hit.status),
+            number,
+        )
         for output in (hit.position, hit.direction, hit.path_length):
             assert output.isfinite().all()
         total = hit.position.sum() + hit.direction.sum() + hit.path_length
@@ -132,3 +138,17 @@ def test_a_sub_range_continues_where_the_whole_trace_stands(first, last):
         Rays(part.position, -part.direction, rays.wavelength), first=first, last=last
     )
     assert torch.allclose(back.position, whole.points[first - 1], rtol=0.0, atol=1e-12)
+
+
+def test_wavelengths_are_one_more_batch_dimension():
+    lens = lens_from_prescription(CASES["object at 1 m"].prescription())
+    position = torch.tensor([[0.0, 1.0, -3.0], [2.0, 0.0, -3.0]], dtype=torch.float64)
+    direction = torch.tensor(AXIAL, dtype=torch.float64)
+    lines = torch.tensor([486.1327, 587.5618, 656.2725], dtype=torch.float64)
+    together = lens.trace(Rays(position, direction, lines[:, None]), record=True)
+    assert together.position.shape == (3, 2, 3)
+    assert together.points.shape == (2, 3, 2, 3)
+    for line, found in zip(lines, together.position, strict=True):
+        alone = lens.trace(Rays(position, direction, float(line))).position
+        assert torch.allclose(found, alone, rtol=1e-14, atol=1e-14)
+    assert (together.position[0] - together.position[2]).abs().max() > 0.01

@@ -101,14 +101,14 @@ def test_an_array_is_one_variable_with_many_elements():
     )  # fmt: skip
     name = "surfaces.1.coefficients"
     variables = DesignVariables(
-        freeform, {"sensor_distance": None, name: {"scale": 0.01, "upper": 0.05}}
+        freeform, {"sensor_distance": None, name: {"scale": 0.01, "upper": 0.075}}
     )
     assert (len(variables), variables.scaled.numel()) == (2, 21)
     assert torch.allclose(variables()[name], torch.tensor(heights, dtype=torch.float64))
     with torch.no_grad():
         variables.scaled[1:] += 1.0
     variables.project()
-    expected = (torch.tensor(heights, dtype=torch.float64) + 0.01).clamp(max=0.05)
+    expected = (torch.tensor(heights, dtype=torch.float64) + 0.01).clamp(max=0.075)
     assert torch.allclose(variables()[name], expected, rtol=1e-14)
     variables.write_to(freeform)
     assert torch.allclose(freeform.surfaces["1"].coefficients, expected, rtol=1e-14)

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from matplotlib.colors import same_color
+from matplotlib.colors import same_color, to_rgb
 
 from dolens.errors import InputError
 from dolens.optics.elements import rotation_matrix
@@ -225,6 +225,24 @@ def test_a_single_precision_lens_is_drawn_too(root):
 def test_what_cannot_be_drawn_is_refused(lens, wrong):
     with pytest.raises(InputError, match="layout"):
         layout_figure(lens("asphere"), **wrong)
+
+
+def test_several_wavelengths_colour_the_rays_from_blue_to_red(root):
+    lens = load_lens(root / "conf/lens/cooke_triplet.yaml")
+    lines = [486.1327, 587.5618, 656.2725]
+    figure = layout_figure(lens, lines, fields_deg=(0.0, 10.0), rays=3)
+    axes = figure.axes[0]
+    drawn = {line.get_color() for line in axes.lines if line.get_gid() == "ray"}
+    assert len([line for line in axes.lines if line.get_gid() == "ray"]) == 3 * 2 * 3
+    assert len(drawn) == 3
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["486.133 nm", "587.562 nm", "656.273 nm"]
+    handles = axes.get_legend().legend_handles
+    red_minus_blue = [to_rgb(h.get_color())[0] - to_rgb(h.get_color())[2] for h in handles]
+    assert red_minus_blue == sorted(red_minus_blue)
+    assert red_minus_blue[0] < 0.0 < red_minus_blue[-1]
+    with pytest.raises(InputError, match="at least one wavelength"):
+        layout_figure(lens, [])
 
 
 def plane_and_sphere(**pose):
