@@ -15,7 +15,7 @@ from dolens.errors import InputError
 # What a surface's block may say and a prescription holds.
 HELD = (
     *("TYPE", "COMM", "STOP", "CURV", "CONI", "PARM", "DISZ", "GLAS"),
-    *("DIAM", "CLAP", "FLAP", "OBDC"),
+    *("DIAM", "CLAP", "FLAP", "SQAP", "OBSC", "SQOB", "OBDC"),
 )
 # What bends no ray: drawing, coatings, mechanical size, and solves whose result is written anyway.
 WITHOUT_EFFECT = (

@@ -1,7 +1,8 @@
 """From the text of a Zemax `.zmx` file to a prescription.
 
 Held: sequential systems of STANDARD and EVENASPH surfaces, glass by model (nd, Vd) or by name,
-circular apertures, fields as angles or object heights, wavelengths, and UNIT MM, CM, IN or METER.
+circular and rectangular apertures and obscurations (`zemax_apertures`), fields as angles or object
+heights, wavelengths, and UNIT MM, CM, IN or METER.
 Everything else that bends rays is an error that says so.
 
 CURV 0, without a decimal point, is a plane; Zemax itself writes 0.0, and that is a curvature
@@ -23,6 +24,7 @@ from dolens.errors import InputError
 from dolens.prescriptions.conditions import PUPIL_KEYS
 from dolens.prescriptions.decimals import number_in_text, radius_of, scaled
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
+from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_system import factor_to_mm, read_system
 
 _TYPES = ("STANDARD", "EVENASPH")
@@ -66,11 +68,12 @@ def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:
     for n, block in enumerate(file.surfaces[1:-1], 1):
         place = f"{where}: surface {n}"
         row = _row(block, before, factor, place)
-        semi_diameter, clips = _semi_diameter(block, factor, place)
+        aperture, clips = read_apertures(block, factor, place)
         beam = n == stops[0] and not prescription.keys().isdisjoint(PUPIL_KEYS)
-        if semi_diameter and (clips or not beam):
-            row["semi_diameter"] = semi_diameter
-        elif not beam and not _is_dummy(row, before):
+        sized = not aperture.keys().isdisjoint(("semi_diameter", "aperture"))
+        if clips or not beam:
+            row |= aperture
+        if not sized and not beam and not _is_dummy(row, before):
             raise InputError(
                 f"{place}: DIAM is missing or 0; write the semi-diameter (a beam on the axis "
                 "alone, which ENPD or FNUM would give, vignettes the fields)"
@@ -101,12 +104,12 @@ def _with_sensor(
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
     for n, row in enumerate(rows, 1):
-        if "semi_diameter" not in row and n != prescription["stop"]:
+        if not ("semi_diameter" in row or "aperture" in row) and n != prescription["stop"]:
             raise InputError(f"{where}: surface {n}: DIAM is missing or 0; write the semi-diameter")
     sensor = {"distance": math.fsum(gaps)}
-    semi_diameter, _ = _semi_diameter(image, factor, place)
-    if semi_diameter and _is_fixed(image):
-        sensor["diameter"] = 2.0 * semi_diameter
+    size = read_apertures(image, factor, place)[0].get("semi_diameter")
+    if size and is_fixed(image):
+        sensor["diameter"] = 2.0 * size
     surfaces = {str(n): row for n, row in enumerate(rows, 1)}
     return {**prescription, "surfaces": surfaces, "sensor": sensor}
 
@@ -212,28 +215,6 @@ def _plain(word: str, place: str) -> str:
     """Decimal text without an exponent; as it stands where it is so already."""
     value = number_in_text(word, place)
     return word if word.replace(".", "", 1).isdecimal() and word[-1] != "." else f"{value!r}"
-
-
-def _semi_diameter(block: Block, factor: Fraction, place: str) -> tuple[float, bool]:
-    """Semi-diameter in mm (0 where there is none), and whether Zemax clips there."""
-    if any(number_in_text(word, f"{place}: OBDC") for word in _arguments(block, "OBDC")[:2]):
-        raise InputError(f"{place}: OBDC, a decentred aperture, is not held")
-    value = scaled(_arguments(block, "DIAM", "0")[0], factor, f"{place}: DIAM")
-    for operand in ("CLAP", "FLAP"):
-        words = _arguments(block, operand)
-        if operand not in block:
-            continue
-        if len(words) < 2 or number_in_text(words[0], f"{place}: {operand}") != 0.0:
-            raise InputError(f"{place}: {operand} must be a full circle, '{operand} 0 radius'")
-        radius = scaled(words[1], factor, f"{place}: {operand}")
-        if operand == "CLAP":
-            return radius, True
-        return value or radius, _is_fixed(block)
-    return value, False
-
-
-def _is_fixed(block: Block) -> bool:
-    return _arguments(block, "DIAM")[1:2] == ["1"]
 
 
 def _is_dummy(row: dict[str, Any], before: str) -> bool:

@@ -9,6 +9,7 @@ from dolens.errors import InputError
 from dolens.prescriptions.checks import as_integer, as_number
 from dolens.prescriptions.compare import require_same
 from dolens.prescriptions.decimals import shifted
+from dolens.prescriptions.zemax_apertures import aperture_lines
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 
 _TYPES = ("plane", "aperture", "sphere", "conic", "even_asphere")
@@ -20,7 +21,7 @@ _POWER = re.compile(r"a(\d+)")
 def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     """Write a prescription as the text of a `.zmx` file (see `encode_zemax`).
 
-    Every semi-diameter is written as a circular aperture, since it clips, and the system's
+    Every semi-diameter is written as an aperture, since it clips, and the system's
     aperture floats by the stop.  Zemax cannot do without a wavelength and a field: where the
     prescription has none, the d line and the axis are written.  A catalogue's name goes into GCAT.
     `occluder` is written as air, which it is in the index models that a file can hold.
@@ -136,10 +137,7 @@ def _surface(row: Mapping[str, Any], place: str) -> list[str]:
                 raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a4 to a16)")
             lines.append(f"  PARM {n // 2} {_text(row[key], place)}")
     lines += _glass(row.get("material"), place)
-    if row.get("semi_diameter") is not None:
-        semi_diameter = _text(row["semi_diameter"], place)
-        lines += [f'  DIAM {semi_diameter} 1 0 0 1 ""', f"  CLAP 0 {semi_diameter} 0"]
-    return lines
+    return lines + aperture_lines(row, place)
 
 
 def _curvature(row: Mapping[str, Any], place: str) -> float:

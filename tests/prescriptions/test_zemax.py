@@ -9,6 +9,7 @@ import torch
 from dolens import InputError, Rays, Status, load_lens
 from dolens.prescriptions.zemax import decode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
+from dolens.prescriptions.zemax_writer import zemax_of
 from tests.prescriptions.samples import require_refused
 
 # The supplement's triplet, written as Zemax writes.
@@ -290,9 +291,11 @@ BAD = {
                          "surface 1: TYPE COORDBRK is not held (allowed: STANDARD, EVENASPH)"),
     "toroid": (singlet("TYPE BICONICX", *GOOD), "surface 1: TYPE BICONICX is not held"),
     "mirror": (singlet("CURV 0.02", "DIAM 5", "GLAS MIRROR 0 0"), "surface 1: GLAS MIRROR"),
-    "rectangle": (singlet(*GOOD, "SQAP 3 4"), "surface 1: operand SQAP (line 18) is not held"),
+    "spider": (singlet(*GOOD, "SPID 3 4"), "surface 1: operand SPID (line 18) is not held"),
+    "half a rectangle": (singlet(*GOOD, "SQAP 3"), "surface 1: SQAP needs two numbers"),
     "decentred aperture": (singlet(*GOOD, "OBDC 0.1 0"), "surface 1: OBDC, a decentred aperture"),
-    "ring": (singlet(*GOOD, "CLAP 1 5 0"), "surface 1: CLAP must be a full circle"),
+    "ring": (singlet(*GOOD, "OBSC 1 2"), "surface 1: OBSC must be a full circle"),
+    "floating ring": (singlet(*GOOD, "FLAP 1 5 0"), "surface 1: FLAP must be a full circle"),
     "several configurations": (singlet(*GOOD) + "MNUM 3 1\n", "MNUM 3: several configurations"),
     "non-sequential": (singlet(*GOOD, head="MODE NSC\n"), "MODE NSC is not held (allowed: SEQ)"),
     "image heights": (singlet(*GOOD, head="FTYP 3 0 1 1\nYFLN 5\n"),
@@ -360,3 +363,43 @@ def test_the_good_file_is_good(tmp_path):
 def test_files_that_are_no_text(data):
     with pytest.raises(InputError, match=r"^x\.zmx: is no"):
         decode_zemax(data, "x.zmx")
+
+
+APERTURES = {
+    "rectangle": {"aperture": {"half_width_x": 5.0, "half_width_y": 4.0}},
+    "ring": {"semi_diameter": 5.0, "obscuration": {"semi_diameter": 2.0}},
+    "rectangular hole": {"semi_diameter": 5.0,
+                         "obscuration": {"half_width_x": 1.0, "half_width_y": 2.0}},
+}  # fmt: skip
+WRITTEN = {
+    "rectangle": "SQAP 5.0 4.0",
+    "ring": "CLAP 2.0 5.0 0",
+    "rectangular hole": "SQOB 1.0 2.0",
+}
+
+
+@pytest.mark.parametrize("shape", APERTURES)
+def test_apertures_of_every_shape_come_back(shape):
+    first = {"radius": 30.0, "thickness": 3.0, "material": "1.5168/64.17"}
+    last = {"radius": -30.0, "semi_diameter": 6.0, "material": "air"}
+    lens = {"name": "Singlet", "sensor": {"distance": 25.0},
+            "surfaces": {"1": first | APERTURES[shape], "2": last}}  # fmt: skip
+    text = zemax_of(lens)
+    assert WRITTEN[shape] in text
+    row = prescription_from_zemax(text)["surfaces"]["1"]
+    assert {key: row.get(key) for key in ("semi_diameter", "aperture", "obscuration")} == {
+        "semi_diameter": None, "aperture": None, "obscuration": None
+    } | APERTURES[shape]  # fmt: skip
+
+
+def test_a_rectangle_with_a_hole_is_refused():
+    row = APERTURES["rectangle"] | {"obscuration": {"semi_diameter": 1.0}}
+    row |= {"radius": 30.0, "material": "1.5168/64.17"}
+    with pytest.raises(InputError, match=r"surface 1: a \.zmx file cannot hold 'obscuration'"):
+        zemax_of({"surfaces": {"1": row}, "sensor": {"distance": 25.0}})
+
+
+def test_an_aperture_is_in_the_file_s_units():
+    text = singlet("CURV 0.1", "DIAM 5", "SQAP 0.5 0.25", GLASS, head="UNIT IN\nFLOA\n")
+    row = prescription_from_zemax(text)["surfaces"]["1"]
+    assert row["aperture"] == {"half_width_x": 12.7, "half_width_y": 6.35}
