@@ -12,6 +12,8 @@ from dolens import Rays, Status, load_lens
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene, pinhole_image
 from dolens.imaging.sensor import Sensor
+from dolens.optics.elements import POSE
+from dolens.prescriptions import lens_from_prescription, load_prescription
 
 ROOT = Path(__file__).resolve().parents[1]
 LENSES = {
@@ -37,7 +39,8 @@ def reference_rays() -> None:
         cells = []
         for dtype in (torch.float64, torch.float32):
             file = ROOT / "conf/lens" / f"{LENSES[data['lens']]}.yaml"
-            lens = load_lens(file, dtype=dtype, index_model=data["index_model"])
+            prescription = load_prescription(file) | {"elements": _elements(data)}
+            lens = lens_from_prescription(prescription, dtype, data["index_model"])
             if "cubic" in data["lens"]:
                 lens.surfaces["5"].x3.fill_(1e-4)
                 lens.surfaces["5"].y3.fill_(1e-4)
@@ -47,6 +50,15 @@ def reference_rays() -> None:
             differ = int((hit.status != status).sum())
             cells.append(f"{str(dtype)[6:]} {float(error):.1e} ({differ})")
         print(f"  {path.stem:32s}", "  ".join(cells))
+
+
+def _elements(data: dict) -> dict:
+    """The file's poses as a prescription writes them."""
+    elements = {}
+    for name, pose in data.get("pose", {"elements": {}})["elements"].items():
+        numbers = [float(value) for value in (*pose["theta_deg"], *pose["shift"])]
+        elements[name] = {"surfaces": pose["surfaces"], **dict(zip(POSE, numbers, strict=True))}
+    return elements
 
 
 def registration() -> None:
