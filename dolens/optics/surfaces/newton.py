@@ -80,8 +80,8 @@ class _Root(torch.autograd.Function):
             if b:
                 t = t.reshape(size, *(1,) * (rank - t.dim() + 1), *t.shape[1:])
             ready.append(t)
-        shape = torch.broadcast_shapes((size,), *(t.shape[:1] for t in ready[:6] if t.dim() > rank))
-        full = torch.broadcast_shapes(*(t.shape for t in ready[:6]), (*shape, *(1,) * rank))
+        # Where the parameters alone differ, the first guess is one for all: it becomes the batch.
+        full = torch.broadcast_shapes((size, *(1,) * rank), *(t.shape for t in ready[:6]))
         ready[0] = ready[0].expand(full)
         return _Root.apply(step, names, scale, *ready), 0
 
