@@ -14,18 +14,15 @@ from dolens.optics.fields import Fields
 from dolens.optics.materials import Medium
 from dolens.optics.paraxial import FirstOrder, first_order, vergence
 from dolens.optics.paraxial_rays import ParaxialRays, paraxial_rays
-from dolens.optics.rays import Components, Rays, TracedRays
+from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.seidel import Seidel, seidel
 from dolens.optics.surfaces.base import Surface, SurfaceState
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import (
-    Trace,
-    distance_to_plane,
-    first_failure,
-    stop_gradient_where_invalid,
+    enter_lens,
     trace_surfaces,
     trace_to_plane,
-    transfer,
+    traced_rays,
 )
 
 
@@ -190,13 +187,13 @@ class Lens(nn.Module):
         """
         system = self.system()
         self._check_range(first, last)
-        ray, before = self._components(rays, system, first, 1.0)
+        ray, before = enter_lens(system, rays, first, 1.0)
         traced = trace_surfaces(
             system, ray, rays.wavelength, 1.0, True, record, first=first, last=last
         )
         if last is None:
             traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, 1.0)
-        return _result(traced, before)
+        return traced_rays(traced, before)
 
     def sensor_to_scene(
         self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
@@ -214,11 +211,11 @@ class Lens(nn.Module):
         """
         system = self.system()
         self._check_range(first, last)
-        ray, before = self._components(rays, system, last or len(self.surfaces), -1.0)
+        ray, before = enter_lens(system, rays, last or len(self.surfaces), -1.0)
         traced = trace_surfaces(
             system, ray, rays.wavelength, -1.0, True, record, first=first, last=last
         )
-        return _result(traced, before)
+        return traced_rays(traced, before)
 
     def first_order(
         self, wavelength: float | Tensor = 587.5618, object_distance: float | Tensor | None = None
@@ -321,44 +318,3 @@ class Lens(nn.Module):
             raise InputError(
                 f"lens '{self.name}': surfaces {first} to {last} are no range of 1 to {count}"
             )
-
-    def _components(
-        self, rays: Rays, system: OpticalSystem, number: int, sense: float
-    ) -> tuple[Components, Tensor | None]:
-        """Rays in the lens's precision, and the optical path to where they were moved, or None.
-
-        Rays of a finer precision than the lens's are moved to the first vertex that they meet
-        before they lose it: a source at 10 km would come out 0.1 mm off.
-        """
-        ray = Components(*(c.to(device=self.device) for c in rays.components()))
-        finer = torch.promote_types(ray.x.dtype, self.dtype)
-        if finer == self.dtype:
-            return Components(*(c.to(self.dtype) for c in ray)), None
-        distance, _ = distance_to_plane(ray, system.vertices[number - 1].to(finer), sense)
-        indices = system.indices(rays.wavelength)
-        index = indices[number - 1 if sense > 0.0 else number]
-        moved = Components(*(c.to(self.dtype) for c in transfer(ray, distance)))
-        return moved, (index * distance).to(self.dtype)
-
-
-def _result(traced: Trace, path_before: Tensor | None) -> TracedRays:
-    path = traced.path_length if path_before is None else traced.path_length + path_before
-    status, surface = first_failure(traced)
-    kept = [stop_gradient_where_invalid(c, traced.valid) for c in traced.ray]
-    points = None
-    if traced.points:
-        points = torch.stack(
-            [
-                torch.stack([stop_gradient_where_invalid(c, traced.valid) for c in point], -1)
-                for point in traced.points
-            ]
-        )
-    return TracedRays(
-        position=torch.stack(kept[:3], -1),
-        direction=torch.stack(kept[3:], -1),
-        valid=traced.valid,
-        status=status,
-        surface=surface,
-        path_length=stop_gradient_where_invalid(path, traced.valid),
-        points=points,
-    )
