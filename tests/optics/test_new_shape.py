@@ -24,10 +24,6 @@ class Wedge(Surface):
         sag = p["slope_x"] * x + p["slope_y"] * y
         return sag, p["slope_x"].expand_as(sag), p["slope_y"].expand_as(sag), None
 
-    @classmethod
-    def paraxial_curvature(cls, p):
-        return 0.0
-
 
 @pytest.fixture
 def with_wedge(monkeypatch):
@@ -68,6 +64,32 @@ def test_a_shape_defined_in_ten_lines_is_traced_exactly(with_wedge):
     assert (a.points - b.points)[:, a.valid].abs().max() < 1e-13
     assert (a.direction - b.direction)[a.valid].abs().max() < 1e-14
     assert (a.path_length - b.path_length)[a.valid].abs().max() < 1e-13
+
+
+class Trough(Surface):
+    """A cylindrical parabola, z = bend·x²/2."""
+
+    kind = "trough"
+
+    @classmethod
+    def parameter_names(cls, keys):
+        return ["bend"]
+
+    @classmethod
+    def sag_and_gradient(cls, p, x, y):
+        return 0.5 * p["bend"] * x * x, p["bend"] * x, torch.zeros_like(y * x), None
+
+
+def test_its_paraxial_properties_follow_from_its_sag(with_wedge, monkeypatch):
+    """A trough bends in one of two azimuths: half its curvature on average, G = -(bend/2)³/8."""
+    assert float(prism({"type": "wedge"}).first_order().power.detach()) == 0.0
+    monkeypatch.setitem(SURFACES, "trough", Trough)
+    lens = prism({"type": "trough", "bend": 0.02})
+    expected = (1.0 - 1.5168) * 0.5 * 0.02
+    assert float(lens.first_order().power.detach()) == pytest.approx(expected, rel=1e-13)
+    surface = lens.surfaces["2"]
+    departure = surface.fourth_order_departure(dict(surface.named_parameters()))
+    assert float(departure.detach()) == pytest.approx(-(0.01**3) / 8.0, rel=1e-13)
 
 
 def test_it_has_gradients_a_prescription_and_statuses(with_wedge):

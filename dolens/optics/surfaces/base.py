@@ -174,8 +174,12 @@ class Surface(nn.Module):
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
-        """Curvature at the vertex (1/mm), the mean over azimuth."""
-        raise NotImplementedError
+        """Curvature at the vertex (1/mm), the mean over azimuth.
+
+        Here: from the derivative of the slopes at the vertex, for any sag.
+        """
+        slope, origin = cls._slope_by_azimuth(p)
+        return _derivative(slope)(origin).mean()
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
@@ -186,6 +190,13 @@ class Surface(nn.Module):
         G is the average over azimuth, which three azimuths 60° apart give exactly, since a quartic
         form has harmonics 0, 2 and 4 only.
         """
+        slope, origin = cls._slope_by_azimuth(p)
+        fourth = _derivative(_derivative(_derivative(slope)))(origin)
+        return fourth.mean() / 24.0 - cls.paraxial_curvature(p) ** 3 / 8.0
+
+    @classmethod
+    def _slope_by_azimuth(cls, p: Parameters) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+        """The slope along three azimuths 60° apart at distances r (3,), and r at the vertex."""
         like = next(iter(p.values()))
         azimuth = torch.arange(3, dtype=like.dtype, device=like.device) * (math.pi / 3.0)
         cosine, sine = torch.cos(azimuth), torch.sin(azimuth)
@@ -194,8 +205,7 @@ class Surface(nn.Module):
             _, sx, sy, _ = cls.sag_and_gradient(p, r * cosine, r * sine)
             return sx * cosine + sy * sine
 
-        fourth = _derivative(_derivative(_derivative(slope)))(torch.zeros_like(azimuth))
-        return fourth.mean() / 24.0 - cls.paraxial_curvature(p) ** 3 / 8.0
+        return slope, torch.zeros_like(azimuth)
 
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
