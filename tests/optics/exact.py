@@ -9,6 +9,7 @@ quadric or by bracketing, and derivatives are differences at 80 digits.  It take
 import random
 
 import mpmath
+import numpy as np
 
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
 
@@ -22,8 +23,19 @@ DERIVATIVE_STEP = mp.mpf(10) ** -18
 
 
 def values_of(lens):
-    """Name → number of every parameter of a lens, as it is stored in its precision."""
-    return {name: mp.mpf(float(p.detach())) for name, p in lens.named_parameters()}
+    """Name → number of every parameter of a lens, as it is stored in its precision.
+
+    The elements of an array are numbers of their own, `name[j,i]`, in row-major order.
+    """
+    values = {}
+    for name, parameter in lens.named_parameters():
+        array = parameter.detach()
+        if array.dim() == 0:
+            values[name] = mp.mpf(float(array))
+        else:
+            for place in np.ndindex(*array.shape):
+                values[f"{name}[{','.join(map(str, place))}]"] = mp.mpf(float(array[place]))
+    return values
 
 
 def trace(lens, values, origin, direction, wavelength):
@@ -46,6 +58,7 @@ def trace(lens, values, origin, direction, wavelength):
             for name, v in values.items()
             if name.startswith(f"surfaces.{number}.")
         }
+        own |= {name: [mp.mpf(float(k)) for k in b] for name, b in surface.named_buffers()}
         rotation, vertex = _place(lens, values, i + 1, z)
         q, e = rotation.T * (p - vertex), rotation.T * d
         t = _meet(surface.kind, own, surface.semi_diameter, q, e)
@@ -85,6 +98,14 @@ def derivatives(function, values):
 
 
 def _sag(kind, p, x, y):
+    """Sag, or None beyond the knots of a B-spline."""
+    if kind == "b_spline":
+        bx, by = (_basis(p[f"knots_{axis}"], u) for axis, u in (("x", x), ("y", y)))
+        if not (bx and by):
+            return None
+        return mp.fsum(
+            p[f"coefficients[{j},{i}]"] * v * u for j, v in by.items() for i, u in bx.items()
+        )
     if kind in ("plane", "aperture"):
         return mp.mpf(0)
     if kind == "xy_polynomial":
@@ -100,6 +121,21 @@ def _sag(kind, p, x, y):
     r2 = x**2 + y**2
     sag = c * r2 / (1 + mp.sqrt(1 - (1 + k) * c**2 * r2))
     return sag + sum(a * r2 ** (int(n[1:]) // 2) for n, a in p.items() if n[0] == "a")
+
+
+def _basis(knots, u):
+    """Index → value of the cubic B-splines that do not vanish at u, by their definition."""
+    value = {i: mp.mpf(1) for i in range(len(knots) - 1) if knots[i] <= u < knots[i + 1]}
+    for degree in (1, 2, 3):
+        higher = {}
+        for i, v in value.items():
+            width = knots[i + degree] - knots[i]
+            if width > 0:
+                # N_i rises in N_i of the next degree, and falls in N_{i-1}.
+                higher[i] = higher.get(i, 0) + v * (u - knots[i]) / width
+                higher[i - 1] = higher.get(i - 1, 0) + v * (knots[i + degree] - u) / width
+        value = higher
+    return value if knots[3] < u < knots[-4] else {}
 
 
 def _slopes(kind, p, x, y):
@@ -151,7 +187,8 @@ def _bracketed_roots(kind, p, semi_diameter, q, e):
     """
 
     def f(t):
-        return q[2] + t * e[2] - _sag(kind, p, q[0] + t * e[0], q[1] + t * e[1])
+        sag = _sag(kind, p, q[0] + t * e[0], q[1] + t * e[1])
+        return None if sag is None else q[2] + t * e[2] - sag
 
     reach = mp.mpf("1.2") * semi_diameter
     low, high = (-q[2] - 2 * reach) / e[2], (-q[2] + 2 * reach) / e[2]
@@ -168,7 +205,7 @@ def _bracketed_roots(kind, p, semi_diameter, q, e):
     return [
         mp.findroot(f, (ts[i], ts[i + 1]), solver="anderson", tol=mp.mpf(10) ** -140)
         for i in range(SAMPLES)
-        if fs[i] < 0 <= fs[i + 1] or fs[i] >= 0 > fs[i + 1]
+        if None not in fs[i : i + 2] and (fs[i] < 0) != (fs[i + 1] < 0)
     ]
 
 

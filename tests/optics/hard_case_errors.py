@@ -76,13 +76,19 @@ def _one_ray(lens, stored, origin, direction, dtype):
     errors = [abs(v - e) for v, e in zip(hit.position.tolist()[:2], expected, strict=True)]
     moves = exact.sensitivity(lambda v: list(point(v))[:2], inputs)
     total = WEIGHTS[0] * hit.position[0] + WEIGHTS[1] * hit.position[1]
-    found = torch.autograd.grad(total, list(lens.parameters()), allow_unused=True)
+    parameters = list(lens.parameters())
+    gradient_of = torch.autograd.grad(total, parameters, allow_unused=True)
+    found = [
+        number
+        for p, g in zip(parameters, gradient_of, strict=True)
+        for number in (torch.zeros_like(p) if g is None else g).flatten().tolist()
+    ]
     slopes = gradients(inputs)
     largest = max(abs(s) for s in slopes)
     slope_moves = exact.sensitivity(gradients, inputs, draws=2)
     relative, roundings = [], []
     for gradient, slope, move in zip(found, slopes, slope_moves, strict=True):
-        error = abs((0.0 if gradient is None else float(gradient)) - slope)
+        error = abs(gradient - slope)
         if abs(slope) <= TINY * largest:
             # Zero by symmetry: what is left is rounding of terms as large as the other slopes.
             slope = move = largest or 1

@@ -43,8 +43,9 @@ def at_angle(degrees, azimuth=0.0):
 
 
 def surface(kind="sphere", **row):
-    """One row of a prescription."""
-    return {"type": kind, "semi_diameter": 10.0, "material": GLASS} | row
+    """One row of a prescription; None leaves a key out."""
+    row = {"type": kind, "semi_diameter": 10.0, "material": GLASS} | row
+    return {key: value for key, value in row.items() if value is not None}
 
 
 def singlet(scale=1.0):
@@ -74,6 +75,12 @@ BELOW = math.degrees(math.asin(math.sin(CRITICAL) * (1.0 - 1e-6)))
 ABOVE = math.degrees(math.asin(math.sin(CRITICAL) * (1.0 + 1e-6)))
 
 ASPHERE = {"curvature": 0.08, "conic": -1.2, "a4": -1e-4, "a6": 2e-6, "a8": -1e-8, "a10": 5e-11}
+
+# Nine by four coefficients: a parabola's depth with bumps; two knots are repeated.
+KNOTS_X = [-10.0] * 4 + [-2.0, -2.0, 1.0, 1.0, 1.0] + [10.0] * 4
+BUMPS = [[0.02 * ((i - 4) ** 2 + (j - 1.5) ** 2) + 0.1 * ((3 * i + 5 * j) % 4) for i in range(9)]
+         for j in range(4)]  # fmt: skip
+SPLINE = {"coefficients": BUMPS, "knots_x": KNOTS_X, "half_width_y": 10.0}
 
 CASES: dict[str, HardCase] = {
     "near-tangent incidence on a sphere": HardCase(
@@ -146,6 +153,17 @@ CASES: dict[str, HardCase] = {
         [surface("xy_polynomial", semi_diameter=8.0, x2=0.02, y2=0.015, xy=1e-3, x3=2e-4, x2y=-1e-4,
                  y4=1e-5, b=0.05)],
         rays=[((5.0, 3.0, -2.0), at_angle(20.0, 30.0)), ((-4.0, 6.0, -2.0), AXIAL)],
+    ),
+    "B-spline, beside a double and a triple knot": HardCase(
+        [surface("b_spline", semi_diameter=8.0, **SPLINE)],
+        rays=[((-2.000001, 3.0, -5.0), AXIAL), ((0.999999, -2.0, -5.0), AXIAL)],
+    ),
+    "B-spline, 0.01 mm from a corner": HardCase(
+        [surface("b_spline", semi_diameter=None, **SPLINE,
+                 aperture={"half_width_x": 9.999, "half_width_y": 9.999})],
+        rays=[((-9.99, 9.99, -5.0), AXIAL)],
+        ends=[((10.01, 0.0, -5.0), AXIAL, "missed", 1)],
+        sensor=20.0,
     ),
     "a millionth below total reflection": HardCase(
         [surface(radius=math.inf, semi_diameter=50.0, material="air")],
