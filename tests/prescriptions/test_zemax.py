@@ -1,95 +1,13 @@
-"""Zemax's .zmx format: what its files mean, and what is wrong with bad ones."""
+"""Zemax's .zmx format: what its files mean."""
 
 import codecs
-import math
 
 import pytest
 import torch
 
-from dolens import InputError, Rays, Status, load_lens
-from dolens.prescriptions.zemax import decode_zemax
+from dolens import Rays, Status, load_lens
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
-from tests.prescriptions.samples import require_refused
-
-# The supplement's triplet, written as Zemax writes.
-HEAD = """VERS 140124 258 36214
-MODE SEQ
-NAME Cooke triplet for 35 µm
-NOTE 0 Supplement, Section III C
-PFIL 0 0 0
-LANG 0
-UNIT MM X W X CM MR CPMM
-FLOA
-ENVD 2.0E+1 1 0
-GFAC 0 0
-GCAT SCHOTT MISC
-RAIM 0.0 0 1 1 0 0 0 0 0
-FTYP 0 0 3 3 0 0 0
-ROPD 2
-XFLN 0.0 0.0 0.0 0.0 0.0 0.0
-YFLN 0.0 1.4E+1 2.0E+1 0.0 0.0 0.0
-FWGN 1.0 1.0 1.0 1.0 1.0 1.0
-VCXN 0.0 0.0 0.0 0.0 0.0 0.0
-WAVM 1 4.861327E-1 1
-WAVM 2 5.875618E-1 1
-WAVM 3 6.562725E-1 1
-WAVM 4 5.5E-1 1
-PWAV 2
-GLRS 1 0
-"""
-TRIPLET = [
-    ("22.014", "3.259", "GLAS ___BLANK 1 0 1.6204 6.031E+1 0 0 0 0 0 0", "9.5"),
-    ("-435.76", "6.008", "", "9.5"),
-    ("-22.213", "1", "GLAS ___BLANK 1 0 1.62 3.637E+1 0 0 0 0 0 0", "4"),
-    ("20.292", "4.75", "", "3.86"),
-    ("79.684", "2.952", "GLAS ___BLANK 1 0 1.6204 6.031E+1 0 0 0 0 0 0", "7.5"),
-    ("-18.395", "42.208", "", "7.5"),
-]
-TAIL = """BLNK
-TOL TOFF   0   0 0.0000000000000000E+00 0.0000000000000000E+00   0 0 0 0 0
-EFFL 0 2 0 0 0 0 50 1 0 0
-MNUM 1 1
-MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""
-"""
-
-
-def surface(n, *lines):
-    common = ("FIMP ", "", "HIDE 0 0 0 0 0 0 0 0 0 0", "MIRR 2 0.0", "SLAB 3")
-    return "".join([f"SURF {n}\n", *(f"  {line}\n" for line in (*common, *lines) if line)])
-
-
-def standard(n, radius, thickness, glass="", semi_diameter="5", *more):
-    return surface(
-        n,
-        *more,
-        "TYPE STANDARD",
-        f'CURV {1.0 / float(radius)!r} 0 0.0 0.0 0 ""',
-        f"DISZ {thickness}",
-        glass,
-        f'DIAM {semi_diameter} 1 0 0 1 ""',
-        f"FLAP 0 {semi_diameter} 0",
-    )
-
-
-def triplet():
-    rows = [standard(n, *row, *(["STOP"] if n == 4 else [])) for n, row in enumerate(TRIPLET, 1)]
-    target = surface(0, "TYPE STANDARD", "CURV 0.0", "DISZ INFINITY")
-    image = surface(7, "TYPE STANDARD", "CURV 0.0", "DISZ 0", 'DIAM 18.173 1 0 0 1 ""')
-    return "".join([HEAD, target, *rows, image, TAIL])
-
-
-def singlet(*first, head="FLOA\n", last="DIAM 5", object_distance="INFINITY", image=""):
-    """A file whose surface 1, the stop, has these lines."""
-    return "".join(
-        (
-            head,
-            surface(0, f"DISZ {object_distance}"),
-            surface(1, "STOP", *first),
-            surface(2, "CURV -0.02", "DISZ 40", last),
-            surface(3, image),
-        )
-    )
+from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet, surface, triplet
 
 
 def numbers(rows):
@@ -186,15 +104,6 @@ def test_wavelengths_are_the_nearest_doubles_in_nm():
     assert found["reference_wavelength"] == 656.2725
 
 
-def lens_of(text, tmp_path):
-    path = tmp_path / "lens.zmx"
-    path.write_text(text)
-    return load_lens(path).requires_grad_(False)
-
-
-GLASS = "GLAS ___BLANK 1 0 1.5168 64.17"
-
-
 @pytest.mark.parametrize("diam", ["", "DIAM 0", "DIAM 12 0", "DIAM 12 1"])
 def test_the_beam_sizes_the_stop(diam, tmp_path):
     """ENPD and FNUM say the beam; a DIAM that does not clip in Zemax does not enlarge it."""
@@ -283,123 +192,3 @@ def test_a_square_term_that_is_a_curvature(c, k, tmp_path):
 def test_a_distance_of_ten_million_metres_is_infinity():
     text = singlet("CURV 0.02", "DIAM 5", object_distance="1.0E+10")
     assert "object_distance" not in prescription_from_zemax(text)
-
-
-GOOD = ("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
-BAD = {
-    "coordinate break": (singlet("TYPE COORDBRK", *GOOD),
-                         "surface 1: TYPE COORDBRK is not held (allowed: STANDARD, EVENASPH)"),
-    "toroid": (singlet("TYPE BICONICX", *GOOD), "surface 1: TYPE BICONICX is not held"),
-    "mirror": (singlet("CURV 0.02", "DIAM 5", "GLAS MIRROR 0 0"), "surface 1: GLAS MIRROR"),
-    "spider": (singlet(*GOOD, "SPID 3 4"), "surface 1: operand SPID (line 18) is not held"),
-    "half a rectangle": (singlet(*GOOD, "SQAP 3"), "surface 1: SQAP needs two numbers"),
-    "decentred aperture": (singlet(*GOOD, "OBDC 0.1 0"), "surface 1: OBDC, a decentred aperture"),
-    "ring": (singlet(*GOOD, "OBSC 1 2"), "surface 1: OBSC must be a full circle"),
-    "floating ring": (singlet(*GOOD, "FLAP 1 5 0"), "surface 1: FLAP must be a full circle"),
-    "several configurations": (singlet(*GOOD) + "MNUM 3 1\n", "MNUM 3: several configurations"),
-    "non-sequential": (singlet(*GOOD, head="MODE NSC\n"), "MODE NSC is not held (allowed: SEQ)"),
-    "image heights": (singlet(*GOOD, head="FTYP 3 0 1 1\nYFLN 5\n"),
-                      "FTYP 3 (real image heights) is not held (allowed: 0, angles; 1, object"),
-    "telecentric": (singlet(*GOOD, head="FTYP 0 1 1 1\nYFLN 5\n"), "telecentric object space"),
-    "numerical aperture": (singlet(*GOOD, head="OBNA 0.1 0\n"),
-                           "OBNA is not held (allowed: ENPD, FNUM, FLOA)"),
-    "working F-number": (singlet(*GOOD, head="FNUM 4 1\n", object_distance="100"),
-                         "FNUM as a working F-number is not held for a finite object"),
-    "unknown unit": (singlet(*GOOD, head="UNIT PARSEC\n"),
-                     "UNIT PARSEC is unknown (allowed: MM, CM, IN, METER)"),
-    "no diameter": (singlet("CURV 0.02", "DISZ 4", GLASS),
-                    "surface 1: DIAM is missing or 0; write the semi-diameter"),
-    "no diameter behind the stop": (singlet(*GOOD, last="", head="ENPD 3\n"),
-                                    "surface 2: DIAM is missing or 0"),
-    "square term": (singlet("TYPE EVENASPH", "PARM 1 1E-3", *GOOD),
-                    "surface 1: PARM 1, the r² term of EVENASPH, must be 0 unless"),
-    "ninth coefficient": (singlet("TYPE EVENASPH", "PARM 9 1E-3", *GOOD),
-                          "surface 1: PARM (line 15): must be from 1 to 8, not 9"),
-    "coefficient of a sphere": (singlet("TYPE STANDARD", "PARM 2 1E-3", *GOOD),
-                                "surface 1: TYPE STANDARD has no PARM"),
-    "partial dispersion": (singlet("CURV 0.02", "DIAM 5", "GLAS ___BLANK 1 0 1.5 60 0.01"),
-                           "surface 1: GLAS ___BLANK: the deviation of its dispersion"),
-    "half a glass": (singlet("CURV 0.02", "DIAM 5", "GLAS ___BLANK 1 0 1.5"),
-                     "surface 1: GLAS ___BLANK needs nd and Vd"),
-    "words for numbers": (singlet("CURV big", "DIAM 5"),
-                          "surface 1: CURV must be a number, not 'big'"),
-    "nan": (singlet("CURV nan", "DIAM 5"), "surface 1: CURV must be a finite number, not 'nan'"),
-    "out of range": (singlet("CURV 0.1", "DIAM 1e308", head="UNIT IN\n"),
-                     "surface 1: DIAM is out of the range of double precision"),
-    "endless gap": (singlet("CURV 0.1", "DIAM 5", "DISZ INFINITY"),
-                    "surface 1: DISZ must be a finite number"),
-    "no stop": (singlet(*GOOD).replace("  STOP\n", ""),
-                "one surface from 1 to 2 must be the STOP, not none"),
-    "two stops": (singlet(*GOOD, last="STOP\n  DIAM 5"), "must be the STOP, not 1, 2"),
-    "missing number": (singlet(*GOOD).replace("SURF 2", "SURF 5"), "expected SURF 2, not 'SURF 5'"),
-    "no surfaces": ("MODE SEQ\n", "needs an object, a surface and an image"),
-    "round image": (singlet(*GOOD, image="CURV 0.1"), "surface 3 (the image): must be a plane"),
-    "round object": (singlet(*GOOD).replace("SURF 1", "  CURV 0.1\nSURF 1"),
-                     "surface 0 (the object): must be a plane"),
-    "primary wavelength": (singlet(*GOOD, head="WAVM 1 0.55 1\nPWAV 2\n"),
-                           "PWAV 2 is none of the wavelengths 1 to 1"),
-    "too few fields": (singlet(*GOOD, head="FTYP 0 0 3 1\nYFLN 0 5\n"), "FTYP says 3 fields"),
-    "heights at infinity": (singlet(*GOOD, head="FTYP 1 0 1 1\nYFLN 5\n"),
-                            "'fields.heights' need an 'object_distance'"),
-    "aperture beyond the sphere": (singlet("CURV 0.2", "DIAM 6", GLASS),
-                                   "surface 1: semi_diameter 6 mm exceeds"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_files(case, tmp_path):
-    require_refused(tmp_path / "bad.zmx", *BAD[case])
-
-
-def test_the_good_file_is_good(tmp_path):
-    lens = lens_of(singlet(*GOOD), tmp_path)
-    n = lens.materials[1].index(587.5618)
-    power = 2 * (n - 1) * 0.02 - (n - 1) ** 2 * 0.02**2 * 4 / n
-    assert float(lens.first_order().efl) == pytest.approx(1 / power, rel=1e-12)
-    assert math.isclose(n, 1.5168, rel_tol=1e-15)
-
-
-@pytest.mark.parametrize("data", [b"\xff\xfe\x00", b"\xef\xbb\xbf\xff", b"SURF 0\0\0\0"])
-def test_files_that_are_no_text(data):
-    with pytest.raises(InputError, match=r"^x\.zmx: is no"):
-        decode_zemax(data, "x.zmx")
-
-
-APERTURES = {
-    "rectangle": {"aperture": {"half_width_x": 5.0, "half_width_y": 4.0}},
-    "ring": {"semi_diameter": 5.0, "obscuration": {"semi_diameter": 2.0}},
-    "rectangular hole": {"semi_diameter": 5.0,
-                         "obscuration": {"half_width_x": 1.0, "half_width_y": 2.0}},
-}  # fmt: skip
-WRITTEN = {
-    "rectangle": "SQAP 5.0 4.0",
-    "ring": "CLAP 2.0 5.0 0",
-    "rectangular hole": "SQOB 1.0 2.0",
-}
-
-
-@pytest.mark.parametrize("shape", APERTURES)
-def test_apertures_of_every_shape_come_back(shape):
-    first = {"radius": 30.0, "thickness": 3.0, "material": "1.5168/64.17"}
-    last = {"radius": -30.0, "semi_diameter": 6.0, "material": "air"}
-    lens = {"name": "Singlet", "sensor": {"distance": 25.0},
-            "surfaces": {"1": first | APERTURES[shape], "2": last}}  # fmt: skip
-    text = zemax_of(lens)
-    assert WRITTEN[shape] in text
-    row = prescription_from_zemax(text)["surfaces"]["1"]
-    assert {key: row.get(key) for key in ("semi_diameter", "aperture", "obscuration")} == {
-        "semi_diameter": None, "aperture": None, "obscuration": None
-    } | APERTURES[shape]  # fmt: skip
-
-
-def test_a_rectangle_with_a_hole_is_refused():
-    row = APERTURES["rectangle"] | {"obscuration": {"semi_diameter": 1.0}}
-    row |= {"radius": 30.0, "material": "1.5168/64.17"}
-    with pytest.raises(InputError, match=r"surface 1: a \.zmx file cannot hold 'obscuration'"):
-        zemax_of({"surfaces": {"1": row}, "sensor": {"distance": 25.0}})
-
-
-def test_an_aperture_is_in_the_file_s_units():
-    text = singlet("CURV 0.1", "DIAM 5", "SQAP 0.5 0.25", GLASS, head="UNIT IN\nFLOA\n")
-    row = prescription_from_zemax(text)["surfaces"]["1"]
-    assert row["aperture"] == {"half_width_x": 12.7, "half_width_y": 6.35}
