@@ -101,7 +101,9 @@ def build_lens(cfg: DictConfig) -> Any:
         raise InputError(f"lens_dtype: '{cfg.lens_dtype}' is unknown; allowed: float32, float64")
     prescription = OmegaConf.to_container(cfg.lens, resolve=True)
     where = f"lens={HydraConfig.get().runtime.choices.get('lens')}"
-    return lens_from_prescription(prescription, _DTYPES[cfg.lens_dtype], where=where)
+    return lens_from_prescription(
+        prescription, _DTYPES[cfg.lens_dtype], where=where, backend=cfg.backend
+    )
 
 
 def checked_checkpoint(path: str | None) -> str | None:

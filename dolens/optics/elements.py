@@ -154,6 +154,21 @@ def surface_axes(
     return axes
 
 
+def relative_axes(now: Axes, then: Axes) -> tuple[Tensor, Tensor]:
+    """From the axes of one surface to those of another, of which at least one is carried.
+
+    Returns:
+        step (3,), mm: from vertex to vertex, along the axes `now`; and turn (3, 3): a direction v
+        along `now` is turn·v along `then`.
+    """
+    like = then.rotation if now.rotation is None else now.rotation
+    step = _origin(then, like) - _origin(now, like)
+    if now.rotation is None:
+        return step, then.rotation.mT
+    step = now.rotation.mT @ step
+    return step, now.rotation if then.rotation is None else then.rotation.mT @ now.rotation
+
+
 def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Tensor | None]:
     """Rays in the axes of one surface, seen from those of the next.
 
@@ -172,18 +187,12 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
     x, y, z, l, m, n = ray  # noqa: E741
     if now.elements == then.elements:
         return Components(x, y, z + (now.z - then.z), l, m, n), None
-    like = then.rotation if now.rotation is None else now.rotation
-    step = _origin(then, like) - _origin(now, like)
-    if now.rotation is not None:
-        step = now.rotation.mT @ step
+    step, turn = relative_axes(now, then)
     # The distance of a ray that crosses at grazing incidence is finite and means nothing.
     cosine = torch.where(n < 0.0, n.clamp(max=-_GRAZING), n.clamp(min=_GRAZING))
     distance = (step[2] - z) / cosine
     near = (torch.addcmul(x - step[0], distance, l), torch.addcmul(y - step[1], distance, m))
     # Now (near, 0) counts from the next vertex, still along the axes `now`.
-    turn = now.rotation if then.rotation is None else then.rotation.mT
-    if now.rotation is not None and then.rotation is not None:
-        turn = then.rotation.mT @ now.rotation
     position = _turn(turn, near[0], near[1], torch.zeros_like(near[0]))
     return Components(*position, *_turn(turn, l, m, n)), distance
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, aim
+from dolens.optics.backend import check_backend, trace_rays
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.materials import Medium
@@ -18,12 +19,6 @@ from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.seidel import Seidel, seidel
 from dolens.optics.surfaces.base import Surface, SurfaceState
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import (
-    enter_lens,
-    trace_surfaces,
-    trace_to_plane,
-    traced_rays,
-)
 
 
 class Lens(nn.Module):
@@ -51,6 +46,7 @@ class Lens(nn.Module):
         reference_wavelength: nm, one of them; the first unless it is given.
         fields: field points that the prescription is meant for.
         object_distance: mm from the object to the first vertex; None is infinity.
+        backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
     """
 
     def __init__(
@@ -69,6 +65,7 @@ class Lens(nn.Module):
         reference_wavelength: float | None = None,
         fields: Fields | None = None,
         object_distance: float | None = None,
+        backend: str = "auto",
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -89,6 +86,7 @@ class Lens(nn.Module):
         self.reference_wavelength = reference_wavelength
         self.fields = fields
         self.object_distance = object_distance
+        self.backend = check_backend(backend)
         self.materials = tuple(materials)
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
@@ -185,15 +183,8 @@ class Lens(nn.Module):
             first: number of the first surface that they meet.
             last: number of the last; given, the trace ends there, in the medium behind it.
         """
-        system = self.system()
         self._check_range(first, last)
-        ray, before = enter_lens(system, rays, first, 1.0)
-        traced = trace_surfaces(
-            system, ray, rays.wavelength, 1.0, True, record, first=first, last=last
-        )
-        if last is None:
-            traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, 1.0)
-        return traced_rays(traced, before)
+        return trace_rays(self.system(), rays, self.backend, 1.0, record, first, last)
 
     def sensor_to_scene(
         self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
@@ -209,13 +200,8 @@ class Lens(nn.Module):
         Returns:
             The rays on surface `first`, travelling towards -z in the medium before it.
         """
-        system = self.system()
         self._check_range(first, last)
-        ray, before = enter_lens(system, rays, last or len(self.surfaces), -1.0)
-        traced = trace_surfaces(
-            system, ray, rays.wavelength, -1.0, True, record, first=first, last=last
-        )
-        return traced_rays(traced, before)
+        return trace_rays(self.system(), rays, self.backend, -1.0, record, first, last)
 
     def first_order(
         self, wavelength: float | Tensor = 587.5618, object_distance: float | Tensor | None = None

@@ -69,6 +69,7 @@ def lens_from_prescription(
     dtype: torch.dtype = torch.float64,
     index_model: str | None = None,
     where: str = "lens",
+    backend: str = "auto",
 ) -> Lens:
     """Build a lens from plain data.
 
@@ -77,6 +78,7 @@ def lens_from_prescription(
         dtype: precision of the lens.
         index_model: used instead of the prescription's own.
         where: what messages call this prescription, usually its file.
+        backend: what traces: auto, reference, cpu or cuda.
 
     Raises:
         InputError: one line that names `where`, the surface and the key.
@@ -121,6 +123,7 @@ def lens_from_prescription(
             None if diameter is None else as_number(diameter, f"{where}: 'sensor.diameter'"),
             dtype,
             elements_from(prescription.get("elements"), dtype, where),
+            backend=backend,
             **used_with,
         )
         return close_stop(lens, prescription)

@@ -63,7 +63,10 @@ def load_prescription(path: str | Path) -> Any:
 
 
 def load_lens(
-    path: str | Path, dtype: torch.dtype = torch.float64, index_model: str | None = None
+    path: str | Path,
+    dtype: torch.dtype = torch.float64,
+    index_model: str | None = None,
+    backend: str = "auto",
 ) -> Lens:
     """Read a lens from a prescription in YAML, the source's `.txt` or Zemax's `.zmx`.
 
@@ -71,12 +74,13 @@ def load_lens(
         path: the file; its suffix says which format it is in.
         dtype: precision of the lens.
         index_model: dfc, do or paper, instead of the file's own.
+        backend: what traces: auto, reference, cpu or cuda.
 
     Raises:
         InputError: the file is missing, not valid, or no prescription; the message is one line
             that names the file, and the surface and key where there is one.
     """
-    return lens_from_prescription(load_prescription(path), dtype, index_model, str(path))
+    return lens_from_prescription(load_prescription(path), dtype, index_model, str(path), backend)
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:

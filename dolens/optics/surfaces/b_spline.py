@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.base import Parameters, Surface, tensor_of
+from dolens.kernels.table import Kind
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, tensor_of
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.spline_basis import check_knots, clamped_knots, cubic_basis
 
@@ -110,6 +111,13 @@ class BSpline(Surface):
         """Sag (S7), slopes (S8), and the distance to the nearest edge of the knot rectangle."""
         sag, sx, sy, *_ = spline_sag(p, x, y)
         return sag, sx, sy, torch.minimum(_inside(p["knots_x"], x), _inside(p["knots_y"], y))
+
+    @classmethod
+    def packed(cls, p: Parameters) -> PackedShape | None:
+        """Knots in x, knots in y, coefficients."""
+        rows, columns = p["coefficients"].shape
+        numbers = (p["knots_x"], p["knots_y"], p["coefficients"])
+        return PackedShape(Kind.B_SPLINE, numbers, count=rows, columns=columns)
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

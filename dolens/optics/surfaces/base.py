@@ -7,7 +7,7 @@ reaches; their gradient is cut off where the trace ends.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.kernels.table import Kind
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 
@@ -43,6 +44,27 @@ class Refraction(NamedTuple):
     m: Tensor
     n: Tensor
     transmitted: Tensor
+
+
+@dataclass(frozen=True)
+class PackedShape:
+    """A shape as the fast kernels take it.
+
+    Attributes:
+        kind: which kernel; it says what the numbers are, in which order.
+        numbers: scalars and arrays, the latter by rows.
+        count: coefficients of an asphere or a polynomial, or rows of a spline.
+        columns: of a spline; 1 for a polynomial with a b·z² term.
+        degree: highest power of x or y.
+        extras: further integers.
+    """
+
+    kind: Kind
+    numbers: Sequence[Tensor | float]
+    count: int = 0
+    columns: int = 0
+    degree: int = 0
+    extras: Sequence[int] = ()
 
 
 def safe_sqrt(squared: Tensor) -> Tensor:
@@ -171,6 +193,11 @@ class Surface(nn.Module):
             (None: everywhere).  Where it does not, the numbers are finite.
         """
         raise NotImplementedError
+
+    @classmethod
+    def packed(cls, p: Parameters) -> PackedShape | None:
+        """The shape for the fast kernels; None, as here, where there is no kernel for it."""
+        return None
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

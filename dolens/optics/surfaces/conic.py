@@ -7,7 +7,15 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.base import GRAZING, Parameters, PlaneRay, Surface, safe_sqrt
+from dolens.kernels.table import Kind
+from dolens.optics.surfaces.base import (
+    GRAZING,
+    PackedShape,
+    Parameters,
+    PlaneRay,
+    Surface,
+    safe_sqrt,
+)
 
 _FLAT = 1e-15  # 1/mm
 
@@ -117,6 +125,11 @@ class Conic(Surface):
         return nx * inverse, ny * inverse, nz * inverse
 
     @classmethod
+    def packed(cls, p: Parameters) -> PackedShape | None:
+        """c, k."""
+        return PackedShape(Kind.CONIC, (p["curvature"], p["conic"]))
+
+    @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
         """The curvature c."""
         return p["curvature"]
@@ -158,3 +171,8 @@ class Sphere(Conic):
         """(-cx, -cy, 1 - cz): a unit vector on the sphere as it stands."""
         c = p["curvature"]
         return -c * x, -c * y, 1.0 - c * z
+
+    @classmethod
+    def packed(cls, p: Parameters) -> PackedShape | None:
+        """c."""
+        return PackedShape(Kind.SPHERE, (p["curvature"],))

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.base import Parameters, PlaneRay, Surface
+from dolens.kernels.table import Kind
+from dolens.optics.surfaces.base import PackedShape, Parameters, PlaneRay, Surface
 from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
 
 _POWER = re.compile(r"a([1-9]\d*)")
@@ -49,6 +50,15 @@ class EvenAsphere(Conic):
             sag = torch.addcmul(sag, q, r2)
             slope = slope + torch.addcmul(q, dq, r2)
         return sag, 2.0 * x * slope, 2.0 * y * slope, exists
+
+    @classmethod
+    def packed(cls, p: Parameters) -> PackedShape | None:
+        """c, k, a4, a6, ...: all powers up to the highest, in groups of four."""
+        powers = [int(name[1:]) for name in p if _POWER.fullmatch(name)]
+        count = -(-(max(powers, default=2) // 2 - 1) // 4) * 4
+        coefficients = [p.get(f"a{2 * i + 4}", 0.0) for i in range(count)]
+        numbers = (p["curvature"], p["conic"], *coefficients)
+        return PackedShape(Kind.EVEN_ASPHERE, numbers, count=count)
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:

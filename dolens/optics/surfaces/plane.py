@@ -5,7 +5,15 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dolens.optics.surfaces.base import Parameters, PlaneRay, Refraction, Surface, safe_sqrt
+from dolens.kernels.table import Kind
+from dolens.optics.surfaces.base import (
+    PackedShape,
+    Parameters,
+    PlaneRay,
+    Refraction,
+    Surface,
+    safe_sqrt,
+)
 
 
 class Plane(Surface):
@@ -46,6 +54,11 @@ class Plane(Surface):
         l, m, n = direction  # noqa: E741
         squared = (1.0 - ratio * ratio) + (ratio * ratio) * (n * n)
         return Refraction(ratio * l, ratio * m, sense * safe_sqrt(squared), squared.detach())
+
+    @classmethod
+    def packed(cls, p: Parameters) -> PackedShape | None:
+        """No numbers."""
+        return PackedShape(Kind.PLANE, ())
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dolens.optics.surfaces.base import Parameters, Surface, safe_sqrt
+from dolens.kernels.table import Kind
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, safe_sqrt
 
 
 def monomial_powers(name: str) -> tuple[int, int] | None:
@@ -46,6 +47,20 @@ class XYPolynomial(Surface):
         discriminant = 1.0 - (4.0 * p["b"]) * polynomial
         root = safe_sqrt(discriminant)
         return 2.0 * polynomial / (1.0 + root), px / root, py / root, discriminant.detach()
+
+    @classmethod
+    def packed(cls, p: Parameters) -> PackedShape | None:
+        """b, then the coefficients, and their powers as extras."""
+        terms = [(powers, a) for n, a in p.items() if (powers := monomial_powers(n)) is not None]
+        flat = [power for powers, _ in terms for power in powers]
+        return PackedShape(
+            Kind.XY_POLYNOMIAL,
+            (p.get("b", 0.0), *(a for _, a in terms)),
+            count=len(terms),
+            columns=int("b" in p),
+            degree=max(flat, default=0),
+            extras=flat,
+        )
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

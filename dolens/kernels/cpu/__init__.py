@@ -1,0 +1,1 @@
+"""Kernels for the CPU, compiled by Numba: blocks of rays carried through all surfaces in cache."""

@@ -1,0 +1,89 @@
+"""The steps that all surfaces share, for one ray: clamps, transfer, Snell's law, and its adjoint.
+
+They mirror `dolens.optics.trace` and `dolens.optics.surfaces.base`.
+"""
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+from numba import njit, types
+
+from dolens.kernels.cpu.compiler import OPTIONS
+
+
+class Arithmetic(NamedTuple):
+    """Compiled scalar functions for one real type, to be inlined in a block's loop."""
+
+    clamp: Any
+    safe_sqrt: Any
+    arrive: Any
+    refract: Any
+    refract_adjoint: Any
+
+
+@cache
+def arithmetic(real: types.Type) -> Arithmetic:
+    """The functions for a real type; every constant in them has it, so that none is promoted."""
+    grazing, tiny = real(1e-9), real(1e-18)
+    one, two = real(1.0), real(2.0)
+
+    @njit(**OPTIONS)
+    def clamp(value, limit):  # noqa: ANN001, ANN202
+        """The value, held within ± limit; NaN stays."""
+        low = -limit
+        value = low if value < low else value
+        return limit if value > limit else value
+
+    @njit(**OPTIONS)
+    def safe_sqrt(squared):  # noqa: ANN001, ANN202
+        """Square root; what is not positive counts as 1e-18."""
+        return math.sqrt(squared if squared > tiny else tiny)
+
+    @njit(**OPTIONS)
+    def arrive(x, y, z, l, m, n, sense, limit):  # noqa: ANN001, ANN202, E741
+        """x, y on the vertex plane, the distance there, and the cosine in the sense of travel."""
+        towards = sense * n
+        t = -sense * z / (towards if towards > grazing else grazing)
+        return clamp(x + t * l, limit), clamp(y + t * m, limit), t, towards
+
+    @njit(**OPTIONS)
+    def refract(l, m, n, nx, ny, nz, ratio, sense):  # noqa: ANN001, ANN202, E741
+        """Directions behind a surface, and cos² of the angle there: positive without TIR."""
+        cosine = clamp(l * nx + m * ny + n * nz, two)
+        squared = (one - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
+        along = sense * safe_sqrt(squared) - ratio * cosine
+        return (
+            clamp(ratio * l + along * nx, two),
+            clamp(ratio * m + along * ny, two),
+            clamp(ratio * n + along * nz, two),
+            squared,
+        )
+
+    @njit(**OPTIONS)
+    def refract_adjoint(a, b, c, l, m, n, nx, ny, nz, out_l, out_m, out_n, ratio, before):  # noqa: ANN001, ANN202, E741
+        """Cotangents of direction, normal and both indices from (a, b, c), that of d'.
+
+        d' = μ·d + Γ·N with Γ = s·cos t - μ·cos i, and s·cos t = d'·N.
+        """
+        cosine = l * nx + m * ny + n * nz
+        inside = out_l * nx + out_m * ny + out_n * nz
+        along = inside - ratio * cosine
+        of_along = a * nx + b * ny + c * nz
+        of_cosine = of_along * (ratio * ratio * cosine / inside - ratio)
+        of_ratio = (a * l + b * m + c * n) - of_along * (
+            ratio * (one - cosine * cosine) / inside + cosine
+        )
+        of_before = of_ratio * ratio / before
+        return (
+            ratio * a + of_cosine * nx,
+            ratio * b + of_cosine * ny,
+            ratio * c + of_cosine * nz,
+            along * a + of_cosine * l,
+            along * b + of_cosine * m,
+            along * c + of_cosine * n,
+            of_before,
+            -of_before * ratio,
+        )
+
+    return Arithmetic(clamp, safe_sqrt, arrive, refract, refract_adjoint)

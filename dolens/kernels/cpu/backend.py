@@ -1,0 +1,279 @@
+"""Running the CPU kernels on tensors."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu.adjoint import adjoint_driver
+from dolens.kernels.cpu.axes import (
+    change_axes_adjoint,
+    change_axes_forward,
+    lens_axes_adjoint,
+    lens_axes_forward,
+    sensor_forward,
+)
+from dolens.kernels.cpu.b_spline import b_spline_bend, b_spline_parameters, b_spline_sag
+from dolens.kernels.cpu.conic import conic_adjoint, conic_forward
+from dolens.kernels.cpu.even_asphere import (
+    even_asphere_bend,
+    even_asphere_parameters,
+    even_asphere_sag,
+)
+from dolens.kernels.cpu.explicit import explicit_adjoint, explicit_forward
+from dolens.kernels.cpu.forward import forward_driver
+from dolens.kernels.cpu.layout import (
+    ADJOINT,
+    BEND,
+    BLOCK,
+    CODES,
+    COTANGENT_HEADER,
+    EXTRAS_ADDRESS,
+    FORWARD,
+    PARAMETERS,
+    SAG,
+    STATE,
+    WORK_ROWS,
+    Job,
+)
+from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
+from dolens.kernels.cpu.sphere import sphere_adjoint, sphere_forward
+from dolens.kernels.cpu.threads import spread, thread_count
+from dolens.kernels.cpu.xy_polynomial import (
+    xy_polynomial_bend,
+    xy_polynomial_parameters,
+    xy_polynomial_sag,
+)
+from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
+
+REAL = {torch.float32: "float32", torch.float64: "float64"}
+# Chunks of rays that sums are kept for: enough for any processor's threads.
+_CHUNKS = 64
+
+_FORWARD = {
+    Kind.PLANE: plane_forward,
+    Kind.SPHERE: sphere_forward,
+    Kind.CONIC: conic_forward,
+    Kind.EVEN_ASPHERE: explicit_forward,
+    Kind.XY_POLYNOMIAL: explicit_forward,
+    Kind.B_SPLINE: explicit_forward,
+    Kind.CHANGE_AXES: change_axes_forward,
+    Kind.LENS_AXES: lens_axes_forward,
+    Kind.SENSOR: sensor_forward,
+}
+_ADJOINT = {
+    Kind.PLANE: plane_adjoint,
+    Kind.SPHERE: sphere_adjoint,
+    Kind.CONIC: conic_adjoint,
+    Kind.EVEN_ASPHERE: explicit_adjoint,
+    Kind.XY_POLYNOMIAL: explicit_adjoint,
+    Kind.B_SPLINE: explicit_adjoint,
+    Kind.CHANGE_AXES: change_axes_adjoint,
+    Kind.LENS_AXES: lens_axes_adjoint,
+    Kind.SENSOR: plane_adjoint,
+}
+_SAG = {
+    Kind.EVEN_ASPHERE: even_asphere_sag,
+    Kind.XY_POLYNOMIAL: xy_polynomial_sag,
+    Kind.B_SPLINE: b_spline_sag,
+}
+_DERIVATIVES = {
+    Kind.EVEN_ASPHERE: (even_asphere_bend, even_asphere_parameters),
+    Kind.XY_POLYNOMIAL: (xy_polynomial_bend, xy_polynomial_parameters),
+    Kind.B_SPLINE: (b_spline_bend, b_spline_parameters),
+}
+
+
+class Program:
+    """A surface table with its compiled steps, and the memory of each worker.
+
+    Args:
+        table: of contiguous tensors on the CPU.
+        derivatives: whether cotangents will be swept back.
+    """
+
+    def __init__(self, table: SurfaceTable, derivatives: bool) -> None:
+        self.real = REAL[table.values.dtype]
+        self.table = table
+        self.derivatives = derivatives
+        steps = table.codes.shape[0]
+        self.codes = np.zeros((max(steps, 1), CODES), dtype=np.int64)
+        self.codes[:steps, : Code.ROW] = table.codes.numpy()
+        longest, degree = Slot.HEADER, 0
+        for row in self.codes[:steps]:
+            kind = Kind(row[Code.KIND])
+            row[FORWARD] = compiler.compile_block(_FORWARD[kind], self.real)
+            if kind in _SAG:
+                row[SAG] = compiler.compile_block(_SAG[kind], self.real)
+            if derivatives:
+                row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], self.real)
+                if kind in _DERIVATIVES:
+                    bend, parameters = _DERIVATIVES[kind]
+                    row[BEND] = compiler.compile_block(bend, self.real)
+                    row[PARAMETERS] = compiler.compile_block(parameters, self.real)
+            row[EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * int(row[Code.EXTRAS])
+            degree = max(degree, int(row[Code.DEGREE]))
+            # A spline's stencil takes 17 rows, whatever the number of its coefficients.
+            length = Slot.HEADER + 17 if kind == Kind.B_SPLINE else int(row[Code.LENGTH])
+            longest = max(longest, length)
+        clips = (self.codes[:, Code.EDGE] == Outline.RECTANGLE) | (self.codes[:, Code.HOLE] != 0)
+        self.job = np.zeros(Job.LENGTH, dtype=np.int64)
+        self.job[Job.STEPS] = steps
+        self.job[Job.CODES] = self.codes.ctypes.data
+        self.job[Job.VALUES] = table.values.data_ptr()
+        self.job[Job.VALUES_LENGTH] = table.values.numel()
+        self.job[Job.INDICES] = table.indices.data_ptr()
+        self.job[Job.WAVELENGTHS] = table.indices.shape[1]
+        last = table.values.numel() - 1
+        self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
+        if clips.any():
+            self.job[Job.CLIP] = compiler.compile_block(clip, self.real)
+        states = steps + 1 if derivatives else 2
+        self._sizes = (
+            states * STATE,
+            (COTANGENT_HEADER + longest) * BLOCK if derivatives else 0,
+            (WORK_ROWS + 2 * (degree + 1)) * BLOCK,
+        )
+
+    def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
+        """Point to rays (N, 3) of any strides, and their wavelengths' places (N,), int32."""
+        for place, tensor in ((Job.POSITION, position), (Job.DIRECTION, direction)):
+            self.job[place] = tensor.data_ptr()
+            self.job[place + 1 : place + 3] = tensor.stride()
+        self.job[Job.RAYS] = position.shape[0]
+        self.job[Job.WHICH] = 0 if which is None else which.data_ptr()
+
+    def point(self, **tensors: Tensor | None) -> None:
+        """Point to contiguous tensors by the name of their place in `Job`."""
+        for name, tensor in tensors.items():
+            self.job[getattr(Job, name)] = 0 if tensor is None else tensor.data_ptr()
+
+    def run(self, driver: Callable[[Any], Callable[..., None]], pieces: int) -> None:
+        """Run a driver over all pieces, on torch's number of threads."""
+        function = compiler.compile_driver(driver, self.real)
+        threads = thread_count(int(self.job[Job.RAYS]))
+        size = sum(self._sizes)
+        memory = torch.empty((threads, size + BLOCK), dtype=self.table.values.dtype)
+        lanes = np.zeros((threads, BLOCK), dtype=np.int64)
+        jobs = np.repeat(self.job[None], threads, axis=0)
+        for worker in range(threads):
+            address = memory[worker].data_ptr()
+            for place, length in zip(
+                (Job.STACK, Job.COTANGENTS, Job.WORK), self._sizes, strict=True
+            ):
+                jobs[worker, place] = address
+                address += length * memory.element_size()
+            jobs[worker, Job.LANES] = lanes[worker].ctypes.data
+
+        def task(worker: int, first: int, last: int) -> None:
+            function(_integers(jobs[worker]), first, last)
+
+        spread(task, pieces, threads)
+
+
+@cache
+def _pointer_type() -> Any:
+    import ctypes
+
+    return ctypes.POINTER(ctypes.c_int64)
+
+
+def _integers(array: np.ndarray) -> Any:
+    return array.ctypes.data_as(_pointer_type())
+
+
+def trace(
+    table: SurfaceTable, position: Tensor, direction: Tensor, which: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Carry rays through every step.
+
+    Args:
+        table: the lens.
+        position: (N, 3), mm, in the table's precision.
+        direction: (N, 3), unit vectors.
+        which: (N,), int32, each ray's column of `table.indices`, or None for the first.
+
+    Returns:
+        position (N, 3), direction (N, 3), path length (N,), mm; status (N,), int8; and the surface
+        where the ray failed (N,), int16.
+    """
+    count = position.shape[0]
+    out = (
+        torch.empty_like(position, memory_format=torch.contiguous_format),
+        torch.empty_like(direction, memory_format=torch.contiguous_format),
+        position.new_empty(count),
+        torch.empty(count, dtype=torch.int8),
+        torch.empty(count, dtype=torch.int16),
+    )
+    if count == 0:
+        return out
+    program = Program(table, derivatives=False)
+    program.set_rays(position, direction, which)
+    names = ("OUT_POSITION", "OUT_DIRECTION", "OUT_PATH", "OUT_STATUS", "OUT_SURFACE")
+    program.point(**dict(zip(names, out, strict=True)))
+    program.run(forward_driver, -(-count // BLOCK))
+    return out
+
+
+def chunk_size(count: int) -> int:
+    """Rays a chunk, a multiple of the block; it does not depend on the threads."""
+    return max(4096, -(-count // (_CHUNKS * BLOCK)) * BLOCK)
+
+
+def trace_adjoint(
+    table: SurfaceTable,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+    status: Tensor,
+    cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
+    wanted: tuple[bool, bool],
+) -> tuple[Tensor | None, Tensor | None, Tensor, Tensor]:
+    """Cotangents of rays and table from those of position, direction and path length.
+
+    Args:
+        table: as in `trace`, and the rays.
+        position: (N, 3).
+        direction: (N, 3).
+        which: (N,), int32, or None.
+        status: (N,), int8, from `trace`: only rays that are valid pass a gradient.
+        cotangents: of position (N, 3), direction (N, 3) and path (N,), of any strides, or None.
+        wanted: whether gradients of position and of direction are needed.
+
+    Returns:
+        Gradients of position and direction (None where not wanted), of `values` and of `indices`.
+    """
+    count = position.shape[0]
+    gradients = [torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted]
+    length = table.values.numel() + table.indices.numel()
+    chunk = chunk_size(count)
+    chunks = -(-count // chunk)
+    sums = torch.zeros((chunks, length), dtype=torch.float64)
+    if count:
+        program = Program(table, derivatives=True)
+        program.set_rays(position, direction, which)
+        program.point(OUT_STATUS=status, SUMS=sums)
+        program.point(POSITION_GRADIENT=gradients[0], DIRECTION_GRADIENT=gradients[1])
+        job = program.job
+        job[Job.SUM_LENGTH], job[Job.CHUNK] = length, chunk
+        of_position, of_direction, of_path = cotangents
+        for place, tensor in (
+            (Job.POSITION_COTANGENT, of_position),
+            (Job.DIRECTION_COTANGENT, of_direction),
+            (Job.PATH_COTANGENT, of_path),
+        ):
+            if tensor is not None:
+                job[place] = tensor.data_ptr()
+                job[place + 1 : place + 1 + tensor.dim()] = tensor.stride()
+        program.run(adjoint_driver, chunks)
+    total, cut = sums.sum(0), table.values.numel()
+    return (
+        gradients[0],
+        gradients[1],
+        total[:cut].to(table.values.dtype, copy=True),
+        total[cut:].reshape(table.indices.shape).clone(),
+    )

@@ -1,0 +1,184 @@
+"""Compiling kernels: C callbacks with an on-disk cache, and the intrinsics that join them.
+
+A kernel is a function of pointers, made by a factory: a function of a real type that returns the
+kernel as a Python function.  Each is compiled when a lens first needs it, and kept on disk.
+"""
+
+import hashlib
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from llvmlite import binding, ir
+from numba import types
+from numba.core import config, event
+from numba.core.caching import FunctionCache
+from numba.core.ccallback import CFunc
+from numba.core.sigutils import normalize_signature
+from numba.extending import intrinsic
+
+logger = logging.getLogger("dolens.kernels")
+
+# NaN keeps its meaning and division stays exact; the rest of `fastmath` gains nothing more.
+FASTMATH = {"contract", "reassoc", "nsz"}
+OPTIONS: dict[str, Any] = {"fastmath": FASTMATH, "error_model": "numpy"}
+
+INTEGERS = types.CPointer(types.int64)
+REALS = {"float32": types.float32, "float64": types.float64}
+
+Factory = Callable[[types.Type], Callable[..., None]]
+
+_lock = threading.RLock()
+
+
+def pointer(real: types.Type) -> types.Type:
+    """The type of a pointer to numbers of this type."""
+    return types.CPointer(real)
+
+
+def block_signature(real: types.Type) -> Any:
+    """Of a step's functions: before, after, cotangents, record, work rows, codes."""
+    p = pointer(real)
+    return types.void(p, p, p, p, p, INTEGERS)
+
+
+@intrinsic
+def call_block(context, address, before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN201
+    """Call a compiled block function by its address."""
+    signature = types.void(address, before, after, cotangents, record, work, codes)
+
+    def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        kind = ir.FunctionType(ir.VoidType(), [a.type for a in arguments[1:]])
+        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def shifted(context, base, count):  # noqa: ANN001, ANN201
+    """The pointer `count` numbers further on: its index then needs no sign test."""
+
+    def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        return builder.gep(arguments[0], [arguments[1]])
+
+    return base(base, count), generate
+
+
+def _pointer_at(real: types.Type) -> Any:
+    @intrinsic
+    def pointer_at(context, address):  # noqa: ANN001, ANN202
+        def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+            return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+        return pointer(real)(address), generate
+
+    return pointer_at
+
+
+real32_at = _pointer_at(types.float32)
+real64_at = _pointer_at(types.float64)
+int64_at = _pointer_at(types.int64)
+int32_at = _pointer_at(types.int32)
+int16_at = _pointer_at(types.int16)
+int8_at = _pointer_at(types.int8)
+
+
+def compile_block(factory: Factory, real: str) -> int:
+    """Address of a block function for `float32` or `float64`."""
+    return _compiled(factory, real, block_signature(REALS[real])).address
+
+
+def compile_driver(factory: Factory, real: str) -> Any:
+    """A driver as a C function of (job, first, last), which runs without Python's lock."""
+    signature = types.void(INTEGERS, types.int64, types.int64)
+    return _compiled(factory, real, signature).ctypes
+
+
+@cache
+def stamp() -> str:
+    """A digest of the kernels' sources: a change in any of them makes every cached one stale."""
+    here = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in (*sorted(here.rglob("*.py")), here.parent / "table.py"):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+class _StampedCache(FunctionCache):
+    """Numba's on-disk cache; a directory that cannot be written costs the cache, not the run."""
+
+    def __init__(self, function: Callable[..., None], real: str) -> None:
+        super().__init__(function)
+        self._real = real
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        # Not what the kernel closes over, as Numba has it: its helpers differ in every process.
+        return sig, self._real, codegen.magic_tuple(), stamp()
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            logger.warning("compiled kernels cannot be kept for the next start: %s", error)
+
+
+_kernels: dict[tuple[Factory, str], CFunc] = {}
+
+
+def _compiled(factory: Factory, real: str, signature: Any) -> CFunc:
+    with _lock:
+        kernel = _kernels.get((factory, real))
+        if kernel is None:
+            with _wide_vectors(), _announced():
+                function = factory(REALS[real])
+                form = normalize_signature(signature)
+                kernel = CFunc(function, form, locals={}, options=dict(OPTIONS))
+                try:
+                    kernel._cache = _StampedCache(function, real)
+                except RuntimeError as error:  # neither beside the source nor in the user's own
+                    logger.warning("compiled kernels cannot be kept for the next start: %s", error)
+                kernel.compile()
+            _kernels[factory, real] = kernel
+    return kernel
+
+
+class _Announcement(event.Listener):
+    """Says once in a process that kernels are being compiled; reading the cache is silent."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        if not _Announcement.said:
+            _Announcement.said = True
+            logger.info("compiling kernels (once for this machine; some seconds)")
+
+    def on_end(self, event: Any) -> None:
+        """Nothing to say."""
+
+
+@contextmanager
+def _announced() -> Iterator[None]:
+    with event.install_listener("numba:run_pass", _Announcement()):
+        yield
+
+
+@contextmanager
+def _wide_vectors() -> Iterator[None]:
+    """Let LLVM use 512-bit vectors where the processor has them: a third faster here.
+
+    Numba reads this when the process compiles for the first time.  A user's own choice stays.
+    """
+    features = binding.get_host_cpu_features()
+    if config.CPU_FEATURES is not None or not features.get("avx512f"):
+        yield
+        return
+    config.CPU_FEATURES = features.flatten() + ",-prefer-256-bit"
+    try:
+        yield
+    finally:
+        config.CPU_FEATURES = None

@@ -1,0 +1,151 @@
+"""The kernels as PyTorch operators: differentiable, and opaque to torch.compile.
+
+`dolens::trace` and `dolens::trace_adjoint` take a packed table as tensors, so that graphs and saved
+programs hold no Python objects of ours.  First derivatives only: a second one says so.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.kernels.table import SurfaceTable
+
+
+def _backend(position: Tensor) -> Any:
+    """The module that runs kernels where the rays are; imported when it is first needed."""
+    if position.device.type == "cpu":
+        from dolens.kernels.cpu import backend
+    elif position.device.type == "cuda":
+        from dolens.kernels.cuda import backend
+    else:
+        raise InputError(f"no kernels for rays on {position.device}; use backend 'reference'")
+    return backend
+
+
+@torch.library.custom_op("dolens::trace", mutates_args=())
+def trace(
+    values: Tensor,
+    indices: Tensor,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+    codes: Tensor,
+    extras: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Carry rays through a `SurfaceTable`, given as its tensors.
+
+    Args:
+        values: (V,), in the rays' precision.
+        indices: (media, wavelengths), float64.
+        position: (N, 3), mm.
+        direction: (N, 3), unit vectors.
+        which: (N,), int32: each ray's wavelength, or None where there is one.
+        codes: (steps, Code.ROW), int64, on the CPU.
+        extras: int64, on the CPU.
+
+    Returns:
+        position and direction (N, 3), path length (N,), status (N,) int8, surface (N,) int16.
+    """
+    table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
+    return _backend(position).trace(table, position, direction, which)
+
+
+@trace.register_fake
+def _(values, indices, position, direction, which, codes, extras):  # noqa: ANN001, ANN202
+    count = position.shape[0]
+    return (
+        position.new_empty((count, 3)),
+        position.new_empty((count, 3)),
+        position.new_empty(count),
+        position.new_empty(count, dtype=torch.int8),
+        position.new_empty(count, dtype=torch.int16),
+    )
+
+
+@torch.library.custom_op("dolens::trace_adjoint", mutates_args=())
+def trace_adjoint(
+    values: Tensor,
+    indices: Tensor,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+    codes: Tensor,
+    extras: Tensor,
+    status: Tensor,
+    of_position: Tensor | None,
+    of_direction: Tensor | None,
+    of_path: Tensor | None,
+    wanted: list[bool],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cotangents of values, indices, position and direction; empty tensors for rays not wanted."""
+    table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
+    of_rays = _backend(position).trace_adjoint(
+        table,
+        position,
+        direction,
+        which,
+        status,
+        (of_position, of_direction, of_path),
+        (wanted[0], wanted[1]),
+    )
+    empty = position.new_empty((0, 3))
+    position_gradient, direction_gradient, of_values, of_indices = of_rays
+    return (
+        of_values,
+        of_indices,
+        empty if position_gradient is None else position_gradient,
+        empty.clone() if direction_gradient is None else direction_gradient,
+    )
+
+
+@trace_adjoint.register_fake
+def _(values, indices, position, direction, which, codes, extras, status, *cotangents):  # noqa: ANN001, ANN002, ANN202
+    wanted = cotangents[-1]
+    count = position.shape[0]
+    return (
+        torch.empty_like(values),
+        torch.empty_like(indices),
+        position.new_empty((count if wanted[0] else 0, 3)),
+        position.new_empty((count if wanted[1] else 0, 3)),
+    )
+
+
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    ctx.save_for_backward(*inputs, output[3])
+    ctx.mark_non_differentiable(output[3], output[4])
+    ctx.set_materialize_grads(False)
+
+
+def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    *inputs, status = ctx.saved_tensors
+    if all(g is None for g in gradients[:3]):
+        return (None,) * 7
+    wanted = list(ctx.needs_input_grad[2:4])
+    of_values, of_indices, of_position, of_direction = trace_adjoint(
+        *inputs, status, *gradients[:3], wanted
+    )
+    return (
+        of_values,
+        of_indices,
+        of_position if wanted[0] else None,
+        of_direction if wanted[1] else None,
+        None,
+        None,
+        None,
+    )
+
+
+trace.register_autograd(_backward, setup_context=_setup)
+
+
+def _no_second_derivative(ctx: Any, *gradients: Tensor | None) -> None:
+    raise InputError(
+        "the fast kernels give first derivatives only; trace with backend 'reference' for second"
+    )
+
+
+trace_adjoint.register_autograd(
+    _no_second_derivative, setup_context=lambda ctx, inputs, output: None
+)

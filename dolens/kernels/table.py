@@ -1,0 +1,93 @@
+"""A lens as a kernel sees it: flat numbers and codes, one record for every step of a ray.
+
+A step is a surface, or a change of axes between elements of different poses, or the sensor plane.
+Steps come in the order that light meets them, so that backward mode is another table, not another
+kernel.  Every step has a row of `codes` (integers) and a record in `values` (numbers): a header of
+fixed slots and then the numbers of its shape.
+
+Positions count from the vertex at hand, along the axes of the surface at hand.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from torch import Tensor
+
+
+class Kind(IntEnum):
+    """What a step is.  The shape's numbers follow the header, in the order given here."""
+
+    PLANE = 0  # none
+    SPHERE = 1  # c
+    CONIC = 2  # c, k
+    EVEN_ASPHERE = 3  # c, k, a4, a6, ...: as many as Code.COUNT says
+    XY_POLYNOMIAL = 4  # b, then coefficients; powers (i, j) in `extras`, two for each
+    B_SPLINE = 5  # knots_x, knots_y, then coefficients, rows of Code.COLUMNS
+    CHANGE_AXES = 6  # the ray is carried to the plane of the next vertex, then turned
+    LENS_AXES = 7  # position ← turn·position + step, direction ← turn·direction
+    SENSOR = 8  # carried along the line to z = 0, after the shift
+
+
+class Slot(IntEnum):
+    """Where a number lies in the header of a record."""
+
+    # Of a surface and the sensor: added to z on arrival, minus the gap.
+    SHIFT = 0
+    # Of a change of axes: step (3) and turn (9, by rows).
+    STEP = 0
+    TURN = 3
+    # The numbers that follow are no variables.
+    LIMIT = 12  # |x|, |y| and the distance from the vertex plane are clamped to it, mm
+    SCALE = 13  # mm, sets the tolerance of Newton's iteration
+    EDGE = 14  # circle: its semi-diameter squared, mm²; else a number out of reach
+    HALF_X = 15  # rectangle: half widths, mm; see also HALF_Y
+    HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; rectangle: half widths
+    HOLE_Y = 17
+    SENSE = 18  # +1 towards the sensor, -1 from it
+    TAG = 19  # 4·surface number; a status is added to it where a ray fails
+    HALF_Y = 20
+    HEADER = 24  # length of the header: the shape's first number
+
+
+class Code(IntEnum):
+    """Where a code lies in a step's row."""
+
+    KIND = 0
+    OFFSET = 1  # of the record in `values`
+    LENGTH = 2  # of the record
+    BEFORE = 3  # row of `indices`: medium in front, in the order of travel
+    AFTER = 4  # and behind
+    REFRACTS = 5  # 0: the same medium on both sides
+    EDGE = 6  # an `Outline`
+    HOLE = 7
+    COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
+    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
+    EXTRAS = 10  # offset in `extras`
+    DEGREE = 11  # highest power of x or y
+    ROW = 16  # length of a row
+
+
+class Outline(IntEnum):
+    """The shape of an aperture's edge or of its obscuration."""
+
+    NONE = 0
+    CIRCLE = 1
+    RECTANGLE = 2
+
+
+@dataclass(frozen=True)
+class SurfaceTable:
+    """A lens, or some of its surfaces, packed for rays of one sense.
+
+    Attributes:
+        values: (V,), the records one after the other, and last of all what is added to z of the
+            rays that leave the last step, mm; in the rays' precision; differentiable.
+        indices: (media, wavelengths), float64, in the order of travel; differentiable.
+        codes: (steps, Code.ROW), int64, on the CPU.
+        extras: (E,), int64, on the CPU.
+    """
+
+    values: Tensor
+    indices: Tensor
+    codes: Tensor
+    extras: Tensor

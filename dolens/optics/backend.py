@@ -1,0 +1,169 @@
+"""Which implementation traces: PyTorch's operations as the reference, or the fast kernels."""
+
+import logging
+from collections.abc import Iterator
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from dolens.errors import InputError
+from dolens.kernels import operators
+from dolens.optics.packing import pack, unsupported
+from dolens.optics.rays import Rays, TracedRays
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane, traced_rays
+
+logger = logging.getLogger("dolens.kernels")
+
+BACKENDS = ("auto", "reference", "cpu", "cuda")
+_KERNEL_DTYPES = (torch.float32, torch.float64)
+
+
+def check_backend(name: str) -> str:
+    """The name itself; raises `InputError` naming the allowed ones."""
+    if name not in BACKENDS:
+        raise InputError(f"backend '{name}' is unknown; allowed: {', '.join(BACKENDS)}")
+    return name
+
+
+def choose_backend(system: OpticalSystem, requested: str, rays: Rays | None = None) -> str:
+    """Which of `reference`, `cpu` and `cuda` traces a lens.
+
+    `auto` takes the kernels of the lens's device where they serve: for its surfaces and precision,
+    outside torch.func's transforms and forward mode, which only the reference can follow.  It logs
+    what it took, once for each reason.
+
+    Raises:
+        InputError: kernels are asked for by name and cannot serve; the message says why.
+    """
+    if requested == "reference":
+        return "reference"
+    device = system.device.type
+    reason = unsupported(system)
+    if device not in ("cpu", "cuda"):
+        reason = f"there are no kernels for {device}"
+    elif system.dtype not in _KERNEL_DTYPES:
+        reason = f"kernels are of float32 and float64, not {system.dtype}"
+    elif requested == "auto" and reason is None:
+        if _transformed(_tensors(system, rays)):
+            reason = "kernels do not follow torch.func or forward mode"
+        elif device == "cuda" and not _has_triton():
+            reason = "triton is not installed"
+    if requested != "auto":
+        if device != requested:
+            raise InputError(f"backend '{requested}' cannot trace a lens on {device}")
+        if reason is not None:
+            raise InputError(f"backend '{requested}': {reason}")
+        return requested
+    if reason is None:
+        _say(f"backend auto: {device} kernels")
+        return device
+    _say(f"backend auto: the reference in PyTorch, since {reason}")
+    return "reference"
+
+
+def trace_rays(
+    system: OpticalSystem,
+    rays: Rays,
+    requested: str,
+    sense: float,
+    record: bool,
+    first: int,
+    last: int | None,
+) -> TracedRays:
+    """Trace rays through surfaces `first` to `last`, and to the sensor where no last is given.
+
+    Args:
+        system: the lens.
+        rays: as users give them.
+        requested: one of `BACKENDS`.
+        sense: +1 towards the sensor, -1 towards the object.
+        record: keep the intersections; the reference does this.
+        first: number of the first surface.
+        last: number of the last, or None.
+    """
+    end = len(system.surfaces) if last is None else last
+    ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
+    to_sensor = last is None and sense > 0.0
+    if record or choose_backend(system, requested, rays) == "reference":
+        traced = trace_surfaces(
+            system, ray, rays.wavelength, sense, True, record, first=first, last=last
+        )
+        if to_sensor:
+            traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, sense)
+        return traced_rays(traced, before)
+    shape = ray.x.shape
+    if before is None:
+        # As the user gave them: views of (..., 3), which a kernel reads in place.
+        options = {"device": system.device, "dtype": system.dtype}
+        position = rays.position.to(**options).expand(*shape, 3)
+        direction = rays.direction.to(**options).expand(*shape, 3)
+    else:
+        position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
+    table = pack(system, rays.wavelength, sense, first, end, to_sensor)
+    position, direction, path, status, surface = operators.trace(
+        table.values,
+        table.indices,
+        position.reshape(-1, 3),
+        direction.reshape(-1, 3),
+        _columns(rays.wavelength, shape, system.device),
+        table.codes,
+        table.extras,
+    )
+    path = path.reshape(shape)
+    if before is not None:
+        path = torch.where(status.reshape(shape) == 0, path + before, path + before.detach())
+    status = status.reshape(shape)
+    return TracedRays(
+        position=position.reshape(*shape, 3),
+        direction=direction.reshape(*shape, 3),
+        valid=status == 0,
+        status=status,
+        surface=surface.reshape(shape),
+        path_length=path,
+    )
+
+
+def _columns(
+    wavelength: float | Tensor, shape: tuple[int, ...], device: torch.device
+) -> Tensor | None:
+    """Each ray's column of the table's indices, (N,) int32; None where there is but one."""
+    if not isinstance(wavelength, Tensor) or wavelength.numel() == 1:
+        return None
+    columns = torch.arange(wavelength.numel(), dtype=torch.int32, device=device)
+    return columns.reshape(wavelength.shape).expand(shape).reshape(-1).contiguous()
+
+
+def _tensors(system: OpticalSystem, rays: Rays | None) -> Iterator[Tensor]:
+    for surface in system.surfaces:
+        yield from surface.parameters.values()
+    yield from system.thicknesses
+    yield system.sensor_distance
+    for element in system.elements:
+        yield from element.parameters.values()
+    if rays is not None:
+        given = (rays.position, rays.direction, rays.wavelength)
+        yield from (t for t in given if isinstance(t, Tensor))
+
+
+def _transformed(tensors: Iterator[Tensor]) -> bool:
+    """Whether any tensor is seen through torch.func, or carries a tangent."""
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor
+    forward = forward_ad._current_level >= 0
+    return any(
+        wrapped(t) or (forward and forward_ad.unpack_dual(t).tangent is not None) for t in tensors
+    )
+
+
+@cache
+def _has_triton() -> bool:
+    from importlib.util import find_spec
+
+    return find_spec("triton") is not None
+
+
+@cache
+def _say(message: str) -> None:
+    logger.info(message)

@@ -1,0 +1,222 @@
+"""Packing a lens for the kernels: an `OpticalSystem` becomes a `SurfaceTable`.
+
+Every number of the table is a sum of parameters with signs, or comes from the poses, so that
+gradients flow back through ordinary tensor operations.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
+from dolens.optics.elements import LENS_AXES, Axes, relative_axes
+from dolens.optics.surfaces.base import FAR, SurfaceState
+from dolens.optics.surfaces.clear_aperture import Circle
+from dolens.optics.system import OpticalSystem
+
+
+class _Writer:
+    """Collects records: constants as numbers, and variables with where they are added."""
+
+    def __init__(self) -> None:
+        self.constants: list[float] = []
+        self.codes: list[list[int]] = []
+        self.extras: list[int] = []
+        self.scalars: list[Tensor] = []
+        self.places: list[int] = []
+        self.signs: list[float] = []
+        self.arrays: list[tuple[int, Tensor]] = []
+
+    def step(self, kind: Kind, before: int, after: int, sense: float, number: int) -> list[int]:
+        """Begin a record; its row of codes, to be filled in further."""
+        row = [0] * Code.ROW
+        row[Code.KIND], row[Code.OFFSET], row[Code.LENGTH] = kind, len(self.constants), Slot.HEADER
+        row[Code.BEFORE], row[Code.AFTER] = before, after
+        header = [0.0] * Slot.HEADER
+        header[Slot.SENSE], header[Slot.TAG] = sense, 4.0 * number
+        self.constants += header
+        self.codes.append(row)
+        return row
+
+    def add(self, place: int, value: Tensor | float, sign: float = 1.0) -> None:
+        """Add a number to one already written."""
+        if not isinstance(value, Tensor):
+            self.constants[place] += sign * float(value)
+        elif value.ndim == 0:
+            self.scalars.append(value)
+            self.places.append(place)
+            self.signs.append(sign)
+        else:
+            self.arrays.append((place, value.reshape(-1)))
+
+    def values(self, like: Tensor) -> Tensor:
+        """The records as one tensor."""
+        options = {"dtype": like.dtype, "device": like.device}
+        values = torch.tensor(self.constants, dtype=torch.float64).to(**options)
+        if self.scalars:
+            places = torch.tensor(self.places, device=like.device)
+            signs = torch.tensor(self.signs, **options)
+            values = values.index_add(0, places, torch.stack(self.scalars) * signs)
+        if self.arrays:
+            lengths = [array.numel() for _, array in self.arrays]
+            places = torch.cat(
+                [torch.arange(p, p + n) for (p, _), n in zip(self.arrays, lengths, strict=True)]
+            )
+            flat = torch.cat([array.to(**options) for _, array in self.arrays])
+            values = values.index_add(0, places.to(like.device), flat)
+        return values
+
+
+def unsupported(system: OpticalSystem) -> str | None:
+    """Why the kernels cannot trace a lens, in words that name the surface; None where they can."""
+    for number, surface in enumerate(system.surfaces, 1):
+        if surface.shape.packed(surface.parameters) is None:
+            return f"surface {number} ({surface.shape.kind}) has no kernel"
+    return None
+
+
+def pack(
+    system: OpticalSystem,
+    wavelength: float | Tensor,
+    sense: float,
+    first: int,
+    last: int,
+    to_sensor: bool,
+) -> SurfaceTable:
+    """Pack surfaces `first` to `last` in the order that light of this sense meets them.
+
+    Args:
+        system: the lens.
+        wavelength: nm; of a tensor, in any shape, each is a column of the indices.
+        sense: +1 from the object towards the sensor, -1 backwards.
+        first: number of the first surface, from 1, as the prescription counts in either sense.
+        last: number of the last.
+        to_sensor: go on to the sensor plane (forward only).
+
+    Raises:
+        InputError: a surface without a kernel.
+    """
+    numbers = list(range(first, last + 1))
+    if sense < 0.0:
+        numbers.reverse()
+    writer = _Writer()
+    places = system.axes
+    axes, at = LENS_AXES, 1  # where the rays are: axes, and the vertex that z counts from
+    media: list[int] = []  # of the prescription, in the order of travel
+    for medium, number in enumerate(numbers):
+        surface, place = system.surfaces[number - 1], places[number - 1]
+        before, behind = (number - 1, number) if sense > 0.0 else (number, number - 1)
+        media.append(before)
+        shift = place.elements == axes.elements
+        if not shift:
+            _change_axes(writer, axes, place, medium, sense, number)
+        packed = surface.shape.packed(surface.parameters)
+        if packed is None:
+            raise InputError(f"surface {number} ({surface.shape.kind}) has no kernel")
+        row = writer.step(packed.kind, medium, medium + 1, sense, number)
+        if shift:
+            _shift(writer, system, at, number)
+        row[Code.REFRACTS] = int(system.materials[before] != system.materials[behind])
+        _aperture(writer, row, surface)
+        row[Code.COUNT], row[Code.COLUMNS] = packed.count, packed.columns
+        row[Code.DEGREE], row[Code.EXTRAS] = packed.degree, len(writer.extras)
+        writer.extras += packed.extras
+        for value in packed.numbers:
+            place_of_value = len(writer.constants)
+            size = value.numel() if isinstance(value, Tensor) else 1
+            writer.constants += [0.0] * size
+            writer.add(place_of_value, value)
+        row[Code.LENGTH] = len(writer.constants) - row[Code.OFFSET]
+        axes, at = place, number
+    media.append(numbers[-1] if sense > 0.0 else numbers[-1] - 1)
+    _leave(writer, system, axes, at, sense, len(numbers), to_sensor)
+    like = system.sensor_distance
+    return SurfaceTable(
+        writer.values(like),
+        _indices(system, wavelength, media).to(like.device),
+        torch.tensor(writer.codes, dtype=torch.int64).reshape(-1, Code.ROW),
+        torch.tensor([*writer.extras, 0], dtype=torch.int64),
+    )
+
+
+def _shift(writer: _Writer, system: OpticalSystem, at: int, number: int) -> None:
+    """z counts from the vertex of another surface (or of the sensor) from here on.
+
+    Gap by gap: the difference of two positions would have the rounding of both.
+    """
+    place = writer.codes[-1][Code.OFFSET] + Slot.SHIFT
+    gaps = (*system.thicknesses, system.sensor_distance)
+    low, high = sorted((at, number))
+    for gap in gaps[low - 1 : high - 1]:
+        writer.add(place, gap, -1.0 if number > at else 1.0)
+
+
+def _change_axes(
+    writer: _Writer, now: Axes, then: Axes, medium: int, sense: float, number: int
+) -> None:
+    row = writer.step(Kind.CHANGE_AXES, medium, medium, sense, number)
+    step, turn = relative_axes(now, then)
+    writer.add(row[Code.OFFSET] + Slot.STEP, step)
+    writer.add(row[Code.OFFSET] + Slot.TURN, turn)
+
+
+def _aperture(writer: _Writer, row: list[int], surface: SurfaceState) -> None:
+    record = row[Code.OFFSET]
+    writer.constants[record + Slot.LIMIT] = FAR * surface.semi_diameter
+    writer.constants[record + Slot.SCALE] = surface.semi_diameter
+    edge, hole = surface.aperture.edge, surface.aperture.obscuration
+    # A full circle is tested on the way; where there is none it is out of reach.
+    writer.constants[record + Slot.EDGE] = (2.0 * FAR * surface.semi_diameter) ** 2
+    if isinstance(edge, Circle):
+        row[Code.EDGE] = Outline.CIRCLE
+        writer.constants[record + Slot.EDGE] = edge.semi_diameter**2
+    else:
+        row[Code.EDGE] = Outline.RECTANGLE
+        writer.constants[record + Slot.HALF_X] = edge.half_width_x
+        writer.constants[record + Slot.HALF_Y] = edge.half_width_y
+    if isinstance(hole, Circle):
+        row[Code.HOLE] = Outline.CIRCLE
+        writer.constants[record + Slot.HOLE_X] = hole.semi_diameter**2
+    elif hole is not None:
+        row[Code.HOLE] = Outline.RECTANGLE
+        writer.constants[record + Slot.HOLE_X] = hole.half_width_x
+        writer.constants[record + Slot.HOLE_Y] = hole.half_width_y
+
+
+def _leave(
+    writer: _Writer,
+    system: OpticalSystem,
+    axes: Axes,
+    at: int,
+    sense: float,
+    medium: int,
+    to_sensor: bool,
+) -> None:
+    """From the last surface to the lens's axes, or to the sensor plane."""
+    sensor = len(system.surfaces) + 1
+    if axes.rotation is not None:
+        row = writer.step(Kind.LENS_AXES, medium, medium, sense, at)
+        writer.add(row[Code.OFFSET] + Slot.STEP, axes.origin)
+        writer.add(row[Code.OFFSET] + Slot.TURN, axes.rotation)
+        at = 1
+    if to_sensor:
+        writer.step(Kind.SENSOR, medium, medium, sense, sensor)
+        _shift(writer, system, at, sensor)
+        at = sensor
+    exit_z = len(writer.constants)
+    writer.constants.append(0.0)
+    for gap in (*system.thicknesses, system.sensor_distance)[: at - 1]:
+        writer.add(exit_z, gap)
+
+
+def _indices(system: OpticalSystem, wavelength: float | Tensor, media: Sequence[int]) -> Tensor:
+    """(media, wavelengths), in double precision whatever the lens's."""
+    if isinstance(wavelength, Tensor):
+        wavelength = wavelength.to(device=system.device, dtype=torch.float64).reshape(-1)
+        one = torch.ones_like(wavelength)
+        found = {m: m.index(wavelength) * one for m in {system.materials[k] for k in media}}
+        return torch.stack([found[system.materials[k]] for k in media])
+    indices = [[float(system.materials[k].index(wavelength))] for k in media]
+    return torch.tensor(indices, dtype=torch.float64)
