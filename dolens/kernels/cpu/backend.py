@@ -38,6 +38,7 @@ from dolens.kernels.cpu.layout import (
     PARAMETERS,
     SAG,
     STATE,
+    STENCIL_ROWS,
     WORK_ROWS,
     Job,
 )
@@ -96,13 +97,13 @@ class Steps(NamedTuple):
     Attributes:
         codes: (steps, CODES), int64: the table's, and the addresses of the block functions.
         longest: numbers of the longest record that has cotangents.
-        degree: highest power of a polynomial.
+        scratch: work rows that the shapes need.
         clip: address of the test of apertures that are no full circles, or zero.
     """
 
     codes: np.ndarray
     longest: int
-    degree: int
+    scratch: int
     clip: int
 
 
@@ -112,7 +113,7 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     table = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW)
     rows = np.zeros((max(len(table), 1), CODES), dtype=np.int64)
     rows[: len(table), : Code.ROW] = table
-    longest = Slot.HEADER
+    longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
         kind = Kind(row[Code.KIND])
         row[FORWARD] = compiler.compile_block(_FORWARD[kind], real)
@@ -124,12 +125,16 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
                 bend, parameters = _DERIVATIVES[kind]
                 row[BEND] = compiler.compile_block(bend, real)
                 row[PARAMETERS] = compiler.compile_block(parameters, real)
-        # A spline's stencil takes 17 rows, whatever the number of its coefficients.
-        length = Slot.HEADER + 17 if kind == Kind.B_SPLINE else int(row[Code.LENGTH])
+        length = int(row[Code.LENGTH])
+        if kind == Kind.B_SPLINE:
+            # Its stencil takes 17 rows of cotangents, whatever the number of its coefficients.
+            length, scratch = Slot.HEADER + 17, max(scratch, STENCIL_ROWS)
+        elif kind == Kind.XY_POLYNOMIAL:
+            scratch = max(scratch, 2 * (int(row[Code.DEGREE]) + 1))
         longest = max(longest, length)
     clips = (rows[:, Code.EDGE] == Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
     address = compiler.compile_block(clip, real) if clips.any() else 0
-    return Steps(rows, longest, int(rows[:, Code.DEGREE].max()), address)
+    return Steps(rows, longest, scratch, address)
 
 
 class Program:
@@ -162,7 +167,7 @@ class Program:
         self._sizes = (
             states * STATE,
             (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0,
-            (WORK_ROWS + 2 * (steps.degree + 1)) * BLOCK,
+            (WORK_ROWS + steps.scratch) * BLOCK,
         )
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:

@@ -41,6 +41,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             )  # fmt: skip
             dst[i], dst[128 + i], dst[256 + i], dst[1152 + i] = x, y, met, t
             w[1792 + i] = zero
+        w[3200] = zero
         if q[0] == 3:
             c, k = p[24], p[25]
             for i in range(128):
