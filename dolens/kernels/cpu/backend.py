@@ -143,9 +143,10 @@ class Program:
     Args:
         table: of contiguous tensors on the CPU.
         derivatives: whether cotangents will be swept back.
+        scratch_rows: rows of memory at `Job.SCRATCH`, for what is no part of the trace.
     """
 
-    def __init__(self, table: SurfaceTable, derivatives: bool) -> None:
+    def __init__(self, table: SurfaceTable, derivatives: bool, scratch_rows: int = 0) -> None:
         self.real = REAL[table.values.dtype]
         self.table = table
         self.derivatives = derivatives
@@ -163,11 +164,13 @@ class Program:
         last = table.values.numel() - 1
         self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
         self.job[Job.CLIP] = steps.clip
-        states = count + 1 if derivatives else 2
+        # Without derivatives two in turn, and one that a driver may keep.
+        states = count + 1 if derivatives else 3
         self._sizes = (
             states * STATE,
             (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0,
             (WORK_ROWS + steps.scratch) * BLOCK,
+            scratch_rows * BLOCK,
         )
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
@@ -194,7 +197,7 @@ class Program:
         for worker in range(threads):
             address = memory[worker].data_ptr()
             for place, length in zip(
-                (Job.STACK, Job.COTANGENTS, Job.WORK), self._sizes, strict=True
+                (Job.STACK, Job.COTANGENTS, Job.WORK, Job.SCRATCH), self._sizes, strict=True
             ):
                 jobs[worker, place] = address
                 address += length * memory.element_size()

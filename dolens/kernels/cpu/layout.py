@@ -44,4 +44,6 @@ class Job:
     POSITION_GRADIENT, DIRECTION_GRADIENT = range(32, 34)
     SUMS, SUM_LENGTH, CHUNK, VALUES_LENGTH = range(34, 38)
     LANES, INDEX_SUMS = 38, 39
+    # Of a renderer: its scratch memory, and arrays of integers and of numbers; see `rendering`.
+    SCRATCH, VIEW, LENGTHS = range(60, 63)
     LENGTH = 64
