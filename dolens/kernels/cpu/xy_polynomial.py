@@ -2,8 +2,8 @@
 
 With P = Σ a·x^i·y^j and W = √(1 - 4bP): s = 2P/(1 + W), s_x = P_x/W.
 
-Up to the third degree, a phase plate's, P is a dense polynomial by Horner's rule; beyond, a sum over
-the terms that there are.
+Up to the third degree, a phase plate's, P is a dense polynomial by Horner's rule; beyond, a sum
+over the terms that there are.
 """
 
 from collections.abc import Callable
