@@ -111,7 +111,6 @@ class RayRenderer:
             return self._fused(system, scene, textures, view)
         if backend == "cuda":
             say_once("render: no fused renderer for cuda; the reference, with fused traces")
-        pixels = self.sensor.height * self.sensor.width
         names = list(parameters)
 
         def piece(i: int, textures: Tensor, *tensors: Tensor) -> Tensor:

@@ -120,7 +120,7 @@ render.register_autograd(_backward, setup_context=_setup)
 
 def _no_second_derivative(ctx: Any, *gradients: Tensor | None) -> None:
     raise InputError(
-        "the fused renderer gives first derivatives only; render with backend 'reference' for second"
+        "the fused renderer gives first derivatives only; use backend 'reference' for second"
     )
 
 

@@ -91,6 +91,11 @@ _DERIVATIVES = {
 }
 
 
+def as_integers(array: np.ndarray) -> Any:
+    """An array of int64 as a driver takes it."""
+    return array.ctypes.data_as(_INTEGERS)
+
+
 class Steps(NamedTuple):
     """The steps of a lens, compiled.
 
@@ -204,7 +209,7 @@ class Program:
             jobs[worker, Job.LANES] = lanes[worker].ctypes.data
 
         def task(worker: int, first: int, last: int) -> None:
-            function(jobs[worker].ctypes.data_as(_INTEGERS), first, last)
+            function(as_integers(jobs[worker]), first, last)
 
         spread(task, pieces, threads)
 

@@ -140,9 +140,7 @@ class _RenderJob:
         self.view[Place.BLOCKS] = self.blocks.ctypes.data
         self.view[Place.TEXTURES] = self.textures.data_ptr()
         z = float(sensor_z)
-        self.lengths = np.zeros(
-            Length.PLANES + 2 * len(view.depths), dtype=self.program.real
-        )
+        self.lengths = np.zeros(Length.PLANES + 2 * len(view.depths), dtype=self.program.real)
         self.lengths[: Length.LAST_COLUMN + 1] = (
             view.pixel_pitch,
             0.5 * (view.height - 1),

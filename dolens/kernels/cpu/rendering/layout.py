@@ -12,7 +12,7 @@ SCRATCH_ROWS = 16  # before the pixels' own
 
 
 class Place:
-    """Places in the array of integers at `Job.VIEW`: counts, and addresses (zero: not asked for)."""
+    """Places in the array of integers at `Job.VIEW`: counts, and addresses (zero: not needed)."""
 
     WIDTH, SIDE, PIXEL_AREA, SEED_LOW, SEED_HIGH, PIXELS = range(6)
     IMAGES, DEPTHS, CHANNELS, TEXTURE_HEIGHT, TEXTURE_WIDTH, MEDIA = range(6, 12)
