@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 
 import torch
@@ -11,13 +12,15 @@ from torch.autograd import forward_ad
 from dolens.errors import InputError
 from dolens.kernels import operators
 from dolens.optics.packing import pack, unsupported
-from dolens.optics.rays import Rays, TracedRays
+from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane, traced_rays
 
 logger = logging.getLogger("dolens.kernels")
 
 BACKENDS = ("auto", "reference", "cpu", "cuda")
+# So many wavelengths are not searched for equal ones.
+_FEW = 64
 _KERNEL_DTYPES = (torch.float32, torch.float64)
 
 
@@ -95,19 +98,13 @@ def trace_rays(
             traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, sense)
         return traced_rays(traced, before)
     shape = ray.x.shape
-    if before is None:
-        # As the user gave them: views of (..., 3), which a kernel reads in place.
-        options = {"device": system.device, "dtype": system.dtype}
-        position = rays.position.to(**options).expand(*shape, 3)
-        direction = rays.direction.to(**options).expand(*shape, 3)
-    else:
-        position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
+    position, direction = _joined(system, rays, ray, before)
     table = pack(system, rays.wavelength, sense, first, end, to_sensor)
     position, direction, path, status, surface = operators.trace(
         table.values,
         table.indices,
-        position.reshape(-1, 3),
-        direction.reshape(-1, 3),
+        position,
+        direction,
         _columns(rays.wavelength, shape, system.device),
         table.codes,
         table.extras,
@@ -124,6 +121,59 @@ def trace_rays(
         surface=surface.reshape(shape),
         path_length=path,
     )
+
+
+def _joined(
+    system: OpticalSystem, rays: Rays, ray: Components, before: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Positions and directions (N, 3) of rays that have entered the lens."""
+    if before is not None:
+        position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
+    else:
+        # As the user gave them: views of (..., 3), which a kernel reads in place.
+        options = {"device": system.device, "dtype": system.dtype}
+        position = rays.position.to(**options).expand(*ray.x.shape, 3)
+        direction = rays.direction.to(**options).expand(*ray.x.shape, 3)
+    return position.reshape(-1, 3), direction.reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class FlatRays:
+    """Rays before a lens as a kernel takes them, in the lens's precision.
+
+    Attributes:
+        position: (N, 3), mm.
+        direction: (N, 3).
+        wavelength: nm, a number or the distinct ones.
+        column: (N,), int32: each ray's wavelength, or None where there is one.
+        before: (N,), mm: optical path to where the rays were moved, or None.
+        shape: the leading shape that they had.
+    """
+
+    position: Tensor
+    direction: Tensor
+    wavelength: float | Tensor
+    column: Tensor | None
+    before: Tensor | None
+    shape: torch.Size
+
+
+@torch.no_grad()
+def flat_rays(system: OpticalSystem, rays: Rays) -> FlatRays:
+    """Rays towards the first surface, without a graph; wavelengths that repeat are one."""
+    ray, before = enter_lens(system, rays, 1, 1.0)
+    shape = ray.x.shape
+    position, direction = _joined(system, rays, ray, before)
+    wavelength = rays.wavelength
+    if isinstance(wavelength, Tensor) and wavelength.numel() > _FEW:
+        wavelength, column = wavelength.unique(return_inverse=True)
+        column = column.to(device=system.device, dtype=torch.int32)
+        column = column.expand(shape).reshape(-1).contiguous()
+    else:
+        column = _columns(wavelength, shape, system.device)
+    if before is not None:
+        before = before.expand(shape).reshape(-1)
+    return FlatRays(position, direction, wavelength, column, before, shape)
 
 
 def _columns(

@@ -125,7 +125,7 @@ class Lens(nn.Module):
         parameters = dict(self.named_parameters())
         chosen: set[str] = set()
         for pattern in patterns:
-            found = fnmatch.filter(parameters, pattern)
+            found = [pattern] if pattern in parameters else fnmatch.filter(parameters, pattern)
             if not found:
                 near = difflib.get_close_matches(pattern, parameters, n=3, cutoff=0.4)
                 hint = f"; near: {', '.join(near)}" if near else ""

@@ -26,6 +26,7 @@ from dolens.kernels.cpu.forward import real_at, streams
 class Sweeps(NamedTuple):
     """Compiled functions that the drivers of derivatives share."""
 
+    load_lanes: Any
     gather: Any
     forward: Any
     back: Any
@@ -40,6 +41,20 @@ def sweeps(real: types.Type) -> Sweeps:
     _, set_indices, step = streams(real)
 
     @njit(**OPTIONS)
+    def load_lanes(job, lanes):  # noqa: ANN001, ANN202
+        """Load the rays of these numbers into the first state."""
+        state = carray(at(job[15]), 1280)
+        for k in range(3):
+            source = carray(shifted(at(job[0]), k * job[2]), 1 << 40)
+            for i in range(128):
+                state[128 * k + i] = source[lanes[i] * job[1]]
+            source = carray(shifted(at(job[3]), k * job[5]), 1 << 40)
+            for i in range(128):
+                state[384 + 128 * k + i] = source[lanes[i] * job[4]]
+        for i in range(128):
+            state[768 + i], state[896 + i], state[1024 + i] = zero, zero, zero
+
+    @njit(**OPTIONS)
     def gather(job, ray, end, lanes):  # noqa: ANN001, ANN202
         """Load the next valid rays from `ray` on; their number, and where to go on."""
         status = carray(int8_at(job[21]), 1 << 40)
@@ -52,16 +67,7 @@ def sweeps(real: types.Type) -> Sweeps:
         for i in range(max(count, 1), 128):
             lanes[i] = lanes[0]
         if count > 0:
-            state = carray(at(job[15]), 1280)
-            for k in range(3):
-                source = carray(shifted(at(job[0]), k * job[2]), 1 << 40)
-                for i in range(128):
-                    state[128 * k + i] = source[lanes[i] * job[1]]
-                source = carray(shifted(at(job[3]), k * job[5]), 1 << 40)
-                for i in range(128):
-                    state[384 + 128 * k + i] = source[lanes[i] * job[4]]
-            for i in range(128):
-                state[768 + i], state[896 + i], state[1024 + i] = zero, zero, zero
+            load_lanes(job, lanes)
         return count, ray
 
     @njit(**OPTIONS)
@@ -123,13 +129,13 @@ def sweeps(real: types.Type) -> Sweeps:
                 for i in range(128):
                     sums[row + which[lanes[i]]] += types.float64(lane[i])
 
-    return Sweeps(gather, forward, back, add_sums)
+    return Sweeps(load_lanes, gather, forward, back, add_sums)
 
 
 def adjoint_driver(real: types.Type) -> Callable[..., None]:
     """Sweep chunks `first` to `last` back: gradients of the rays, and sums for each chunk."""
     at = real_at(real)
-    gather, forward, back, add_sums = sweeps(real)
+    _, gather, forward, back, add_sums = sweeps(real)
     zero = real(0.0)
 
     @njit(**OPTIONS)

@@ -42,7 +42,7 @@ from dolens.kernels.cpu.layout import (
 )
 from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
 from dolens.kernels.cpu.sphere import sphere_adjoint, sphere_forward
-from dolens.kernels.cpu.threads import spread, thread_count
+from dolens.kernels.cpu.threads import SMALL, spread, thread_count
 from dolens.kernels.cpu.xy_polynomial import (
     xy_polynomial_bend,
     xy_polynomial_parameters,
@@ -94,9 +94,13 @@ class Program:
     Args:
         table: of contiguous tensors on the CPU.
         derivatives: whether cotangents will be swept back.
+        outputs: sets of cotangents that a block holds.
+        columns: further rows of a block that a driver asks for.
     """
 
-    def __init__(self, table: SurfaceTable, derivatives: bool) -> None:
+    def __init__(
+        self, table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0
+    ) -> None:
         self.real = REAL[table.values.dtype]
         self.table = table
         self.derivatives = derivatives
@@ -133,11 +137,14 @@ class Program:
         if clips.any():
             self.job[Job.CLIP] = compiler.compile_block(clip, self.real)
         states = steps + 1 if derivatives else 2
-        self._sizes = (
-            states * STATE,
-            (COTANGENT_HEADER + longest) * BLOCK if derivatives else 0,
-            (WORK_ROWS + 2 * (degree + 1)) * BLOCK,
-        )
+        cotangents = (COTANGENT_HEADER + longest) * BLOCK if derivatives else 0
+        self.job[Job.COTANGENT_LENGTH] = cotangents
+        self._sizes = {
+            Job.STACK: states * STATE,
+            Job.COTANGENTS: outputs * cotangents,
+            Job.WORK: (WORK_ROWS + 2 * (degree + 1)) * BLOCK,
+            Job.COLUMNS: columns * BLOCK,
+        }
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
         """Point to rays (N, 3) of any strides, and their wavelengths' places (N,), int32."""
@@ -152,22 +159,23 @@ class Program:
         for name, tensor in tensors.items():
             self.job[getattr(Job, name)] = 0 if tensor is None else tensor.data_ptr()
 
-    def run(self, driver: Callable[[Any], Callable[..., None]], pieces: int) -> None:
-        """Run a driver over all pieces, on torch's number of threads."""
+    def run(
+        self, driver: Callable[[Any], Callable[..., None]], pieces: int, small: int = SMALL
+    ) -> None:
+        """Run a driver over all pieces, on torch's number of threads, or on one for few rays."""
         function = compiler.compile_driver(driver, self.real)
-        threads = thread_count(int(self.job[Job.RAYS]))
-        size = sum(self._sizes)
+        threads = thread_count(int(self.job[Job.RAYS]), small)
+        size = sum(self._sizes.values())
         memory = torch.empty((threads, size + BLOCK), dtype=self.table.values.dtype)
-        lanes = np.zeros((threads, BLOCK), dtype=np.int64)
+        lanes = np.zeros((threads, 3 * BLOCK), dtype=np.int64)
         jobs = np.repeat(self.job[None], threads, axis=0)
         for worker in range(threads):
             address = memory[worker].data_ptr()
-            for place, length in zip(
-                (Job.STACK, Job.COTANGENTS, Job.WORK), self._sizes, strict=True
-            ):
+            for place, length in self._sizes.items():
                 jobs[worker, place] = address
                 address += length * memory.element_size()
             jobs[worker, Job.LANES] = lanes[worker].ctypes.data
+            jobs[worker, Job.PENDING] = jobs[worker, Job.LANES] + BLOCK * lanes.itemsize
 
         def task(worker: int, first: int, last: int) -> None:
             function(_integers(jobs[worker]), first, last)

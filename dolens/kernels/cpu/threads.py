@@ -16,9 +16,9 @@ SMALL = 1 << 14
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
-def thread_count(rays: int) -> int:
-    """Threads for this many rays: torch's own setting, and one for a few rays."""
-    return 1 if rays < SMALL else max(1, torch.get_num_threads())
+def thread_count(rays: int, small: int = SMALL) -> int:
+    """Threads for this many rays: torch's own setting, and one for fewer than `small`."""
+    return 1 if rays < small else max(1, torch.get_num_threads())
 
 
 def spread(task: Callable[[int, int, int], None], pieces: int, threads: int) -> None:
