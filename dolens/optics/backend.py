@@ -1,7 +1,7 @@
 """Which implementation traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -144,15 +144,15 @@ class FlatRays:
     Attributes:
         position: (N, 3), mm.
         direction: (N, 3).
-        wavelength: nm, a number or the distinct ones.
-        column: (N,), int32: each ray's wavelength, or None where there is one.
+        wavelengths: nm, the distinct ones.
+        column: (N,), int32: which of them a ray has, or None where there is one.
         before: (N,), mm: optical path to where the rays were moved, or None.
         shape: the leading shape that they had.
     """
 
     position: Tensor
     direction: Tensor
-    wavelength: float | Tensor
+    wavelengths: Sequence[float]
     column: Tensor | None
     before: Tensor | None
     shape: torch.Size
@@ -173,7 +173,8 @@ def flat_rays(system: OpticalSystem, rays: Rays) -> FlatRays:
         column = _columns(wavelength, shape, system.device)
     if before is not None:
         before = before.expand(shape).reshape(-1)
-    return FlatRays(position, direction, wavelength, column, before, shape)
+    several = wavelength.reshape(-1).tolist() if isinstance(wavelength, Tensor) else (wavelength,)
+    return FlatRays(position, direction, several, column, before, shape)
 
 
 def _columns(

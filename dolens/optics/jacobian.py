@@ -14,12 +14,11 @@ from torch import Tensor
 from torch.func import jacfwd
 
 from dolens.errors import InputError
-from dolens.kernels.table import SurfaceTable
-from dolens.kernels.variable_map import VariableMap
-from dolens.optics.backend import FlatRays, choose_backend, flat_rays, trace_rays
+from dolens.optics.backend import choose_backend, flat_rays, trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack_with_variables
 from dolens.optics.rays import Components, Rays, TracedRays
+from dolens.optics.system import OpticalSystem
 
 logger = logging.getLogger("dolens.kernels")
 
@@ -134,12 +133,14 @@ def ray_jacobian(
     outputs = _checked_outputs(outputs)
     parameters = lens.variables(variables)
     columns = _columns(parameters)
-    if not _has_kernel(lens, rays):
+    system, leaves = _with_leaves(lens, parameters)
+    if not _has_kernel(lens, system, rays):
         values, derivatives, valid = _reference_jacobian(lens, rays, parameters, outputs)
         return RayJacobian(outputs, columns, values, derivatives, valid)
-    from dolens.kernels.cpu import derivatives as kernels
+    from dolens.kernels.cpu import derivatives as kernels  # compiles when first needed
 
-    flat, table, entries = _packed(lens, rays, parameters)
+    flat = flat_rays(system, rays)
+    table, entries = pack_with_variables(system, flat.wavelengths, leaves)
     valid, values, jacobian = kernels.ray_jacobian(
         table, entries, outputs, (flat.position, flat.direction, flat.column)
     )
@@ -193,10 +194,12 @@ def normal_equations(
     groups = 0
     if group is not None:
         group, groups = _checked_groups(group.to(lens.device), shape)
-    if _has_kernel(lens, rays):
-        from dolens.kernels.cpu import derivatives as kernels
+    system, leaves = _with_leaves(lens, parameters)
+    if _has_kernel(lens, system, rays):
+        from dolens.kernels.cpu import derivatives as kernels  # compiles when first needed
 
-        flat, table, entries = _packed(lens, rays, parameters)
+        flat = flat_rays(system, rays)
+        table, entries = pack_with_variables(system, flat.wavelengths, leaves)
         if flat.before is not None and "path_length" in outputs:
             target = target.clone()
             target[:, outputs.index("path_length")] -= flat.before
@@ -257,19 +260,17 @@ def _columns(parameters: Mapping[str, Tensor]) -> dict[str, slice]:
     return columns
 
 
-def _packed(
-    lens: Lens, rays: Rays, parameters: Mapping[str, Tensor]
-) -> tuple[FlatRays, SurfaceTable, VariableMap]:
-    """Rays and lens as a kernel takes them."""
+def _with_leaves(
+    lens: Lens, parameters: Mapping[str, Tensor]
+) -> tuple[OpticalSystem, list[Tensor]]:
+    """The lens with leaves of their own in the place of the variables, and these."""
     leaves = {name: p.detach().requires_grad_() for name, p in parameters.items()}
-    system = lens.system(leaves)
-    flat = flat_rays(system, rays)
-    return flat, *pack_with_variables(system, flat.wavelength, list(leaves.values()))
+    return lens.system(leaves), list(leaves.values())
 
 
-def _has_kernel(lens: Lens, rays: Rays) -> bool:
+def _has_kernel(lens: Lens, system: OpticalSystem, rays: Rays) -> bool:
     """Whether the CPU's kernels differentiate; on a GPU the reference does, and says so."""
-    chosen = choose_backend(lens.system(), lens.backend, rays)
+    chosen = choose_backend(system, lens.backend, rays)
     if chosen == "cuda":
         if lens.backend == "cuda":
             raise InputError("backend 'cuda' has no Jacobians; use 'auto' or 'reference'")

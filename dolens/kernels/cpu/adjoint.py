@@ -38,11 +38,12 @@ def sweeps(real: types.Type) -> Sweeps:
     """Functions that fill a block with valid rays, trace it, and sweep back, for one real type."""
     at = real_at(real)
     zero = real(0.0)
-    _, set_indices, step = streams(real)
+    find_wavelength, _, set_indices, step = streams(real)
 
     @njit(**OPTIONS)
     def load_lanes(job, lanes):  # noqa: ANN001, ANN202
         """Load the rays of these numbers into the first state."""
+        find_wavelength(job, lanes)
         state = carray(at(job[15]), 1280)
         for k in range(3):
             source = carray(shifted(at(job[0]), k * job[2]), 1 << 40)
@@ -123,6 +124,8 @@ def sweeps(real: types.Type) -> Sweeps:
             row = values + codes[3 + side] * count
             if count == 1:
                 add_row(cotangents, 7 + side, sums, row)
+            elif job[39] > 0:
+                add_row(cotangents, 7 + side, sums, row + job[39] - 1)
             else:
                 which = carray(int32_at(job[6]), 1 << 40)
                 lane = carray(shifted(cotangents, 896 + 128 * side), 128)

@@ -70,11 +70,14 @@ def arithmetic(real: types.Type) -> Arithmetic:
         inside = out_l * nx + out_m * ny + out_n * nz
         along = inside - ratio * cosine
         of_along = a * nx + b * ny + c * nz
-        of_cosine = of_along * (ratio * ratio * cosine / inside - ratio)
+        # One division for both reciprocals.
+        inverse = one / (inside * before)
+        over_inside, over_before = inverse * before, inverse * inside
+        of_cosine = of_along * ratio * (ratio * cosine * over_inside - one)
         of_ratio = (a * l + b * m + c * n) - of_along * (
-            ratio * (one - cosine * cosine) / inside + cosine
+            ratio * (one - cosine * cosine) * over_inside + cosine
         )
-        of_before = of_ratio * ratio / before
+        of_before = of_ratio * ratio * over_before
         return (
             ratio * a + of_cosine * nx,
             ratio * b + of_cosine * ny,

@@ -27,15 +27,9 @@ from dolens.kernels.cpu.even_asphere import (
 from dolens.kernels.cpu.explicit import explicit_adjoint, explicit_forward
 from dolens.kernels.cpu.forward import forward_driver
 from dolens.kernels.cpu.layout import (
-    ADJOINT,
-    BEND,
     BLOCK,
     CODES,
     COTANGENT_HEADER,
-    EXTRAS_ADDRESS,
-    FORWARD,
-    PARAMETERS,
-    SAG,
     STATE,
     WORK_ROWS,
     Job,
@@ -88,6 +82,20 @@ _DERIVATIVES = {
 }
 
 
+@cache
+def _addresses(kind: Kind, real: str, derivatives: bool) -> list[int]:
+    """Compiled functions of a step in the order of their places in its codes."""
+    bend, parameters = _DERIVATIVES.get(kind, (None, None))
+    wanted = (
+        _FORWARD[kind],
+        _ADJOINT[kind] if derivatives else None,
+        _SAG.get(kind),
+        bend if derivatives else None,
+        parameters if derivatives else None,
+    )
+    return [0 if f is None else compiler.compile_block(f, real) for f in wanted]
+
+
 class Program:
     """A surface table with its compiled steps, and the memory of each worker.
 
@@ -104,26 +112,21 @@ class Program:
         self.real = REAL[table.values.dtype]
         self.table = table
         self.derivatives = derivatives
-        steps = table.codes.shape[0]
-        self.codes = np.zeros((max(steps, 1), CODES), dtype=np.int64)
-        self.codes[:steps, : Code.ROW] = table.codes.numpy()
+        rows = table.codes.tolist()
+        steps, extras = len(rows), table.extras.data_ptr()
         longest, degree = Slot.HEADER, 0
-        for row in self.codes[:steps]:
-            kind = Kind(row[Code.KIND])
-            row[FORWARD] = compiler.compile_block(_FORWARD[kind], self.real)
-            if kind in _SAG:
-                row[SAG] = compiler.compile_block(_SAG[kind], self.real)
-            if derivatives:
-                row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], self.real)
-                if kind in _DERIVATIVES:
-                    bend, parameters = _DERIVATIVES[kind]
-                    row[BEND] = compiler.compile_block(bend, self.real)
-                    row[PARAMETERS] = compiler.compile_block(parameters, self.real)
-            row[EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * int(row[Code.EXTRAS])
-            degree = max(degree, int(row[Code.DEGREE]))
+        self.codes = np.zeros((max(steps, 1), CODES), dtype=np.int64)
+        for row in rows:
+            kind = row[Code.KIND]
+            row += _addresses(Kind(kind), self.real, derivatives)
+            row.append(extras + 8 * row[Code.EXTRAS])
+            row += [0] * (CODES - len(row))
+            degree = max(degree, row[Code.DEGREE])
             # A spline's stencil takes 17 rows, whatever the number of its coefficients.
-            length = Slot.HEADER + 17 if kind == Kind.B_SPLINE else int(row[Code.LENGTH])
+            length = Slot.HEADER + 17 if kind == Kind.B_SPLINE else row[Code.LENGTH]
             longest = max(longest, length)
+        if steps:
+            self.codes[:] = rows
         clips = (self.codes[:, Code.EDGE] == Outline.RECTANGLE) | (self.codes[:, Code.HOLE] != 0)
         self.job = np.zeros(Job.LENGTH, dtype=np.int64)
         self.job[Job.STEPS] = steps

@@ -88,11 +88,13 @@ int16_at = _pointer_at(types.int16)
 int8_at = _pointer_at(types.int8)
 
 
+@cache
 def compile_block(factory: Factory, real: str) -> int:
     """Address of a block function for `float32` or `float64`."""
     return _compiled(factory, real, block_signature(REALS[real])).address
 
 
+@cache
 def compile_driver(factory: Factory, real: str) -> Any:
     """A driver as a C function of (job, first, last), which runs without Python's lock."""
     signature = types.void(INTEGERS, types.int64, types.int64)

@@ -147,14 +147,25 @@ class _Derivatives:
             self._spline = np.full(table.values.numel(), -1, dtype=np.int64)
             self._spline[places[local]] = columns[local]
             job[Job.SPLINE_COLUMNS] = self._spline.ctypes.data
+        # By steps; after the last come columns that begin as zero: nothing overwrites them.
         order = np.argsort(steps, kind="stable")
         order = order[~local[order]]
+        rows, columns, weights, steps = (a[order] for a in (rows, columns, weights, steps))
+        # A sweep takes the entries last first: the last of a column is the one that comes first.
+        last = np.full(variables.count, -1, dtype=np.int64)
+        last[columns] = np.arange(len(columns))
+        empty = np.flatnonzero(last < 0)
+        is_first = np.zeros(len(columns), dtype=np.int64)
+        is_first[last[last >= 0]] = 1
+        end = len(columns) + len(empty)
+        padding = np.zeros_like(empty)
         self._entries = (
-            np.searchsorted(steps[order], np.arange(codes.shape[0] + 1)),
-            rows[order],
-            columns[order],
-            weights[order],
+            np.append(np.searchsorted(steps, np.arange(codes.shape[0] + 1)), end),
+            np.append(rows, padding),
+            np.append(columns, empty),
+            np.append(weights, padding.astype(np.float64)),
+            np.append(is_first, padding + 1),
         )
-        entries = (Job.ENTRIES, Job.ENTRY_ROWS, Job.ENTRY_COLUMNS, Job.ENTRY_WEIGHTS)
-        for place, array in zip(entries, self._entries, strict=True):
-            job[place] = array.ctypes.data
+        names = ("ENTRIES", "ENTRY_ROWS", "ENTRY_COLUMNS", "ENTRY_WEIGHTS", "ENTRY_FIRST")
+        for name, array in zip(names, self._entries, strict=True):
+            job[getattr(Job, name)] = array.ctypes.data

@@ -121,8 +121,6 @@ def normal_equations_driver(real: types.Type) -> Callable[..., None]:
                 row = carray(shifted(rows, 128 * c), 128)
                 out = carray(shifted(weighted, 128 * c), 128)
                 for i in range(128):
-                    row[i] = row[i] if ended[i] == zero else zero
-                for i in range(128):
                     out[i] = w[i] * row[i]
                 total[2 + c] += dot(shifted(weighted, 128 * c), residual)
             for c in range(p):
@@ -153,14 +151,14 @@ def normal_equations_driver(real: types.Type) -> Callable[..., None]:
                 if start < end:
                     count = min(128, end - start)
                     if begin(job, start, count, lanes) >= 72:
-                        differentiate(job, lanes)
+                        differentiate(job, lanes, at(job[49]), 128)
                         accumulate(job, lanes, count, sums)
                     else:
                         waiting = wait(job, lanes, count, waiting)
                     start += 128
                 if waiting >= 128 or (waiting > 0 and start >= end):
                     count = resume(job, lanes, waiting)
-                    differentiate(job, lanes)
+                    differentiate(job, lanes, at(job[49]), 128)
                     accumulate(job, lanes, count, sums)
                     waiting -= count
 
