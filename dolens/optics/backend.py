@@ -161,7 +161,9 @@ class FlatRays:
 @torch.no_grad()
 def flat_rays(system: OpticalSystem, rays: Rays) -> FlatRays:
     """Rays towards the first surface, without a graph; wavelengths that repeat are one."""
-    ray, before = enter_lens(system, rays, 1, 1.0)
+    ray, before = rays.components(), None
+    if torch.promote_types(ray.x.dtype, system.dtype) != system.dtype:
+        ray, before = enter_lens(system, rays, 1, 1.0)
     shape = ray.x.shape
     position, direction = _joined(system, rays, ray, before)
     wavelength = rays.wavelength

@@ -1,69 +1,28 @@
-"""Jacobians of every ray and normal equations, on the kernels and on the reference alike."""
+"""Jacobians of every ray, on the kernels and on the reference alike."""
 
 import pytest
 import torch
-import yaml
 
 from dolens import InputError, Rays, load_lens
 from dolens.optics.jacobian import normal_equations, ray_jacobian
-from dolens.prescriptions import lens_from_prescription
-
-ALL = ("x", "y", "path_length")
-EVERY = ["surfaces.*", "thicknesses.*", "sensor_distance"]
-
-
-def posed_triplet(root):
-    """A Cooke triplet of three elements out of place; the second lies within a moved group."""
-    text = (root / "conf/lens/cooke_triplet.yaml").read_text(encoding="utf-8")
-    elements = {
-        "front": {"surfaces": [1, 2], "tilt_x": 0.5, "decenter_y": 0.1, "pivot": [0.0, 0.2, 1.0]},
-        "group": {"surfaces": [3, 6], "tilt_y": -0.4, "tilt_z": 3.0, "shift_z": 0.05},
-        "inner": {"surfaces": [3, 4], "tilt_x": 0.3, "pivot": [-0.4, 0.0, 0.0]},
-    }
-    return lens_from_prescription(yaml.safe_load(text) | {"elements": elements})
+from tests.optics.jacobian_samples import (
+    ALL,
+    EVERY,
+    freeform,
+    posed_triplet,
+    sample_lens,
+    wide_bundle,
+)
 
 
-def freeform():
-    """A singlet with a B-spline back of 7×6 coefficients, of which a pencil meets a few."""
-    row = [-0.01 * (3 * (i - 2.4) ** 2 + i) for i in range(6)]
-    spline = {
-        "type": "b_spline", "half_width": 10.0, "semi_diameter": 9.0, "material": "air",
-        "coefficients": [[h - 0.02 * (j - 3.1) ** 2 for h in row] for j in range(7)],
-    }  # fmt: skip
-    front = {
-        "type": "conic", "radius": 40.0, "conic": -0.4, "semi_diameter": 9.0, "thickness": 5.0,
-        "material": "1.5168/64.17",
-    }  # fmt: skip
-    return lens_from_prescription(
-        {"surfaces": {"1": front, "2": spline}, "sensor": {"distance": 45.0}}
-    )
-
-
-@pytest.fixture(params=["bent", "posed", "freeform"])
+@pytest.fixture(params=["asphere", "posed", "freeform"])
 def any_lens(request, root):
-    """Lenses that have every kind of parameter; `bent` is several."""
-    if request.param == "posed":
-        return posed_triplet(root)
-    if request.param == "freeform":
-        return freeform()
-    return load_lens(root / "conf/lens/asphere.yaml")
+    return sample_lens(request.param, root)
 
 
 @pytest.fixture(params=["auto", "reference"])
 def backend(request):
     return request.param
-
-
-def wide_bundle(lens, count=300, dtype=torch.float64, wavelengths=(486.1, 587.6, 656.3)):
-    """Rays of three wavelengths over more than the lens lets through, skew to its axis."""
-    radius = 1.15 * lens.surfaces["1"].semi_diameter
-    generator = torch.Generator().manual_seed(3)
-    start = 2.0 * torch.rand((count, 3), generator=generator, dtype=torch.float64) - 1.0
-    position = start * torch.tensor([radius, radius, 0.0]).double() + torch.tensor([0, 0, -3.0])
-    direction = torch.tensor([0.03, -0.05, 1.0]).double().expand(count, 3)
-    direction = direction / direction.norm(dim=-1, keepdim=True)
-    wavelength = torch.tensor(wavelengths).double()[torch.arange(count) % len(wavelengths)]
-    return Rays(position.to(dtype), direction.to(dtype), wavelength)
 
 
 def traced(lens, rays, values):
@@ -221,111 +180,6 @@ def test_rays_of_finer_precision_than_the_lens(root, backend):
     assert float(sums.sum_of_squares) == pytest.approx(0.25, rel=1e-3)
 
 
-def explicit(found, target, weight):
-    """JᵀWJ, JᵀWr and Σ w·r² from a stored Jacobian."""
-    r = (found.values - target)[found.valid].double()
-    j, w = found.derivatives[found.valid].double(), weight[found.valid].double()
-    return (
-        torch.einsum("n,nkp,nkq->pq", w, j, j),
-        torch.einsum("n,nkp,nk->p", w, j, r),
-        (w[:, None] * r * r).sum(),
-    )
-
-
-def close(a, b, relative):
-    return bool((a - b).abs().max() <= relative * b.abs().max())
-
-
-def bundle_for_sums(lens, backend="auto"):
-    """Rays of several chunks, with weights, targets near their points, and groups."""
-    count = 5000 if backend == "auto" else 400
-    rays = wide_bundle(lens, count=count)
-    generator = torch.Generator().manual_seed(5)
-    weight = torch.rand(count, generator=generator, dtype=torch.float64)
-    target = 1e-2 * torch.randn((count, 3), generator=generator, dtype=torch.float64)
-    group = torch.arange(count) * 7 // count * 2  # runs of even numbers: odd groups are empty
-    group[::11] = 3
-    target = target + ray_jacobian(lens, rays, ["sensor_distance"], ALL).values
-    return rays, target, weight, group
-
-
-def test_normal_equations_are_sums_over_the_jacobian(any_lens, backend):
-    rays, target, weight, _ = bundle_for_sums(any_lens, backend)
-    any_lens.backend = backend
-    stored = ray_jacobian(any_lens, rays, EVERY, ALL)
-    jtj, jtr, squares = explicit(stored, target, weight)
-    found = normal_equations(any_lens, rays, EVERY, target, weight, outputs=ALL)
-    assert int(found.count) == int(stored.valid.sum())
-    assert found.columns == stored.columns
-    assert found.groups is None
-    assert close(found.jtj, jtj, 1e-12)
-    assert close(found.jtr, jtr, 1e-12)
-    assert close(found.sum_of_squares, squares, 1e-12)
-
-
-def test_residuals_about_the_centroid_of_every_group(root, backend):
-    lens = load_lens(root / "conf/lens/asphere.yaml")
-    rays, target, weight, group = bundle_for_sums(lens, backend)
-    lens.backend = backend
-    stored = ray_jacobian(lens, rays, EVERY, ALL)
-    found = normal_equations(lens, rays, EVERY, target, weight, group, ALL)
-    residual, jacobian = (stored.values - target).clone(), stored.derivatives.clone()
-    for g in range(13):
-        chosen = stored.valid & (group == g)
-        w = weight[chosen]
-        assert int(found.groups.count[g]) == int(chosen.sum())
-        assert close(found.groups.weight[g], w.sum(), 1e-12)
-        if not chosen.any():
-            assert not found.groups.jacobian[g].any()
-            continue
-        total = torch.einsum("n,nkp->kp", w, jacobian[chosen])
-        assert close(found.groups.jacobian[g], total, 1e-12)
-        share = w / w.sum()
-        residual[chosen] -= torch.einsum("n,nk->k", share, residual[chosen])
-        jacobian[chosen] -= torch.einsum("n,nkp->kp", share, jacobian[chosen])
-    r, j, w = residual[stored.valid], jacobian[stored.valid], weight[stored.valid]
-    centred = found.about_centroids()
-    assert close(centred.jtj, torch.einsum("n,nkp,nkq->pq", w, j, j), 1e-10)
-    assert close(centred.jtr, torch.einsum("n,nkp,nk->p", w, j, r), 1e-10)
-    assert close(centred.sum_of_squares, (w[:, None] * r * r).sum(), 1e-10)
-    assert int((found.groups.count == 0).sum()) == 5
-
-
-def test_a_spot_radius_by_groups(root, backend):
-    """The RMS radius of two fields, each about its own centroid."""
-    lens = load_lens(root / "conf/lens/cooke_triplet.yaml")
-    lens.backend = backend
-    position = wide_bundle(lens, count=200).position
-    tangent = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.1, 1.0]]).double()
-    direction = (tangent / tangent.norm(dim=-1, keepdim=True))[:, None]
-    rays = Rays(position.expand(2, 200, 3), direction)
-    found = normal_equations(
-        lens, rays, ["thicknesses.*"], group=torch.tensor([[0], [1]])
-    ).about_centroids()
-    hit = lens.trace(rays)
-    squares = 0.0
-    for field in range(2):
-        spot = hit.position[field, hit.valid[field], :2].detach()
-        squares += float((spot - spot.mean(0)).square().sum())
-    assert float(found.sum_of_squares) == pytest.approx(squares, rel=1e-9)
-
-
-def test_the_same_to_the_bit_with_any_number_of_threads(any_lens):
-    rays, target, weight, group = bundle_for_sums(any_lens)
-    kept = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 2, 3):
-            torch.set_num_threads(threads)
-            sums = normal_equations(any_lens, rays, EVERY, target, weight, group, ALL)
-            stored = ray_jacobian(any_lens, rays, EVERY, ALL)
-            results.append((sums.jtj, sums.jtr, sums.groups.jacobian, stored.derivatives))
-    finally:
-        torch.set_num_threads(kept)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
 def test_single_precision_is_close(root):
     name = root / "conf/lens/cooke_triplet.yaml"
     exact, lens = load_lens(name), load_lens(name, dtype=torch.float32)
@@ -338,34 +192,6 @@ def test_single_precision_is_close(root):
     scale = expected.derivatives.abs().amax(0)
     error = (found.derivatives - expected.derivatives)[both].abs().amax(0)
     assert (error <= 1e-4 * scale).all()
-    sums = normal_equations(lens, single, EVERY)
-    assert sums.jtj.dtype == torch.float64
-    assert close(sums.jtj, normal_equations(exact, rays, EVERY).jtj, 1e-2)
-
-
-def test_a_step_of_gauss_and_newton_refocuses(root, backend):
-    """From the sums alone: the sensor of a defocused lens goes back."""
-    lens = load_lens(root / "conf/lens/cooke_triplet.yaml")
-    lens.backend = backend
-    position = 0.4 * wide_bundle(lens, count=400).position
-    rays = Rays(position, torch.tensor([0.0, 0.0, 1.0]).double())
-    group = torch.zeros((), dtype=torch.int64)
-
-    def sums():
-        return normal_equations(lens, rays, ["sensor_distance"], group=group).about_centroids()
-
-    def refocus():
-        found = sums()
-        lens.sensor_distance -= (found.jtr / found.jtj[0]).reshape(())
-        return float(lens.sensor_distance), float(found.jtr.abs())
-
-    with torch.no_grad():
-        best, _ = refocus()
-        lens.sensor_distance += 0.5
-        again, slope = refocus()
-        # A ray goes straight to the sensor, so one step is exact.
-        assert again == pytest.approx(best, abs=1e-9)
-        assert float(sums().jtr.abs()) < 1e-9 * slope
 
 
 def test_wrong_input_is_refused(root):
@@ -375,13 +201,3 @@ def test_wrong_input_is_refused(root):
         ray_jacobian(lens, rays, ["surfaces.9.curvature"])
     with pytest.raises(InputError, match="path_length"):
         ray_jacobian(lens, rays, EVERY, ("z",))
-    with pytest.raises(InputError, match="target must broadcast"):
-        normal_equations(lens, rays, EVERY, torch.zeros(4, 3))
-    with pytest.raises(InputError, match="weight must broadcast"):
-        normal_equations(lens, rays, EVERY, weight=torch.ones(3))
-    with pytest.raises(InputError, match="integers"):
-        normal_equations(lens, rays, EVERY, group=torch.zeros(4))
-    with pytest.raises(InputError, match="count from 0"):
-        normal_equations(lens, rays, EVERY, group=torch.tensor(-1))
-    with pytest.raises(InputError, match="groups"):
-        normal_equations(lens, rays, EVERY).about_centroids()

@@ -36,7 +36,7 @@ from dolens.kernels.cpu.layout import (
 )
 from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
 from dolens.kernels.cpu.sphere import sphere_adjoint, sphere_forward
-from dolens.kernels.cpu.threads import SMALL, spread, thread_count
+from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
 from dolens.kernels.cpu.xy_polynomial import (
     xy_polynomial_bend,
     xy_polynomial_parameters,
@@ -47,6 +47,7 @@ from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 # Chunks of rays that sums are kept for: enough for any processor's threads.
 _CHUNKS = 64
+_ALIGNMENT = 64  # bytes: a line of the cache
 
 _FORWARD = {
     Kind.PLANE: plane_forward,
@@ -168,20 +169,17 @@ class Program:
         """Run a driver over all pieces, on torch's number of threads, or on one for few rays."""
         function = compiler.compile_driver(driver, self.real)
         threads = thread_count(int(self.job[Job.RAYS]), small)
-        size = sum(self._sizes.values())
-        memory = torch.empty((threads, size + BLOCK), dtype=self.table.values.dtype)
-        lanes = np.zeros((threads, 3 * BLOCK), dtype=np.int64)
-        jobs = np.repeat(self.job[None], threads, axis=0)
-        for worker in range(threads):
-            address = memory[worker].data_ptr()
-            for place, length in self._sizes.items():
-                jobs[worker, place] = address
-                address += length * memory.element_size()
-            jobs[worker, Job.LANES] = lanes[worker].ctypes.data
-            jobs[worker, Job.PENDING] = jobs[worker, Job.LANES] + BLOCK * lanes.itemsize
+        step = self.table.values.element_size()
+        size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
 
         def task(worker: int, first: int, last: int) -> None:
-            function(_integers(jobs[worker]), first, last)
+            job, memory = self.job.copy(), scratch(size + _ALIGNMENT)
+            address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
+            for place, length in self._sizes.items():
+                job[place] = address
+                address += length * step
+            job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
+            function(_integers(job), first, last)
 
         spread(task, pieces, threads)
 
