@@ -88,17 +88,20 @@ def trace_rays(
         last: number of the last, or None.
     """
     end = len(system.surfaces) if last is None else last
-    ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
     to_sensor = last is None and sense > 0.0
-    if record or choose_backend(system, requested, rays) == "reference":
+    reference = record or choose_backend(system, requested, rays) == "reference"
+    finer = torch.promote_types(rays.position.dtype, rays.direction.dtype)
+    ray = before = None
+    if reference or torch.promote_types(finer, system.dtype) != system.dtype:
+        ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
+    if reference:
         traced = trace_surfaces(
             system, ray, rays.wavelength, sense, True, record, first=first, last=last
         )
         if to_sensor:
             traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, sense)
         return traced_rays(traced, before)
-    shape = ray.x.shape
-    position, direction = _joined(system, rays, ray, before)
+    position, direction, shape = _joined(system, rays, ray, before)
     table = pack(system, rays.wavelength, sense, first, end, to_sensor)
     position, direction, path, status, surface = operators.trace(
         table.values,
@@ -124,17 +127,17 @@ def trace_rays(
 
 
 def _joined(
-    system: OpticalSystem, rays: Rays, ray: Components, before: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Positions and directions (N, 3) of rays that have entered the lens."""
-    if before is not None:
-        position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
+    system: OpticalSystem, rays: Rays, ray: Components | None, before: Tensor | None
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """Positions and directions (N, 3), and the leading shape; of `ray` where it was moved."""
+    if ray is not None and before is not None:
+        position, direction, shape = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1), ray.x.shape
     else:
         # As the user gave them: views of (..., 3), which a kernel reads in place.
-        options = {"device": system.device, "dtype": system.dtype}
-        position = rays.position.to(**options).expand(*ray.x.shape, 3)
-        direction = rays.direction.to(**options).expand(*ray.x.shape, 3)
-    return position.reshape(-1, 3), direction.reshape(-1, 3)
+        options, shape = {"device": system.device, "dtype": system.dtype}, _shape(rays)
+        position = rays.position.to(**options).expand(*shape, 3)
+        direction = rays.direction.to(**options).expand(*shape, 3)
+    return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(shape)
 
 
 @dataclass(frozen=True)
@@ -155,17 +158,16 @@ class FlatRays:
     wavelengths: Sequence[float]
     column: Tensor | None
     before: Tensor | None
-    shape: torch.Size
+    shape: tuple[int, ...]
 
 
 @torch.no_grad()
 def flat_rays(system: OpticalSystem, rays: Rays) -> FlatRays:
     """Rays towards the first surface, without a graph; wavelengths that repeat are one."""
-    ray, before = rays.components(), None
-    if torch.promote_types(ray.x.dtype, system.dtype) != system.dtype:
+    ray = before = None
+    if torch.promote_types(rays.position.dtype, system.dtype) != system.dtype:
         ray, before = enter_lens(system, rays, 1, 1.0)
-    shape = ray.x.shape
-    position, direction = _joined(system, rays, ray, before)
+    position, direction, shape = _joined(system, rays, ray, before)
     wavelength = rays.wavelength
     if isinstance(wavelength, Tensor) and wavelength.numel() > _FEW:
         wavelength, column = wavelength.unique(return_inverse=True)
@@ -177,6 +179,13 @@ def flat_rays(system: OpticalSystem, rays: Rays) -> FlatRays:
         before = before.expand(shape).reshape(-1)
     several = wavelength.reshape(-1).tolist() if isinstance(wavelength, Tensor) else (wavelength,)
     return FlatRays(position, direction, several, column, before, shape)
+
+
+def _shape(rays: Rays) -> tuple[int, ...]:
+    """The common leading shape of a bundle."""
+    if rays.position.shape == rays.direction.shape and not isinstance(rays.wavelength, Tensor):
+        return tuple(rays.position.shape[:-1])
+    return tuple(rays.components().x.shape)
 
 
 def _columns(

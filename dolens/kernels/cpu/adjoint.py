@@ -38,7 +38,7 @@ def sweeps(real: types.Type) -> Sweeps:
     """Functions that fill a block with valid rays, trace it, and sweep back, for one real type."""
     at = real_at(real)
     zero = real(0.0)
-    find_wavelength, _, set_indices, step = streams(real)
+    find_wavelength, load, set_indices, step = streams(real)
 
     @njit(**OPTIONS)
     def load_lanes(job, lanes):  # noqa: ANN001, ANN202
@@ -67,7 +67,9 @@ def sweeps(real: types.Type) -> Sweeps:
             ray += 1
         for i in range(max(count, 1), 128):
             lanes[i] = lanes[0]
-        if count > 0:
+        if count == 128 and lanes[127] - lanes[0] == 127:
+            load(job, lanes[0], 128, at(job[15]), lanes)
+        elif count > 0:
             load_lanes(job, lanes)
         return count, ray
 
@@ -119,13 +121,15 @@ def sweeps(real: types.Type) -> Sweeps:
         else:
             for j in range(24, length):
                 add_row(cotangents, 16 + j, sums, offset + j)
+        if job[39] == 0:
+            return
         count, values = job[12], job[37]
         for side in range(2):
             row = values + codes[3 + side] * count
             if count == 1:
                 add_row(cotangents, 7 + side, sums, row)
-            elif job[39] > 0:
-                add_row(cotangents, 7 + side, sums, row + job[39] - 1)
+            elif job[63] > 0:
+                add_row(cotangents, 7 + side, sums, row + job[63] - 1)
             else:
                 which = carray(int32_at(job[6]), 1 << 40)
                 lane = carray(shifted(cotangents, 896 + 128 * side), 128)

@@ -1,8 +1,9 @@
 """Running the CPU kernels on tensors."""
 
+import ctypes
 from collections.abc import Callable
-from functools import cache
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,10 +28,17 @@ from dolens.kernels.cpu.even_asphere import (
 from dolens.kernels.cpu.explicit import explicit_adjoint, explicit_forward
 from dolens.kernels.cpu.forward import forward_driver
 from dolens.kernels.cpu.layout import (
+    ADJOINT,
+    BEND,
     BLOCK,
     CODES,
     COTANGENT_HEADER,
+    EXTRAS_ADDRESS,
+    FORWARD,
+    PARAMETERS,
+    SAG,
     STATE,
+    STENCIL_ROWS,
     WORK_ROWS,
     Job,
 )
@@ -44,6 +52,7 @@ from dolens.kernels.cpu.xy_polynomial import (
 )
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
 
+_INTEGERS = ctypes.POINTER(ctypes.c_int64)
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 # Chunks of rays that sums are kept for: enough for any processor's threads.
 _CHUNKS = 64
@@ -83,18 +92,50 @@ _DERIVATIVES = {
 }
 
 
-@cache
-def _addresses(kind: Kind, real: str, derivatives: bool) -> list[int]:
-    """Compiled functions of a step in the order of their places in its codes."""
-    bend, parameters = _DERIVATIVES.get(kind, (None, None))
-    wanted = (
-        _FORWARD[kind],
-        _ADJOINT[kind] if derivatives else None,
-        _SAG.get(kind),
-        bend if derivatives else None,
-        parameters if derivatives else None,
-    )
-    return [0 if f is None else compiler.compile_block(f, real) for f in wanted]
+class Steps(NamedTuple):
+    """The steps of a lens, compiled.
+
+    Attributes:
+        codes: (steps, CODES), int64: the table's, and the addresses of the block functions.
+        longest: numbers of the longest record that has cotangents.
+        scratch: work rows that the shapes need.
+        clip: address of the test of apertures that are no full circles, or zero.
+    """
+
+    codes: np.ndarray
+    longest: int
+    scratch: int
+    clip: int
+
+
+@lru_cache(maxsize=256)
+def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
+    """Compile what the steps of a table need: a pure function of its codes."""
+    table = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW)
+    rows = np.zeros((max(len(table), 1), CODES), dtype=np.int64)
+    rows[: len(table), : Code.ROW] = table
+    longest, scratch = Slot.HEADER, 0
+    for row in rows[: len(table)]:
+        kind = Kind(row[Code.KIND])
+        row[FORWARD] = compiler.compile_block(_FORWARD[kind], real)
+        if kind in _SAG:
+            row[SAG] = compiler.compile_block(_SAG[kind], real)
+        if derivatives:
+            row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], real)
+            if kind in _DERIVATIVES:
+                bend, parameters = _DERIVATIVES[kind]
+                row[BEND] = compiler.compile_block(bend, real)
+                row[PARAMETERS] = compiler.compile_block(parameters, real)
+        length = int(row[Code.LENGTH])
+        if kind == Kind.B_SPLINE:
+            # Its stencil takes 17 rows of cotangents, whatever the number of its coefficients.
+            length, scratch = Slot.HEADER + 17, max(scratch, STENCIL_ROWS)
+        elif kind == Kind.XY_POLYNOMIAL:
+            scratch = max(scratch, 2 * (int(row[Code.DEGREE]) + 1))
+        longest = max(longest, length)
+    clips = (rows[:, Code.EDGE] == Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
+    address = compiler.compile_block(clip, real) if clips.any() else 0
+    return Steps(rows, longest, scratch, address)
 
 
 class Program:
@@ -113,24 +154,12 @@ class Program:
         self.real = REAL[table.values.dtype]
         self.table = table
         self.derivatives = derivatives
-        rows = table.codes.tolist()
-        steps, extras = len(rows), table.extras.data_ptr()
-        longest, degree = Slot.HEADER, 0
-        self.codes = np.zeros((max(steps, 1), CODES), dtype=np.int64)
-        for row in rows:
-            kind = row[Code.KIND]
-            row += _addresses(Kind(kind), self.real, derivatives)
-            row.append(extras + 8 * row[Code.EXTRAS])
-            row += [0] * (CODES - len(row))
-            degree = max(degree, row[Code.DEGREE])
-            # A spline's stencil takes 17 rows, whatever the number of its coefficients.
-            length = Slot.HEADER + 17 if kind == Kind.B_SPLINE else row[Code.LENGTH]
-            longest = max(longest, length)
-        if steps:
-            self.codes[:] = rows
-        clips = (self.codes[:, Code.EDGE] == Outline.RECTANGLE) | (self.codes[:, Code.HOLE] != 0)
+        steps = _steps(table.codes.numpy().tobytes(), self.real, derivatives)
+        count = table.codes.shape[0]
+        self.codes = steps.codes.copy()
+        self.codes[:, EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * self.codes[:, Code.EXTRAS]
         self.job = np.zeros(Job.LENGTH, dtype=np.int64)
-        self.job[Job.STEPS] = steps
+        self.job[Job.STEPS] = count
         self.job[Job.CODES] = self.codes.ctypes.data
         self.job[Job.VALUES] = table.values.data_ptr()
         self.job[Job.VALUES_LENGTH] = table.values.numel()
@@ -138,15 +167,14 @@ class Program:
         self.job[Job.WAVELENGTHS] = table.indices.shape[1]
         last = table.values.numel() - 1
         self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
-        if clips.any():
-            self.job[Job.CLIP] = compiler.compile_block(clip, self.real)
-        states = steps + 1 if derivatives else 2
-        cotangents = (COTANGENT_HEADER + longest) * BLOCK if derivatives else 0
+        self.job[Job.CLIP] = steps.clip
+        states = count + 1 if derivatives else 2
+        cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
         self.job[Job.COTANGENT_LENGTH] = cotangents
         self._sizes = {
             Job.STACK: states * STATE,
             Job.COTANGENTS: outputs * cotangents,
-            Job.WORK: (WORK_ROWS + 2 * (degree + 1)) * BLOCK,
+            Job.WORK: (WORK_ROWS + steps.scratch) * BLOCK,
             Job.COLUMNS: columns * BLOCK,
         }
 
@@ -179,20 +207,9 @@ class Program:
                 job[place] = address
                 address += length * step
             job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
-            function(_integers(job), first, last)
+            function(job.ctypes.data_as(_INTEGERS), first, last)
 
         spread(task, pieces, threads)
-
-
-@cache
-def _pointer_type() -> Any:
-    import ctypes
-
-    return ctypes.POINTER(ctypes.c_int64)
-
-
-def _integers(array: np.ndarray) -> Any:
-    return array.ctypes.data_as(_pointer_type())
 
 
 def trace(
@@ -240,7 +257,7 @@ def trace_adjoint(
     which: Tensor | None,
     status: Tensor,
     cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
-    wanted: tuple[bool, bool],
+    wanted: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor, Tensor]:
     """Cotangents of rays and table from those of position, direction and path length.
 
@@ -251,13 +268,16 @@ def trace_adjoint(
         which: (N,), int32, or None.
         status: (N,), int8, from `trace`: only rays that are valid pass a gradient.
         cotangents: of position (N, 3), direction (N, 3) and path (N,), of any strides, or None.
-        wanted: whether gradients of position and of direction are needed.
+        wanted: whether gradients of position, direction and indices are needed.
 
     Returns:
-        Gradients of position and direction (None where not wanted), of `values` and of `indices`.
+        Gradients of position and direction (None where not wanted), of `values` and of `indices`
+        (zeros where not wanted).
     """
     count = position.shape[0]
-    gradients = [torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted]
+    gradients = [
+        torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted[:2]
+    ]
     length = table.values.numel() + table.indices.numel()
     chunk = chunk_size(count)
     chunks = -(-count // chunk)
@@ -269,6 +289,7 @@ def trace_adjoint(
         program.point(POSITION_GRADIENT=gradients[0], DIRECTION_GRADIENT=gradients[1])
         job = program.job
         job[Job.SUM_LENGTH], job[Job.CHUNK] = length, chunk
+        job[Job.INDEX_SUMS] = int(wanted[2])
         of_position, of_direction, of_path = cotangents
         for place, tensor in (
             (Job.POSITION_COTANGENT, of_position),

@@ -42,14 +42,14 @@ def streams(real: types.Type) -> Streams:
     @njit(**OPTIONS)
     def find_wavelength(job, lanes):  # noqa: ANN001, ANN202
         """Note whether the rays of these numbers have one wavelength."""
-        job[39] = 1
+        job[63] = 1
         if job[12] > 1:
             which = carray(int32_at(job[6]), 1 << 40)
             first = which[lanes[0]]
             different = 0
             for i in range(128):
                 different += 1 if which[lanes[i]] != first else 0
-            job[39] = 0 if different > 0 else types.int64(first) + 1
+            job[63] = 0 if different > 0 else types.int64(first) + 1
 
     @njit(**OPTIONS)
     def load(job, start, count, state, lanes):  # noqa: ANN001, ANN202
@@ -100,22 +100,25 @@ def streams(real: types.Type) -> Streams:
     @njit(**OPTIONS)
     def set_indices(job, codes, lanes, work):  # noqa: ANN001, ANN202
         """The index in front and the ratio of a step; `lanes` are the rays' numbers."""
-        w = carray(work, 256)
+        w = carray(work, 6144)
         count = job[12]
         before = carray(shifted(real64_at(job[11]), codes[3] * count), 1 << 40)
         after = carray(shifted(real64_at(job[11]), codes[4] * count), 1 << 40)
-        if job[39] > 0:
-            common = job[39] - 1
+        if job[63] > 0:
+            common = job[63] - 1
             index, ratio = real(before[common]), real(before[common] / after[common])
+            inverse = real(types.float64(1.0) / before[common])
             for i in range(128):
                 w[i] = index
                 w[128 + i] = ratio
+                w[3072 + i] = inverse
         else:
             which = carray(int32_at(job[6]), 1 << 40)
             for i in range(128):
                 wavelength = which[lanes[i]]
                 w[i] = real(before[wavelength])
                 w[128 + i] = real(before[wavelength] / after[wavelength])
+                w[3072 + i] = real(types.float64(1.0) / before[wavelength])
 
     @njit(**OPTIONS)
     def step(job, k, lanes, before, after, cotangents, work):  # noqa: ANN001, ANN202
