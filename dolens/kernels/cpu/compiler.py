@@ -95,6 +95,7 @@ def compile_block(factory: Factory, real: str) -> int:
     return _compiled(factory, real, block_signature(REALS[real])).address
 
 
+@cache
 def compile_driver(factory: Factory, real: str) -> Any:
     """A driver as a C function of (job, first, last), which runs without Python's lock."""
     signature = types.void(INTEGERS, types.int64, types.int64)
