@@ -74,9 +74,8 @@ def render_adjoint(
     of_lens, of_indices, of_textures = wanted
     groups = min(_TEXTURE_GROUPS if of_textures else _GROUPS, len(job.blocks))
     bounds = np.array([len(job.blocks) * g // groups for g in range(groups + 1)])
-    media, channels = table.indices.shape
     cut = table.values.numel()
-    sums = torch.zeros((groups, cut + media * channels + 1), dtype=torch.float64)
+    sums = torch.zeros((groups, cut + table.indices.numel() + 1), dtype=torch.float64)
     image = of_image.contiguous()
     job.view[Place.IMAGE], job.view[Place.GROUPS] = image.data_ptr(), bounds.ctypes.data
     job.view[Place.OF_LENS] = int(of_lens)
@@ -94,7 +93,7 @@ def render_adjoint(
         of_texture = _unpad(texture_sums.sum(0), textures)
     return (
         total[:cut].to(table.values.dtype, copy=True),
-        total[cut:-1].reshape(channels, media).T.contiguous(),
+        total[cut:-1].reshape(table.indices.shape).clone(),
         of_texture,
         total[-1].to(sensor_z.dtype, copy=True),
     )
@@ -113,13 +112,9 @@ class _RenderJob:
         derivatives: bool,
     ) -> None:
         images, channels, height, width = textures.shape
-        # A driver traces one wavelength at a time, and reads its indices one after the other.
-        self.table = SurfaceTable(
-            table.values, table.indices.T.contiguous(), table.codes, table.extras
-        )
         self.textures = _pad(textures).contiguous()
         rows = SCRATCH_ROWS + images * len(view.depths) * channels
-        self.program = Program(self.table, derivatives, rows)
+        self.program = Program(table, derivatives, columns=rows)
         self.blocks = _blocks(pieces)
         self.view = np.zeros(Place.LENGTH, dtype=np.int64)
         self.view[: Place.PIXELS + 1] = (
@@ -130,12 +125,11 @@ class _RenderJob:
             (view.seed >> 32) & _LOW,
             view.height * view.width,
         )
-        self.view[Place.IMAGES : Place.MEDIA + 1] = (
+        self.view[Place.IMAGES : Place.TEXTURE_WIDTH + 1] = (
             images,
             len(view.depths),
             channels,
             *self.textures.shape[-2:],
-            table.indices.shape[0],
         )
         self.view[Place.BLOCKS] = self.blocks.ctypes.data
         self.view[Place.TEXTURES] = self.textures.data_ptr()
@@ -157,7 +151,6 @@ class _RenderJob:
         self.lengths[Length.PLANES :: 2] = view.depths
         self.lengths[Length.PLANES + 1 :: 2] = [m / view.pixel_pitch for m in view.magnifications]
         job = self.program.job
-        job[Job.WAVELENGTHS] = 1
         job[Job.VIEW], job[Job.LENGTHS] = self.view.ctypes.data, self.lengths.ctypes.data
         pixels = int(self.blocks[:, 1].sum())
         job[Job.RAYS] = pixels * view.pupil_samples**2 * channels

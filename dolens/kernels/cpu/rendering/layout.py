@@ -1,6 +1,6 @@
 """Where a renderer's driver finds its numbers, and the rows of its scratch memory.
 
-Scratch, rows of 128 as in `kernels.cpu.layout`:
+Scratch, at `Job.COLUMNS`, rows of 128 as in `kernels.cpu.layout`:
     0, 1 row and column of the pixels; 2 weights of the samples; 3 one where a ray arrives at the
     plane, else zero; 4, 5 fractions between texels, along rows and columns; 6 distance to the
     plane, 7 one over the cosine there; 8, 9 texels a mm of the plane, zero beyond the texture;
@@ -15,7 +15,7 @@ class Place:
     """Places in the array of integers at `Job.VIEW`: counts, and addresses (zero: not needed)."""
 
     WIDTH, SIDE, PIXEL_AREA, SEED_LOW, SEED_HIGH, PIXELS = range(6)
-    IMAGES, DEPTHS, CHANNELS, TEXTURE_HEIGHT, TEXTURE_WIDTH, MEDIA = range(6, 12)
+    IMAGES, DEPTHS, CHANNELS, TEXTURE_HEIGHT, TEXTURE_WIDTH = range(6, 11)
     # Blocks: first pixel and number of pixels; groups: the first block of each, and the end.
     BLOCKS, GROUPS, TEXTURES, IMAGE, TEXTURE_SUMS, OF_LENS = range(12, 18)
     LENGTH = 24

@@ -24,11 +24,10 @@ def render_driver(real: types.Type) -> Callable[..., None]:
     zero = real(0.0)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 64)
-        view, lengths = carray(int64_at(job[61]), 24), carray(at(job[62]), 1 << 40)
+        job = carray(job_, 72)
+        view, lengths = carray(int64_at(job[64]), 24), carray(at(job[65]), 1 << 40)
         lanes = carray(int64_at(job[38]), 128)
-        indices = job[11]
-        scratch, work, stack = at(job[60]), at(job[17]), at(job[15])
+        scratch, work, stack = at(job[49]), at(job[17]), at(job[15])
         sums, exit_z = shifted(scratch, 2048), carray(at(job[13]), 1)[0]
         images, depths, channels = view[6], view[7], view[8]
         height, width = view[9], view[10]
@@ -42,7 +41,7 @@ def render_driver(real: types.Type) -> Callable[..., None]:
             for number in range(view[1] * view[1]):
                 sample(view, lengths, number, start, count, stack, scratch)
                 for channel in range(channels):
-                    job[11] = indices + 8 * channel * view[11]
+                    job[63] = channel + 1
                     before, now = stack, shifted(stack, 1280)
                     for k in range(job[8]):
                         step(job, k, lanes, before, now, now, work)
@@ -63,6 +62,5 @@ def render_driver(real: types.Type) -> Callable[..., None]:
                 row = carray(shifted(sums, 128 * j), 128)
                 for i in range(count):
                     out[i] = row[i]
-        job[11] = indices
 
     return kernel

@@ -74,14 +74,13 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
     zero, full = real(0.0), real(128.0)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 64)
-        view, lengths = carray(int64_at(job[61]), 24), carray(at(job[62]), 1 << 40)
+        job = carray(job_, 72)
+        view, lengths = carray(int64_at(job[64]), 24), carray(at(job[65]), 1 << 40)
         lanes = carray(int64_at(job[38]), 128)
-        scratch, stack, cotangents = at(job[60]), at(job[15]), at(job[16])
+        scratch, stack, cotangents = at(job[49]), at(job[15]), at(job[16])
         cot = carray(cotangents, 896)
         state = shifted(stack, 1280 * job[8])
         exit_z = carray(at(job[13]), 1)[0]
-        indices, values = job[11], job[37]
         images, depths, channels = view[6], view[7], view[8]
         width, texels = view[10], view[9] * view[10]
         blocks, groups = carray(int64_at(view[12]), 1 << 40), carray(int64_at(view[13]), 1 << 40)
@@ -98,7 +97,7 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                     if channel == 0 or not whole:
                         whole = True
                         sample(view, lengths, number, start, count, stack, scratch)
-                    job[11], job[37] = indices + 8 * channel * view[11], values + channel * view[11]
+                    job[63] = channel + 1
                     forward(job, lanes)
                     arrived = arrive(state, scratch)
                     if arrived == zero:
@@ -130,13 +129,12 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                     total = zero
                     for i in range(128):
                         total += cot[256 + i]
-                    sums[values - 1] += types.float64(total)
+                    sums[job[37] - 1] += types.float64(total)
                     for k in range(job[8] - 1, -1, -1):
                         back(job, k, lanes)
                         add_sums(job, k, lanes, sums)
                     sums[job[35] - 1] += types.float64(
                         of_sensor_z(lengths, stack, cotangents, scratch)
                     )
-        job[11], job[37] = indices, values
 
     return kernel
