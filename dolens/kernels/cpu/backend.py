@@ -173,8 +173,8 @@ class Program:
         last = table.values.numel() - 1
         self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
         self.job[Job.CLIP] = steps.clip
-        # Without derivatives two in turn, and one that a driver may keep.
-        states = count + 1 if derivatives else 3
+        # All of them with derivatives, else two in turn; and some that a driver may keep.
+        states = count + 2 if derivatives else 4
         cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
         self.job[Job.COTANGENT_LENGTH] = cotangents
         self._sizes = {

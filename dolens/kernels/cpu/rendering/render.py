@@ -11,6 +11,7 @@ from numba import carray, types
 
 from dolens.kernels.cpu.compiler import int64_at, shifted
 from dolens.kernels.cpu.forward import real_at, streams
+from dolens.kernels.cpu.rendering.first_surface import first_surface
 from dolens.kernels.cpu.rendering.lookup import lookup
 from dolens.kernels.cpu.rendering.samples import sampler
 
@@ -21,6 +22,7 @@ def render_driver(real: types.Type) -> Callable[..., None]:
     step = streams(real).step
     place_pixels, sample, _ = sampler(real)
     arrive, meet, see, _, _ = lookup(real)
+    reusable, refract_again = first_surface(real)
     zero = real(0.0)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
@@ -28,6 +30,7 @@ def render_driver(real: types.Type) -> Callable[..., None]:
         view, lengths = carray(int64_at(job[64]), 24), carray(at(job[65]), 1 << 40)
         lanes = carray(int64_at(job[38]), 128)
         scratch, work, stack = at(job[49]), at(job[17]), at(job[15])
+        kept = shifted(stack, 3840)
         sums, exit_z = shifted(scratch, 2048), carray(at(job[13]), 1)[0]
         images, depths, channels = view[6], view[7], view[8]
         height, width = view[9], view[10]
@@ -40,12 +43,20 @@ def render_driver(real: types.Type) -> Callable[..., None]:
                 clear[i] = zero
             for number in range(view[1] * view[1]):
                 sample(view, lengths, number, start, count, stack, scratch)
+                shared = False
                 for channel in range(channels):
                     job[63] = channel + 1
-                    before, now = stack, shifted(stack, 1280)
-                    for k in range(job[8]):
+                    before = kept if channel == 0 else shifted(stack, 1280)
+                    if shared:
+                        refract_again(job, channel, stack, kept, before)
+                    else:
+                        step(job, 0, lanes, stack, before, before, work)
+                    if channel == 0 and channels > 1:
+                        shared = reusable(job, stack, kept)
+                    for k in range(1, job[8]):
+                        now = shifted(stack, 2560 if k % 2 == 1 else 1280)
                         step(job, k, lanes, before, now, now, work)
-                        before, now = now, shifted(stack, 2560 if k % 2 == 0 else 1280)
+                        before = now
                     if arrive(before, scratch) == zero:
                         continue
                     for d in range(depths):

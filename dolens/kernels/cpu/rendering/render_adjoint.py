@@ -12,14 +12,15 @@ from numba import carray, njit, types
 
 from dolens.kernels.cpu.adjoint import sweeps
 from dolens.kernels.cpu.compiler import OPTIONS, int64_at, real64_at, shifted
-from dolens.kernels.cpu.forward import real_at
+from dolens.kernels.cpu.forward import real_at, streams
+from dolens.kernels.cpu.rendering.first_surface import first_surface
 from dolens.kernels.cpu.rendering.lookup import lookup, texel_sums
 from dolens.kernels.cpu.rendering.samples import sampler
 
 
 @cache
-def _preparation(real: types.Type) -> tuple[Any, Any, Any]:
-    """Compiled: load the pixels' cotangents, replace rays that fail, and clear cotangents."""
+def _preparation(real: types.Type) -> tuple[Any, Any, Any, Any]:
+    """Compiled: load the pixels' cotangents, replace rays that fail, clear cotangents, copy."""
     at = real_at(real)
     zero = real(0.0)
 
@@ -59,18 +60,26 @@ def _preparation(real: types.Type) -> tuple[Any, Any, Any]:
         for i in range(128 * 7):
             cot[i] = zero
 
-    return load, replace, clear
+    @njit(**OPTIONS)
+    def copy(state, to):  # noqa: ANN001, ANN202
+        src, dst = carray(state, 1280), carray(to, 1280)
+        for i in range(1280):
+            dst[i] = src[i]
+
+    return load, replace, clear, copy
 
 
 def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
     """Sweep groups `first` to `last` of blocks back, from pixels to the lens and the textures."""
     at = real_at(real)
+    step = streams(real).step
     sweep = sweeps(real)
-    forward, back, add_sums = sweep.forward, sweep.back, sweep.add_sums
+    back, add_sums = sweep.back, sweep.add_sums
+    reusable, refract_again = first_surface(real)
     place_pixels, sample, of_sensor_z = sampler(real)
     arrive, meet, _, of_texels, of_rays = lookup(real)
     add_texels = texel_sums(real)
-    load, replace, clear = _preparation(real)
+    load, replace, clear, copy = _preparation(real)
     zero, full = real(0.0), real(128.0)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
@@ -79,7 +88,8 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
         lanes = carray(int64_at(job[38]), 128)
         scratch, stack, cotangents = at(job[49]), at(job[15]), at(job[16])
         cot = carray(cotangents, 896)
-        state = shifted(stack, 1280 * job[8])
+        work, behind = at(job[17]), shifted(stack, 1280)
+        state, kept = shifted(stack, 1280 * job[8]), shifted(stack, 1280 * (job[8] + 1))
         exit_z = carray(at(job[13]), 1)[0]
         images, depths, channels = view[6], view[7], view[8]
         width, texels = view[10], view[9] * view[10]
@@ -91,14 +101,23 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                 start, count = blocks[2 * block], blocks[2 * block + 1]
                 place_pixels(view, start, count, scratch)
                 load(view, lengths, start, count, scratch)
-                whole = True
+                whole, shared = True, False
                 for turn in range(view[1] * view[1] * channels):
                     number, channel = turn // channels, turn % channels
                     if channel == 0 or not whole:
                         whole = True
                         sample(view, lengths, number, start, count, stack, scratch)
                     job[63] = channel + 1
-                    forward(job, lanes)
+                    if channel > 0 and shared:
+                        refract_again(job, channel, stack, kept, behind)
+                    else:
+                        step(job, 0, lanes, stack, behind, behind, work)
+                    if channel == 0 and channels > 1:
+                        shared = reusable(job, stack, behind)
+                        copy(behind, kept)
+                    for k in range(1, job[8]):
+                        now = shifted(stack, 1280 * (k + 1))
+                        step(job, k, lanes, shifted(stack, 1280 * k), now, now, work)
                     arrived = arrive(state, scratch)
                     if arrived == zero:
                         continue
