@@ -174,7 +174,7 @@ class Program:
         self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
         self.job[Job.CLIP] = steps.clip
         # All of them with derivatives, else two in turn; and some that a driver may keep.
-        states = count + 2 if derivatives else 4
+        states = count + 3 if derivatives else 5
         cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
         self.job[Job.COTANGENT_LENGTH] = cotangents
         self._sizes = {

@@ -23,10 +23,14 @@ class FirstSurface(NamedTuple):
 
 @cache
 def first_surface(real: types.Type) -> FirstSurface:
-    """The functions for one real type; wavelengths are columns of the indices."""
+    """The functions for one real type.
+
+    What they keep: the state behind the first step at the first wavelength, with Γ in the row of
+    the path, which a renderer has no use for; then a row of d·N and three of N.
+    """
     at = real_at(real)
     zero, one, two, tiny = real(0.0), real(1.0), real(2.0), real(1e-18)
-    # (Γ² of a refraction too weak to give the normal.)
+    # Γ² of a refraction too weak to give the normal.
     weak = real(1e-4)
 
     @njit(**OPTIONS)
@@ -37,50 +41,56 @@ def first_surface(real: types.Type) -> FirstSurface:
         return real(indices[codes[3] * count + wavelength] / indices[codes[4] * count + wavelength])
 
     @njit(**OPTIONS)
-    def reusable(job, before, after):  # noqa: ANN001, ANN202
-        """Whether the first wavelength's step serves the others: no ray of the block ended."""
-        src, dst = carray(before, 1280), carray(after, 1280)
+    def reusable(job, before, kept):  # noqa: ANN001, ANN202
+        """Whether the first wavelength's step serves the others: no ray of the block ended.
+
+        N is taken along d' - μ·d, so that Γ is positive.
+        """
+        src, dst = carray(before, 1280), carray(kept, 1792)
         codes = carray(int64_at(job[9]), 24)
         refracts, mu = codes[5] != 0, ratio(job, codes, 0)
         good = zero
         for i in range(128):
-            x = dst[384 + i] - mu * src[384 + i]
-            y = dst[512 + i] - mu * src[512 + i]
-            z = dst[640 + i] - mu * src[640 + i]
-            strong = not refracts or x * x + y * y + z * z > weak
-            good += one if strong and dst[896 + i] == zero else zero
-        return good == real(128.0)
-
-    @njit(**OPTIONS)
-    def refract_again(job, wavelength, before, known, after):  # noqa: ANN001, ANN202
-        """The state behind the first step from that of the first wavelength.
-
-        The optical path is not carried on.
-        """
-        src, old, dst = carray(before, 1280), carray(known, 1280), carray(after, 1280)
-        codes = carray(int64_at(job[9]), 24)
-        record = carray(shifted(at(job[10]), codes[1]), 32)
-        for i in range(1280):
-            dst[i] = old[i]
-        if codes[5] == 0:
-            return
-        total_reflection = record[19] + two
-        mu_known, mu = ratio(job, codes, 0), ratio(job, codes, wavelength)
-        for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            a, b, c = dst[384 + i], dst[512 + i], dst[640 + i]
-            x, y, z = a - mu_known * l, b - mu_known * m, c - mu_known * n
-            size = math.sqrt(x * x + y * y + z * z)
+            x, y, z = dst[384 + i] - mu * l, dst[512 + i] - mu * m, dst[640 + i] - mu * n
+            squared = x * x + y * y + z * z
+            good += one if squared > weak and dst[896 + i] == zero else zero
+            size = math.sqrt(squared if squared > tiny else tiny)
             inverse = one / size
             x, y, z = x * inverse, y * inverse, z * inverse
-            cosine, inside = l * x + m * y + n * z, a * x + b * y + c * z
-            squared = (one - mu * mu) + (mu * mu) * (cosine * cosine)
-            root = math.sqrt(squared if squared > tiny else tiny)
+            dst[768 + i], dst[1280 + i] = size, l * x + m * y + n * z
+            dst[1408 + i], dst[1536 + i], dst[1664 + i] = x, y, z
+        return good == real(128.0) or not refracts
+
+    @njit(**OPTIONS)
+    def refract_again(job, wavelength, before, kept, after):  # noqa: ANN001, ANN202
+        """The state behind the first step at another wavelength, but for its path."""
+        src, old, dst = carray(before, 1280), carray(kept, 1792), carray(after, 1280)
+        codes = carray(int64_at(job[9]), 24)
+        record = carray(shifted(at(job[10]), codes[1]), 32)
+        for i in range(128):
+            dst[i], dst[128 + i], dst[256 + i] = old[i], old[128 + i], old[256 + i]
+            dst[768 + i], dst[896 + i] = zero, old[896 + i]
+            dst[1024 + i], dst[1152 + i] = old[1024 + i], old[1152 + i]
+        if codes[5] == 0:
+            for i in range(128 * 3):
+                dst[384 + i] = old[384 + i]
+            return
+        total_reflection = record[19] + two
+        known, mu = ratio(job, codes, 0), ratio(job, codes, wavelength)
+        change, constant, square = mu - known, one - mu * mu, mu * mu
+        # s·cos t = μ·d·N + Γ has the same sign at all wavelengths.
+        for i in range(128):
+            size, cosine = old[768 + i], old[1280 + i]
+            squared = constant + square * (cosine * cosine)
+            root = math.copysign(
+                math.sqrt(squared if squared > tiny else tiny), known * cosine + size
+            )
             # Small changes: the normal's rounding does not count.
-            more = ((root if inside > zero else -root) - mu * cosine) - size
-            dst[384 + i] = a + ((mu - mu_known) * l + more * x)
-            dst[512 + i] = b + ((mu - mu_known) * m + more * y)
-            dst[640 + i] = c + ((mu - mu_known) * n + more * z)
+            more = (root - mu * cosine) - size
+            dst[384 + i] = old[384 + i] + (change * src[384 + i] + more * old[1408 + i])
+            dst[512 + i] = old[512 + i] + (change * src[512 + i] + more * old[1536 + i])
+            dst[640 + i] = old[640 + i] + (change * src[640 + i] + more * old[1664 + i])
             dst[896 + i] = zero if squared > zero else total_reflection
 
     return FirstSurface(reusable, refract_again)

@@ -113,8 +113,8 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                     else:
                         step(job, 0, lanes, stack, behind, behind, work)
                     if channel == 0 and channels > 1:
-                        shared = reusable(job, stack, behind)
                         copy(behind, kept)
+                        shared = reusable(job, stack, kept)
                     for k in range(1, job[8]):
                         now = shifted(stack, 1280 * (k + 1))
                         step(job, k, lanes, shifted(stack, 1280 * k), now, now, work)
