@@ -95,9 +95,7 @@ def adjoint_kernel(
         if tl.max(alive.to(tl.int32), 0) > 0:
             # Rays that failed give way to axial ones: they would keep Newton's iteration busy.
             x, y, z = load_vectors(position, position_row, position_column, rays, alive, 0.0)
-            l, m, n = load_vectors(
-                direction, direction_row, direction_column, rays, alive, sense
-            )
+            l, m, n = load_vectors(direction, direction_row, direction_column, rays, alive, sense)
             columns = load_columns(which, rays, alive)
             path = tl.zeros_like(x)
             ended, vignetted = tl.zeros([BLOCK], tl.int32), tl.zeros([BLOCK], tl.int32)

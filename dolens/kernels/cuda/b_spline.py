@@ -146,9 +146,7 @@ def b_spline_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive):
     One stencil of 16 at a time, for all rays of the block that share it: the order of the additions
     is fixed.  Knots are no variables.
     """
-    columns, near_x, near_y, place, coefficients, x_low, x_high, y_low, y_high = _stencil(
-        record, codes, x, y
-    )
+    columns, near_x, near_y, place, _, x_low, x_high, y_low, y_high = _stencil(record, codes, x, y)
     bx0, bx1, bx2, bx3, dx0, dx1, dx2, dx3 = _basis(near_x, x, x_low, x_high)
     by0, by1, by2, by3, dy0, dy1, dy2, dy3 = _basis(near_y, y, y_low, y_high)
     into = sums + (tl.load(codes + COUNT) + columns + 8 + SHAPE)

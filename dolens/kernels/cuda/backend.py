@@ -4,6 +4,7 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import triton
 from torch import Tensor
@@ -15,13 +16,14 @@ from dolens.kernels.cuda.forward import forward_kernel
 from dolens.kernels.cuda.layout import STATE
 from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
 
-# Rays a block.  A program is one warp: sums and the end of Newton's iteration stay within it, and
-# its threads carry two rays or more, which hide each other's latency.
-FORWARD_BLOCK = 128
-ADJOINT_BLOCK = 64
-_WARPS = 1
+# Rays a block.  A program is one warp, so that sums and the end of Newton's iteration need no word
+# from other warps; two rays a thread share its control, as far as registers reach.
+FORWARD_BLOCK = 64
+ADJOINT_BLOCK = {torch.float32: 64, torch.float64: 32}
+# Triton's own choice of fused multiply-add differs between its versions.
+_OPTIONS = {"num_warps": 1, "enable_fp_fusion": True}
 # Programs of the adjoint for each of a GPU's multiprocessors.
-_ADJOINT_PROGRAMS = 8
+_ADJOINT_PROGRAMS = 16
 # States kept by all of them: at most so much a ray, or so much in all, whichever is more.
 _KEPT_PER_RAY = 32
 _KEPT_BYTES = 1 << 24
@@ -62,25 +64,23 @@ def _monomials(row: list[int], extras: list[int]) -> tuple[int, list[int]]:
 
 
 @lru_cache(maxsize=128)
-def _device_codes(
-    rows: tuple[tuple[int, ...], ...], extras: tuple[int, ...], device: torch.device
-) -> DeviceCodes:
-    """Copied once for every lens: gradients change its numbers, not its codes."""
-    codes, places, kinds = [], [0], 0
-    for given in rows:
-        row = list(given)
+def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCodes:
+    """Copied once for a lens, from int64: an optimization changes its numbers, not its codes."""
+    rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()
+    powers = np.frombuffer(extras, dtype=np.int64).tolist()
+    places, kinds = [0], 0
+    for row in rows:
         kinds |= 1 << row[Code.KIND]
         if row[Code.KIND] == Kind.XY_POLYNOMIAL:
-            row[Code.DEGREE], order = _monomials(row, list(extras))
+            row[Code.DEGREE], order = _monomials(row, powers)
             row[Code.EXTRAS] = len(places)
             places += order
-        codes.append(row)
-    table = torch.tensor(codes, dtype=torch.int32).reshape(-1, Code.ROW).to(device)
+    table = torch.tensor(rows, dtype=torch.int32).reshape(-1, Code.ROW)
     return DeviceCodes(
-        table,
+        table.to(device),
         torch.tensor(places, dtype=torch.int32).to(device),
-        table[:, Code.BEFORE].long(),
-        table[:, Code.AFTER].long(),
+        table[:, Code.BEFORE].long().to(device),
+        table[:, Code.AFTER].long().to(device),
         kinds,
     )
 
@@ -92,8 +92,9 @@ def _prepared(table: SurfaceTable, like: Tensor) -> tuple[DeviceCodes, Tensor]:
             f"Triton's kernels run on a GPU, not on {like.device} (or set TRITON_INTERPRET=1, "
             "to test them)"
         )
-    rows = tuple(map(tuple, table.codes.tolist()))
-    codes = _device_codes(rows, tuple(table.extras.tolist()), like.device)
+    codes = _device_codes(
+        table.codes.numpy().tobytes(), table.extras.numpy().tobytes(), like.device
+    )
     front = table.indices[codes.before]
     ratio = front / table.indices[codes.after]
     return codes, torch.stack((front, ratio), 1).to(like.dtype)
@@ -138,25 +139,29 @@ def trace(
             table.values, table.values.numel() - 1, media, table.indices.shape[1],
             codes.codes, codes.extras, codes.codes.shape[0], count,
             position, *position.stride(), direction, *direction.stride(), which,
-            *out, KINDS=codes.kinds, BLOCK=FORWARD_BLOCK, num_warps=_WARPS,
+            *out, KINDS=codes.kinds, BLOCK=FORWARD_BLOCK, **_OPTIONS,
         )  # fmt: skip
     return out
 
 
-def program_count(count: int, kept: int, device: torch.device) -> int:
-    """Programs of the adjoint.
+def program_count(count: int, blocks: int, kept: int, processors: int) -> int:
+    """Programs of the adjoint: as many as fill the GPU, and as memory allows.
 
     Args:
         count: rays.
+        blocks: of rays.
         kept: bytes that each program keeps.
-        device: of the rays.
+        processors: multiprocessors of the GPU.
     """
-    blocks = triton.cdiv(count, ADJOINT_BLOCK)
-    fits = max(1, max(_KEPT_BYTES, _KEPT_PER_RAY * count) // kept)
-    processors = 1
-    if device.type == "cuda":
-        processors = torch.cuda.get_device_properties(device).multi_processor_count
-    return min(blocks, fits, _ADJOINT_PROGRAMS * processors)
+    fits = max(_KEPT_BYTES, _KEPT_PER_RAY * count) // kept
+    return max(1, min(blocks, fits, _ADJOINT_PROGRAMS * processors))
+
+
+def _processors(device: torch.device) -> int:
+    """Multiprocessors; Triton's interpreter has one."""
+    if device.type != "cuda":
+        return 1
+    return torch.cuda.get_device_properties(device).multi_processor_count
 
 
 def trace_adjoint(
@@ -192,21 +197,23 @@ def trace_adjoint(
     steps = codes.codes.shape[0]
     gradients = [position.new_zeros(count, 3) if want else None for want in wanted]
     length = values.numel() + table.indices.numel()
-    kept = (steps + 1) * STATE.value * ADJOINT_BLOCK
+    block = ADJOINT_BLOCK[values.dtype]
+    blocks = triton.cdiv(count, block)
+    kept = (steps + 1) * STATE.value * block
     bytes_kept = kept * values.element_size() + length * 8
-    programs = max(1, program_count(count, bytes_kept, position.device))
+    programs = program_count(count, blocks, bytes_kept, _processors(position.device))
     sums = torch.zeros((programs, length), dtype=torch.float64, device=position.device)
     if count:
         of_position, of_direction, of_path = cotangents
         with _on(position.device):
             adjoint_kernel[(programs,)](
                 values, values.numel() - 1, media, table.indices.shape[1],
-                codes.codes, codes.extras, steps, count, triton.cdiv(count, ADJOINT_BLOCK),
+                codes.codes, codes.extras, steps, count, blocks,
                 position, *position.stride(), direction, *direction.stride(), which, status,
                 of_position, *_strides(of_position, 2), of_direction, *_strides(of_direction, 2),
                 of_path, *_strides(of_path, 1), *gradients, sums, length,
                 values.new_empty(programs * kept),
-                KINDS=codes.kinds, BLOCK=ADJOINT_BLOCK, num_warps=_WARPS,
+                KINDS=codes.kinds, BLOCK=block, **_OPTIONS,
             )  # fmt: skip
     total, cut = sums.sum(0), values.numel()
     return (

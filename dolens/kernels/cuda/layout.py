@@ -1,4 +1,4 @@
-"""Places in a table's records and rows of codes, as the constants that Triton lets a kernel read."""
+"""Places in records and rows of codes (`dolens.kernels.table`), as constants for Triton."""
 
 import triton.language as tl
 

@@ -124,13 +124,13 @@ def step(
         t0, towards = distance_to_plane(z + tl.load(record + SHIFT), n, sense)
         limit = tl.load(record + LIMIT)
         x, y = clamp(x + t0 * l, limit), clamp(y + t0 * m, limit)
-        t, nx, ny, nz, met = intersect(
-            record, codes, extras, kind, x, y, l, m, n, sense, KINDS
-        )
+        t, nx, ny, nz, met = intersect(record, codes, extras, kind, x, y, l, m, n, sense, KINDS)
         x, y, z = x + t * l, y + t * m, t * n
         travelled = t0 + t
         ended = tl.where((ended > 0) | (met & towards), ended, tag + MISSED)
-        vignetted = tl.where((vignetted > 0) | passes(record, codes, x, y), vignetted, tag + VIGNETTED)
+        vignetted = tl.where(
+            (vignetted > 0) | passes(record, codes, x, y), vignetted, tag + VIGNETTED
+        )
         if tl.load(codes + REFRACTS) != 0:
             l, m, n, transmitted = refract(l, m, n, nx, ny, nz, ratio, sense)
             ended = tl.where((ended > 0) | (transmitted > 0.0), ended, tag + TOTALLY_REFLECTED)

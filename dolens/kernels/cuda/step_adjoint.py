@@ -93,14 +93,10 @@ def shape_sums(
             conic_sums(record, sums, x, y, z, along, ux, uy, uz, alive)
     if HAS_EVEN_ASPHERE & KINDS:
         if kind == EVEN_ASPHERE:
-            explicit_sums(
-                record, codes, extras, sums, x, y, along, -ux, -uy, alive, EVEN_ASPHERE
-            )
+            explicit_sums(record, codes, extras, sums, x, y, along, -ux, -uy, alive, EVEN_ASPHERE)
     if HAS_XY_POLYNOMIAL & KINDS:
         if kind == XY_POLYNOMIAL:
-            explicit_sums(
-                record, codes, extras, sums, x, y, along, -ux, -uy, alive, XY_POLYNOMIAL
-            )
+            explicit_sums(record, codes, extras, sums, x, y, along, -ux, -uy, alive, XY_POLYNOMIAL)
     if HAS_B_SPLINE & KINDS:
         if kind == B_SPLINE:
             explicit_sums(record, codes, extras, sums, x, y, along, -ux, -uy, alive, B_SPLINE)
