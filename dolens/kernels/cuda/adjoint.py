@@ -19,11 +19,15 @@ from dolens.kernels.cuda.step import step
 from dolens.kernels.cuda.step_adjoint import step_adjoint
 from dolens.kernels.cuda.sums import add_by_column, add_sum
 
+# One compiled kernel serves bundles of any size, strides and alignment.
 _VARYING = (
     "exit_place", "wavelengths", "steps", "count", "blocks", "sum_length",
     "position_row", "position_column", "direction_row", "direction_column",
     "of_position_row", "of_position_column", "of_direction_row", "of_direction_column",
     "of_path_row",
+)  # fmt: skip
+_ANYWHERE = (
+    "position", "direction", "which", "status", "of_position", "of_direction", "of_path",
 )  # fmt: skip
 
 
@@ -62,14 +66,14 @@ def _vectors_or_zero(pointer, row, column, rays, mask, like):
         return load_vectors(pointer, row, column, rays, mask, 0.0)
 
 
-@triton.jit(do_not_specialize=_VARYING)
+@triton.jit(do_not_specialize=_VARYING, do_not_specialize_on_alignment=_ANYWHERE)
 def adjoint_kernel(
     values, exit_place, media, wavelengths, codes, extras, steps, count, blocks,
     position, position_row, position_column, direction, direction_row, direction_column, which,
     status, of_position, of_position_row, of_position_column,
     of_direction, of_direction_row, of_direction_column, of_path, of_path_row,
     position_gradient, direction_gradient, sums, sum_length, scratch,
-    KINDS: tl.constexpr, BLOCK: tl.constexpr,
+    KINDS: tl.constexpr, INDICES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sweep cotangents back; see `dolens.kernels.cuda.backend.trace_adjoint`.
 
@@ -82,6 +86,7 @@ def adjoint_kernel(
             indices (media, wavelengths).
         scratch: (programs, steps + 1, STATE, BLOCK).
         KINDS: see `step`.
+        INDICES: whether cotangents of the indices are summed.
         BLOCK: rays a block.
     """
     program = tl.program_id(0).to(tl.int64)
@@ -133,13 +138,14 @@ def adjoint_kernel(
                     row, values + offset, extras, own_sums + offset, index, ratio,
                     before, after, px, py, pz, a, b, c, of_length, alive, KINDS,
                 )  # fmt: skip
-                front = of_indices + tl.load(row + BEFORE) * wavelengths
-                behind = of_indices + tl.load(row + AFTER) * wavelengths
-                if which is None:
-                    add_sum(front, of_front, alive)
-                    add_sum(behind, of_behind, alive)
-                else:
-                    add_by_column(front, behind, columns, of_front, of_behind, alive)
+                if INDICES:
+                    front = of_indices + tl.load(row + BEFORE) * wavelengths
+                    behind = of_indices + tl.load(row + AFTER) * wavelengths
+                    if which is None:
+                        add_sum(front, of_front, alive)
+                        add_sum(behind, of_behind, alive)
+                    else:
+                        add_by_column(front, behind, columns, of_front, of_behind, alive)
             if position_gradient is not None:
                 store_vectors(position_gradient, rays, alive, px, py, pz)
             if direction_gradient is not None:

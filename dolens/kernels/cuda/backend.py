@@ -171,7 +171,7 @@ def trace_adjoint(
     which: Tensor | None,
     status: Tensor,
     cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
-    wanted: tuple[bool, bool],
+    wanted: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor, Tensor]:
     """Cotangents of rays and table from those of position, direction and path length.
 
@@ -184,10 +184,11 @@ def trace_adjoint(
         which: (N,), int32, or None.
         status: (N,), int8, from `trace`: only rays that are valid pass a gradient.
         cotangents: of position (N, 3), direction (N, 3) and path (N,), of any strides, or None.
-        wanted: whether gradients of position and of direction are needed.
+        wanted: whether gradients of position, direction and indices are needed.
 
     Returns:
-        Gradients of position and direction (None where not wanted), of `values` and of `indices`.
+        Gradients of position and direction (None where not wanted), of `values` and of `indices`
+        (zeros where not wanted).
 
     Raises:
         InputError: rays that are not on a GPU, outside Triton's interpreter.
@@ -195,7 +196,7 @@ def trace_adjoint(
     count, values = position.shape[0], table.values
     codes, media = _prepared(table, position)
     steps = codes.codes.shape[0]
-    gradients = [position.new_zeros(count, 3) if want else None for want in wanted]
+    gradients = [position.new_zeros(count, 3) if want else None for want in wanted[:2]]
     length = values.numel() + table.indices.numel()
     block = ADJOINT_BLOCK[values.dtype]
     blocks = triton.cdiv(count, block)
@@ -213,7 +214,7 @@ def trace_adjoint(
                 of_position, *_strides(of_position, 2), of_direction, *_strides(of_direction, 2),
                 of_path, *_strides(of_path, 1), *gradients, sums, length,
                 values.new_empty(programs * kept),
-                KINDS=codes.kinds, BLOCK=block, **_OPTIONS,
+                KINDS=codes.kinds, INDICES=wanted[2], BLOCK=block, **_OPTIONS,
             )  # fmt: skip
     total, cut = sums.sum(0), values.numel()
     return (

@@ -13,13 +13,16 @@ from dolens.kernels.cuda.rays import (
 )
 from dolens.kernels.cuda.step import step
 
+# One compiled kernel serves bundles of any size, strides and alignment.
 _VARYING = (
     "exit_place", "wavelengths", "steps", "count", "position_row", "position_column",
     "direction_row", "direction_column",
 )  # fmt: skip
 
 
-@triton.jit(do_not_specialize=_VARYING)
+@triton.jit(
+    do_not_specialize=_VARYING, do_not_specialize_on_alignment=("position", "direction", "which")
+)
 def forward_kernel(
     values, exit_place, media, wavelengths, codes, extras, steps, count,
     position, position_row, position_column, direction, direction_row, direction_column, which,
