@@ -176,6 +176,18 @@ def _kind(name):
     return re.sub(r"\d+|_[xyz]$", "", name)
 
 
+def _sizes(gradients):
+    """How large each gradient is, and the largest of its kind.
+
+    Some vanish by symmetry, but for rounding: their like say how large that may be.
+    """
+    own = {name: float(g.abs().max()) for name, g in gradients.items()}
+    return {
+        name: (size, max(s for other, s in own.items() if _kind(other) == _kind(name)))
+        for name, size in own.items()
+    }
+
+
 def require_equal(found, expected, length=1e-11, relative=1e-11):
     """Same fates of all rays; of valid ones the same numbers (mm) and gradients."""
     assert torch.equal(found.status, expected.status)
@@ -185,12 +197,9 @@ def require_equal(found, expected, length=1e-11, relative=1e-11):
     for name in ("position", "direction", "path"):
         a, b = getattr(found, name), getattr(expected, name)
         assert (a - b)[valid].abs().max() < length, name
-    sizes = {name: float(g.abs().max()) for name, g in expected.gradients.items()}
-    for name, gradient in expected.gradients.items():
-        error = (found.gradients[name] - gradient).abs().max()
-        # Some vanish by symmetry, but for rounding: their like say how large that may be.
-        alike = max(size for other, size in sizes.items() if _kind(other) == _kind(name))
-        assert error <= relative * max(sizes[name], 1e-2 * alike), name
+    for name, (own, alike) in _sizes(expected.gradients).items():
+        error = (found.gradients[name] - expected.gradients[name]).abs().max()
+        assert error <= relative * max(own, 1e-2 * alike), name
 
 
 def root_mean_square(values):
@@ -198,23 +207,29 @@ def root_mean_square(values):
     return float(values.square().mean().sqrt())
 
 
-def require_no_worse(found, reference, exact, factor=1.5):
+def require_no_worse(found, reference, exact):
     """Errors in single precision, of what was found and of the reference's, against double.
 
-    Over the rays that are valid for all three; gradients relative to each parameter's own.
+    Both are rounding: half as much again passes for rays, and twice for gradients, since Triton's
+    interpreter rounds products that the reference adds without.
     """
     same = found.valid & reference.valid & exact.valid
     assert same.sum() > 0.9 * exact.valid.sum()
     for name in ("position", "direction", "path"):
         true = getattr(exact, name)[same]
         errors = [root_mean_square(getattr(t, name)[same] - true) for t in (found, reference)]
-        assert errors[0] <= factor * errors[1], name
-    worst = [
-        max(
-            float((t.gradients[name] - true).abs().max() / true.abs().max().clamp(min=1e-30))
-            for name, true in exact.gradients.items()
-            if name not in ("position", "direction") and true.abs().max() > 0.0
+        assert errors[0] <= 1.5 * errors[1], name
+    sizes = _sizes(exact.gradients)
+    errors = [
+        root_mean_square(
+            torch.cat(
+                [
+                    (t.gradients[name] - exact.gradients[name]).flatten() / alike
+                    for name, (_, alike) in sizes.items()
+                    if alike > 0.0
+                ]
+            )
         )
         for t in (found, reference)
     ]
-    assert worst[0] <= 3.0 * worst[1] + 1e-6, worst
+    assert errors[0] <= 2.0 * errors[1], errors
