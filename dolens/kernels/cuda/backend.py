@@ -1,7 +1,8 @@
 """Running the Triton kernels on tensors."""
 
+import logging
 from contextlib import AbstractContextManager, nullcontext
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from dolens.kernels.cuda.adjoint import adjoint_kernel
 from dolens.kernels.cuda.forward import forward_kernel
 from dolens.kernels.cuda.layout import STATE
 from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
+
+logger = logging.getLogger("dolens.kernels")
 
 # Rays a block.  A program is one warp, so that sums and the end of Newton's iteration need no word
 # from other warps; two rays a thread share its control, as far as registers reach.
@@ -100,8 +103,16 @@ def _prepared(table: SurfaceTable, like: Tensor) -> tuple[DeviceCodes, Tensor]:
     return codes, torch.stack((front, ratio), 1).to(like.dtype)
 
 
+@cache
+def _announce() -> None:
+    logger.info(
+        "compiling kernels for the GPU (some seconds a lens, unless Triton's cache has them)"
+    )
+
+
 def _on(device: torch.device) -> AbstractContextManager[object]:
     """Launch there, whichever GPU is the current one."""
+    _announce()
     return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
 
 
