@@ -6,6 +6,7 @@ kernel as a Python function.  Each is compiled when a lens first needs it, and k
 
 import hashlib
 import logging
+import pickle
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -94,6 +95,7 @@ def compile_block(factory: Factory, real: str) -> int:
     return _compiled(factory, real, block_signature(REALS[real])).address
 
 
+@cache
 def compile_driver(factory: Factory, real: str) -> Any:
     """A driver as a C function of (job, first, last), which runs without Python's lock."""
     signature = types.void(INTEGERS, types.int64, types.int64)
@@ -120,6 +122,14 @@ class _StampedCache(FunctionCache):
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         # Not what the kernel closes over, as Numba has it: its helpers differ in every process.
         return sig, self._real, codegen.magic_tuple(), stamp()
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except (EOFError, pickle.UnpicklingError, OSError) as error:
+            logger.warning("compiled kernels on disk are damaged and made anew: %r", error)
+            self.flush()
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
