@@ -22,3 +22,17 @@ def reference():
         return json.loads((ROOT / "tests" / "reference" / name).read_text())
 
     return read
+
+
+@pytest.fixture(params=["reference", "cpu"])
+def backend(request, monkeypatch):
+    """What traces a lens that leaves the choice open; tests that use it state no physics twice."""
+    from dolens.optics import backend
+
+    choose = backend.choose_backend
+
+    def chosen(system, requested, rays=None):
+        return choose(system, request.param if requested == "auto" else requested, rays)
+
+    monkeypatch.setattr(backend, "choose_backend", chosen)
+    return request.param

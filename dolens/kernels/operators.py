@@ -79,7 +79,10 @@ def trace_adjoint(
     of_path: Tensor | None,
     wanted: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cotangents of values, indices, position and direction; empty tensors for rays not wanted."""
+    """Cotangents of values, indices, position and direction.
+
+    `wanted`: of position, direction and indices; what is not comes back empty, or zero.
+    """
     table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
     of_rays = _backend(position).trace_adjoint(
         table,
@@ -88,7 +91,7 @@ def trace_adjoint(
         which,
         status,
         (of_position, of_direction, of_path),
-        (wanted[0], wanted[1]),
+        (wanted[0], wanted[1], wanted[2]),
     )
     empty = position.new_empty((0, 3))
     position_gradient, direction_gradient, of_values, of_indices = of_rays
@@ -122,7 +125,8 @@ def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
     *inputs, status = ctx.saved_tensors
     if all(g is None for g in gradients[:3]):
         return (None,) * 7
-    wanted = list(ctx.needs_input_grad[2:4])
+    needs = ctx.needs_input_grad
+    wanted = [needs[2], needs[3], needs[1]]
     of_values, of_indices, of_position, of_direction = trace_adjoint(
         *inputs, status, *gradients[:3], wanted
     )

@@ -85,22 +85,27 @@ def trace_rays(
         last: number of the last, or None.
     """
     end = len(system.surfaces) if last is None else last
-    ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
     to_sensor = last is None and sense > 0.0
-    if record or choose_backend(system, requested, rays) == "reference":
+    reference = record or choose_backend(system, requested, rays) == "reference"
+    finer = torch.promote_types(rays.position.dtype, rays.direction.dtype)
+    before = None
+    if reference or torch.promote_types(finer, system.dtype) != system.dtype:
+        ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
+    if reference:
         traced = trace_surfaces(
             system, ray, rays.wavelength, sense, True, record, first=first, last=last
         )
         if to_sensor:
             traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, sense)
         return traced_rays(traced, before)
-    shape = ray.x.shape
     if before is None:
         # As the user gave them: views of (..., 3), which a kernel reads in place.
         options = {"device": system.device, "dtype": system.dtype}
-        position = rays.position.to(**options).expand(*shape, 3)
-        direction = rays.direction.to(**options).expand(*shape, 3)
+        position, direction = rays.position.to(**options), rays.direction.to(**options)
+        shape = _shape(rays)
+        position, direction = position.expand(*shape, 3), direction.expand(*shape, 3)
     else:
+        shape = ray.x.shape
         position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
     table = pack(system, rays.wavelength, sense, first, end, to_sensor)
     position, direction, path, status, surface = operators.trace(
@@ -124,6 +129,13 @@ def trace_rays(
         surface=surface.reshape(shape),
         path_length=path,
     )
+
+
+def _shape(rays: Rays) -> tuple[int, ...]:
+    """The common leading shape of a bundle."""
+    if rays.position.shape == rays.direction.shape and not isinstance(rays.wavelength, Tensor):
+        return tuple(rays.position.shape[:-1])
+    return tuple(rays.components().x.shape)
 
 
 def _columns(

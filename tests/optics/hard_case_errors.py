@@ -1,6 +1,7 @@
 """What dolens makes of a hard case, against 80 digits."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 
@@ -34,8 +35,9 @@ class Errors:
 def measure(case, dtype):
     """Trace the rays of a case, and compare values and gradients of all parameters."""
     lens = lens_from_prescription(case.prescription(), dtype)
-    stored = exact.values_of(lens)
-    rows = [_one_ray(lens, stored, *ray, dtype) for ray in case.rays]
+    rows = [
+        _one_ray(lens, _exactly(case, i, dtype), *ray, dtype) for i, ray in enumerate(case.rays)
+    ]
     return Errors(*(max(column) for column in zip(*rows, strict=True)))
 
 
@@ -47,10 +49,26 @@ def traced(lens, origin, direction, dtype):
     return origin, direction, lens.trace(Rays(origin, direction, WAVELENGTH))
 
 
-def _one_ray(lens, stored, origin, direction, dtype):
-    origin, direction, hit = traced(lens, origin, direction, dtype)
+@dataclass(frozen=True)
+class Exact:
+    """A ray in 80 digits, and what one rounding of the inputs does to each number."""
+
+    point: list
+    moves: list
+    slopes: list
+    slope_moves: list
+
+
+@cache
+def _exactly(case, number, dtype):
+    """The ray of that number, through the lens as the precision holds both."""
+    lens = lens_from_prescription(case.prescription(), dtype)
+    stored = exact.values_of(lens)
+    origin, direction = (
+        torch.tensor(v, dtype=torch.float64).to(dtype).tolist() for v in case.rays[number]
+    )
     axes = ("o0", "o1", "o2", "d0", "d1", "d2")
-    numbers = [exact.mp.mpf(v) for v in (*origin.tolist(), *direction.tolist())]
+    numbers = [exact.mp.mpf(v) for v in (*origin, *direction)]
     inputs = stored | dict(zip(axes, numbers, strict=True))
 
     def point(values):
@@ -70,11 +88,20 @@ def _one_ray(lens, stored, origin, direction, dtype):
         found = exact.derivatives(lambda some: weighted(some | fixed), parameters)
         return [found[name] for name in stored]
 
+    return Exact(
+        list(point(inputs))[:2],
+        exact.sensitivity(lambda v: list(point(v))[:2], inputs),
+        gradients(inputs),
+        exact.sensitivity(gradients, inputs, draws=2),
+    )
+
+
+def _one_ray(lens, expected, origin, direction, dtype):
+    *_, hit = traced(lens, origin, direction, dtype)
     assert bool(hit.valid), "the ray must pass"
     epsilon = torch.finfo(dtype).eps
-    expected = list(point(inputs))[:2]
-    errors = [abs(v - e) for v, e in zip(hit.position.tolist()[:2], expected, strict=True)]
-    moves = exact.sensitivity(lambda v: list(point(v))[:2], inputs)
+    points = zip(hit.position.tolist()[:2], expected.point, strict=True)
+    errors = [abs(v - e) for v, e in points]
     total = WEIGHTS[0] * hit.position[0] + WEIGHTS[1] * hit.position[1]
     parameters = list(lens.parameters())
     gradient_of = torch.autograd.grad(total, parameters, allow_unused=True)
@@ -83,20 +110,19 @@ def _one_ray(lens, stored, origin, direction, dtype):
         for p, g in zip(parameters, gradient_of, strict=True)
         for number in (torch.zeros_like(p) if g is None else g).flatten().tolist()
     ]
-    slopes = gradients(inputs)
-    largest = max(abs(s) for s in slopes)
-    slope_moves = exact.sensitivity(gradients, inputs, draws=2)
+    largest = max(abs(s) for s in expected.slopes)
     relative, roundings = [], []
-    for gradient, slope, move in zip(found, slopes, slope_moves, strict=True):
+    for gradient, slope, move in zip(found, expected.slopes, expected.slope_moves, strict=True):
         error = abs(gradient - slope)
         if abs(slope) <= TINY * largest:
             # Zero by symmetry: what is left is rounding of terms as large as the other slopes.
             slope = move = largest or 1
         relative.append(float(error / abs(slope)))
         roundings.append(float(error / (epsilon * move)))
+    moved = zip(errors, expected.moves, strict=True)
     return (
         float(max(errors)),
         max(relative),
-        float(max(e / (epsilon * max(m, TINY)) for e, m in zip(errors, moves, strict=True))),
+        float(max(e / (epsilon * max(m, TINY)) for e, m in moved)),
         max(roundings),
     )

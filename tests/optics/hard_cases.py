@@ -8,7 +8,7 @@ GLASS = "1.5168/64.17"
 AXIAL = (0.0, 0.0, 1.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HardCase:
     """A lens, rays (origin, direction) that pass, and rays that end (…, status, surface)."""
 

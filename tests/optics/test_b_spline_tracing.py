@@ -15,6 +15,8 @@ from dolens.optics.surfaces.spline_basis import clamped_knots
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.spline_samples import F64, KNOTS, marsden, polynomial_spline, random
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 # A plano-convex singlet whose front is a polynomial, of powers that a bicubic spline holds.
 POWERS = {"x2": (2, 0), "y2": (0, 2), "xy": (1, 1), "x3": (3, 0), "x2y": (2, 1), "y3": (0, 3),
           "x2y2": (2, 2), "y": (0, 1)}  # fmt: skip

@@ -6,6 +6,8 @@ import torch
 from dolens import InputError, Rays, Status
 from dolens.prescriptions import lens_from_prescription, prescription_of
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 
 def window(**aperture):
     """A plane that does nothing but clip."""

@@ -10,6 +10,8 @@ from dolens import InputError, Rays, Status
 from dolens.optics.elements import rotation_matrix
 from dolens.prescriptions import lens_from_prescription, prescription_of
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 PI = math.pi
 
 

@@ -7,6 +7,8 @@ import torch
 
 from dolens import Rays, Status, load_lens
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 
 def weighted(hit, valid=None):
     """One number that every output of a trace goes into."""

@@ -9,6 +9,8 @@ from tests.optics import exact
 from tests.optics.hard_case_errors import WAVELENGTH, measure, traced
 from tests.optics.hard_cases import AXIAL, CASES, from_points, singlet, surface
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 STATUS = {"missed": Status.MISSED, "vignetted": Status.VIGNETTED, "tir": Status.TIR}
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
 PASSING = [name for name, case in CASES.items() if case.rays]

@@ -11,6 +11,8 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model, parse_material
 from dolens.optics.surfaces import Plane, Sphere
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 
 @pytest.fixture
 def triplet(root):

@@ -13,6 +13,8 @@ from dolens.optics.surfaces.base import PlaneRay
 from dolens.optics.trace import trace_surfaces
 from dolens.prescriptions import lens_from_prescription
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 LENSES, RAYS = 150, 64
 EPSILON = torch.finfo(torch.float64).eps
 CHECKED = settings(

@@ -7,6 +7,8 @@ import yaml
 from dolens import Rays, Status
 from dolens.prescriptions import lens_from_prescription
 
+pytestmark = pytest.mark.usefixtures("backend")
+
 FILES = {
     "rays_asphere_initial__dfc.json": ("asphere", {}),
     "rays_largefov__dfc.json": ("large_fov_doublet", {}),

@@ -37,7 +37,7 @@ def sweeps(real: types.Type) -> Sweeps:
     """Functions that fill a block with valid rays, trace it, and sweep back, for one real type."""
     at = real_at(real)
     zero = real(0.0)
-    _, set_indices, step = streams(real)
+    load, set_indices, step = streams(real)
 
     @njit(**OPTIONS)
     def gather(job, ray, end, lanes):  # noqa: ANN001, ANN202
@@ -51,7 +51,9 @@ def sweeps(real: types.Type) -> Sweeps:
             ray += 1
         for i in range(max(count, 1), 128):
             lanes[i] = lanes[0]
-        if count > 0:
+        if count == 128 and lanes[127] - lanes[0] == 127:
+            load(job, lanes[0], 128, at(job[15]))
+        elif count > 0:
             state = carray(at(job[15]), 1280)
             for k in range(3):
                 source = carray(shifted(at(job[0]), k * job[2]), 1 << 40)
@@ -112,6 +114,8 @@ def sweeps(real: types.Type) -> Sweeps:
         else:
             for j in range(24, length):
                 add_row(cotangents, 16 + j, sums, offset + j)
+        if job[39] == 0:
+            return
         count, values = job[12], job[37]
         for side in range(2):
             row = values + codes[3 + side] * count

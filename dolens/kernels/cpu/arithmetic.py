@@ -61,20 +61,21 @@ def arithmetic(real: types.Type) -> Arithmetic:
         )
 
     @njit(**OPTIONS)
-    def refract_adjoint(a, b, c, l, m, n, nx, ny, nz, out_l, out_m, out_n, ratio, before):  # noqa: ANN001, ANN202, E741
-        """Cotangents of direction, normal and both indices from (a, b, c), that of d'.
+    def refract_adjoint(a, b, c, l, m, n, nx, ny, nz, out_l, out_m, out_n, ratio, per_index):  # noqa: ANN001, ANN202, E741
+        """Cotangents of direction, normal and both indices from (a, b, c), that of d'; 1/cos i.
 
-        d' = μ·d + Γ·N with Γ = s·cos t - μ·cos i, and s·cos t = d'·N.
+        d' = μ·d + Γ·N with Γ = s·cos t - μ·cos i, and s·cos t = d'·N.  `per_index` is one over the
+        index in front.  One division serves both cosines.
         """
         cosine = l * nx + m * ny + n * nz
         inside = out_l * nx + out_m * ny + out_n * nz
+        both = one / (cosine * inside)
         along = inside - ratio * cosine
         of_along = a * nx + b * ny + c * nz
-        of_cosine = of_along * (ratio * ratio * cosine / inside - ratio)
-        of_ratio = (a * l + b * m + c * n) - of_along * (
-            ratio * (one - cosine * cosine) / inside + cosine
-        )
-        of_before = of_ratio * ratio / before
+        bend = ratio * both * cosine
+        of_cosine = of_along * (ratio * bend * cosine - ratio)
+        of_ratio = (a * l + b * m + c * n) - of_along * (bend * (one - cosine * cosine) + cosine)
+        of_before = of_ratio * ratio * per_index
         return (
             ratio * a + of_cosine * nx,
             ratio * b + of_cosine * ny,
@@ -84,6 +85,7 @@ def arithmetic(real: types.Type) -> Arithmetic:
             along * c + of_cosine * n,
             of_before,
             -of_before * ratio,
+            both * inside,
         )
 
     return Arithmetic(clamp, safe_sqrt, arrive, refract, refract_adjoint)

@@ -1,20 +1,32 @@
 """Cubic B-spline surfaces by their local stencil; see `dolens.optics.surfaces.b_spline`.
 
 The record holds the knots in x, the knots in y, and the coefficients, rows along y.
+
+Each ray needs six knots of either axis and 16 coefficients.  They are copied to work rows when the
+ray's span changes, which between Newton's steps is seldom; the arithmetic then runs over rows.
+Rows 48 to 53 hold the knots about x, 54 to 59 those about y, 60 to 75 the coefficients, 76 and 77
+the first column and row.  Row 25 says (one) that they hold anything.
 """
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import carray, njit, types
 
 from dolens.kernels.cpu.compiler import OPTIONS, shifted
 
 
+class Spline(NamedTuple):
+    """Compiled functions of one real type."""
+
+    fetch: Any
+    basis: Any
+    bend: Any
+
+
 @cache
-def _spline(real: types.Type) -> tuple[Any, Any, Any]:
-    """Compiled: the span of a coordinate, and its basis without and with second derivatives."""
+def _spline(real: types.Type) -> Spline:
     zero, one, three, six = real(0.0), real(1.0), real(3.0), real(6.0)
 
     @njit(**OPTIONS)
@@ -28,8 +40,7 @@ def _spline(real: types.Type) -> tuple[Any, Any, Any]:
             first = last
         else:
             # Knots are nearly even as a rule: guess, and walk.
-            first = types.int64((u - low) / (high - low) * real(last + 1))
-            first = last if first > last else first
+            first = min(types.int64((u - low) / (high - low) * real(last + 1)), last)
             while first > 0 and u < knots[first + 3]:
                 first -= 1
         while first < last and u >= knots[first + 4]:
@@ -37,9 +48,38 @@ def _spline(real: types.Type) -> tuple[Any, Any, Any]:
         return first
 
     @njit(**OPTIONS)
-    def basis(knots, u, low, high):  # noqa: ANN001, ANN202
-        """Values and slopes of four basis functions; `knots` are those about the span."""
-        a, b, c, d, e, f = knots[1], knots[2], knots[3], knots[4], knots[5], knots[6]
+    def fetch(record, work, rows, columns):  # noqa: ANN001, ANN202
+        """Bring every ray's knots and coefficients to its lane, where they are not there yet."""
+        w = carray(work, 9984)
+        if w[3200] == one:
+            outside = zero
+            for i in range(128):
+                x, y = w[256 + i], w[384 + i]
+                here = x >= w[6400 + i] and x < w[6528 + i] and y >= w[7168 + i] and y < w[7296 + i]
+                outside += zero if here else one
+            if outside == zero:
+                return
+        w[3200] = one
+        knots_x = carray(shifted(record, 24), 1 << 40)
+        knots_y = carray(shifted(record, 28 + columns), 1 << 40)
+        coefficients = shifted(record, 32 + columns + rows)
+        for i in range(128):
+            column, row = span(knots_x, columns, w[256 + i]), span(knots_y, rows, w[384 + i])
+            around_x = carray(shifted(record, 25 + column), 8)
+            around_y = carray(shifted(record, 29 + columns + row), 8)
+            for k in range(6):
+                w[6144 + 128 * k + i] = around_x[k]
+                w[6912 + 128 * k + i] = around_y[k]
+            first = shifted(coefficients, row * columns + column)
+            for j in range(4):
+                c = carray(shifted(first, j * columns), 4)
+                for k in range(4):
+                    w[7680 + 128 * (4 * j + k) + i] = c[k]
+            w[9728 + i], w[9856 + i] = real(column), real(row)
+
+    @njit(**OPTIONS)
+    def basis(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
+        """Values and slopes of the four basis functions of the span [c, d]; see `cubic_basis`."""
         inside = low if u < low else u
         inside = high if inside > high else inside
         beyond = u - inside
@@ -56,82 +96,95 @@ def _spline(real: types.Type) -> tuple[Any, Any, Any]:
             after_a * q0 + to_e * q1 + beyond * d1,
             after_b * q1 + to_f * q2 + beyond * d2,
             after_c * q2 + beyond * d3,
-            d0, d1, d2, d3,
-        )  # fmt: skip
+            d0,
+            d1,
+            d2,
+            d3,
+        )
 
     @njit(**OPTIONS)
-    def bend(knots, u, low, high):  # noqa: ANN001, ANN202
+    def bend(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
         """Second derivatives of the four; zero beyond the ends."""
-        a, b, c, d, e, f = knots[1], knots[2], knots[3], knots[4], knots[5], knots[6]
         scale = zero if u < low or u > high else six
         width = one / (d - c)
         p0, p1 = (d - u) * width / (d - b), (u - c) * width / (e - c)
         r0, r1, r2 = -p0 / (d - a), (p0 - p1) / (e - b), p1 / (f - c)
         return -scale * r0, scale * (r0 - r1), scale * (r1 - r2), scale * r2
 
-    return span, basis, bend
+    return Spline(fetch, basis, bend)
 
 
 def b_spline_sag(real: types.Type) -> Callable[..., None]:
     """Sag, slopes, and the distance to the nearest edge of the knot rectangle."""
-    span, basis, _ = _spline(real)
+    fetch, basis, _ = _spline(real)
+    zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, q = carray(work, 6144), carray(codes, 24)
+        w, q = carray(work, 9984), carray(codes, 24)
         rows, columns = q[8], q[9]
         knots_x = carray(shifted(record, 24), 1 << 40)
         knots_y = carray(shifted(record, 28 + columns), 1 << 40)
-        coefficients = shifted(record, 32 + columns + rows)
         x_low, x_high = knots_x[3], knots_x[columns]
         y_low, y_high = knots_y[3], knots_y[rows]
+        fetch(record, work, rows, columns)
         for i in range(128):
             x, y = w[256 + i], w[384 + i]
-            column, row = span(knots_x, columns, x), span(knots_y, rows, y)
-            bx = basis(carray(shifted(record, 24 + column), 8), x, x_low, x_high)
-            by = basis(carray(shifted(record, 28 + columns + row), 8), y, y_low, y_high)
-            first = shifted(coefficients, row * columns + column)
-            level = carray(shifted(first, columns), 4)[1]
-            s = sx = sy = real(0.0)
+            bx = basis(
+                w[6144 + i], w[6272 + i], w[6400 + i], w[6528 + i], w[6656 + i], w[6784 + i],
+                x, x_low, x_high,
+            )  # fmt: skip
+            by = basis(
+                w[6912 + i], w[7040 + i], w[7168 + i], w[7296 + i], w[7424 + i], w[7552 + i],
+                y, y_low, y_high,
+            )  # fmt: skip
+            level = w[8320 + i]
+            s = sx = sy = zero
             for j in range(4):
-                c = carray(shifted(first, j * columns), 4)
-                c0, c1, c2, c3 = c[0] - level, c[1] - level, c[2] - level, c[3] - level
+                c0, c1 = w[7680 + 512 * j + i] - level, w[7808 + 512 * j + i] - level
+                c2, c3 = w[7936 + 512 * j + i] - level, w[8064 + 512 * j + i] - level
                 along = c0 * bx[0] + c1 * bx[1] + c2 * bx[2] + c3 * bx[3]
                 slope = c0 * bx[4] + c1 * bx[5] + c2 * bx[6] + c3 * bx[7]
                 s += along * by[j]
                 sx += slope * by[j]
                 sy += along * by[4 + j]
             w[512 + i], w[640 + i], w[768 + i] = level + s, sx, sy
-            edge = min(min(x - x_low, x_high - x), min(y - y_low, y_high - y))
-            w[896 + i] = edge
+            left, right, below, above = x - x_low, x_high - x, y - y_low, y_high - y
+            left = right if right < left else left
+            below = above if above < below else below
+            w[896 + i] = below if below < left else left
 
     return kernel
 
 
 def b_spline_bend(real: types.Type) -> Callable[..., None]:
     """Slopes and second derivatives."""
-    span, basis, bend = _spline(real)
+    fetch, basis, bend = _spline(real)
+    zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, q = carray(work, 6144), carray(codes, 24)
+        w, q = carray(work, 9984), carray(codes, 24)
         rows, columns = q[8], q[9]
         knots_x = carray(shifted(record, 24), 1 << 40)
         knots_y = carray(shifted(record, 28 + columns), 1 << 40)
-        coefficients = shifted(record, 32 + columns + rows)
         x_low, x_high = knots_x[3], knots_x[columns]
         y_low, y_high = knots_y[3], knots_y[rows]
+        w[3200] = zero
+        fetch(record, work, rows, columns)
         for i in range(128):
             x, y = w[256 + i], w[384 + i]
-            column, row = span(knots_x, columns, x), span(knots_y, rows, y)
-            around_x = carray(shifted(record, 24 + column), 8)
-            around_y = carray(shifted(record, 28 + columns + row), 8)
-            bx, by = basis(around_x, x, x_low, x_high), basis(around_y, y, y_low, y_high)
-            ex, ey = bend(around_x, x, x_low, x_high), bend(around_y, y, y_low, y_high)
-            first = shifted(coefficients, row * columns + column)
-            level = carray(shifted(first, columns), 4)[1]
-            sx = sy = sxx = sxy = syy = real(0.0)
+            xa, xb, xc = w[6144 + i], w[6272 + i], w[6400 + i]
+            xd, xe, xf = w[6528 + i], w[6656 + i], w[6784 + i]
+            ya, yb, yc = w[6912 + i], w[7040 + i], w[7168 + i]
+            yd, ye, yf = w[7296 + i], w[7424 + i], w[7552 + i]
+            bx = basis(xa, xb, xc, xd, xe, xf, x, x_low, x_high)
+            by = basis(ya, yb, yc, yd, ye, yf, y, y_low, y_high)
+            ex = bend(xa, xb, xc, xd, xe, xf, x, x_low, x_high)
+            ey = bend(ya, yb, yc, yd, ye, yf, y, y_low, y_high)
+            level = w[8320 + i]
+            sx = sy = sxx = sxy = syy = zero
             for j in range(4):
-                c = carray(shifted(first, j * columns), 4)
-                c0, c1, c2, c3 = c[0] - level, c[1] - level, c[2] - level, c[3] - level
+                c0, c1 = w[7680 + 512 * j + i] - level, w[7808 + 512 * j + i] - level
+                c2, c3 = w[7936 + 512 * j + i] - level, w[8064 + 512 * j + i] - level
                 along = c0 * bx[0] + c1 * bx[1] + c2 * bx[2] + c3 * bx[3]
                 slope = c0 * bx[4] + c1 * bx[5] + c2 * bx[6] + c3 * bx[7]
                 curve = c0 * ex[0] + c1 * ex[1] + c2 * ex[2] + c3 * ex[3]
@@ -149,28 +202,33 @@ def b_spline_bend(real: types.Type) -> Callable[..., None]:
 def b_spline_parameters(real: types.Type) -> Callable[..., None]:
     """Cotangents of the 16 coefficients at hand (rows 40 to 55), and where they lie (row 56).
 
-    The place counts from the record's first coefficient.
+    The place counts from the record's first coefficient.  `b_spline_bend` has fetched the knots.
     """
-    span, basis, _ = _spline(real)
+    _, basis, _ = _spline(real)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, q = carray(work, 6144), carray(codes, 24)
+        w, q = carray(work, 9984), carray(codes, 24)
         rows, columns = q[8], q[9]
         cot = carray(cotangents, 7296)
         knots_x = carray(shifted(record, 24), 1 << 40)
         knots_y = carray(shifted(record, 28 + columns), 1 << 40)
         x_low, x_high = knots_x[3], knots_x[columns]
         y_low, y_high = knots_y[3], knots_y[rows]
+        width = real(columns)
         for i in range(128):
-            x, y = w[256 + i], w[384 + i]
             of_sag, of_sx, of_sy = w[1408 + i], w[1536 + i], w[1664 + i]
-            column, row = span(knots_x, columns, x), span(knots_y, rows, y)
-            bx = basis(carray(shifted(record, 24 + column), 8), x, x_low, x_high)
-            by = basis(carray(shifted(record, 28 + columns + row), 8), y, y_low, y_high)
+            bx = basis(
+                w[6144 + i], w[6272 + i], w[6400 + i], w[6528 + i], w[6656 + i], w[6784 + i],
+                w[256 + i], x_low, x_high,
+            )  # fmt: skip
+            by = basis(
+                w[6912 + i], w[7040 + i], w[7168 + i], w[7296 + i], w[7424 + i], w[7552 + i],
+                w[384 + i], y_low, y_high,
+            )  # fmt: skip
             for j in range(4):
                 along, across = of_sag * by[j] + of_sy * by[4 + j], of_sx * by[j]
                 for k in range(4):
                     cot[5120 + 128 * (4 * j + k) + i] = along * bx[k] + across * bx[4 + k]
-            cot[7168 + i] = real(row * columns + column)
+            cot[7168 + i] = w[9856 + i] * width + w[9728 + i]
 
     return kernel

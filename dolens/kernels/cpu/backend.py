@@ -1,8 +1,9 @@
 """Running the CPU kernels on tensors."""
 
+import ctypes
 from collections.abc import Callable
-from functools import cache
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,6 +38,7 @@ from dolens.kernels.cpu.layout import (
     PARAMETERS,
     SAG,
     STATE,
+    STENCIL_ROWS,
     WORK_ROWS,
     Job,
 )
@@ -50,6 +52,7 @@ from dolens.kernels.cpu.xy_polynomial import (
 )
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
 
+_INTEGERS = ctypes.POINTER(ctypes.c_int64)
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 # Chunks of rays that sums are kept for: enough for any processor's threads.
 _CHUNKS = 64
@@ -88,6 +91,52 @@ _DERIVATIVES = {
 }
 
 
+class Steps(NamedTuple):
+    """The steps of a lens, compiled.
+
+    Attributes:
+        codes: (steps, CODES), int64: the table's, and the addresses of the block functions.
+        longest: numbers of the longest record that has cotangents.
+        scratch: work rows that the shapes need.
+        clip: address of the test of apertures that are no full circles, or zero.
+    """
+
+    codes: np.ndarray
+    longest: int
+    scratch: int
+    clip: int
+
+
+@lru_cache(maxsize=256)
+def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
+    """Compile what the steps of a table need: a pure function of its codes."""
+    table = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW)
+    rows = np.zeros((max(len(table), 1), CODES), dtype=np.int64)
+    rows[: len(table), : Code.ROW] = table
+    longest, scratch = Slot.HEADER, 0
+    for row in rows[: len(table)]:
+        kind = Kind(row[Code.KIND])
+        row[FORWARD] = compiler.compile_block(_FORWARD[kind], real)
+        if kind in _SAG:
+            row[SAG] = compiler.compile_block(_SAG[kind], real)
+        if derivatives:
+            row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], real)
+            if kind in _DERIVATIVES:
+                bend, parameters = _DERIVATIVES[kind]
+                row[BEND] = compiler.compile_block(bend, real)
+                row[PARAMETERS] = compiler.compile_block(parameters, real)
+        length = int(row[Code.LENGTH])
+        if kind == Kind.B_SPLINE:
+            # Its stencil takes 17 rows of cotangents, whatever the number of its coefficients.
+            length, scratch = Slot.HEADER + 17, max(scratch, STENCIL_ROWS)
+        elif kind == Kind.XY_POLYNOMIAL:
+            scratch = max(scratch, 2 * (int(row[Code.DEGREE]) + 1))
+        longest = max(longest, length)
+    clips = (rows[:, Code.EDGE] == Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
+    address = compiler.compile_block(clip, real) if clips.any() else 0
+    return Steps(rows, longest, scratch, address)
+
+
 class Program:
     """A surface table with its compiled steps, and the memory of each worker.
 
@@ -100,29 +149,12 @@ class Program:
         self.real = REAL[table.values.dtype]
         self.table = table
         self.derivatives = derivatives
-        steps = table.codes.shape[0]
-        self.codes = np.zeros((max(steps, 1), CODES), dtype=np.int64)
-        self.codes[:steps, : Code.ROW] = table.codes.numpy()
-        longest, degree = Slot.HEADER, 0
-        for row in self.codes[:steps]:
-            kind = Kind(row[Code.KIND])
-            row[FORWARD] = compiler.compile_block(_FORWARD[kind], self.real)
-            if kind in _SAG:
-                row[SAG] = compiler.compile_block(_SAG[kind], self.real)
-            if derivatives:
-                row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], self.real)
-                if kind in _DERIVATIVES:
-                    bend, parameters = _DERIVATIVES[kind]
-                    row[BEND] = compiler.compile_block(bend, self.real)
-                    row[PARAMETERS] = compiler.compile_block(parameters, self.real)
-            row[EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * int(row[Code.EXTRAS])
-            degree = max(degree, int(row[Code.DEGREE]))
-            # A spline's stencil takes 17 rows, whatever the number of its coefficients.
-            length = Slot.HEADER + 17 if kind == Kind.B_SPLINE else int(row[Code.LENGTH])
-            longest = max(longest, length)
-        clips = (self.codes[:, Code.EDGE] == Outline.RECTANGLE) | (self.codes[:, Code.HOLE] != 0)
+        steps = _steps(table.codes.numpy().tobytes(), self.real, derivatives)
+        count = table.codes.shape[0]
+        self.codes = steps.codes.copy()
+        self.codes[:, EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * self.codes[:, Code.EXTRAS]
         self.job = np.zeros(Job.LENGTH, dtype=np.int64)
-        self.job[Job.STEPS] = steps
+        self.job[Job.STEPS] = count
         self.job[Job.CODES] = self.codes.ctypes.data
         self.job[Job.VALUES] = table.values.data_ptr()
         self.job[Job.VALUES_LENGTH] = table.values.numel()
@@ -130,13 +162,12 @@ class Program:
         self.job[Job.WAVELENGTHS] = table.indices.shape[1]
         last = table.values.numel() - 1
         self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
-        if clips.any():
-            self.job[Job.CLIP] = compiler.compile_block(clip, self.real)
-        states = steps + 1 if derivatives else 2
+        self.job[Job.CLIP] = steps.clip
+        states = count + 1 if derivatives else 2
         self._sizes = (
             states * STATE,
-            (COTANGENT_HEADER + longest) * BLOCK if derivatives else 0,
-            (WORK_ROWS + 2 * (degree + 1)) * BLOCK,
+            (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0,
+            (WORK_ROWS + steps.scratch) * BLOCK,
         )
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
@@ -170,20 +201,9 @@ class Program:
             jobs[worker, Job.LANES] = lanes[worker].ctypes.data
 
         def task(worker: int, first: int, last: int) -> None:
-            function(_integers(jobs[worker]), first, last)
+            function(jobs[worker].ctypes.data_as(_INTEGERS), first, last)
 
         spread(task, pieces, threads)
-
-
-@cache
-def _pointer_type() -> Any:
-    import ctypes
-
-    return ctypes.POINTER(ctypes.c_int64)
-
-
-def _integers(array: np.ndarray) -> Any:
-    return array.ctypes.data_as(_pointer_type())
 
 
 def trace(
@@ -231,7 +251,7 @@ def trace_adjoint(
     which: Tensor | None,
     status: Tensor,
     cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
-    wanted: tuple[bool, bool],
+    wanted: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor, Tensor]:
     """Cotangents of rays and table from those of position, direction and path length.
 
@@ -242,13 +262,16 @@ def trace_adjoint(
         which: (N,), int32, or None.
         status: (N,), int8, from `trace`: only rays that are valid pass a gradient.
         cotangents: of position (N, 3), direction (N, 3) and path (N,), of any strides, or None.
-        wanted: whether gradients of position and of direction are needed.
+        wanted: whether gradients of position, direction and indices are needed.
 
     Returns:
-        Gradients of position and direction (None where not wanted), of `values` and of `indices`.
+        Gradients of position and direction (None where not wanted), of `values` and of `indices`
+        (zeros where not wanted).
     """
     count = position.shape[0]
-    gradients = [torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted]
+    gradients = [
+        torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted[:2]
+    ]
     length = table.values.numel() + table.indices.numel()
     chunk = chunk_size(count)
     chunks = -(-count // chunk)
@@ -260,6 +283,7 @@ def trace_adjoint(
         program.point(POSITION_GRADIENT=gradients[0], DIRECTION_GRADIENT=gradients[1])
         job = program.job
         job[Job.SUM_LENGTH], job[Job.CHUNK] = length, chunk
+        job[Job.INDEX_SUMS] = int(wanted[2])
         of_position, of_direction, of_path = cotangents
         for place, tensor in (
             (Job.POSITION_COTANGENT, of_position),

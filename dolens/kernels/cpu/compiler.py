@@ -88,6 +88,7 @@ int16_at = _pointer_at(types.int16)
 int8_at = _pointer_at(types.int8)
 
 
+@cache
 def compile_block(factory: Factory, real: str) -> int:
     """Address of a block function for `float32` or `float64`."""
     return _compiled(factory, real, block_signature(REALS[real])).address

@@ -95,9 +95,9 @@ def conic_adjoint(real: types.Type) -> Callable[..., None]:
             gx, gy, gz = -c * x, -c * y, one - e * c * z
             inverse = one / math.sqrt(gx * gx + gy * gy + gz * gz)
             nx, ny, nz = gx * inverse, gy * inverse, gz * inverse
-            dl, dm, dn, vx, vy, vz, of_before, of_behind = refract_adjoint(
+            dl, dm, dn, vx, vy, vz, of_before, of_behind, per_cosine = refract_adjoint(
                 cot[384 + i], cot[512 + i], cot[640 + i], l, m, n, nx, ny, nz,
-                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[i],
+                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[3072 + i],
             )  # fmt: skip
             if not refracts:
                 dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
@@ -111,7 +111,7 @@ def conic_adjoint(real: types.Type) -> Callable[..., None]:
             )
             px, py, pz = cot[i] - c * vx, cot[128 + i] - c * vy, cot[256 + i] - e * c * vz
             path, t = cot[768 + i], dst[1152 + i]
-            along = (px * l + py * m + pz * n + w[i] * path) / (gx * l + gy * m + gz * n)
+            along = (px * l + py * m + pz * n + w[i] * path) * per_cosine * inverse
             qx, qy, qz = px - along * gx, py - along * gy, pz - along * gz
             cot[i], cot[128 + i], cot[256 + i] = qx, qy, qz
             cot[384 + i] = dl + t * qx

@@ -68,8 +68,9 @@ def even_asphere_sag(real: types.Type) -> Callable[..., None]:
             q, h, d = w[2048 + i], w[2176 + i], w[2304 + i]
             squared = one - ec2 * q
             root = safe_sqrt(squared)
-            twice = c / root + two * q * (two * h + q * d)
-            w[512 + i] = c * q / (one + root) + q * q * h
+            both = c / (root * (one + root))
+            twice = both * (one + root) + two * q * (two * h + q * d)
+            w[512 + i] = both * root * q + q * q * h
             w[640 + i], w[768 + i] = w[256 + i] * twice, w[384 + i] * twice
             w[896 + i] = squared
 

@@ -41,6 +41,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             )  # fmt: skip
             dst[i], dst[128 + i], dst[256 + i], dst[1152 + i] = x, y, met, t
             w[1792 + i] = zero
+        w[3200] = zero
         if q[0] == 3:
             c, k = p[24], p[25]
             for i in range(128):
@@ -136,9 +137,9 @@ def explicit_adjoint(real: types.Type) -> Callable[..., None]:
             sx, sy = w[640 + i], w[768 + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
             nx, ny = -sx * nz, -sy * nz
-            dl, dm, dn, vx, vy, vz, of_before, of_behind = refract_adjoint(
+            dl, dm, dn, vx, vy, vz, of_before, of_behind, per_cosine = refract_adjoint(
                 cot[384 + i], cot[512 + i], cot[640 + i], l, m, n, nx, ny, nz,
-                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[i],
+                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[3072 + i],
             )  # fmt: skip
             if not refracts:
                 dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
@@ -149,7 +150,7 @@ def explicit_adjoint(real: types.Type) -> Callable[..., None]:
             py = cot[128 + i] + of_sx * w[1152 + i] + of_sy * w[1280 + i]
             pz = cot[256 + i]
             path, t = cot[768 + i], dst[1152 + i]
-            along = (px * l + py * m + pz * n + w[i] * path) / (n - sx * l - sy * m)
+            along = (px * l + py * m + pz * n + w[i] * path) * per_cosine * nz
             qx, qy, qz = px + along * sx, py + along * sy, pz - along
             cot[i], cot[128 + i], cot[256 + i] = qx, qy, qz
             cot[384 + i] = dl + t * qx

@@ -84,21 +84,24 @@ def streams(real: types.Type) -> Streams:
     @njit(**OPTIONS)
     def set_indices(job, codes, lanes, work):  # noqa: ANN001, ANN202
         """The index in front and the ratio of a step; `lanes` are the rays' numbers."""
-        w = carray(work, 256)
+        w = carray(work, 6144)
         count = job[12]
         before = carray(shifted(real64_at(job[11]), codes[3] * count), 1 << 40)
         after = carray(shifted(real64_at(job[11]), codes[4] * count), 1 << 40)
         if count == 1:
             index, ratio = real(before[0]), real(before[0] / after[0])
+            inverse = real(types.float64(1.0) / before[0])
             for i in range(128):
                 w[i] = index
                 w[128 + i] = ratio
+                w[3072 + i] = inverse
         else:
             which = carray(int32_at(job[6]), 1 << 40)
             for i in range(128):
                 wavelength = which[lanes[i]]
                 w[i] = real(before[wavelength])
                 w[128 + i] = real(before[wavelength] / after[wavelength])
+                w[3072 + i] = real(types.float64(1.0) / before[wavelength])
 
     @njit(**OPTIONS)
     def step(job, k, lanes, before, after, cotangents, work):  # noqa: ANN001, ANN202

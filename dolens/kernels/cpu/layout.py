@@ -9,7 +9,8 @@ State (10 rows): x, y, z, l, m, n; 6 path; 7 ended; 8 vignetted; 9 distance trav
 Work: 0 index in front, 1 index ratio μ, then scratch:
     2 x, 3 y, 4 sag, 5 s_x, 6 s_y, 7 margin of the sag branch, 8 s_xx, 9 s_xy, 10 s_yy;
     11, 12, 13 cotangents of sag, s_x and s_y; 14, 15 the axial distance t and its start;
-    16 and on: a shape's own.
+    16 to 23: a shape's own; 24 one over the index in front; 25 zero when a ray comes to the
+    surface; 26 the coefficients of a cubic; 48 and on: a polynomial's powers, a spline's stencil.
 
 Cotangents: 0 to 6 as in the state; 7 of the index in front, 8 of the index behind;
     16 + j: of the record's number j.  A spline's local stencil: 40 to 55, its first place in 56.
@@ -17,7 +18,8 @@ Cotangents: 0 to 6 as in the state; 7 of the index in front, 8 of the index behi
 
 BLOCK = 128
 STATE = 10 * BLOCK
-WORK_ROWS = 48  # before the powers of a polynomial
+WORK_ROWS = 48  # before the powers of a polynomial or the stencil of a spline
+STENCIL_ROWS = 30
 COTANGENT_HEADER = 16
 
 # A step's codes as the CPU kernels take them: `table.Code`, then addresses.
@@ -41,5 +43,5 @@ class Job:
     PATH_COTANGENT, PATH_COTANGENT_ROW = range(30, 32)
     POSITION_GRADIENT, DIRECTION_GRADIENT = range(32, 34)
     SUMS, SUM_LENGTH, CHUNK, VALUES_LENGTH = range(34, 38)
-    LANES = 38
+    LANES, INDEX_SUMS = 38, 39
     LENGTH = 64

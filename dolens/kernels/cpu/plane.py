@@ -60,7 +60,7 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
             if refracts:
                 ratio, behind = w[128 + i], dst[640 + i]
                 of_ratio = a * l + b * m - c * ratio * (one - n * n) / behind
-                of_before = of_ratio * ratio / w[i]
+                of_before = of_ratio * ratio * w[3072 + i]
                 of_behind = -of_before * ratio
                 a, b, c = ratio * a, ratio * b, ratio * ratio * n / behind * c
             path, t = cot[768 + i], dst[1152 + i]

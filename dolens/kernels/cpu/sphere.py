@@ -63,16 +63,16 @@ def sphere_adjoint(real: types.Type) -> Callable[..., None]:
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
             x, y, z = dst[i], dst[128 + i], dst[256 + i]
             nx, ny, nz = -c * x, -c * y, one - c * z
-            dl, dm, dn, gx, gy, gz, of_before, of_behind = refract_adjoint(
+            dl, dm, dn, gx, gy, gz, of_before, of_behind, per_cosine = refract_adjoint(
                 cot[384 + i], cot[512 + i], cot[640 + i], l, m, n, nx, ny, nz,
-                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[i],
+                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[3072 + i],
             )  # fmt: skip
             if not refracts:
                 dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
                 gx = gy = gz = of_before = of_behind = zero
             px, py, pz = cot[i] - c * gx, cot[128 + i] - c * gy, cot[256 + i] - c * gz
             path, t = cot[768 + i], dst[1152 + i]
-            along = (px * l + py * m + pz * n + w[i] * path) / (nx * l + ny * m + nz * n)
+            along = (px * l + py * m + pz * n + w[i] * path) * per_cosine
             of_c = half * along * (x * x + y * y + z * z) - (gx * x + gy * y + gz * z)
             qx, qy, qz = px - along * nx, py - along * ny, pz - along * nz
             cot[i], cot[128 + i], cot[256 + i] = qx, qy, qz

@@ -1,6 +1,9 @@
 """XY polynomials with the implicit b·z² term; see `dolens.optics.surfaces.xy_polynomial`.
 
 With P = Σ a·x^i·y^j and W = √(1 - 4bP): s = 2P/(1 + W), s_x = P_x/W.
+
+Up to the third degree, a phase plate's, P is a dense polynomial by Horner's rule; beyond, a sum
+over the terms that there are.
 """
 
 from collections.abc import Callable
@@ -18,7 +21,14 @@ from dolens.kernels.cpu.compiler import OPTIONS, int64_at, shifted
 @cache
 def _polynomial(real: types.Type) -> tuple[Any, Any, Any]:
     """Compiled: powers of a block; P and its slopes (rows 4 to 6); its second derivatives."""
-    zero, one = real(0.0), real(1.0)
+    zero, one, two, three = real(0.0), real(1.0), real(2.0), real(3.0)
+
+    @njit(**OPTIONS)
+    def total_degree(extras, count):  # noqa: ANN001, ANN202
+        highest = 0
+        for t in range(count):
+            highest = max(highest, extras[2 * t] + extras[2 * t + 1])
+        return highest
 
     @njit(**OPTIONS)
     def powers(work, degree):  # noqa: ANN001, ANN202
@@ -46,8 +56,34 @@ def _polynomial(real: types.Type) -> tuple[Any, Any, Any]:
             out[k] += a * (u[k] * v[k])
 
     @njit(**OPTIONS)
+    def cubic_slopes(work, p, extras, count):  # noqa: ANN001, ANN202
+        """P and its slopes, with every coefficient in a register."""
+        w, a = carray(work, 6144), carray(shifted(work, 3328), 16)
+        for k in range(16):
+            a[k] = zero
+        for t in range(count):
+            a[4 * extras[2 * t] + extras[2 * t + 1]] += p[25 + t]
+        a00, a01, a02, a03 = a[0], a[1], a[2], a[3]
+        a10, a11, a12, a20, a21, a30 = a[4], a[5], a[6], a[8], a[9], a[12]
+        for i in range(128):
+            x, y = w[256 + i], w[384 + i]
+            # Coefficients of x⁰, x¹ and x² at this y.
+            b0 = ((a03 * y + a02) * y + a01) * y + a00
+            b1 = (a12 * y + a11) * y + a10
+            b2 = a21 * y + a20
+            w[512 + i] = ((a30 * x + b2) * x + b1) * x + b0
+            w[640 + i] = (three * a30 * x + two * b2) * x + b1
+            d0 = (three * a03 * y + two * a02) * y + a01
+            d1 = two * a12 * y + a11
+            w[768 + i] = (a21 * x + d1) * x + d0
+
+    @njit(**OPTIONS)
     def slopes(work, p, extras, count, degree):  # noqa: ANN001, ANN202
+        if total_degree(extras, count) <= 3:
+            cubic_slopes(work, p, extras, count)
+            return
         w = carray(work, 6144)
+        powers(work, degree)
         for i in range(128):
             w[512 + i], w[640 + i], w[768 + i] = zero, zero, zero
         for t in range(count):
@@ -78,13 +114,12 @@ def _polynomial(real: types.Type) -> tuple[Any, Any, Any]:
 def xy_polynomial_sag(real: types.Type) -> Callable[..., None]:
     """Sag, slopes, and the margin 1 - 4bP of the branch through the vertex."""
     _, safe_sqrt, *_ = arithmetic(real)
-    powers, slopes, _ = _polynomial(real)
+    _, slopes, _ = _polynomial(real)
     one, two, four = real(1.0), real(2.0), real(4.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         p, w, q = carray(record, 1 << 40), carray(work, 6144), carray(codes, 24)
         extras = carray(int64_at(q[21]), 1 << 40)
-        powers(work, q[11])
         slopes(work, p, extras, q[8], q[11])
         if q[9] == 0:
             for i in range(128):
