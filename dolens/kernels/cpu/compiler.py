@@ -18,6 +18,7 @@ from numba import types
 from numba.core import config, event
 from numba.core.caching import FunctionCache
 from numba.core.ccallback import CFunc
+from numba.core.runtime import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
@@ -120,6 +121,13 @@ class _StampedCache(FunctionCache):
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         # Not what the kernel closes over, as Numba has it: its helpers differ in every process.
         return sig, self._real, codegen.magic_tuple(), stamp()
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        # Numba's own prepares to compile first, which imports SciPy and half of Numba (0.6 s);
+        # compiled code needs the runtime's symbols only.
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
