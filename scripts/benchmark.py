@@ -17,7 +17,6 @@ from datetime import datetime
 from pathlib import Path
 
 import torch
-
 from benchmarks import (
     aims,
     figure,
@@ -32,7 +31,7 @@ from benchmarks.cases import LENSES, ROOT
 from benchmarks.results import Results
 from benchmarks.tracing import FORWARD, GRADIENT, GRADIENT_OF_RAYS, Plan, compare
 
-PARTS = ("trace", "rays", "memory", "jacobian", "b_spline", "render", "start")
+PARTS = ("trace", "rays", "memory", "peak", "jacobian", "b_spline", "render", "start")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -107,11 +106,13 @@ def main(options: argparse.Namespace) -> int:
 def _measure(results: Results, plan: Plan, options: argparse.Namespace) -> None:
     """The parts asked for, on one device."""
     parts = options.parts
+    one_or_all = plan.lenses[:1] if options.quick else plan.lenses
     if "trace" in parts:
         tracing.measure(results, plan, (FORWARD, GRADIENT))
     if "rays" in parts:
         fewer = plan.rays[-1:] if options.quick else [n for n in plan.rays if n <= 10**6]
-        tracing.measure(results, Plan(**vars(plan) | {"rays": fewer}), (GRADIENT_OF_RAYS,))
+        chosen = {"rays": fewer, "lenses": one_or_all}
+        tracing.measure(results, Plan(**vars(plan) | chosen), (GRADIENT_OF_RAYS,))
     if "b_spline" in parts:
         count = max(n for n in plan.rays if n <= 10**6 or n == min(plan.rays))
         for part, title in ((FORWARD, aims.B_SPLINE), (GRADIENT, "B-spline forward and gradient")):
@@ -120,13 +121,15 @@ def _measure(results: Results, plan: Plan, options: argparse.Namespace) -> None:
                     torch.set_num_threads(threads)
                     compare(results, plan, part, "b_spline", dtype, count, threads, "ns/ray", title)
     if "memory" in parts:
-        memory.measure(results, plan)
+        memory.measure_saved(results, plan)
+    if "peak" in parts and plan.device.type == "cpu":
+        memory.measure_peak(results, Plan(**vars(plan) | {"lenses": one_or_all}))
     if "jacobian" in parts:
         jacobians.measure(results, plan)
     if "render" in parts:
         rendering.measure(results, plan, options.pixels)
     if "start" in parts and plan.device.type == "cpu":
-        chosen = {"lenses": plan.lenses[:1], "dtypes": plan.dtypes[:1]} if options.quick else {}
+        chosen = {"lenses": one_or_all, "dtypes": plan.dtypes[:1] if options.quick else plan.dtypes}
         starting.measure(results, Plan(**vars(plan) | chosen), 2 if options.quick else 5)
 
 

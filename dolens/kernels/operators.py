@@ -119,8 +119,8 @@ def trace_adjoint(
     )
 
 
-def _trace_adjoint_shapes(values, indices, position, direction, which, codes, extras, status, *cotangents):  # noqa: ANN001, ANN002, ANN202
-    wanted = cotangents[-1]
+def _trace_adjoint_shapes(values, indices, position, *others):  # noqa: ANN001, ANN002, ANN202
+    wanted = others[-1]
     count = position.shape[0]
     return (
         torch.empty_like(values),

@@ -87,11 +87,10 @@ def library() -> dict[str, Callable[[Lens, Rays, list[str]], Tensor]] | str:
         return f"{error}"
 
     def jacobian(lens: Lens, rays: Rays, names: list[str]) -> Tensor:
-        found = ray_jacobian(lens, rays, names)
-        return torch.stack((found.x, found.y))
+        return ray_jacobian(lens, rays, names).derivatives.movedim(-2, 0)
 
     def normal(lens: Lens, rays: Rays, names: list[str]) -> Tensor:
-        return normal_equations(lens, rays, names).matrix
+        return normal_equations(lens, rays, names).jtj
 
     return {JACOBIAN: jacobian, NORMAL_EQUATIONS: normal}
 

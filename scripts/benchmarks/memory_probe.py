@@ -33,7 +33,7 @@ def main(name: str, dtype: str, backend: str, count: int) -> None:
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     before = _resident("VmRSS")
     hit = case.lens.trace(rays)
-    hit.position.square().sum().backward()
+    hit.position.sum().backward()
     peak = _resident("VmHWM") - before
     outputs = (hit.position, hit.direction, hit.path_length, hit.status, hit.surface, hit.valid)
     size = sum(t.numel() * t.element_size() for t in outputs)

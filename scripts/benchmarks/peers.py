@@ -47,7 +47,7 @@ class Peer(ABC):
 
     @abstractmethod
     def sensor_points(self, rays: Rays, gradients: bool) -> tuple[Tensor, list[Tensor]]:
-        """Points (N, 2) on the sensor, mm, and the leaves that have gradients: the curvatures."""
+        """Points (N, 2) on the sensor, mm, and leaves with gradients: curvatures or radii."""
 
 
 class Optiland(Peer):
@@ -84,6 +84,7 @@ class Optiland(Peer):
         self._surfaces = self._optic.surfaces
 
     def sensor_points(self, rays: Rays, gradients: bool) -> tuple[Tensor, list[Tensor]]:
+        """As `Peer`; the leaves are radii."""
         from optiland.rays import RealRays
 
         be = self._backend
@@ -125,6 +126,7 @@ class SourceProgram(Peer):
         self._lens.d_sensor = places[-1]
 
     def sensor_points(self, rays: Rays, gradients: bool) -> tuple[Tensor, list[Tensor]]:
+        """As `Peer`."""
         leaves = []
         for surface in self._lens.surfaces:
             surface.c = surface.c.detach().requires_grad_(gradients)
@@ -237,9 +239,9 @@ def _error(part: str, model: Peer, case: Case, exact: Case) -> dict[str, Any]:
     exact.lens.trace(through).position[:, :2].square().sum().backward()
     worst = 0.0
     for surface, leaf in zip(exact.lens.surfaces.values(), leaves, strict=True):
-        curvature = surface.curvature
+        curvature, slope = surface.curvature.detach(), surface.curvature.grad
         theirs = leaf.grad.double()
         # A radius R = 1/c: dL/dR = -c² dL/dc.
-        ours = curvature.grad if model.name != "Optiland" else -(curvature**2) * curvature.grad
+        ours = slope if model.name != "Optiland" else -(curvature**2) * slope
         worst = max(worst, float(abs(theirs - ours) / abs(ours)))
     return against | {"error": worst, "error_unit": "relative", "note": note}

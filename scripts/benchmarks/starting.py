@@ -13,8 +13,11 @@ from benchmarks.results import Results, Row
 from benchmarks.timing import quartiles
 from benchmarks.tracing import Plan
 
-CACHED, COLD = "start, kernels cached", "start, nothing cached"
-_PARTS = ("python", "torch", "dolens", "kernel_imports", "lens", "first", "second")
+CACHED, COLD = "start, kernels cached", "start, kernels compiled"
+# The same without what any program that uses PyTorch waits for.
+CACHED_OWN, COLD_OWN = (f"{part}, after importing torch" for part in (CACHED, COLD))
+_OWN = ("dolens", "kernel_imports", "lens", "first")
+_PARTS = ("python", "torch", *_OWN)
 
 
 def start(name: str, dtype: str, backend: str, cache: str | None) -> dict:
@@ -32,7 +35,7 @@ def start(name: str, dtype: str, backend: str, cache: str | None) -> dict:
     return json.loads(done.stdout)
 
 
-def measure(results: Results, plan: Plan, repeats: int, cold: bool = True) -> None:
+def measure(results: Results, plan: Plan, repeats: int) -> None:
     """Rows of seconds from the process's start to its first result; backends in turn."""
     for name in plan.lenses:
         for dtype in (str(d)[6:] for d in plan.dtypes):
@@ -49,28 +52,36 @@ def measure(results: Results, plan: Plan, repeats: int, cold: bool = True) -> No
                         continue
                     if turn:  # the first filled the caches
                         runs[backend].append(found)
-            for backend, found in runs.items():
-                results.add(_row(CACHED, name, dtype, backend, found, failures.get(backend, "")))
-            if not cold:
-                continue
+            for part, pieces in ((CACHED, _PARTS), (CACHED_OWN, _OWN)):
+                for backend, found in runs.items():
+                    failure = failures.get(backend, "")
+                    results.add(_row(part, pieces, name, dtype, backend, found, failure))
             for backend in plan.backends:
                 if backend in ("reference", *failures):
                     continue
                 with tempfile.TemporaryDirectory() as empty:
                     found = [start(name, dtype, backend, empty)]
-                results.add(_row(COLD, name, dtype, backend, found, ""))
+                results.add(_row(COLD, _PARTS, name, dtype, backend, found, ""))
+                results.add(_row(COLD_OWN, _OWN, name, dtype, backend, found, ""))
 
 
-def _row(part: str, name: str, dtype: str, backend: str, found: list[dict], failure: str) -> Row:
-    totals = [sum(run[p] for p in _PARTS if p != "second") for run in found]
-    low, middle, high = quartiles(totals)
+def _row(
+    part: str,
+    pieces: tuple[str, ...],
+    name: str,
+    dtype: str,
+    backend: str,
+    found: list[dict],
+    failure: str,
+) -> Row:
+    low, middle, high = quartiles([sum(run[p] for p in pieces) for run in found])
     note = f"failed: {failure}"
     if not failure:
-        medians = {p: quartiles([run[p] for run in found])[1] for p in _PARTS}
+        medians = {p: quartiles([run[p] for run in found])[1] for p in (*_PARTS, "second")}
         note = (
-            f"python {medians['python']:.2f}, import torch {medians['torch']:.2f}, "
-            f"dolens {medians['dolens']:.2f}, numba and kernels {medians['kernel_imports']:.2f}, "
-            f"load lens {medians['lens']:.2f}, first trace {medians['first']:.3f}, "
+            f"python {medians['python']:.2f}, torch {medians['torch']:.2f}, "
+            f"dolens {medians['dolens']:.2f}, numba {medians['kernel_imports']:.2f}, "
+            f"lens {medians['lens']:.2f}, first trace {medians['first']:.3f}, "
             f"second {medians['second']:.4f} s"
         )
     return Row(
