@@ -32,6 +32,7 @@ from benchmarks.results import Results
 from benchmarks.tracing import FORWARD, GRADIENT, GRADIENT_OF_RAYS, Plan, compare
 
 PARTS = ("trace", "rays", "memory", "peak", "jacobian", "b_spline", "render", "start")
+BUSY = 0.7  # processes of the last minute
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -76,6 +77,11 @@ def main(options: argparse.Namespace) -> int:
         threads = threads[-1:]
     results = Results(options.output, _environment(options, cores))
     print("\n".join(f"{key}: {value}" for key, value in results.environment.items()))
+    if os.getloadavg()[0] > BUSY:
+        print(
+            "other programs are running: PyTorch's threads wait for each other after every "
+            "operation, so with all threads the ratios flatter the kernels; one thread is fairer"
+        )
     devices = [(torch.device("cpu"), ("reference", "cpu"))]
     if torch.cuda.is_available():
         devices.append((torch.device("cuda"), ("reference", "cuda")))

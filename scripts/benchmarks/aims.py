@@ -89,7 +89,7 @@ def summarise(rows: Sequence[Row]) -> list[dict]:
 def print_summary(lines: Sequence[dict]) -> None:
     """The aims as a table."""
     print("\naims: worst and best median over the numbers of rays from 1e5, all threads")
-    missing = [line["aim"] for line in lines if line["met"] is None]
+    missing = dict.fromkeys(line["aim"] for line in lines if line["met"] is None)
     for line in lines:
         if line["met"] is None:
             continue
