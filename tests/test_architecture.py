@@ -14,7 +14,7 @@ ALLOWED = {
     "kernels": {"errors"},
     "optics": {"errors", "kernels"},
     "prescriptions": {"errors", "optics"},
-    "imaging": {"errors", "optics"},
+    "imaging": {"errors", "optics", "kernels"},
     "optimize": {"errors", "optics", "imaging"},
     "reconstruction": {"errors", "optics", "imaging"},
     "plotting": {"errors", "optics", "imaging"},

@@ -9,9 +9,12 @@ from dolens.errors import InputError
 from dolens.imaging.sampling import regular_square, square_to_disc
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.kernels import splatting
+from dolens.optics.backend import choose_backend, trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
-from dolens.optics.rays import Components
+from dolens.optics.rays import Components, Rays
+from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces, trace_to_plane
 
 # The paraxial pupil is widened a little, so that the real one lies within it.
@@ -48,6 +51,7 @@ def axial_point_spread_functions(
     if size < 3 or size % 2 == 0:
         raise InputError(f"psf size must be odd and at least 3, not {size}")
     system = lens.system(values)
+    backend = choose_backend(system, lens.backend)
     scene.check(system)
     u, v = regular_square(pupil_samples, system.dtype, system.device)
     disc_x, disc_y = square_to_disc(u, v)
@@ -62,20 +66,34 @@ def axial_point_spread_functions(
             n = dz / torch.sqrt(dx * dx + dy * dy + dz * dz)
             zero = torch.zeros_like(n)
             ray = Components(zero, zero, zero - depth, dx / dz * n, dy / dz * n, n)
-            traced = trace_surfaces(system, ray, wavelength)
-            traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
+            x, y, valid = _on_sensor(system, ray, wavelength, backend)
             # A Lambertian point sends cos⁴ over the pupil plane, like a pixel does backwards.
-            weight = torch.where(traced.valid, n**4, zero)
+            weight = torch.where(valid, n**4, zero)
             total = weight.sum()
             if not bool(total > 0.0):
                 raise InputError(f"no light from the axis at {depth:g} mm reaches the sensor")
-            columns = size // 2 - traced.ray.x / sensor.pixel_pitch
-            rows = size // 2 + traced.ray.y / sensor.pixel_pitch
-            functions.append(splat(rows, columns, weight / total, size))
+            columns = size // 2 - x / sensor.pixel_pitch
+            rows = size // 2 + y / sensor.pixel_pitch
+            functions.append(splat(rows, columns, weight / total, size, backend))
     return torch.stack(functions).reshape(len(scene.depths), len(scene.wavelengths), size, size)
 
 
-def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
+def _on_sensor(
+    system: OpticalSystem, ray: Components, wavelength: float, backend: str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where rays meet the sensor, x and y in mm, and which of them got there."""
+    if backend == "reference":
+        traced = trace_surfaces(system, ray, wavelength)
+        traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
+        return traced.ray.x, traced.ray.y, traced.valid
+    rays = Rays.from_components(ray, wavelength)
+    hit = trace_rays(system, rays, backend, 1.0, record=False, first=1, last=None)
+    return hit.position[..., 0], hit.position[..., 1], hit.valid
+
+
+def splat(
+    rows: Tensor, columns: Tensor, weight: Tensor, size: int, backend: str = "reference"
+) -> Tensor:
     """Sum weighted quadratic B-splines, centred on points, onto a grid of pixels.
 
     Args:
@@ -83,11 +101,16 @@ def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
         columns: (N,).
         weight: (N,); zero leaves a point out, wherever it lies.
         size: pixels along each side of the grid.
+        backend: `cpu` takes the fused kernel, whose result is always the same to the bit.  The
+            others take PyTorch's operations; on a GPU these are so on request only, by
+            `torch.use_deterministic_algorithms`.
 
     Returns:
         (size, size).  Once continuously differentiable in rows and columns.  Points within a
         pixel and a half of the edge lose what falls outside.
     """
+    if backend == "cpu":
+        return splatting.splat(rows, columns, weight, size)
     row_taps, row_weights = _spline_taps(rows)
     column_taps, column_weights = _spline_taps(columns)
     flat = torch.zeros(size * size, dtype=weight.dtype, device=weight.device)

@@ -1,4 +1,8 @@
-"""Backward-mode rendering: from pixels through the exit pupil and the lens to textured planes."""
+"""Backward-mode rendering: from pixels through the exit pupil and the lens to textured planes.
+
+Two implementations of one computation, with the same samples: fused kernels, and PyTorch's
+operations, the reference that they must equal.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,19 +11,23 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.pupil import ExitPupil, aim, axial_exit_pupil
+from dolens.imaging.pupil import aim, axial_exit_pupil
+from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.replay import replay
 from dolens.imaging.sampling import square_to_disc, stratified_square
 from dolens.imaging.scene import PlanarScene, texture_coordinates
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.texture import bilinear
+from dolens.kernels import rendering
+from dolens.kernels.view import View
+from dolens.optics.backend import choose_backend, say_once, trace_rays
 from dolens.optics.lens import Lens
-from dolens.optics.rays import Components
+from dolens.optics.packing import pack
+from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane, trace_surfaces
 
-# Two large primes give every (seed, piece) its own stream without shared state.
-_SEED_FACTOR, _PIECE_FACTOR, _SEED_RANGE = 1_000_000_007, 998_244_353, 2**63 - 1
+_SEED_RANGE = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -34,8 +42,9 @@ class RayRenderer:
     Attributes:
         sensor: the pixels.
         pupil_samples: strata along each side; rays a pixel are its square.
-        chunk_rays: rays traced at a time; sets the memory, not the result's distribution.
-        replay: recompute each chunk in the backward pass, so that memory stays bounded.
+        chunk_rays: rays that the reference traces at a time; sets its memory, not the image.
+        replay: recompute each chunk in the backward pass, so that memory stays bounded; the fused
+            kernels always do.
         gradient_fraction: share of the chunks that the backward pass recomputes, drawn at random
             for each seed; below 1 the gradient is an unbiased estimate, and the image is whole.
         pixel_area: sample over the pixel's area (a real pixel integrates), or at its centre.
@@ -92,83 +101,144 @@ class RayRenderer:
             )
         stored = {n: p for n, p in lens.named_parameters() if p.requires_grad}
         parameters = {**stored, **(values or {})}
-        names = list(parameters)
+        textures = textures.to(device=lens.device, dtype=lens.dtype)
+        system = lens.system(parameters)
+        backend = choose_backend(system, lens.backend, others=[textures])
         now = lens.system({n: p.detach() for n, p in parameters.items()})
         scene.check(now)
-        pupil = axial_exit_pupil(now, scene.wavelengths)
-        magnifications = scene.magnifications(now)
-        pixels = self.sensor.height * self.sensor.width
-        per_chunk = max(1, self.chunk_rays // self.pupil_samples**2)
-        starts = list(range(0, pixels, per_chunk))
-        sizes = [min(per_chunk, pixels - start) for start in starts]
+        view = self._view(now, scene, seed)
+        if backend == "cpu":
+            return self._fused(system, scene, textures, view)
+        if backend == "cuda":
+            say_once("render: no fused renderer for cuda; the reference, with fused traces")
+        names = list(parameters)
 
         def piece(i: int, textures: Tensor, *tensors: Tensor) -> Tensor:
             system = lens.system(dict(zip(names, tensors, strict=True)))
-            samples = self._samples(system, pupil, starts[i], sizes[i], seed, i)
-            return self._shade(system, scene, textures, magnifications, *samples)
+            start, end = self._chunk(i)
+            ray, weight = self._samples(system, view, start, end)
+            return self._shade(system, scene, view, textures, ray, weight, backend)
 
-        tensors = [textures.to(device=lens.device, dtype=lens.dtype), *parameters.values()]
+        tensors = [textures, *parameters.values()]
+        sizes = [end - start for start, end in map(self._chunk, range(self._chunks))]
         if self.replay:
-            count = max(1, round(self.gradient_fraction * len(sizes)))
-            generator = torch.Generator().manual_seed(seed % _SEED_RANGE)
-            replayed = torch.randperm(len(sizes), generator=generator)[:count].tolist()
-            flat = replay(piece, sizes, tensors, replayed)
+            flat = replay(piece, sizes, tensors, self._replayed(seed))
         else:
             flat = torch.cat([piece(i, *tensors) for i in range(len(sizes))], dim=-1)
         return flat.unflatten(-1, (self.sensor.height, self.sensor.width))
 
+    def _view(self, system: OpticalSystem, scene: PlanarScene, seed: int) -> View:
+        """What does not depend on the lens's gradient: pixels, samples, pupil and planes."""
+        pupil = axial_exit_pupil(system, scene.wavelengths)
+        return View(
+            self.sensor.height,
+            self.sensor.width,
+            self.sensor.pixel_pitch,
+            self.pupil_samples,
+            self.pixel_area,
+            seed,
+            pupil.z,
+            pupil.radius,
+            scene.depths,
+            tuple(scene.magnifications(system)),
+        )
+
+    @property
+    def _chunks(self) -> int:
+        """Number of chunks of pixels."""
+        per_chunk = max(1, self.chunk_rays // self.pupil_samples**2)
+        return -(-self.sensor.height * self.sensor.width // per_chunk)
+
+    def _chunk(self, i: int) -> tuple[int, int]:
+        """First pixel and end of chunk i."""
+        per_chunk = max(1, self.chunk_rays // self.pupil_samples**2)
+        pixels = self.sensor.height * self.sensor.width
+        return i * per_chunk, min((i + 1) * per_chunk, pixels)
+
+    def _replayed(self, seed: int) -> list[int]:
+        """The chunks that the backward pass traces again."""
+        count = max(1, round(self.gradient_fraction * self._chunks))
+        generator = torch.Generator().manual_seed(seed % _SEED_RANGE)
+        return torch.randperm(self._chunks, generator=generator)[:count].tolist()
+
+    def _fused(
+        self, system: OpticalSystem, scene: PlanarScene, textures: Tensor, view: View
+    ) -> Tensor:
+        """The render in one kernel."""
+        wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64)
+        table = pack(system, wavelengths, -1.0, 1, len(system.surfaces), False)
+        pieces, scale = [(0, view.height * view.width)], 1.0
+        if self.gradient_fraction < 1.0:
+            replayed = self._replayed(view.seed)
+            pieces = [self._chunk(i) for i in sorted(replayed)]
+            scale = self._chunks / len(replayed)
+        return rendering.render(
+            table.values,
+            table.indices,
+            textures,
+            system.vertices[-1],
+            table.codes,
+            table.extras,
+            view.integers(),
+            view.numbers(),
+            torch.tensor(pieces),
+            scale,
+        )
+
     def _samples(
-        self,
-        system: OpticalSystem,
-        pupil: ExitPupil,
-        start: int,
-        count: int,
-        seed: int,
-        index: int,
+        self, system: OpticalSystem, view: View, start: int, end: int
     ) -> tuple[Components, Tensor]:
-        """Rays (count, samples) from the sensor, and their weights, which sum to one on axis."""
-        number = (seed * _SEED_FACTOR + index * _PIECE_FACTOR) % _SEED_RANGE
-        generator = torch.Generator(system.device).manual_seed(number)
-        u, v = stratified_square(self.pupil_samples, count, generator, system.dtype)
-        disc_x, disc_y = square_to_disc(u, v)
-        pixel = torch.arange(start, start + count, device=system.device)[:, None]
-        rows = torch.div(pixel, self.sensor.width, rounding_mode="floor").to(system.dtype)
-        columns = (pixel % self.sensor.width).to(system.dtype)
-        if self.pixel_area:
-            options = {"generator": generator, "dtype": system.dtype, "device": system.device}
-            jitter = torch.rand((2, *u.shape), **options) - 0.5
-            rows, columns = rows + jitter[0], columns + jitter[1]
+        """Rays (pixels, samples) from the sensor, and their weights, which sum to one on axis."""
+        side = view.pupil_samples
+        pixel = torch.arange(start, end, device=system.device)[:, None]
+        sample = torch.arange(side * side, device=system.device)
+        jitters = [uniform(word, system.dtype) for word in random_words(view.seed, pixel, sample)]
+        disc_x, disc_y = square_to_disc(*stratified_square(side, *jitters[:2]))
+        rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)
+        columns = (pixel % view.width).to(system.dtype)
+        if view.pixel_area:
+            rows, columns = rows + (jitters[2] - 0.5), columns + (jitters[3] - 0.5)
         x, y = self.sensor.positions(rows, columns)
         sensor_z = system.vertices[-1]
-        ray = aim(x, y, sensor_z, disc_x * pupil.radius, disc_y * pupil.radius, pupil.z)
-        # cos⁴ of the ray's angle, relative to its mean over the disc seen from the axis, which is
-        # L²/(L² + a²) for a disc of radius a at distance L.
-        squared = ((sensor_z - pupil.z) ** 2).detach()
-        axial = squared / (squared + pupil.radius**2)
-        return ray, (ray.n * ray.n) ** 2 / (axial * self.pupil_samples**2)
+        radius = view.pupil_radius
+        ray = aim(x, y, sensor_z, disc_x * radius, disc_y * radius, view.pupil_z)
+        return ray, (ray.n * ray.n) ** 2 * view.weight(float(sensor_z.detach()))
 
     def _shade(
         self,
         system: OpticalSystem,
         scene: PlanarScene,
+        view: View,
         textures: Tensor,
-        magnifications: list[float],
         ray: Components,
         weight: Tensor,
+        backend: str,
     ) -> Tensor:
         """(B, depths, C, count): trace, meet each plane, look the texture up, sum the samples."""
         size = (textures.shape[-2], textures.shape[-1])
         channels = []
         for channel, wavelength in enumerate(scene.wavelengths):
-            traced = trace_surfaces(system, ray, wavelength, sense=-1.0)
-            arriving = torch.where(traced.valid & (traced.ray.n < 0.0), weight, 0.0)
+            there, valid = _trace(system, ray, wavelength, backend)
+            arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
             by_depth = []
-            for depth, magnification in zip(scene.depths, magnifications, strict=True):
-                t, _ = distance_to_plane(traced.ray, -depth, -1.0)
-                x = torch.addcmul(traced.ray.x, t, traced.ray.l)
-                y = torch.addcmul(traced.ray.y, t, traced.ray.m)
+            for depth, magnification in zip(view.depths, view.magnifications, strict=True):
+                t, _ = distance_to_plane(there, -depth, -1.0)
+                x = torch.addcmul(there.x, t, there.l)
+                y = torch.addcmul(there.y, t, there.m)
                 rows, columns = texture_coordinates(x, y, magnification, self.sensor, size)
                 radiance = bilinear(textures[:, channel], rows, columns)
                 by_depth.append((radiance * arriving).sum(dim=-1))
             channels.append(torch.stack(by_depth, dim=1))
         return torch.stack(channels, dim=2)
+
+
+def _trace(
+    system: OpticalSystem, ray: Components, wavelength: float, backend: str
+) -> tuple[Components, Tensor]:
+    """Rays behind the lens, in object space, and which of them got there."""
+    if backend == "reference":
+        traced = trace_surfaces(system, ray, wavelength, sense=-1.0)
+        return traced.ray, traced.valid
+    rays = Rays.from_components(ray, wavelength)
+    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
+    return Components(*hit.position.unbind(-1), *hit.direction.unbind(-1)), hit.valid

@@ -6,25 +6,20 @@ import torch
 from torch import Tensor
 
 
-def stratified_square(
-    side: int, count: int, generator: torch.Generator, dtype: torch.dtype
-) -> tuple[Tensor, Tensor]:
-    """`count` jittered samplings of the unit square, each with one point in every cell.
+def stratified_square(side: int, jitter_u: Tensor, jitter_v: Tensor) -> tuple[Tensor, Tensor]:
+    """Jittered samplings of the unit square, each with one point in every cell.
 
     Args:
         side: the square is cut into side × side cells.
-        count: independent samplings.
-        generator: the source of the jitter; its device is the result's.
-        dtype: of the result.
+        jitter_u: (count, side²), in [0, 1): where in its cell each point lies.
+        jitter_v: (count, side²).
 
     Returns:
         u and v in [0, 1), each (count, side²).
     """
-    device = generator.device
-    jitter = torch.rand((2, count, side * side), generator=generator, device=device, dtype=dtype)
-    cell = torch.arange(side * side, device=device)
-    u = (jitter[0] + (cell % side)) / side
-    v = (jitter[1] + torch.div(cell, side, rounding_mode="floor")) / side
+    cell = torch.arange(side * side, device=jitter_u.device)
+    u = (jitter_u + cell % side) / side
+    v = (jitter_v + torch.div(cell, side, rounding_mode="floor")) / side
     return u, v
 
 

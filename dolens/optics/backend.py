@@ -1,9 +1,10 @@
 """Which implementation traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -31,12 +32,23 @@ def check_backend(name: str) -> str:
     return name
 
 
-def choose_backend(system: OpticalSystem, requested: str, rays: Rays | None = None) -> str:
+def choose_backend(
+    system: OpticalSystem,
+    requested: str,
+    rays: Rays | None = None,
+    others: Iterable[Tensor] = (),
+) -> str:
     """Which of `reference`, `cpu` and `cuda` traces a lens.
 
     `auto` takes the kernels of the lens's device where they serve: for its surfaces and precision,
     outside torch.func's transforms and forward mode, which only the reference can follow.  It logs
     what it took, once for each reason.
+
+    Args:
+        system: the lens.
+        requested: one of `BACKENDS`.
+        rays: what is traced.
+        others: tensors besides that enter the computation.
 
     Raises:
         InputError: kernels are asked for by name and cannot serve; the message says why.
@@ -50,7 +62,7 @@ def choose_backend(system: OpticalSystem, requested: str, rays: Rays | None = No
     elif system.dtype not in _KERNEL_DTYPES:
         reason = f"kernels are of float32 and float64, not {system.dtype}"
     elif requested == "auto" and reason is None:
-        if _transformed(_tensors(system, rays)):
+        if _transformed(chain(_tensors(system, rays), others)):
             reason = "kernels do not follow torch.func or forward mode"
         elif device == "cuda" and not _has_triton():
             reason = "triton is not installed"
@@ -61,9 +73,9 @@ def choose_backend(system: OpticalSystem, requested: str, rays: Rays | None = No
             raise InputError(f"backend '{requested}': {reason}")
         return requested
     if reason is None:
-        _say(f"backend auto: {device} kernels")
+        say_once(f"backend auto: {device} kernels")
         return device
-    _say(f"backend auto: the reference in PyTorch, since {reason}")
+    say_once(f"backend auto: the reference in PyTorch, since {reason}")
     return "reference"
 
 
@@ -210,7 +222,7 @@ def _tensors(system: OpticalSystem, rays: Rays | None) -> Iterator[Tensor]:
         yield from (t for t in given if isinstance(t, Tensor))
 
 
-def _transformed(tensors: Iterator[Tensor]) -> bool:
+def _transformed(tensors: Iterable[Tensor]) -> bool:
     """Whether any tensor is seen through torch.func, or carries a tangent."""
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     forward = forward_ad._current_level >= 0
@@ -227,5 +239,6 @@ def _has_triton() -> bool:
 
 
 @cache
-def _say(message: str) -> None:
+def say_once(message: str) -> None:
+    """Log a message when it is first said."""
     logger.info(message)

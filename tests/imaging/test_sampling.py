@@ -8,15 +8,20 @@ import torch
 from dolens.imaging.sampling import square_to_disc, stratified_square
 
 
+def jitter(count: int, cells: int, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(2, count, cells, dtype=torch.float64, generator=generator)
+
+
 def test_every_cell_of_every_sampling_holds_one_point():
-    u, v = stratified_square(7, 100, torch.Generator().manual_seed(3), torch.float64)
+    u, v = stratified_square(7, *jitter(100, 49, seed=3))
     cell = (u * 7).floor() + 7 * (v * 7).floor()
     assert torch.equal(cell.sort(dim=1).values, torch.arange(49.0).double().expand(100, 49))
 
 
 def test_the_disc_map_preserves_area():
     # A uniform square has r² uniform on [0, 1] and the angle uniform.
-    u, v = stratified_square(100, 60, torch.Generator().manual_seed(0), torch.float64)
+    u, v = stratified_square(100, *jitter(60, 10_000, seed=0))
     x, y = square_to_disc(u, v)
     r2 = x * x + y * y
     assert float(r2.max()) <= 1.0

@@ -92,6 +92,11 @@ _DERIVATIVES = {
 }
 
 
+def as_integers(array: np.ndarray) -> Any:
+    """An array of int64 as a driver takes it."""
+    return array.ctypes.data_as(_INTEGERS)
+
+
 class Steps(NamedTuple):
     """The steps of a lens, compiled.
 
@@ -168,7 +173,8 @@ class Program:
         last = table.values.numel() - 1
         self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
         self.job[Job.CLIP] = steps.clip
-        states = count + 1 if derivatives else 2
+        # Without derivatives two in turn, and one that a driver may keep.
+        states = count + 1 if derivatives else 3
         cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
         self.job[Job.COTANGENT_LENGTH] = cotangents
         self._sizes = {
@@ -207,7 +213,7 @@ class Program:
                 job[place] = address
                 address += length * step
             job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
-            function(job.ctypes.data_as(_INTEGERS), first, last)
+            function(as_integers(job), first, last)
 
         spread(task, pieces, threads)
 

@@ -95,10 +95,13 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                 residual / math.copysign(size if size > grazing else grazing, slope), scale
             )
             t = clamp(t, limit)
-            x, y = dst[i] + t * l, dst[128 + i] + t * m
-            travelled = dst[1152 + i] + t
-            dst[i], dst[128 + i], dst[256 + i], dst[1152 + i] = x, y, t * n, travelled
-            dst[768 + i] = src[768 + i] + w[i] * travelled
+            dst[i], dst[128 + i], dst[256 + i] = dst[i] + t * l, dst[128 + i] + t * m, t * n
+            dst[1152 + i] += t
+            dst[896 + i] = met
+        for i in range(128):
+            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
+            x, y, sx, sy, met = dst[i], dst[128 + i], w[640 + i], w[768 + i], dst[896 + i]
+            dst[768 + i] = src[768 + i] + w[i] * dst[1152 + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
             l2, m2, n2, transmitted = refract(l, m, n, -sx * nz, -sy * nz, nz, w[128 + i], sense)
             if refracts:

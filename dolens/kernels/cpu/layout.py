@@ -53,4 +53,6 @@ class Job:
     ENTRY_FIRST = 62
     # Of all rays of the block at hand, plus one; zero where they differ.
     WAVELENGTH = 63
-    LENGTH = 64
+    # Of a renderer: arrays of integers and of numbers; see `rendering`.
+    VIEW, LENGTHS = 64, 65
+    LENGTH = 72

@@ -20,25 +20,33 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
         p, w = carray(record, 32), carray(work, 6144)
         shift, limit, sense, tag, c = p[0], p[12], p[18], p[19], p[24]
         edge = p[14]
+        # Three loops: a processor looks only so far ahead, and this way finds several iterations'
+        # divisions and roots to work on at once.
+        for i in range(128):
+            x, y, t, _ = arrive(
+                src[i], src[128 + i], src[256 + i] + shift,
+                src[384 + i], src[512 + i], src[640 + i], sense, limit,
+            )  # fmt: skip
+            dst[i], dst[128 + i], dst[1152 + i] = x, y, t
         for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            x, y, t0, met = arrive(
-                src[i], src[128 + i], src[256 + i] + shift, l, m, n, sense, limit
-            )
+            x, y, met = dst[i], dst[128 + i], sense * n
             f = c * (x * x + y * y)
             g = n - c * (l * x + m * y)
             squared = g * g - c * f
             near = sense * g + safe_sqrt(squared)
             t = clamp(sense * f / (near if near > grazing else grazing), limit)
-            x, y, z = x + t * l, y + t * m, t * n
+            dst[i], dst[128 + i], dst[256 + i] = x + t * l, y + t * m, t * n
+            dst[1152 + i] += t
+            dst[896 + i] = squared if squared < met else met
+        for i in range(128):
+            x, y, z, met = dst[i], dst[128 + i], dst[256 + i], dst[896 + i]
             nx, ny, nz = -c * x, -c * y, one - c * z
-            met = squared if squared < met else met
             met = nz if nz < met else met
-            dst[i], dst[128 + i], dst[256 + i] = x, y, z
-            travelled = t0 + t
-            dst[1152 + i] = travelled
-            dst[768 + i] = src[768 + i] + w[i] * travelled
-            l, m, n, transmitted = refract(l, m, n, nx, ny, nz, w[128 + i], sense)  # noqa: E741
+            dst[768 + i] = src[768 + i] + w[i] * dst[1152 + i]
+            l, m, n, transmitted = refract(  # noqa: E741
+                src[384 + i], src[512 + i], src[640 + i], nx, ny, nz, w[128 + i], sense
+            )
             dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
             ended, vignetted = src[896 + i], src[1024 + i]
             ended = ended if ended > zero or met > zero else tag + three

@@ -1,0 +1,179 @@
+"""Running the renderer and the splat on tensors."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dolens.kernels.cpu.backend import Program
+from dolens.kernels.cpu.layout import BLOCK, Job
+from dolens.kernels.cpu.rendering.layout import SCRATCH_ROWS, Length, Place
+from dolens.kernels.cpu.rendering.render import render_driver
+from dolens.kernels.cpu.rendering.render_adjoint import render_adjoint_driver
+from dolens.kernels.table import SurfaceTable
+from dolens.kernels.view import View
+
+# Groups of blocks that sums are kept for: enough for any processor's threads, but fewer where each
+# needs a texture's memory.
+_GROUPS, _TEXTURE_GROUPS = 64, 8
+_LOW = 0xFFFFFFFF
+
+
+def render(table: SurfaceTable, textures: Tensor, sensor_z: Tensor, view: View) -> Tensor:
+    """Render every image, depth and channel.
+
+    Args:
+        table: the lens backwards, from its last surface to its first.
+        textures: (B, C, H, W), C as many as the table's wavelengths, in the table's precision.
+        sensor_z: (), mm.
+        view: what is rendered.
+
+    Returns:
+        (B, depths, C, height, width).
+    """
+    pieces = torch.tensor([[0, view.height * view.width]])
+    job = _RenderJob(table, textures, sensor_z, view, pieces, derivatives=False)
+    image = textures.new_empty(
+        (textures.shape[0], len(view.depths), textures.shape[1], view.height, view.width)
+    )
+    job.view[Place.IMAGE] = image.data_ptr()
+    job.program.run(render_driver, len(job.blocks))
+    return image
+
+
+def render_adjoint(
+    table: SurfaceTable,
+    textures: Tensor,
+    sensor_z: Tensor,
+    view: View,
+    of_image: Tensor,
+    pieces: Tensor,
+    scale: float,
+    wanted: Sequence[bool],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cotangents of the table, the textures and the sensor's z from those of the image.
+
+    Args:
+        table: as in `render`, and the textures, the sensor's z and the view.
+        textures: (B, C, H, W).
+        sensor_z: ().
+        view: what was rendered.
+        of_image: (B, depths, C, height, width).
+        pieces: (P, 2), int64, first pixel and end of the ranges that are rendered again.
+        scale: factor of all gradients.
+        wanted: whether those of the lens, of its indices, and of the textures are needed; zero
+            where not.
+
+    Returns:
+        Gradients of `values`, `indices`, `textures` and `sensor_z`.
+    """
+    job = _RenderJob(table, textures, sensor_z, view, pieces, derivatives=True)
+    job.lengths[Length.SCALE] = scale
+    of_lens, of_indices, of_textures = wanted
+    groups = min(_TEXTURE_GROUPS if of_textures else _GROUPS, len(job.blocks))
+    bounds = np.array([len(job.blocks) * g // groups for g in range(groups + 1)])
+    cut = table.values.numel()
+    sums = torch.zeros((groups, cut + table.indices.numel() + 1), dtype=torch.float64)
+    image = of_image.contiguous()
+    job.view[Place.IMAGE], job.view[Place.GROUPS] = image.data_ptr(), bounds.ctypes.data
+    job.view[Place.OF_LENS] = int(of_lens)
+    texture_sums = None
+    if of_textures:
+        texture_sums = torch.zeros((groups, *job.textures.shape), dtype=textures.dtype)
+        job.view[Place.TEXTURE_SUMS] = texture_sums.data_ptr()
+    job.program.point(SUMS=sums)
+    job.program.job[Job.SUM_LENGTH] = sums.shape[1]
+    job.program.job[Job.INDEX_SUMS] = int(of_indices)
+    job.program.run(render_adjoint_driver, groups)
+    total = sums.sum(0)
+    of_texture = torch.zeros_like(textures)
+    if texture_sums is not None:
+        of_texture = _unpad(texture_sums.sum(0), textures)
+    return (
+        total[:cut].to(table.values.dtype, copy=True),
+        total[cut:-1].reshape(table.indices.shape).clone(),
+        of_texture,
+        total[-1].to(sensor_z.dtype, copy=True),
+    )
+
+
+class _RenderJob:
+    """A program with the arrays of a renderer's driver, which it keeps alive."""
+
+    def __init__(
+        self,
+        table: SurfaceTable,
+        textures: Tensor,
+        sensor_z: Tensor,
+        view: View,
+        pieces: Tensor,
+        derivatives: bool,
+    ) -> None:
+        images, channels, height, width = textures.shape
+        self.textures = _pad(textures).contiguous()
+        rows = SCRATCH_ROWS + images * len(view.depths) * channels
+        self.program = Program(table, derivatives, columns=rows)
+        self.blocks = _blocks(pieces)
+        self.view = np.zeros(Place.LENGTH, dtype=np.int64)
+        self.view[: Place.PIXELS + 1] = (
+            view.width,
+            view.pupil_samples,
+            int(view.pixel_area),
+            view.seed & _LOW,
+            (view.seed >> 32) & _LOW,
+            view.height * view.width,
+        )
+        self.view[Place.IMAGES : Place.TEXTURE_WIDTH + 1] = (
+            images,
+            len(view.depths),
+            channels,
+            *self.textures.shape[-2:],
+        )
+        self.view[Place.BLOCKS] = self.blocks.ctypes.data
+        self.view[Place.TEXTURES] = self.textures.data_ptr()
+        z = float(sensor_z)
+        self.lengths = np.zeros(Length.PLANES + 2 * len(view.depths), dtype=self.program.real)
+        self.lengths[: Length.LAST_COLUMN + 1] = (
+            view.pixel_pitch,
+            0.5 * (view.height - 1),
+            0.5 * (view.width - 1),
+            view.pupil_z,
+            view.pupil_radius,
+            z,
+            view.weight(z),
+            0.5 * (height - 1),
+            0.5 * (width - 1),
+            height - 1,
+            width - 1,
+        )
+        self.lengths[Length.PLANES :: 2] = view.depths
+        self.lengths[Length.PLANES + 1 :: 2] = [m / view.pixel_pitch for m in view.magnifications]
+        job = self.program.job
+        job[Job.VIEW], job[Job.LENGTHS] = self.view.ctypes.data, self.lengths.ctypes.data
+        pixels = int(self.blocks[:, 1].sum())
+        job[Job.RAYS] = pixels * view.pupil_samples**2 * channels
+
+
+def _blocks(pieces: Tensor) -> np.ndarray:
+    """First pixel and number of pixels of every block of the pieces, (blocks, 2)."""
+    blocks = [
+        (start, min(BLOCK, end - start))
+        for first, end in pieces.tolist()
+        for start in range(first, end, BLOCK)
+    ]
+    return np.array(blocks, dtype=np.int64).reshape(-1, 2)
+
+
+def _pad(textures: Tensor) -> Tensor:
+    """At least two texels each way: a texture's edge goes on."""
+    below, right = (int(size == 1) for size in textures.shape[-2:])
+    if not (below or right):
+        return textures
+    return functional.pad(textures, (0, right, 0, below), mode="replicate")
+
+
+def _unpad(sums: Tensor, textures: Tensor) -> Tensor:
+    """The adjoint of `_pad`: added texels are never read with a weight."""
+    return sums[..., : textures.shape[-2], : textures.shape[-1]].contiguous()

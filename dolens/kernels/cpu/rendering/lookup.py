@@ -1,0 +1,149 @@
+"""Where rays meet a textured plane, what they see there, and the adjoint of both.
+
+It mirrors `distance_to_plane`, `texture_coordinates` and `bilinear` of the reference.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+from numba import carray, njit, types
+
+from dolens.kernels.cpu.compiler import OPTIONS, int32_at, shifted
+
+
+class Lookup(NamedTuple):
+    """Compiled functions between a block's rays and the texels of a plane."""
+
+    arrive: Any
+    meet: Any
+    see: Any
+    of_texels: Any
+    of_rays: Any
+
+
+@cache
+def lookup(real: types.Type) -> Lookup:
+    """The functions for one real type.
+
+    Textures have at least two texels each way, so that a texel always has neighbours.
+    """
+    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+
+    @njit(**OPTIONS)
+    def arrive(state, scratch):  # noqa: ANN001, ANN202
+        """Mark the rays that got through the lens; their number."""
+        src, rows = carray(state, 1280), carray(scratch, 512)
+        total = zero
+        for i in range(128):
+            passes = one if src[640 + i] < zero else zero
+            passes = zero if src[896 + i] > zero or src[1024 + i] > zero else passes
+            rows[384 + i] = passes
+            total += passes
+        return total
+
+    @njit(**OPTIONS)
+    def meet(lengths, depth, per_mm, width, state, scratch, texels):  # noqa: ANN001, ANN202
+        """Carry rays to a plane: the texel above and to the left, and the fractions beyond it."""
+        src, rows = carray(state, 1280), carray(scratch, 1280)
+        first = carray(int32_at(texels), 128)
+        middle_row, middle_column = lengths[7], lengths[8]
+        last_row, last_column = lengths[9], lengths[10]
+        before_row, before_column = last_row - one, last_column - one
+        before_row = before_row if before_row > zero else zero
+        before_column = before_column if before_column > zero else zero
+        wide = types.int32(width)
+        for i in range(128):
+            cosine = -src[640 + i]
+            inverse = one / (cosine if cosine > grazing else grazing)
+            t = (depth + src[256 + i]) * inverse
+            row = middle_row - (src[128 + i] + t * src[512 + i]) * per_mm
+            column = middle_column + (src[i] + t * src[384 + i]) * per_mm
+            rows[768 + i], rows[896 + i] = t, inverse
+            rows[1024 + i] = -per_mm if row > zero and row < last_row else zero
+            rows[1152 + i] = per_mm if column > zero and column < last_column else zero
+            row, column = row if row > zero else zero, column if column > zero else zero
+            row = row if row < last_row else last_row
+            column = column if column < last_column else last_column
+            upper = row if row < before_row else before_row
+            left = column if column < before_column else before_column
+            upper_texel, left_texel = types.int32(upper), types.int32(left)
+            rows[512 + i] = row - real(upper_texel)
+            rows[640 + i] = column - real(left_texel)
+            first[i] = types.int32(types.int32(upper_texel * wide) + left_texel)
+
+    @njit(**OPTIONS)
+    def see(texture, width, texels, scratch, pixels):  # noqa: ANN001, ANN202
+        """Add the samples' radiance, weighted, to their pixels."""
+        rows, out = carray(scratch, 1280), carray(pixels, 128)
+        first = carray(int32_at(texels), 128)
+        above, below = carray(texture, 1 << 40), carray(shifted(texture, width), 1 << 40)
+        for i in range(128):
+            k = types.uint64(first[i])
+            down, across = rows[512 + i], rows[640 + i]
+            upper = above[k] + across * (above[k + types.uint64(1)] - above[k])
+            lower = below[k] + across * (below[k + types.uint64(1)] - below[k])
+            out[i] += rows[256 + i] * rows[384 + i] * (upper + down * (lower - upper))
+
+    @njit(**OPTIONS)
+    def of_texels(texture, width, texels, scratch, pixels):  # noqa: ANN001, ANN202
+        """Add cotangents of row, column and weight, from those of the pixels."""
+        rows, cot = carray(scratch, 1664), carray(pixels, 128)
+        first = carray(int32_at(texels), 128)
+        above, below = carray(texture, 1 << 40), carray(shifted(texture, width), 1 << 40)
+        for i in range(128):
+            k = types.uint64(first[i])
+            down, across = rows[512 + i], rows[640 + i]
+            u0, l0 = above[k], below[k]
+            u1, l1 = above[k + types.uint64(1)] - u0, below[k + types.uint64(1)] - l0
+            upper, lower = u0 + across * u1, l0 + across * l1
+            rows[1280 + i] += cot[i] * (lower - upper)
+            rows[1408 + i] += cot[i] * (u1 + down * (l1 - u1))
+            rows[1536 + i] += cot[i] * (upper + down * (lower - upper))
+
+    @njit(**OPTIONS)
+    def of_rays(state, scratch, cotangents):  # noqa: ANN001, ANN202
+        """Add the cotangents of rays to those of row and column, and clear these.
+
+        With p = Q + t·d, t = (depth + z)/(-n): Q̄ = (x̄, ȳ, t̄/(-n)), d̄ = (t·x̄, t·ȳ, t·t̄/(-n)),
+        where t̄ = x̄·l + ȳ·m.
+        """
+        src, rows, cot = carray(state, 1280), carray(scratch, 1664), carray(cotangents, 768)
+        for i in range(128):
+            shine = rows[256 + i] * rows[384 + i]
+            y = shine * rows[1280 + i] * rows[1024 + i]
+            x = shine * rows[1408 + i] * rows[1152 + i]
+            t = rows[768 + i]
+            along = (x * src[384 + i] + y * src[512 + i]) * rows[896 + i]
+            cot[i] += x
+            cot[128 + i] += y
+            cot[256 + i] += along
+            cot[384 + i] += t * x
+            cot[512 + i] += t * y
+            cot[640 + i] += t * along
+            rows[1280 + i], rows[1408 + i] = zero, zero
+
+    return Lookup(arrive, meet, see, of_texels, of_rays)
+
+
+@cache
+def texel_sums(real: types.Type) -> Any:
+    """Compiled: add what a block's pixels ask of the texels to a texture's sums."""
+    one = real(1.0)
+
+    @njit(**OPTIONS)
+    def add_texels(sums, width, texels, scratch, pixels):  # noqa: ANN001, ANN202
+        rows, cot = carray(scratch, 1280), carray(pixels, 128)
+        first = carray(int32_at(texels), 128)
+        above, below = carray(sums, 1 << 40), carray(shifted(sums, width), 1 << 40)
+        for i in range(128):
+            k = types.uint64(first[i])
+            amount = cot[i] * rows[256 + i] * rows[384 + i]
+            lower = amount * rows[512 + i]
+            upper = amount - lower
+            across = rows[640 + i]
+            above[k] += upper * (one - across)
+            above[k + types.uint64(1)] += upper * across
+            below[k] += lower * (one - across)
+            below[k + types.uint64(1)] += lower * across
+
+    return add_texels

@@ -1,0 +1,52 @@
+"""Running the splat on tensors."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu.backend import REAL, as_integers
+from dolens.kernels.cpu.rendering.splat import SplatJob, splat_adjoint_driver, splat_driver
+from dolens.kernels.cpu.threads import spread, thread_count
+
+# Chunks of points that have a grid of their own.
+_CHUNKS, _SMALLEST = 16, 4096
+
+
+def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
+    """Sum weighted quadratic B-splines at points (N,) onto a grid (size, size)."""
+    job, chunks = _job(rows, columns, weight, size)
+    grids = rows.new_zeros((max(chunks, 1), size, size))
+    job[SplatJob.GRIDS] = grids.data_ptr()
+    _run(splat_driver, job, chunks, rows)
+    return grids.sum(0)
+
+
+def splat_adjoint(
+    rows: Tensor, columns: Tensor, weight: Tensor, of_grid: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cotangents (N,) of rows, columns and weight from that of the grid (size, size)."""
+    job, chunks = _job(rows, columns, weight, of_grid.shape[0])
+    job[SplatJob.GRIDS] = of_grid.data_ptr()
+    gradients = torch.empty_like(rows), torch.empty_like(rows), torch.empty_like(rows)
+    job[SplatJob.OF_ROWS : SplatJob.OF_WEIGHT + 1] = [g.data_ptr() for g in gradients]
+    _run(splat_adjoint_driver, job, chunks, rows)
+    return gradients
+
+
+def _job(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> tuple[np.ndarray, int]:
+    points = rows.numel()
+    chunk = max(_SMALLEST, -(-points // _CHUNKS))
+    job = np.zeros(SplatJob.LENGTH, dtype=np.int64)
+    job[: SplatJob.WEIGHT + 1] = (rows.data_ptr(), columns.data_ptr(), weight.data_ptr())
+    job[SplatJob.POINTS : SplatJob.CHUNK + 1] = (points, size, chunk)
+    return job, -(-points // chunk)
+
+
+def _run(driver: compiler.Factory, job: np.ndarray, chunks: int, like: Tensor) -> None:
+    function = compiler.compile_driver(driver, REAL[like.dtype])
+
+    def task(worker: int, first: int, last: int) -> None:
+        function(as_integers(job), first, last)
+
+    spread(task, chunks, thread_count(like.numel()))
