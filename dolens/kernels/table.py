@@ -28,7 +28,7 @@ class Kind(IntEnum):
     SENSOR = 8  # carried along the line to z = 0, after the shift
 
 
-class Slot(IntEnum):
+class Slot:
     """Where a number lies in the header of a record."""
 
     # Of a surface and the sensor: added to z on arrival, minus the gap.
@@ -49,7 +49,7 @@ class Slot(IntEnum):
     HEADER = 24  # length of the header: the shape's first number
 
 
-class Code(IntEnum):
+class Code:
     """Where a code lies in a step's row."""
 
     KIND = 0

@@ -1,7 +1,8 @@
 """Which implementation traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import torch
@@ -11,13 +12,15 @@ from torch.autograd import forward_ad
 from dolens.errors import InputError
 from dolens.kernels import operators
 from dolens.optics.packing import pack, unsupported
-from dolens.optics.rays import Rays, TracedRays
+from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane, traced_rays
 
 logger = logging.getLogger("dolens.kernels")
 
 BACKENDS = ("auto", "reference", "cpu", "cuda")
+# So many wavelengths are not searched for equal ones.
+_FEW = 64
 _KERNEL_DTYPES = (torch.float32, torch.float64)
 
 
@@ -88,7 +91,7 @@ def trace_rays(
     to_sensor = last is None and sense > 0.0
     reference = record or choose_backend(system, requested, rays) == "reference"
     finer = torch.promote_types(rays.position.dtype, rays.direction.dtype)
-    before = None
+    ray = before = None
     if reference or torch.promote_types(finer, system.dtype) != system.dtype:
         ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
     if reference:
@@ -98,21 +101,13 @@ def trace_rays(
         if to_sensor:
             traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, sense)
         return traced_rays(traced, before)
-    if before is None:
-        # As the user gave them: views of (..., 3), which a kernel reads in place.
-        options = {"device": system.device, "dtype": system.dtype}
-        position, direction = rays.position.to(**options), rays.direction.to(**options)
-        shape = _shape(rays)
-        position, direction = position.expand(*shape, 3), direction.expand(*shape, 3)
-    else:
-        shape = ray.x.shape
-        position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
+    position, direction, shape = _joined(system, rays, ray, before)
     table = pack(system, rays.wavelength, sense, first, end, to_sensor)
     position, direction, path, status, surface = operators.trace(
         table.values,
         table.indices,
-        position.reshape(-1, 3),
-        direction.reshape(-1, 3),
+        position,
+        direction,
         _columns(rays.wavelength, shape, system.device),
         table.codes,
         table.extras,
@@ -129,6 +124,61 @@ def trace_rays(
         surface=surface.reshape(shape),
         path_length=path,
     )
+
+
+def _joined(
+    system: OpticalSystem, rays: Rays, ray: Components | None, before: Tensor | None
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """Positions and directions (N, 3), and the leading shape; of `ray` where it was moved."""
+    if ray is not None and before is not None:
+        position, direction, shape = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1), ray.x.shape
+    else:
+        # As the user gave them: views of (..., 3), which a kernel reads in place.
+        options, shape = {"device": system.device, "dtype": system.dtype}, _shape(rays)
+        position = rays.position.to(**options).expand(*shape, 3)
+        direction = rays.direction.to(**options).expand(*shape, 3)
+    return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(shape)
+
+
+@dataclass(frozen=True)
+class FlatRays:
+    """Rays before a lens as a kernel takes them, in the lens's precision.
+
+    Attributes:
+        position: (N, 3), mm.
+        direction: (N, 3).
+        wavelengths: nm, the distinct ones.
+        column: (N,), int32: which of them a ray has, or None where there is one.
+        before: (N,), mm: optical path to where the rays were moved, or None.
+        shape: the leading shape that they had.
+    """
+
+    position: Tensor
+    direction: Tensor
+    wavelengths: Sequence[float]
+    column: Tensor | None
+    before: Tensor | None
+    shape: tuple[int, ...]
+
+
+@torch.no_grad()
+def flat_rays(system: OpticalSystem, rays: Rays) -> FlatRays:
+    """Rays towards the first surface, without a graph; wavelengths that repeat are one."""
+    ray = before = None
+    if torch.promote_types(rays.position.dtype, system.dtype) != system.dtype:
+        ray, before = enter_lens(system, rays, 1, 1.0)
+    position, direction, shape = _joined(system, rays, ray, before)
+    wavelength = rays.wavelength
+    if isinstance(wavelength, Tensor) and wavelength.numel() > _FEW:
+        wavelength, column = wavelength.unique(return_inverse=True)
+        column = column.to(device=system.device, dtype=torch.int32)
+        column = column.expand(shape).reshape(-1).contiguous()
+    else:
+        column = _columns(wavelength, shape, system.device)
+    if before is not None:
+        before = before.expand(shape).reshape(-1)
+    several = wavelength.reshape(-1).tolist() if isinstance(wavelength, Tensor) else (wavelength,)
+    return FlatRays(position, direction, several, column, before, shape)
 
 
 def _shape(rays: Rays) -> tuple[int, ...]:

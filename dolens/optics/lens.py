@@ -125,7 +125,7 @@ class Lens(nn.Module):
         parameters = dict(self.named_parameters())
         chosen: set[str] = set()
         for pattern in patterns:
-            found = fnmatch.filter(parameters, pattern)
+            found = [pattern] if pattern in parameters else fnmatch.filter(parameters, pattern)
             if not found:
                 near = difflib.get_close_matches(pattern, parameters, n=3, cutoff=0.4)
                 hint = f"; near: {', '.join(near)}" if near else ""
@@ -142,9 +142,10 @@ class Lens(nn.Module):
         values = dict(values or {})
         surfaces = []
         for number, surface in self.surfaces.items():
+            # Their own tables: `named_parameters` searches submodules, and takes ten times as long.
             parameters = {
                 name: values.pop(f"surfaces.{number}.{name}", value)
-                for name, value in (*surface.named_parameters(), *surface.named_buffers())
+                for name, value in (*surface._parameters.items(), *surface._buffers.items())
             }
             surfaces.append(SurfaceState(type(surface), parameters, surface.aperture))
         thicknesses = [

@@ -26,6 +26,7 @@ from dolens.kernels.cpu.forward import real_at, streams
 class Sweeps(NamedTuple):
     """Compiled functions that the drivers of derivatives share."""
 
+    load_lanes: Any
     gather: Any
     forward: Any
     back: Any
@@ -37,7 +38,22 @@ def sweeps(real: types.Type) -> Sweeps:
     """Functions that fill a block with valid rays, trace it, and sweep back, for one real type."""
     at = real_at(real)
     zero = real(0.0)
-    load, set_indices, step = streams(real)
+    find_wavelength, load, set_indices, step = streams(real)
+
+    @njit(**OPTIONS)
+    def load_lanes(job, lanes):  # noqa: ANN001, ANN202
+        """Load the rays of these numbers into the first state."""
+        find_wavelength(job, lanes)
+        state = carray(at(job[15]), 1280)
+        for k in range(3):
+            source = carray(shifted(at(job[0]), k * job[2]), 1 << 40)
+            for i in range(128):
+                state[128 * k + i] = source[lanes[i] * job[1]]
+            source = carray(shifted(at(job[3]), k * job[5]), 1 << 40)
+            for i in range(128):
+                state[384 + 128 * k + i] = source[lanes[i] * job[4]]
+        for i in range(128):
+            state[768 + i], state[896 + i], state[1024 + i] = zero, zero, zero
 
     @njit(**OPTIONS)
     def gather(job, ray, end, lanes):  # noqa: ANN001, ANN202
@@ -52,18 +68,9 @@ def sweeps(real: types.Type) -> Sweeps:
         for i in range(max(count, 1), 128):
             lanes[i] = lanes[0]
         if count == 128 and lanes[127] - lanes[0] == 127:
-            load(job, lanes[0], 128, at(job[15]))
+            load(job, lanes[0], 128, at(job[15]), lanes)
         elif count > 0:
-            state = carray(at(job[15]), 1280)
-            for k in range(3):
-                source = carray(shifted(at(job[0]), k * job[2]), 1 << 40)
-                for i in range(128):
-                    state[128 * k + i] = source[lanes[i] * job[1]]
-                source = carray(shifted(at(job[3]), k * job[5]), 1 << 40)
-                for i in range(128):
-                    state[384 + 128 * k + i] = source[lanes[i] * job[4]]
-            for i in range(128):
-                state[768 + i], state[896 + i], state[1024 + i] = zero, zero, zero
+            load_lanes(job, lanes)
         return count, ray
 
     @njit(**OPTIONS)
@@ -121,19 +128,21 @@ def sweeps(real: types.Type) -> Sweeps:
             row = values + codes[3 + side] * count
             if count == 1:
                 add_row(cotangents, 7 + side, sums, row)
+            elif job[63] > 0:
+                add_row(cotangents, 7 + side, sums, row + job[63] - 1)
             else:
                 which = carray(int32_at(job[6]), 1 << 40)
                 lane = carray(shifted(cotangents, 896 + 128 * side), 128)
                 for i in range(128):
                     sums[row + which[lanes[i]]] += types.float64(lane[i])
 
-    return Sweeps(gather, forward, back, add_sums)
+    return Sweeps(load_lanes, gather, forward, back, add_sums)
 
 
 def adjoint_driver(real: types.Type) -> Callable[..., None]:
     """Sweep chunks `first` to `last` back: gradients of the rays, and sums for each chunk."""
     at = real_at(real)
-    gather, forward, back, add_sums = sweeps(real)
+    _, gather, forward, back, add_sums = sweeps(real)
     zero = real(0.0)
 
     @njit(**OPTIONS)

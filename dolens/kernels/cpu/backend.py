@@ -44,7 +44,7 @@ from dolens.kernels.cpu.layout import (
 )
 from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
 from dolens.kernels.cpu.sphere import sphere_adjoint, sphere_forward
-from dolens.kernels.cpu.threads import spread, thread_count
+from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
 from dolens.kernels.cpu.xy_polynomial import (
     xy_polynomial_bend,
     xy_polynomial_parameters,
@@ -56,6 +56,7 @@ _INTEGERS = ctypes.POINTER(ctypes.c_int64)
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 # Chunks of rays that sums are kept for: enough for any processor's threads.
 _CHUNKS = 64
+_ALIGNMENT = 64  # bytes: a line of the cache
 
 _FORWARD = {
     Kind.PLANE: plane_forward,
@@ -143,9 +144,13 @@ class Program:
     Args:
         table: of contiguous tensors on the CPU.
         derivatives: whether cotangents will be swept back.
+        outputs: sets of cotangents that a block holds.
+        columns: further rows of a block that a driver asks for.
     """
 
-    def __init__(self, table: SurfaceTable, derivatives: bool) -> None:
+    def __init__(
+        self, table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0
+    ) -> None:
         self.real = REAL[table.values.dtype]
         self.table = table
         self.derivatives = derivatives
@@ -164,11 +169,14 @@ class Program:
         self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
         self.job[Job.CLIP] = steps.clip
         states = count + 1 if derivatives else 2
-        self._sizes = (
-            states * STATE,
-            (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0,
-            (WORK_ROWS + steps.scratch) * BLOCK,
-        )
+        cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
+        self.job[Job.COTANGENT_LENGTH] = cotangents
+        self._sizes = {
+            Job.STACK: states * STATE,
+            Job.COTANGENTS: outputs * cotangents,
+            Job.WORK: (WORK_ROWS + steps.scratch) * BLOCK,
+            Job.COLUMNS: columns * BLOCK,
+        }
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
         """Point to rays (N, 3) of any strides, and their wavelengths' places (N,), int32."""
@@ -183,25 +191,23 @@ class Program:
         for name, tensor in tensors.items():
             self.job[getattr(Job, name)] = 0 if tensor is None else tensor.data_ptr()
 
-    def run(self, driver: Callable[[Any], Callable[..., None]], pieces: int) -> None:
-        """Run a driver over all pieces, on torch's number of threads."""
+    def run(
+        self, driver: Callable[[Any], Callable[..., None]], pieces: int, small: int = SMALL
+    ) -> None:
+        """Run a driver over all pieces, on torch's number of threads, or on one for few rays."""
         function = compiler.compile_driver(driver, self.real)
-        threads = thread_count(int(self.job[Job.RAYS]))
-        size = sum(self._sizes)
-        memory = torch.empty((threads, size + BLOCK), dtype=self.table.values.dtype)
-        lanes = np.zeros((threads, BLOCK), dtype=np.int64)
-        jobs = np.repeat(self.job[None], threads, axis=0)
-        for worker in range(threads):
-            address = memory[worker].data_ptr()
-            for place, length in zip(
-                (Job.STACK, Job.COTANGENTS, Job.WORK), self._sizes, strict=True
-            ):
-                jobs[worker, place] = address
-                address += length * memory.element_size()
-            jobs[worker, Job.LANES] = lanes[worker].ctypes.data
+        threads = thread_count(int(self.job[Job.RAYS]), small)
+        step = self.table.values.element_size()
+        size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
 
         def task(worker: int, first: int, last: int) -> None:
-            function(jobs[worker].ctypes.data_as(_INTEGERS), first, last)
+            job, memory = self.job.copy(), scratch(size + _ALIGNMENT)
+            address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
+            for place, length in self._sizes.items():
+                job[place] = address
+                address += length * step
+            job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
+            function(job.ctypes.data_as(_INTEGERS), first, last)
 
         spread(task, pieces, threads)
 

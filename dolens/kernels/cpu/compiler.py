@@ -6,6 +6,7 @@ kernel as a Python function.  Each is compiled when a lens first needs it, and k
 
 import hashlib
 import logging
+import pickle
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -95,6 +96,7 @@ def compile_block(factory: Factory, real: str) -> int:
     return _compiled(factory, real, block_signature(REALS[real])).address
 
 
+@cache
 def compile_driver(factory: Factory, real: str) -> Any:
     """A driver as a C function of (job, first, last), which runs without Python's lock."""
     signature = types.void(INTEGERS, types.int64, types.int64)
@@ -126,8 +128,13 @@ class _StampedCache(FunctionCache):
         # Numba's own prepares to compile first, which imports SciPy and half of Numba (0.6 s);
         # compiled code needs the runtime's symbols only.
         rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+        try:
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
+        except (EOFError, pickle.UnpicklingError, OSError) as error:
+            logger.warning("compiled kernels on disk are damaged and made anew: %r", error)
+            self.flush()
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:

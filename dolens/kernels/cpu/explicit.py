@@ -68,7 +68,9 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                 change = clamp(change, scale)
                 t = t - change
                 w[1792 + i] = t
-                moving += one if math.fabs(change) > close * (math.fabs(t) + scale) else zero
+                # A ray that has ended already keeps no other waiting.
+                far = math.fabs(change) > close * (math.fabs(t) + scale)
+                moving += one if far and not src[896 + i] > zero else zero
             if moving == zero:
                 break
         for i in range(128):

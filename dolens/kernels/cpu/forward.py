@@ -22,6 +22,7 @@ from dolens.kernels.cpu.compiler import (
 class Streams(NamedTuple):
     """Compiled functions that drivers share."""
 
+    find_wavelength: Any
     load: Any
     set_indices: Any
     step: Any
@@ -39,8 +40,23 @@ def streams(real: types.Type) -> Streams:
     zero = real(0.0)
 
     @njit(**OPTIONS)
-    def load(job, start, count, state):  # noqa: ANN001, ANN202
+    def find_wavelength(job, lanes):  # noqa: ANN001, ANN202
+        """Note whether the rays of these numbers have one wavelength."""
+        job[63] = 1
+        if job[12] > 1:
+            which = carray(int32_at(job[6]), 1 << 40)
+            first = which[lanes[0]]
+            different = 0
+            for i in range(128):
+                different += 1 if which[lanes[i]] != first else 0
+            job[63] = 0 if different > 0 else types.int64(first) + 1
+
+    @njit(**OPTIONS)
+    def load(job, start, count, state, lanes):  # noqa: ANN001, ANN202
         """Rays `start` to `start + count` into a block; the lanes beyond repeat its first ray."""
+        for i in range(128):
+            lanes[i] = start + (i if i < count else 0)
+        find_wavelength(job, lanes)
         out = carray(state, 1280)
         row, column = job[1], job[2]
         first = shifted(at(job[0]), start * row)
@@ -88,9 +104,10 @@ def streams(real: types.Type) -> Streams:
         count = job[12]
         before = carray(shifted(real64_at(job[11]), codes[3] * count), 1 << 40)
         after = carray(shifted(real64_at(job[11]), codes[4] * count), 1 << 40)
-        if count == 1:
-            index, ratio = real(before[0]), real(before[0] / after[0])
-            inverse = real(types.float64(1.0) / before[0])
+        if job[63] > 0:
+            common = job[63] - 1
+            index, ratio = real(before[common]), real(before[common] / after[common])
+            inverse = real(types.float64(1.0) / before[common])
             for i in range(128):
                 w[i] = index
                 w[128 + i] = ratio
@@ -114,13 +131,13 @@ def streams(real: types.Type) -> Streams:
         if codes[6] == 2 or codes[7] != 0:
             call_block(job[14], before, after, cotangents, record, work, place)
 
-    return Streams(load, set_indices, step)
+    return Streams(find_wavelength, load, set_indices, step)
 
 
 def forward_driver(real: types.Type) -> Callable[..., None]:
     """Trace blocks `first` to `last` and write the rays behind the last step."""
     at = real_at(real)
-    load, _, step = streams(real)
+    _, load, _, step = streams(real)
     zero = real(0.0)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
@@ -133,9 +150,7 @@ def forward_driver(real: types.Type) -> Callable[..., None]:
             start = 128 * block
             count = min(128, rays - start)
             now, then = at(job[15]), shifted(at(job[15]), 1280)
-            load(job, start, count, now)
-            for i in range(128):
-                lanes[i] = start + min(i, count - 1)
+            load(job, start, count, now, lanes)
             for k in range(steps):
                 step(job, k, lanes, now, then, then, work)
                 now, then = then, now

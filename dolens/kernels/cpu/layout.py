@@ -44,4 +44,13 @@ class Job:
     POSITION_GRADIENT, DIRECTION_GRADIENT = range(32, 34)
     SUMS, SUM_LENGTH, CHUNK, VALUES_LENGTH = range(34, 38)
     LANES, INDEX_SUMS = 38, 39
+    # Of the drivers of Jacobians.
+    OUTPUTS, OUTPUT_ROWS, VARIABLES, FIRST_STEP = range(40, 44)
+    ENTRIES, ENTRY_ROWS, ENTRY_COLUMNS, ENTRY_WEIGHTS, SPLINE_COLUMNS = range(44, 49)
+    COLUMNS, PENDING, COTANGENT_LENGTH = range(49, 52)
+    OUT_VALID, OUT_VALUES, OUT_JACOBIAN = range(52, 55)
+    TARGET, TARGET_ROW, TARGET_COLUMN, WEIGHT, WEIGHT_ROW, GROUP, GROUPS = range(55, 62)
+    ENTRY_FIRST = 62
+    # Of all rays of the block at hand, plus one; zero where they differ.
+    WAVELENGTH = 63
     LENGTH = 64

@@ -5,20 +5,41 @@ process: a forked worker makes its own.
 """
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import torch
 
 # Fewer rays than this are traced sooner than another thread is woken.
 SMALL = 1 << 14
 
+# Memory that a thread keeps for its next task, bytes at most.
+_KEPT = 1 << 23
+
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 
 
-def thread_count(rays: int) -> int:
-    """Threads for this many rays: torch's own setting, and one for a few rays."""
-    return 1 if rays < SMALL else max(1, torch.get_num_threads())
+def thread_count(rays: int, small: int = SMALL) -> int:
+    """Threads for this many rays: torch's own setting, and one for fewer than `small`."""
+    return 1 if rays < small else max(1, torch.get_num_threads())
+
+
+_own = threading.local()
+
+
+def scratch(size: int) -> np.ndarray:
+    """Memory of at least this many bytes, of this thread's own, for the task that it runs now.
+
+    Asking the system for fresh pages at every call would cost a tenth of a small trace.
+    """
+    memory = getattr(_own, "memory", None)
+    if memory is None or memory.nbytes < size:
+        memory = np.empty(size, dtype=np.uint8)
+        if size <= _KEPT:
+            _own.memory = memory
+    return memory
 
 
 def spread(task: Callable[[int, int, int], None], pieces: int, threads: int) -> None:

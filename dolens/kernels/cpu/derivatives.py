@@ -1,0 +1,171 @@
+"""Running the drivers of Jacobians and of least squares on tensors."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.kernels.cpu.backend import Program
+from dolens.kernels.cpu.jacobian import jacobian_driver
+from dolens.kernels.cpu.layout import BLOCK, COTANGENT_HEADER, Job
+from dolens.kernels.cpu.normal_equations import normal_equations_driver
+from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
+from dolens.kernels.variable_map import VariableMap
+
+# Where an output lies among a state's rows, and so where its cotangent is one.
+OUTPUT_ROWS = {"x": 0, "y": 1, "path_length": 6}
+# Fewer rays than this are differentiated sooner than another thread is woken.
+_SMALL = 1 << 10
+# Sums are kept for this many chunks, or fewer where they would take more numbers than that.
+_CHUNKS, _NUMBERS = 64, 1 << 23
+
+RayTensors = tuple[Tensor, Tensor, Tensor | None]
+
+
+def ray_jacobian(
+    table: SurfaceTable, variables: VariableMap, outputs: Sequence[str], rays: RayTensors
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Outputs of every ray and their derivatives by every variable.
+
+    Args:
+        table: the lens, up to the sensor.
+        variables: P of them.
+        outputs: K names of `OUTPUT_ROWS`.
+        rays: position (N, 3), direction (N, 3), and wavelength's column (N,), int32, or None.
+
+    Returns:
+        valid (N,), bool; outputs (K, N); derivatives (K, P, N); zero where a ray is not valid.
+    """
+    position = rays[0]
+    count, wanted = position.shape[0], len(outputs)
+    valid = torch.empty(count, dtype=torch.bool)
+    values = position.new_empty((wanted, count))
+    jacobian = position.new_empty((wanted, variables.count, count))
+    if count:
+        chunk = _chunk(count, 1)
+        derivatives = _Derivatives(table, variables, outputs, rays, chunk, further=0)
+        derivatives.program.point(OUT_VALID=valid, OUT_VALUES=values, OUT_JACOBIAN=jacobian)
+        derivatives.program.run(jacobian_driver, -(-count // chunk), _SMALL)
+    return valid, values, jacobian
+
+
+def normal_equations(
+    table: SurfaceTable,
+    variables: VariableMap,
+    outputs: Sequence[str],
+    rays: RayTensors,
+    target: Tensor,
+    weight: Tensor | None,
+    group: Tensor | None,
+    groups: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sums over valid rays for least squares with residuals r = output - target.
+
+    Args:
+        table: and the three that follow, as in `ray_jacobian`.
+        variables: P of them.
+        outputs: K names.
+        rays: N of them.
+        target: (N, K), of any strides, in the rays' precision.
+        weight: (N,), of any stride, in the rays' precision; None: one.
+        group: (N,), int64, contiguous, from 0 to `groups` - 1; None: no sums by group.
+        groups: G.
+
+    Returns:
+        All float64: number of rays and Σ w·r² (2,); Jᵀwr (P,); JᵀwJ (P, P); and by groups
+        (G, 2 + K + K·P): number of rays, Σ w, Σ w·r, Σ w·J.
+    """
+    count, wanted, p = rays[0].shape[0], len(outputs), variables.count
+    by_group = 2 + wanted * (1 + p)
+    length = 2 + p + p * p + groups * by_group
+    chunk = _chunk(count, length)
+    chunks = -(-count // chunk)
+    sums = torch.zeros((chunks, length), dtype=torch.float64)
+    if count:
+        derivatives = _Derivatives(table, variables, outputs, rays, chunk, further=p + 1 + wanted)
+        program = derivatives.program
+        program.point(SUMS=sums, TARGET=target, WEIGHT=weight, GROUP=group)
+        job = program.job
+        job[Job.SUM_LENGTH], job[Job.GROUPS] = length, groups
+        job[Job.TARGET_ROW], job[Job.TARGET_COLUMN] = target.stride()
+        job[Job.WEIGHT_ROW] = 0 if weight is None else weight.stride(0)
+        program.run(normal_equations_driver, chunks, _SMALL)
+    head, right, square, rest = sums.sum(0).split([2, p, p * p, groups * by_group])
+    lower = square.reshape(p, p)
+    return head, right, lower + lower.tril(-1).mT, rest.reshape(groups, by_group)
+
+
+def _chunk(count: int, length: int) -> int:
+    """Rays a chunk, a multiple of the block; it does not depend on the threads."""
+    chunks = max(1, min(_CHUNKS, _NUMBERS // length))
+    return max(8 * BLOCK, -(-count // (chunks * BLOCK)) * BLOCK)
+
+
+class _Derivatives:
+    """A program, and the arrays that its job points to while it runs."""
+
+    def __init__(
+        self,
+        table: SurfaceTable,
+        variables: VariableMap,
+        outputs: Sequence[str],
+        rays: RayTensors,
+        chunk: int,
+        further: int,
+    ) -> None:
+        self.program = Program(
+            table,
+            derivatives=True,
+            outputs=len(outputs),
+            columns=len(outputs) * variables.count + further,
+        )
+        self.program.set_rays(*rays)
+        job = self.program.job
+        job[Job.OUTPUTS], job[Job.VARIABLES], job[Job.CHUNK] = len(outputs), variables.count, chunk
+        self._seeds = np.array([OUTPUT_ROWS[name] for name in outputs], dtype=np.int64)
+        job[Job.OUTPUT_ROWS] = self._seeds.ctypes.data
+        self._set_entries(table, variables)
+
+    def _set_entries(self, table: SurfaceTable, variables: VariableMap) -> None:
+        """The map by steps; coefficients of splines are looked up by their place instead."""
+        codes, job = table.codes.numpy(), self.program.job
+        # The last number moves z of the rays only, which is no output.
+        kept = variables.places.numpy() < table.values.numel() - 1
+        places, columns, weights = (
+            array.numpy()[kept]
+            for array in (variables.places, variables.columns, variables.weights)
+        )
+        steps = np.searchsorted(codes[:, Code.OFFSET], places, side="right") - 1
+        rows = places - codes[steps, Code.OFFSET] + COTANGENT_HEADER
+        # A sweep ends at the first step that any variable belongs to.
+        job[Job.FIRST_STEP] = steps.min(initial=codes.shape[0])
+        local = (codes[steps, Code.KIND] == Kind.B_SPLINE) & (
+            rows >= COTANGENT_HEADER + Slot.HEADER
+        )
+        if local.any():
+            self._spline = np.full(table.values.numel(), -1, dtype=np.int64)
+            self._spline[places[local]] = columns[local]
+            job[Job.SPLINE_COLUMNS] = self._spline.ctypes.data
+        # By steps; after the last come columns that begin as zero: nothing overwrites them.
+        order = np.argsort(steps, kind="stable")
+        order = order[~local[order]]
+        rows, columns, weights, steps = (a[order] for a in (rows, columns, weights, steps))
+        # A sweep takes the entries last first: the last of a column is the one that comes first.
+        last = np.full(variables.count, -1, dtype=np.int64)
+        last[columns] = np.arange(len(columns))
+        empty = np.flatnonzero(last < 0)
+        is_first = np.zeros(len(columns), dtype=np.int64)
+        is_first[last[last >= 0]] = 1
+        end = len(columns) + len(empty)
+        padding = np.zeros_like(empty)
+        self._entries = (
+            np.append(np.searchsorted(steps, np.arange(codes.shape[0] + 1)), end),
+            np.append(rows, padding),
+            np.append(columns, empty),
+            np.append(weights, padding.astype(np.float64)),
+            np.append(is_first, padding + 1),
+        )
+        names = ("ENTRIES", "ENTRY_ROWS", "ENTRY_COLUMNS", "ENTRY_WEIGHTS", "ENTRY_FIRST")
+        for name, array in zip(names, self._entries, strict=True):
+            job[getattr(Job, name)] = array.ctypes.data

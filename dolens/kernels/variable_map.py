@@ -1,0 +1,25 @@
+"""How the numbers of a packed table follow from a lens's variables."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class VariableMap:
+    """d(values)/d(variables), a sparse matrix in lists of its entries.
+
+    A number that follows from several variables, or a variable that several numbers follow from,
+    has as many entries.  Coefficients of a spline are variables themselves, so their weights are 1.
+
+    Attributes:
+        places: (E,), int64: which of `SurfaceTable.values`.
+        columns: (E,), int64: which variable.
+        weights: (E,), float64: the derivative.
+        count: of variables.
+    """
+
+    places: Tensor
+    columns: Tensor
+    weights: Tensor
+    count: int
