@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.backend import trace_rays
 from dolens.optics.paraxial import exit_pupil
-from dolens.optics.rays import Components
+from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces
 
@@ -46,12 +47,19 @@ def aim(
 
 
 @torch.no_grad()
-def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> ExitPupil:
+def axial_exit_pupil(
+    system: OpticalSystem, wavelengths: Sequence[float], backend: str = "reference"
+) -> ExitPupil:
     """The largest disc in the paraxial exit pupil's plane that real axial rays fill.
 
     Rays from the sensor's centre are traced backwards at many radii and azimuths, and again in
     between to narrow the first radius that fails, for every wavelength.  Sampling this disc, and
     no larger one, lets every axial sample through, so that a white scene renders white.
+
+    Args:
+        system: the lens.
+        wavelengths: nm.
+        backend: what traces: `reference`, `cpu` or `cuda`.
 
     Raises:
         InputError: no ray from the sensor's centre gets through.
@@ -68,10 +76,8 @@ def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> Exi
     for _ in range(3):
         radii = torch.linspace(low, high, _RADII, **options)[:, None]
         ray = aim(origin, origin, sensor_z, radii * torch.cos(angle), radii * torch.sin(angle), z)
-        passes = torch.ones(_RADII, dtype=torch.bool, device=system.device)
-        for wavelength in wavelengths:
-            passes &= trace_surfaces(system, ray, wavelength, sense=-1.0).valid.all(dim=1)
-        failing = torch.nonzero(~passes).flatten()
+        passes = _get_through(system, ray, wavelengths, backend)
+        failing = torch.nonzero(~passes.all(dim=1)).flatten()
         if len(failing) == 0:
             return ExitPupil(z, high)
         first = int(failing[0])
@@ -81,3 +87,16 @@ def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> Exi
             )
         low, high = float(radii[first - 1]), float(radii[first])
     return ExitPupil(z, low)
+
+
+def _get_through(
+    system: OpticalSystem, ray: Components, wavelengths: Sequence[float], backend: str
+) -> Tensor:
+    """Which rays get through the lens backwards, at every wavelength."""
+    if backend == "reference":
+        passes = [trace_surfaces(system, ray, w, sense=-1.0).valid for w in wavelengths]
+        return torch.stack(passes).all(dim=0)
+    every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)[:, None, None]
+    rays = Rays.from_components(ray, every)
+    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
+    return hit.valid.all(dim=0)

@@ -106,7 +106,7 @@ class RayRenderer:
         backend = choose_backend(system, lens.backend, others=[textures])
         now = lens.system({n: p.detach() for n, p in parameters.items()})
         scene.check(now)
-        view = self._view(now, scene, seed)
+        view = self._view(now, scene, seed, backend)
         if backend == "cpu":
             return self._fused(system, scene, textures, view)
         if backend == "cuda":
@@ -127,9 +127,9 @@ class RayRenderer:
             flat = torch.cat([piece(i, *tensors) for i in range(len(sizes))], dim=-1)
         return flat.unflatten(-1, (self.sensor.height, self.sensor.width))
 
-    def _view(self, system: OpticalSystem, scene: PlanarScene, seed: int) -> View:
+    def _view(self, system: OpticalSystem, scene: PlanarScene, seed: int, backend: str) -> View:
         """What does not depend on the lens's gradient: pixels, samples, pupil and planes."""
-        pupil = axial_exit_pupil(system, scene.wavelengths)
+        pupil = axial_exit_pupil(system, scene.wavelengths, backend)
         return View(
             self.sensor.height,
             self.sensor.width,

@@ -171,7 +171,7 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     # What a GPU does: the reference's samples and lookup about a fused trace.
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
-    view = renderer._view(system, scene, 0)
+    view = renderer._view(system, scene, 0, "reference")
     ray, weight = renderer._samples(system, view, 0, 180)
     images = [renderer._shade(system, scene, view, texture(40), ray, weight, backend)
               for backend in ("reference", "cpu")]  # fmt: skip

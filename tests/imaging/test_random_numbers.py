@@ -63,7 +63,7 @@ def test_numbers_are_the_same_in_either_precision():
     for word in words:
         single = uniform(word, torch.float32)
         assert torch.equal(single.double(), uniform(word, torch.float64))
-        assert 0.0 <= float(single.min()) and float(single.max()) < 1.0
+        assert float(single.min()) >= 0.0 and float(single.max()) < 1.0
 
 
 def test_negative_seeds_and_bits_beyond_64_are_seeds_too():
