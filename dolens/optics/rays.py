@@ -52,11 +52,11 @@ class Rays:
 
     def components(self) -> Components:
         """The rays as six tensors of the common leading shape."""
-        shape = torch.broadcast_shapes(self.position.shape, self.direction.shape)
+        # Not torch.broadcast_shapes, whose first call imports SymPy: half a second.
+        given = [self.position, self.direction]
         if isinstance(self.wavelength, Tensor):
-            shape = (*torch.broadcast_shapes(shape[:-1], self.wavelength.shape), shape[-1])
-        position = self.position.expand(shape)
-        direction = self.direction.expand(shape)
+            given.append(self.wavelength[..., None])
+        position, direction, *_ = torch.broadcast_tensors(*given)
         return Components(*position.unbind(-1), *direction.unbind(-1))
 
     @staticmethod

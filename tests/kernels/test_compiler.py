@@ -80,7 +80,7 @@ def test_a_full_disk_costs_time_only(forget, caplog):
     def full(self, sig, data):
         raise OSError(28, "No space left on device")
 
-    forget.setattr(FunctionCache, "load_overload", lambda self, sig, context: None)
+    forget.setattr(compiler._StampedCache, "load_overload", lambda self, sig, context: None)
     forget.setattr(FunctionCache, "save_overload", full)
     assert compiler.compile_block(clip, "float32") != 0
     assert "No space left on device" in caplog.text

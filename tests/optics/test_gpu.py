@@ -1,18 +1,26 @@
-"""The same trace on a GPU."""
+"""The same trace on a GPU, by the reference and by the Triton kernels."""
 
 import pytest
 import torch
 
 from dolens import Rays, load_lens
+from tests.kernels.trace_cases import (
+    LENSES,
+    bundle,
+    require_equal,
+    require_no_worse,
+    returning,
+    traced,
+)
 
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
 ]
-LENSES = ["cooke_triplet", "nikon", "asphere", "wavefront_coding", "double_gauss"]
+FILES = ["cooke_triplet", "nikon", "asphere", "wavefront_coding", "double_gauss"]
 
 
-def bundle(device):
+def pencil(device):
     generator = torch.Generator().manual_seed(0)
     position = torch.rand((1000, 3), generator=generator, dtype=torch.float64) * 2.0 - 1.0
     direction = torch.randn((1000, 3), generator=generator, dtype=torch.float64) * 0.05
@@ -21,13 +29,13 @@ def bundle(device):
     return Rays(position.to(device), direction.to(device), 587.5618)
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("dtype, error", [(torch.float64, 1e-11), (torch.float32, 3e-5)])
 def test_sensor_points_and_gradients_are_those_of_the_cpu(root, name, dtype, error):
     results = []
     for device in ("cpu", "cuda"):
         lens = load_lens(root / "conf" / "lens" / f"{name}.yaml", dtype).to(device)
-        hit = lens.trace(bundle(device), record=True)
+        hit = lens.trace(pencil(device), record=True)
         assert hit.position.device.type == device
         total = hit.position[hit.valid].square().sum()
         gradients = torch.autograd.grad(total, list(lens.parameters()), allow_unused=True)
@@ -46,3 +54,78 @@ def test_rays_are_aimed_on_a_gpu(root):
     rays = lens.marginal_rays((0.0, 30.0))
     assert rays.converged.all()
     assert rays.position.device.type == "cuda"
+
+
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("sense", [1.0, -1.0], ids=["forward", "backward"])
+def test_the_kernels_rays_and_gradients_are_those_of_the_reference(root, name, sense):
+    lens = LENSES[name](root)
+    rays = bundle(lens, 1000)
+    if sense < 0.0:
+        rays = returning(lens, rays)
+    expected = traced(lens, rays, "reference", sense)
+    assert (~expected.valid).sum() > 3, "some rays must fail"
+    require_equal(traced(lens, rays, "cuda", sense, "cuda"), expected)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_the_kernels_in_single_precision_are_no_worse_than_the_reference(root, name):
+    lens = LENSES[name](root).float().double()
+    rays = bundle(lens, 1000, fill=0.9)
+    held = Rays(rays.position.float().double(), rays.direction.float().double(), 550.0)
+    found = traced(lens, held, "cuda", device="cuda", dtype=torch.float32)
+    reference = traced(lens, held, "reference", dtype=torch.float32)
+    require_no_worse(found, reference, traced(lens, held, "reference"))
+
+
+def test_every_ray_may_have_its_own_wavelength(root):
+    lens = LENSES["posed"](root)
+    rays = bundle(lens, 300, wavelengths=[[486.1327], [587.5618], [656.2725]])
+    require_equal(
+        traced(lens, rays, "cuda", device="cuda"),
+        traced(lens, rays, "reference"),
+    )
+
+
+@pytest.mark.parametrize("name", ["cooke_triplet", "b_spline"])
+def test_a_repeated_gradient_has_the_same_bits(root, name):
+    """Where programs of the adjoint take many blocks in turn, and share coefficients."""
+    lens = LENSES[name](root)
+    rays = bundle(lens, 300_000)
+    first, second = (traced(lens, rays, "cuda", device="cuda") for _ in range(2))
+    assert all(torch.equal(first.gradients[k], second.gradients[k]) for k in first.gradients)
+    require_equal(first, traced(lens, rays, "cpu"), relative=1e-10)
+
+
+def test_broken_rays_spoil_no_other(root):
+    lens = LENSES["posed"](root)
+    rays = bundle(lens, 1000)
+    missing = rays.position.clone()
+    missing[::50, 0] = 900.0
+    broken = rays.position.clone()
+    broken[::50] = float("nan")
+    expected = traced(lens, Rays(missing, rays.direction, 550.0), "cuda", device="cuda")
+    found = traced(lens, Rays(broken, rays.direction, 550.0), "cuda", device="cuda")
+    assert not found.valid[::50].any()
+    assert torch.equal(found.position[expected.valid], expected.position[expected.valid])
+    assert all(torch.equal(found.gradients[k], g) for k, g in expected.gradients.items())
+
+
+def test_the_backward_pass_takes_at_most_64_bytes_a_ray(root):
+    lens = load_lens(root / "conf" / "lens" / "nikon.yaml", torch.float32).to("cuda")
+    lens.backend = "cuda"
+    count = 1 << 21
+    position = torch.zeros((count, 3), device="cuda", requires_grad=True)
+    direction = torch.tensor([0.0, 0.0, 1.0], device="cuda").repeat(count, 1).requires_grad_()
+    for _ in range(2):  # compiled, and then measured
+        hit = lens.trace(Rays(position, direction, 550.0))
+        total = hit.position.sum() + hit.path_length.sum()
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        gradients = torch.autograd.grad(
+            total, [position, direction, *lens.parameters()], allow_unused=True
+        )
+        taken = torch.cuda.max_memory_allocated() - before
+        del gradients, hit, total
+    assert taken <= 64 * count

@@ -19,6 +19,7 @@ from numba import types
 from numba.core import config, event
 from numba.core.caching import FunctionCache
 from numba.core.ccallback import CFunc
+from numba.core.runtime import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
@@ -124,8 +125,12 @@ class _StampedCache(FunctionCache):
         return sig, self._real, codegen.magic_tuple(), stamp()
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        # Numba's own prepares to compile first, which imports SciPy and half of Numba (0.6 s);
+        # compiled code needs the runtime's symbols only.
+        rtsys.initialize(target_context)
         try:
-            return super().load_overload(sig, target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
         except (EOFError, pickle.UnpicklingError, OSError) as error:
             logger.warning("compiled kernels on disk are damaged and made anew: %r", error)
             self.flush()

@@ -1,0 +1,92 @@
+"""Surfaces that are given by their sag: Newton's iteration to them, and the three they are for."""
+
+import triton
+import triton.language as tl
+
+from dolens.kernels.cuda.arithmetic import away_from_zero, clamp, divide, safe_sqrt
+from dolens.kernels.cuda.b_spline import b_spline_bend, b_spline_sag, b_spline_sums
+from dolens.kernels.cuda.conic import conic_distance
+from dolens.kernels.cuda.even_asphere import (
+    even_asphere_bend,
+    even_asphere_sag,
+    even_asphere_sums,
+)
+from dolens.kernels.cuda.layout import EVEN_ASPHERE, SHAPE, XY_POLYNOMIAL
+from dolens.kernels.cuda.xy_polynomial import (
+    xy_polynomial_bend,
+    xy_polynomial_sag,
+    xy_polynomial_sums,
+)
+
+
+@triton.jit
+def sag_and_slopes(record, codes, extras, x, y, FORM: tl.constexpr):
+    """Sag, slopes, and a margin that is positive on the sag's branch."""
+    if FORM == EVEN_ASPHERE:
+        return even_asphere_sag(record, codes, x, y)
+    elif FORM == XY_POLYNOMIAL:
+        return xy_polynomial_sag(record, codes, extras, x, y)
+    else:
+        return b_spline_sag(record, codes, x, y)
+
+
+@triton.jit
+def slopes_and_bends(record, codes, extras, x, y, FORM: tl.constexpr):
+    """s_x, s_y, s_xx, s_xy, s_yy."""
+    if FORM == EVEN_ASPHERE:
+        return even_asphere_bend(record, codes, x, y)
+    elif FORM == XY_POLYNOMIAL:
+        return xy_polynomial_bend(record, codes, extras, x, y)
+    else:
+        return b_spline_bend(record, codes, x, y)
+
+
+@triton.jit
+def explicit_sums(
+    record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive, FORM: tl.constexpr
+):
+    """Add the cotangents of the shape's numbers, from those of the sag and its slopes."""
+    if FORM == EVEN_ASPHERE:
+        even_asphere_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive)
+    elif FORM == XY_POLYNOMIAL:
+        xy_polynomial_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive)
+    else:
+        b_spline_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive)
+
+
+@triton.jit
+def explicit_intersect(
+    record, codes, extras, x, y, l, m, n, sense, limit, scale, FORM: tl.constexpr
+):
+    """Distance from the vertex plane, unit normal there, and whether it is met.
+
+    As `Surface.intersect`: the iteration ends when no ray of the block moves any more, or after 40
+    steps; whether a ray has converged is read off its residual at the end.
+    """
+    # √ε, and 64 ε.
+    close = 2.0**-26 if x.dtype == tl.float64 else 2.0**-11.5
+    rounding = 2.0**-46 if x.dtype == tl.float64 else 2.0**-17
+    t = tl.zeros_like(x)
+    if FORM == EVEN_ASPHERE:
+        c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
+        start, squared = conic_distance(c, c + (c * k) * (n * n), x, y, l, m, n, sense)
+        t = tl.where(squared > 0.0, clamp(start, limit), 0.0)
+    moving = tl.full((), 1, tl.int32)
+    steps = tl.full((), 0, tl.int32)
+    while (moving > 0) & (steps < 40):
+        sag, sx, sy, _ = sag_and_slopes(record, codes, extras, x + l * t, y + m * t, FORM)
+        change = divide(sag - n * t, away_from_zero(l * sx + m * sy - n))
+        change = clamp(change, scale)
+        t = t - change
+        moves = tl.abs(change) > close * (tl.abs(t) + scale)
+        moving = tl.max(moves.to(tl.int32), 0)
+        steps += 1
+    sag, sx, sy, margin = sag_and_slopes(record, codes, extras, x + l * t, y + m * t, FORM)
+    residual = sag - n * t
+    slope = l * sx + m * sy - n
+    allowed = rounding * (tl.abs(sag) + tl.abs(t) + scale)
+    met = (sense * slope < 0.0) & (margin > 0.0) & (tl.abs(residual) < allowed)
+    # One step more, too short to matter for the slopes.
+    t = clamp(t - clamp(divide(residual, away_from_zero(slope)), scale), limit)
+    nz = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
+    return t, -sx * nz, -sy * nz, nz, met

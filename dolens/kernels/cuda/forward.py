@@ -1,0 +1,70 @@
+"""The forward trace: each program carries a block of rays through all steps, in registers."""
+
+import triton
+import triton.language as tl
+
+from dolens.kernels.cuda.layout import OFFSET, ROW
+from dolens.kernels.cuda.rays import (
+    first_sense,
+    load_columns,
+    load_media,
+    load_vectors,
+    store_vectors,
+)
+from dolens.kernels.cuda.step import step
+
+# One compiled kernel serves bundles of any size, strides and alignment.
+_VARYING = (
+    "exit_place", "wavelengths", "steps", "count", "position_row", "position_column",
+    "direction_row", "direction_column",
+)  # fmt: skip
+
+
+@triton.jit(
+    do_not_specialize=_VARYING, do_not_specialize_on_alignment=("position", "direction", "which")
+)
+def forward_kernel(
+    values, exit_place, media, wavelengths, codes, extras, steps, count,
+    position, position_row, position_column, direction, direction_row, direction_column, which,
+    out_position, out_direction, out_path, out_status, out_surface,
+    KINDS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Trace `count` rays; see `dolens.kernels.cuda.backend.trace`.
+
+    Args:
+        values: the table's records.
+        exit_place: where in `values` the number lies that is added to z in the end.
+        media: (steps, 2, wavelengths): index in front and ratio μ.
+        wavelengths: columns of `media`.
+        codes: (steps, ROW), int32.
+        extras: int32.
+        steps: rows of `codes`.
+        count: rays.
+        position: (count, 3), with its strides; and so on for the direction.
+        which: (count,), int32, or None.
+        out_position: and the other results, contiguous.
+        KINDS: see `step`.
+        BLOCK: rays a program.
+    """
+    rays = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    mask = rays < count
+    x, y, z = load_vectors(position, position_row, position_column, rays, mask, 0.0)
+    sense = first_sense(values, steps)
+    l, m, n = load_vectors(direction, direction_row, direction_column, rays, mask, sense)
+    columns = load_columns(which, rays, mask)
+    path = tl.zeros_like(x)
+    ended, vignetted = tl.zeros([BLOCK], tl.int32), tl.zeros([BLOCK], tl.int32)
+    for k in range(steps):
+        row = codes + k * ROW
+        record = values + tl.load(row + OFFSET)
+        index, ratio = load_media(media, k, wavelengths, columns)
+        x, y, z, l, m, n, path, ended, vignetted, _ = step(
+            row, record, extras, index, ratio, x, y, z, l, m, n, path, ended, vignetted, KINDS
+        )
+    z = z + tl.load(values + exit_place)
+    store_vectors(out_position, rays, mask, x, y, z)
+    store_vectors(out_direction, rays, mask, l, m, n)
+    tl.store(out_path + rays, path, mask=mask)
+    failed = tl.where(ended > 0, ended, vignetted)
+    tl.store(out_status + rays, (failed & 3).to(tl.int8), mask=mask)
+    tl.store(out_surface + rays, (failed >> 2).to(tl.int16), mask=mask)

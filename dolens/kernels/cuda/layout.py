@@ -1,0 +1,62 @@
+"""Places in records and rows of codes (`dolens.kernels.table`), as constants for Triton."""
+
+import triton.language as tl
+
+from dolens.kernels.table import Code, Kind, Outline, Slot
+
+SHIFT = tl.constexpr(int(Slot.SHIFT))
+STEP = tl.constexpr(int(Slot.STEP))
+TURN = tl.constexpr(int(Slot.TURN))
+LIMIT = tl.constexpr(int(Slot.LIMIT))
+SCALE = tl.constexpr(int(Slot.SCALE))
+EDGE = tl.constexpr(int(Slot.EDGE))
+HALF_X = tl.constexpr(int(Slot.HALF_X))
+HALF_Y = tl.constexpr(int(Slot.HALF_Y))
+HOLE_X = tl.constexpr(int(Slot.HOLE_X))
+HOLE_Y = tl.constexpr(int(Slot.HOLE_Y))
+SENSE = tl.constexpr(int(Slot.SENSE))
+TAG = tl.constexpr(int(Slot.TAG))
+SHAPE = tl.constexpr(int(Slot.HEADER))
+
+KIND = tl.constexpr(int(Code.KIND))
+OFFSET = tl.constexpr(int(Code.OFFSET))
+BEFORE = tl.constexpr(int(Code.BEFORE))
+AFTER = tl.constexpr(int(Code.AFTER))
+REFRACTS = tl.constexpr(int(Code.REFRACTS))
+OUTLINE = tl.constexpr(int(Code.EDGE))
+HOLE = tl.constexpr(int(Code.HOLE))
+COUNT = tl.constexpr(int(Code.COUNT))
+COLUMNS = tl.constexpr(int(Code.COLUMNS))
+EXTRAS = tl.constexpr(int(Code.EXTRAS))
+DEGREE = tl.constexpr(int(Code.DEGREE))
+ROW = tl.constexpr(int(Code.ROW))
+
+SPHERE = tl.constexpr(int(Kind.SPHERE))
+CONIC = tl.constexpr(int(Kind.CONIC))
+EVEN_ASPHERE = tl.constexpr(int(Kind.EVEN_ASPHERE))
+XY_POLYNOMIAL = tl.constexpr(int(Kind.XY_POLYNOMIAL))
+B_SPLINE = tl.constexpr(int(Kind.B_SPLINE))
+CHANGE_AXES = tl.constexpr(int(Kind.CHANGE_AXES))
+LENS_AXES = tl.constexpr(int(Kind.LENS_AXES))
+SENSOR = tl.constexpr(int(Kind.SENSOR))
+
+# Bits of `KINDS`, the kinds of step that a lens has: a kernel is compiled for those.
+HAS_SPHERE = tl.constexpr(1 << int(Kind.SPHERE))
+HAS_CONIC = tl.constexpr(1 << int(Kind.CONIC))
+HAS_EVEN_ASPHERE = tl.constexpr(1 << int(Kind.EVEN_ASPHERE))
+HAS_XY_POLYNOMIAL = tl.constexpr(1 << int(Kind.XY_POLYNOMIAL))
+HAS_B_SPLINE = tl.constexpr(1 << int(Kind.B_SPLINE))
+HAS_CHANGE_AXES = tl.constexpr(1 << int(Kind.CHANGE_AXES))
+HAS_LENS_AXES = tl.constexpr(1 << int(Kind.LENS_AXES))
+HAS_SENSOR = tl.constexpr(1 << int(Kind.SENSOR))
+
+CIRCLE = tl.constexpr(int(Outline.CIRCLE))
+RECTANGLE = tl.constexpr(int(Outline.RECTANGLE))
+
+# Added to a surface's tag where a ray fails; `dolens.optics.rays.Status`.
+VIGNETTED = tl.constexpr(1)
+TOTALLY_REFLECTED = tl.constexpr(2)
+MISSED = tl.constexpr(3)
+
+# What the adjoint keeps of a block behind every step: x, y, z, l, m, n, and the distance there.
+STATE = tl.constexpr(7)

@@ -1,0 +1,48 @@
+"""Reading and writing a block of rays, and the indices that each of them meets."""
+
+import triton
+import triton.language as tl
+
+from dolens.kernels.cuda.layout import SENSE
+
+
+@triton.jit
+def load_vectors(pointer, row, column, rays, mask, third):
+    """x, y, z of each ray's vector; (0, 0, third) where the mask is off."""
+    place = pointer + rays * row
+    return (
+        tl.load(place, mask=mask, other=0.0),
+        tl.load(place + column, mask=mask, other=0.0),
+        tl.load(place + 2 * column, mask=mask, other=third),
+    )
+
+
+@triton.jit
+def store_vectors(pointer, rays, mask, x, y, z):
+    """Write vectors to (N, 3), contiguous."""
+    place = pointer + rays * 3
+    tl.store(place, x, mask=mask)
+    tl.store(place + 1, y, mask=mask)
+    tl.store(place + 2, z, mask=mask)
+
+
+@triton.jit
+def first_sense(values, steps):
+    """+1 or -1, from the first record: the direction of the axial rays that fill a block up."""
+    return tl.load(values + SENSE, mask=steps > 0, other=1.0)
+
+
+@triton.jit
+def load_columns(which, rays, mask):
+    """Each ray's column of the indices; one for all where none is given."""
+    if which is None:
+        return 0
+    else:
+        return tl.load(which + rays, mask=mask, other=0)
+
+
+@triton.jit
+def load_media(media, k, wavelengths, columns):
+    """Of step k: the index in front, and its ratio μ to the one behind."""
+    front = media + 2 * k * wavelengths + columns
+    return tl.load(front), tl.load(front + wavelengths)

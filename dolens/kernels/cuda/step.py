@@ -1,0 +1,148 @@
+"""One step of a block of rays: to a surface and through it, to other axes, or to the sensor."""
+
+import triton
+import triton.language as tl
+
+from dolens.kernels.cuda.arithmetic import clamp, distance_to_plane, refract
+from dolens.kernels.cuda.axes import change_axes, lens_axes
+from dolens.kernels.cuda.conic import conic_intersect, sphere_intersect
+from dolens.kernels.cuda.explicit import explicit_intersect
+from dolens.kernels.cuda.layout import (
+    B_SPLINE,
+    CHANGE_AXES,
+    CIRCLE,
+    CONIC,
+    EDGE,
+    EVEN_ASPHERE,
+    HALF_X,
+    HALF_Y,
+    HAS_B_SPLINE,
+    HAS_CHANGE_AXES,
+    HAS_CONIC,
+    HAS_EVEN_ASPHERE,
+    HAS_LENS_AXES,
+    HAS_SENSOR,
+    HAS_SPHERE,
+    HAS_XY_POLYNOMIAL,
+    HOLE,
+    HOLE_X,
+    HOLE_Y,
+    KIND,
+    LENS_AXES,
+    LIMIT,
+    MISSED,
+    OUTLINE,
+    RECTANGLE,
+    REFRACTS,
+    SCALE,
+    SENSE,
+    SENSOR,
+    SHIFT,
+    SPHERE,
+    TAG,
+    TOTALLY_REFLECTED,
+    VIGNETTED,
+    XY_POLYNOMIAL,
+)
+
+
+@triton.jit
+def intersect(record, codes, extras, kind, x, y, l, m, n, sense, KINDS: tl.constexpr):
+    """Distance from the vertex plane to a surface, unit normal there, and whether it is met."""
+    limit = tl.load(record + LIMIT)
+    t, nx, ny = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
+    nz = 1.0 + tl.zeros_like(x)
+    met = tl.full(x.shape, True, tl.int1)
+    if HAS_SPHERE & KINDS:
+        if kind == SPHERE:
+            t, nx, ny, nz, met = sphere_intersect(record, x, y, l, m, n, sense, limit)
+    if HAS_CONIC & KINDS:
+        if kind == CONIC:
+            t, nx, ny, nz, met = conic_intersect(record, x, y, l, m, n, sense, limit)
+    scale = tl.load(record + SCALE)
+    if HAS_EVEN_ASPHERE & KINDS:
+        if kind == EVEN_ASPHERE:
+            t, nx, ny, nz, met = explicit_intersect(
+                record, codes, extras, x, y, l, m, n, sense, limit, scale, EVEN_ASPHERE
+            )
+    if HAS_XY_POLYNOMIAL & KINDS:
+        if kind == XY_POLYNOMIAL:
+            t, nx, ny, nz, met = explicit_intersect(
+                record, codes, extras, x, y, l, m, n, sense, limit, scale, XY_POLYNOMIAL
+            )
+    if HAS_B_SPLINE & KINDS:
+        if kind == B_SPLINE:
+            t, nx, ny, nz, met = explicit_intersect(
+                record, codes, extras, x, y, l, m, n, sense, limit, scale, B_SPLINE
+            )
+    return t, nx, ny, nz, met
+
+
+@triton.jit
+def passes(record, codes, x, y):
+    """Whether a point is strictly inside the clear aperture."""
+    inside = tl.load(record + EDGE) - (x * x + y * y) > 0.0
+    if tl.load(codes + OUTLINE) == RECTANGLE:
+        inside &= tl.abs(x) < tl.load(record + HALF_X)
+        inside &= tl.abs(y) < tl.load(record + HALF_Y)
+    hole = tl.load(codes + HOLE)
+    if hole == CIRCLE:
+        inside &= x * x + y * y > tl.load(record + HOLE_X)
+    if hole == RECTANGLE:
+        across = tl.abs(x) > tl.load(record + HOLE_X)
+        inside &= across | (tl.abs(y) > tl.load(record + HOLE_Y))
+    return inside
+
+
+@triton.jit
+def step(
+    codes, record, extras, index, ratio,
+    x, y, z, l, m, n, path, ended, vignetted, KINDS: tl.constexpr,
+):  # fmt: skip
+    """Carry a block through one step.
+
+    Args:
+        codes: the step's row.
+        record: its numbers.
+        extras: places of polynomials' coefficients.
+        index: in front.
+        ratio: μ.
+        x: to n: the ray, in the axes of the step before.
+        path: optical path so far, mm.
+        ended: tag and status of a miss or a total reflection, else 0; int32.
+        vignetted: of the first aperture that stopped the ray, else 0.
+        KINDS: bit k is set where the lens has steps of kind k; code for no others is made.
+
+    Returns:
+        x to vignetted behind the step, and the distance travelled to it.
+    """
+    kind = tl.load(codes + KIND)
+    sense = tl.load(record + SENSE)
+    tag = tl.load(record + TAG).to(tl.int32)
+    travelled = tl.zeros_like(x)
+    if kind <= B_SPLINE:
+        t0, towards = distance_to_plane(z + tl.load(record + SHIFT), n, sense)
+        limit = tl.load(record + LIMIT)
+        x, y = clamp(x + t0 * l, limit), clamp(y + t0 * m, limit)
+        t, nx, ny, nz, met = intersect(record, codes, extras, kind, x, y, l, m, n, sense, KINDS)
+        x, y, z = x + t * l, y + t * m, t * n
+        travelled = t0 + t
+        ended = tl.where((ended > 0) | (met & towards), ended, tag + MISSED)
+        vignetted = tl.where(
+            (vignetted > 0) | passes(record, codes, x, y), vignetted, tag + VIGNETTED
+        )
+        if tl.load(codes + REFRACTS) != 0:
+            l, m, n, transmitted = refract(l, m, n, nx, ny, nz, ratio, sense)
+            ended = tl.where((ended > 0) | (transmitted > 0.0), ended, tag + TOTALLY_REFLECTED)
+    if HAS_CHANGE_AXES & KINDS:
+        if kind == CHANGE_AXES:
+            x, y, z, l, m, n, travelled = change_axes(record, x, y, z, l, m, n)
+    if HAS_LENS_AXES & KINDS:
+        if kind == LENS_AXES:
+            x, y, z, l, m, n = lens_axes(record, x, y, z, l, m, n)
+    if HAS_SENSOR & KINDS:
+        if kind == SENSOR:
+            travelled, towards = distance_to_plane(z + tl.load(record + SHIFT), n, sense)
+            x, y, z = x + travelled * l, y + travelled * m, tl.zeros_like(x)
+            ended = tl.where((ended > 0) | towards, ended, tag + MISSED)
+    return x, y, z, l, m, n, path + index * travelled, ended, vignetted, travelled

@@ -1,0 +1,33 @@
+"""Sums over a block's rays, kept in double precision in a row that belongs to one program.
+
+A program adds in the order of its blocks, with no atomic operations, so that a repeated call gives
+the same bits.  Rays that are not `alive` may hold anything, NaN too, and do not count.
+"""
+
+import triton
+import triton.language as tl
+
+
+@triton.jit
+def add_sum(place, numbers, alive):
+    """Add the sum over the rays that are alive to the number at `place`."""
+    total = tl.sum(tl.where(alive, numbers, 0.0), 0)
+    tl.store(place, tl.load(place) + total.to(tl.float64))
+
+
+@triton.jit
+def first_of(keys, left):
+    """The smallest key among the rays that are left, and which of them have it."""
+    key = tl.min(tl.where(left, keys, 2147483647), 0)
+    return key, left & (keys == key)
+
+
+@triton.jit
+def add_by_column(front, behind, column, of_front, of_behind, alive):
+    """Add cotangents of the indices of two media, each ray's to that of its own wavelength."""
+    left = alive
+    while tl.max(left.to(tl.int32), 0) > 0:
+        wavelength, here = first_of(column, left)
+        add_sum(front + wavelength, of_front, here)
+        add_sum(behind + wavelength, of_behind, here)
+        left = left & (column != wavelength)

@@ -1,0 +1,127 @@
+"""The Triton kernels on a machine without a GPU: interpreted, compiled, and out of the way."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from dolens import InputError, Rays, load_lens
+from dolens.kernels.table import Kind
+
+pytest.importorskip("triton")
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+compiled = pytest.mark.skipif(INTERPRETED, reason="the interpreter compiles nothing")
+
+
+def python(root, *arguments, **environment):
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=root,
+        env=os.environ | {"PYTHONPATH": str(root)} | environment,
+        capture_output=True,
+        text=True,
+    )
+
+
+@compiled
+def test_in_tritons_interpreter_the_kernels_are_the_reference(root):
+    """`tests/kernels/interpreted_cuda.py`, in a process where Triton was told before it came up."""
+    tests = ["tests/kernels/interpreted_cuda.py", "-q", "--tb=short", "-p", "no:cacheprovider"]
+    run = python(root, "-m", "pytest", *tests, TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
+    assert run.returncode == 0, run.stdout[-20000:] + run.stderr[-5000:]
+    assert " passed" in run.stdout
+
+
+def test_a_lens_on_the_cpu_does_not_load_these_kernels(root):
+    program = (
+        "import sys, torch, dolens\n"
+        "lens = dolens.load_lens('conf/lens/asphere.yaml', backend='cpu')\n"
+        "ray = torch.tensor([[0.0, 1.0, -5.0]]), torch.tensor([[0.0, 0.0, 1.0]])\n"
+        "lens.trace(dolens.Rays(*ray))\n"
+        "sys.exit(any(name.startswith('dolens.kernels.cuda') for name in sys.modules))\n"
+    )
+    run = python(root, "-c", program)
+    assert run.returncode == 0, run.stderr
+
+
+@compiled
+def test_rays_on_the_cpu_are_refused(root):
+    from dolens.kernels.cuda import backend
+    from dolens.optics.packing import pack
+
+    lens = load_lens(root / "conf/lens/asphere.yaml")
+    table = pack(lens.system(), 550.0, 1.0, 1, 2, True)
+    rays = Rays(torch.zeros(3, 3).double(), torch.eye(3).double())
+    with pytest.raises(InputError, match="GPU"):
+        backend.trace(table, rays.position, rays.direction, None)
+    lens.backend = "cuda"
+    with pytest.raises(InputError, match="cuda"):
+        lens.trace(rays)
+
+
+def compile_for(kernel, real, kinds, block, absent):
+    """PTX of a kernel for an H100 or H200, which need not be here."""
+    import triton
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    numbers = "*fp64" if real == torch.float64 else "*fp32"
+    types = dict.fromkeys(("codes", "extras", "which"), "*i32") | {
+        "sums": "*fp64", "status": "*i8", "out_status": "*i8", "out_surface": "*i16",
+    }  # fmt: skip
+    pointers = ("values", "media", "position", "direction", "out_position", "out_direction",
+                "out_path", "of_position", "of_direction", "of_path", "position_gradient",
+                "direction_gradient", "scratch")  # fmt: skip
+    types |= dict.fromkeys(pointers, numbers)
+    fixed = {"KINDS": kinds, "BLOCK": block, "INDICES": False} | dict.fromkeys(absent)
+    fixed = {name: value for name, value in fixed.items() if name in kernel.arg_names}
+    signature = {
+        name: "constexpr" if name in fixed else types.get(name, "i32") for name in kernel.arg_names
+    }
+    source = ASTSource(kernel, signature=signature, constexprs=fixed)
+    options = {"num_warps": 1, "enable_fp_fusion": True}
+    return triton.compile(source, target=GPUTarget("cuda", 90, 32), options=options).asm["ptx"]
+
+
+SPHERES = 1 << Kind.PLANE | 1 << Kind.SPHERE | 1 << Kind.SENSOR
+LENSES = {
+    "spheres": SPHERES,
+    "aspheres": SPHERES | 1 << Kind.EVEN_ASPHERE,
+    "posed plates": SPHERES | 1 << Kind.XY_POLYNOMIAL | 1 << Kind.CHANGE_AXES | 1 << Kind.LENS_AXES,
+}
+
+
+@compiled
+@pytest.mark.parametrize(
+    "name, real",
+    [
+        ("spheres", torch.float32),
+        ("spheres", torch.float64),
+        ("posed plates", torch.float32),
+        ("aspheres", torch.float64),
+    ],
+)
+def test_the_kernels_compile_and_keep_their_precision(name, real):
+    """Divisions and square roots are rounded to nearest, denormals kept, and constants not widened.
+
+    The interpreter could not tell: it has no types but NumPy's.
+    """
+    from dolens.kernels.cuda.adjoint import adjoint_kernel
+    from dolens.kernels.cuda.backend import ADJOINT_BLOCK, FORWARD_BLOCK
+    from dolens.kernels.cuda.forward import forward_kernel
+
+    forward = compile_for(forward_kernel, real, LENSES[name], FORWARD_BLOCK, ("which",))
+    absent = ("which", "of_direction", "of_path")
+    adjoint = compile_for(adjoint_kernel, real, LENSES[name], ADJOINT_BLOCK[real], absent)
+    bits = 64 if real == torch.float64 else 32
+    for ptx in (forward, adjoint):
+        assert f"div.rn.f{bits}" in ptx and f"sqrt.rn.f{bits}" in ptx
+        assert not re.search(r"\b(div|sqrt|rcp|rsqrt)\.(approx|full)|\.ftz", ptx)
+        assert not re.search(r"\b(fma|mul|div|sqrt)\S*\.f" + str(96 - bits), ptx)
+    # Sums alone are in double precision.
+    if real == torch.float32:
+        assert "f64" not in forward
+        assert re.search(r"add\S*\.f64", adjoint)

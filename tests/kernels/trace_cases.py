@@ -1,0 +1,235 @@
+"""Lenses and rays that a backend is tried on, and the comparison with the reference."""
+
+import copy
+import math
+import re
+from dataclasses import dataclass
+
+import torch
+
+from dolens import Rays, load_lens
+from dolens.optics.surfaces.spline_basis import clamped_knots
+from dolens.prescriptions import lens_from_prescription
+
+F64 = torch.float64
+_GLASS = "1.5168/64.17"
+_KNOTS = clamped_knots(6.0, 9)
+
+
+def _random(*shape, seed):
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
+
+
+def _singlet(front, back, **more):
+    surfaces = {
+        "1": {"semi_diameter": 5.0, "thickness": 3.0, "material": _GLASS, **front},
+        "2": {"semi_diameter": 5.0, "material": "air", **back},
+    }
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 40.0}, **more})
+
+
+def _spline():
+    """A curved spline with a random ripple, behind a conic."""
+    u = torch.linspace(-6.0, 6.0, 9, dtype=F64)
+    bowl = -0.008 * (u[:, None] ** 2 + u[None] ** 2) + 0.004 * _random(9, 9, seed=4)
+    back = {"type": "b_spline", "coefficients": bowl.tolist(), "knots_x": _KNOTS, "knots_y": _KNOTS}
+    return _singlet({"type": "conic", "radius": 40.0, "conic": -0.7}, back)
+
+
+def _polynomial():
+    """Every kind of monomial, b, and a hole in the order of powers."""
+    back = {"type": "xy_polynomial", "x2": -0.008, "y2": -0.007, "xy": 1e-3, "x3": 2e-5,
+            "x2y": -3e-5, "xy2": 1e-5, "y3": 4e-5, "x4": 1e-6, "x2y3": 2e-7, "b": 0.03}  # fmt: skip
+    return _singlet({"type": "sphere", "radius": 40.0}, back)
+
+
+def _aspheres():
+    """Aspheres of many and of no coefficients; the second has a conic that nothing simplifies."""
+    front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "a6": -1e-7,
+             "a8": 3e-9, "a10": 1e-11, "a12": -1e-13}  # fmt: skip
+    return _singlet(front, {"type": "even_asphere", "radius": -60.0, "conic": 0.4, "a4": 1e-5})
+
+
+def _posed(root):
+    import yaml
+
+    text = (root / "conf/lens/cooke_triplet.yaml").read_text(encoding="utf-8")
+    elements = {
+        "1": {"surfaces": [1, 2], "tilt_x": 1.0, "decenter_x": 0.1, "shift_z": 0.05},
+        "2": {"surfaces": [5, 6], "tilt_y": -2.0, "tilt_z": 15.0, "decenter_y": -0.1},
+    }
+    return lens_from_prescription(yaml.safe_load(text) | {"elements": elements})
+
+
+def _clipped():
+    """A rectangle with a round obscuration, and a circle with a rectangular one."""
+    front = {"type": "sphere", "radius": 40.0, "obscuration": {"semi_diameter": 0.8},
+             "aperture": {"half_width_x": 3.0, "half_width_y": 2.0}}  # fmt: skip
+    obscured = {"type": "plane", "obscuration": {"half_width_x": 1.0, "half_width_y": 0.3}}
+    surfaces = {
+        "1": {"thickness": 3.0, "material": _GLASS, **front},
+        "2": {"semi_diameter": 5.0, "material": "air", **obscured},
+    }
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
+
+
+def _plate(root):
+    lens = load_lens(root / "conf/lens/wavefront_coding.yaml", F64)
+    with torch.no_grad():
+        for name, value in {"x3": 1e-4, "x2y": -2e-5, "xy2": 3e-5, "y3": 8e-5}.items():
+            lens.variables([f"surfaces.5.{name}"])[f"surfaces.5.{name}"].fill_(value)
+    return lens
+
+
+def _loaded(name):
+    return lambda root: load_lens(root / "conf" / "lens" / f"{name}.yaml", F64)
+
+
+LENSES = {
+    "cooke_triplet": _loaded("cooke_triplet"),
+    "nikon": _loaded("nikon"),
+    "asphere": _loaded("asphere"),
+    "wavefront_coding": _plate,
+    "posed": _posed,
+    "b_spline": lambda root: _spline(),
+    "polynomial": lambda root: _polynomial(),
+    "even_aspheres": lambda root: _aspheres(),
+    "clipped": lambda root: _clipped(),
+}
+
+
+def bundle(lens, count=100, fill=1.3, wavelengths=None):
+    """Skew rays from a finite source that overfill the entrance pupil: some of them fail."""
+    pupil = lens.first_order(550.0).entrance_pupil
+    radius = 0.5 * fill * float(pupil.diameter.detach())
+    generator = torch.Generator().manual_seed(1)
+    r, angle = torch.rand((2, count), generator=generator, dtype=F64)
+    r, angle = radius * r.sqrt(), 2.0 * math.pi * angle
+    z = torch.full_like(r, float(pupil.z.detach()))
+    target = torch.stack((r * torch.cos(angle), r * torch.sin(angle), z), -1)
+    source = torch.tensor([4.0, -6.0, -200.0], dtype=F64)
+    direction = target - source
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    if wavelengths is None:
+        return Rays(source.expand(count, 3), direction, 550.0)
+    return Rays(source.expand(count, 3), direction, torch.tensor(wavelengths, dtype=F64))
+
+
+def returning(lens, rays):
+    """The light that arrived, sent back: a little astray, and every eighth ray far."""
+    hit = lens.trace(rays, record=True)
+    direction = 0.01 * _random(*hit.direction.shape, seed=8) - hit.direction.detach()
+    direction[::8, 0] += 0.8
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    ok = hit.valid.nonzero()[:, 0]
+    # As many as there were: those that never arrived give way to others.
+    kept = ok[torch.arange(len(hit.valid)) % len(ok)]
+    return Rays(hit.position.detach()[kept], direction[kept], rays.wavelength)
+
+
+@dataclass
+class Traced:
+    """What a trace gave, and the gradients of one number that all its outputs go into."""
+
+    position: torch.Tensor
+    direction: torch.Tensor
+    path: torch.Tensor
+    status: torch.Tensor
+    surface: torch.Tensor
+    valid: torch.Tensor
+    gradients: dict
+
+
+def traced(lens, rays, backend, sense=1.0, device="cpu", dtype=F64):
+    """Trace, and sweep back, in a precision and on a device; results in double, on the CPU."""
+    lens = copy.deepcopy(lens).to(device=device, dtype=dtype)
+    lens.backend = backend
+    position = rays.position.to(device, dtype).clone().requires_grad_()
+    direction = rays.direction.to(device, dtype).clone().requires_grad_()
+    wavelength = rays.wavelength
+    if isinstance(wavelength, torch.Tensor):
+        wavelength = wavelength.to(device)
+    send = lens.trace if sense > 0.0 else lens.sensor_to_scene
+    hit = send(Rays(position, direction, wavelength))
+    shape = hit.valid.shape
+    weights = _random(*shape, 7, seed=5).to(device, dtype)
+    outputs = torch.cat((hit.position, hit.direction, hit.path_length[..., None]), -1)
+    total = torch.where(hit.valid[..., None], outputs * weights, 0.0).sum()
+    inputs = {"position": position, "direction": direction, **dict(lens.named_parameters())}
+    found = torch.autograd.grad(total, list(inputs.values()), allow_unused=True)
+    gradients = {
+        k: torch.zeros_like(v) if g is None else g
+        for (k, v), g in zip(inputs.items(), found, strict=True)
+    }
+    # A unit vector moves across itself only.
+    across, along = gradients["direction"], direction.detach()
+    gradients["direction"] = across - (across * along).sum(-1, keepdim=True) * along
+    return Traced(
+        *(v.detach().cpu().to(F64) for v in (hit.position, hit.direction, hit.path_length)),
+        *(v.cpu() for v in (hit.status, hit.surface, hit.valid)),
+        {k: g.cpu().to(F64) for k, g in gradients.items()},
+    )
+
+
+def _kind(name):
+    """What a parameter is: its name without numbers and axes."""
+    return re.sub(r"\d+|_[xyz]$", "", name)
+
+
+def _sizes(gradients):
+    """How large each gradient is, and the largest of its kind.
+
+    Some vanish by symmetry, but for rounding: their like say how large that may be.
+    """
+    own = {name: float(g.abs().max()) for name, g in gradients.items()}
+    return {
+        name: (size, max(s for other, s in own.items() if _kind(other) == _kind(name)))
+        for name, size in own.items()
+    }
+
+
+def require_equal(found, expected, length=1e-11, relative=1e-11):
+    """Same fates of all rays; of valid ones the same numbers (mm) and gradients."""
+    assert torch.equal(found.status, expected.status)
+    assert torch.equal(found.surface, expected.surface)
+    valid = expected.valid
+    assert valid.sum() > 0
+    for name in ("position", "direction", "path"):
+        a, b = getattr(found, name), getattr(expected, name)
+        assert (a - b)[valid].abs().max() < length, name
+    for name, (own, alike) in _sizes(expected.gradients).items():
+        error = (found.gradients[name] - expected.gradients[name]).abs().max()
+        assert error <= relative * max(own, 1e-2 * alike), name
+
+
+def root_mean_square(values):
+    """Of all numbers in a tensor."""
+    return float(values.square().mean().sqrt())
+
+
+def require_no_worse(found, reference, exact):
+    """Errors in single precision, of what was found and of the reference's, against double.
+
+    Both are rounding: half as much again passes for rays, and twice for gradients, since Triton's
+    interpreter rounds products that the reference adds without.
+    """
+    same = found.valid & reference.valid & exact.valid
+    assert same.sum() > 0.9 * exact.valid.sum()
+    for name in ("position", "direction", "path"):
+        true = getattr(exact, name)[same]
+        errors = [root_mean_square(getattr(t, name)[same] - true) for t in (found, reference)]
+        assert errors[0] <= 1.5 * errors[1], name
+    sizes = _sizes(exact.gradients)
+    errors = [
+        root_mean_square(
+            torch.cat(
+                [
+                    (t.gradients[name] - exact.gradients[name]).flatten() / alike
+                    for name, (_, alike) in sizes.items()
+                    if alike > 0.0
+                ]
+            )
+        )
+        for t in (found, reference)
+    ]
+    assert errors[0] <= 2.0 * errors[1], errors
