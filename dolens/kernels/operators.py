@@ -4,13 +4,18 @@
 programs hold no Python objects of ours.  First derivatives only: a second one says so.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.registration import (
+    forbid_derivative,
+    operator,
+    register_derivative,
+    register_shapes,
+)
 from dolens.kernels.table import SurfaceTable
 
 
@@ -25,23 +30,7 @@ def _backend(position: Tensor) -> Any:
     return backend
 
 
-_library = torch.library.Library("dolens", "DEF")
-
-
-def _operator(function: Callable[..., Any]) -> Any:
-    """Make a function an operator of PyTorch's dispatcher.
-
-    `torch.library.custom_op` does the same, but imports PyTorch's whole compiler with the first
-    call (seconds), and makes every call 20 to 50 µs longer.
-    """
-    schema = torch.library.infer_schema(function, mutates_args=())
-    name = function.__name__
-    _library.define(name + schema, tags=(torch.Tag.pt2_compliant_tag,))
-    _library.impl(name, function, "CompositeExplicitAutograd")
-    return getattr(torch.ops.dolens, name).default
-
-
-@_operator
+@operator
 def trace(
     values: Tensor,
     indices: Tensor,
@@ -80,7 +69,7 @@ def _trace_shapes(values, indices, position, direction, which, codes, extras):  
     )
 
 
-@_operator
+@operator
 def trace_adjoint(
     values: Tensor,
     indices: Tensor,
@@ -156,20 +145,7 @@ def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
     )
 
 
-torch.library.register_fake("dolens::trace", _trace_shapes, lib=_library)
-torch.library.register_autograd("dolens::trace", _backward, setup_context=_setup, lib=_library)
-
-
-def _no_second_derivative(ctx: Any, *gradients: Tensor | None) -> None:
-    raise InputError(
-        "the fast kernels give first derivatives only; trace with backend 'reference' for second"
-    )
-
-
-torch.library.register_fake("dolens::trace_adjoint", _trace_adjoint_shapes, lib=_library)
-torch.library.register_autograd(
-    "dolens::trace_adjoint",
-    _no_second_derivative,
-    setup_context=lambda ctx, inputs, output: None,
-    lib=_library,
-)
+register_shapes("trace", _trace_shapes)
+register_derivative("trace", _backward, _setup)
+register_shapes("trace_adjoint", _trace_adjoint_shapes)
+forbid_derivative("trace_adjoint")

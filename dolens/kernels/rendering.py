@@ -10,6 +10,12 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.registration import (
+    forbid_derivative,
+    operator,
+    register_derivative,
+    register_shapes,
+)
 from dolens.kernels.table import SurfaceTable
 from dolens.kernels.view import View
 
@@ -23,7 +29,7 @@ def _backend(textures: Tensor) -> Any:
     return backend
 
 
-@torch.library.custom_op("dolens::render", mutates_args=())
+@operator
 def render(
     values: Tensor,
     indices: Tensor,
@@ -59,14 +65,14 @@ def render(
     return _backend(textures).render(table, textures, sensor_z, view)
 
 
-@render.register_fake
-def _(values, indices, textures, sensor_z, codes, extras, integers, numbers, replayed, scale):  # noqa: ANN001, ANN202
+def _render_shapes(values, indices, textures, sensor_z, codes, extras, *others):  # noqa: ANN001, ANN002, ANN202
+    integers, numbers, *_ = others
     view = View.from_lists(integers, numbers)
     images, channels = textures.shape[:2]
     return textures.new_empty((images, len(view.depths), channels, view.height, view.width))
 
 
-@torch.library.custom_op("dolens::render_adjoint", mutates_args=())
+@operator
 def render_adjoint(
     values: Tensor,
     indices: Tensor,
@@ -95,8 +101,7 @@ def render_adjoint(
     )
 
 
-@render_adjoint.register_fake
-def _(values, indices, textures, sensor_z, *others):  # noqa: ANN001, ANN002, ANN202
+def _render_adjoint_shapes(values, indices, textures, sensor_z, *others):  # noqa: ANN001, ANN002, ANN202
     return tuple(torch.empty_like(t) for t in (values, indices, textures, sensor_z))
 
 
@@ -115,15 +120,7 @@ def _backward(ctx: Any, of_image: Tensor) -> tuple[Tensor | None, ...]:
     return (*gradients, None, None, None, None, None, None)
 
 
-render.register_autograd(_backward, setup_context=_setup)
-
-
-def _no_second_derivative(ctx: Any, *gradients: Tensor | None) -> None:
-    raise InputError(
-        "the fused renderer gives first derivatives only; use backend 'reference' for second"
-    )
-
-
-render_adjoint.register_autograd(
-    _no_second_derivative, setup_context=lambda ctx, inputs, output: None
-)
+register_shapes("render", _render_shapes)
+register_derivative("render", _backward, _setup)
+register_shapes("render_adjoint", _render_adjoint_shapes)
+forbid_derivative("render_adjoint")

@@ -6,6 +6,12 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.registration import (
+    forbid_derivative,
+    operator,
+    register_derivative,
+    register_shapes,
+)
 
 
 def _backend(points: Tensor) -> Any:
@@ -17,7 +23,7 @@ def _backend(points: Tensor) -> Any:
     return splat_backend
 
 
-@torch.library.custom_op("dolens::splat", mutates_args=())
+@operator
 def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
     """Sum weighted quadratic B-splines, centred on points, onto a grid of pixels.
 
@@ -34,12 +40,11 @@ def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
     return _backend(rows).splat(*points, size)
 
 
-@splat.register_fake
-def _(rows, columns, weight, size):  # noqa: ANN001, ANN202
+def _splat_shapes(rows, columns, weight, size):  # noqa: ANN001, ANN202
     return rows.new_empty((size, size))
 
 
-@torch.library.custom_op("dolens::splat_adjoint", mutates_args=())
+@operator
 def splat_adjoint(
     rows: Tensor, columns: Tensor, weight: Tensor, of_grid: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -48,8 +53,7 @@ def splat_adjoint(
     return _backend(rows).splat_adjoint(*tensors)
 
 
-@splat_adjoint.register_fake
-def _(rows, columns, weight, of_grid):  # noqa: ANN001, ANN202
+def _splat_adjoint_shapes(rows, columns, weight, of_grid):  # noqa: ANN001, ANN202
     return torch.empty_like(rows), torch.empty_like(rows), torch.empty_like(rows)
 
 
@@ -61,15 +65,7 @@ def _backward(ctx: Any, of_grid: Tensor) -> tuple[Tensor | None, ...]:
     return (*splat_adjoint(*ctx.saved_tensors, of_grid), None)
 
 
-splat.register_autograd(_backward, setup_context=_setup)
-
-
-def _no_second_derivative(ctx: Any, *gradients: Tensor | None) -> None:
-    raise InputError(
-        "the fused splat gives first derivatives only; use backend 'reference' for second"
-    )
-
-
-splat_adjoint.register_autograd(
-    _no_second_derivative, setup_context=lambda ctx, inputs, output: None
-)
+register_shapes("splat", _splat_shapes)
+register_derivative("splat", _backward, _setup)
+register_shapes("splat_adjoint", _splat_adjoint_shapes)
+forbid_derivative("splat_adjoint")

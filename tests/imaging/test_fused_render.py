@@ -9,6 +9,8 @@ from dolens.errors import InputError
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.kernels import rendering
+from dolens.optics.rays import Rays, Status
 from dolens.prescriptions import lens_from_prescription
 
 LINES = (656.2725, 587.5618, 486.1327)
@@ -57,6 +59,48 @@ def any_lens(request, root):
             lens.surfaces["5"].x2y.fill_(-4e-6)
             lens.surfaces["5"].y3.fill_(1.1e-5)
     return lens
+
+
+def singlet(last: dict):
+    """A lens whose last surface, the first that a renderer's rays meet, is given."""
+    front = {"type": "sphere", "radius": 30.0, "semi_diameter": 6.0, "thickness": 4.0,
+             "material": "1.5168/64.17"}  # fmt: skip
+    back = {"type": "sphere", "radius": -60.0, "semi_diameter": 6.0, "thickness": 2.0,
+            "material": "air"}  # fmt: skip
+    surfaces = {"1": front, "2": back, "3": {"semi_diameter": 5.0, **last}}
+    return lens_from_prescription(
+        {"name": "Singlet", "surfaces": surfaces, "stop": 1, "sensor": {"distance": 36.0}}
+    )
+
+
+LAST_SURFACES = {
+    "a stop in air": {"type": "plane", "material": "air"},
+    "glass": {"type": "conic", "radius": -80.0, "conic": 0.3, "material": "1.62/60.0"},
+    "hardly any refraction": {"type": "sphere", "radius": -40.0, "material": "1.002/20.0"},
+    # Steep: blue is totally reflected at the rim before red is.
+    "total reflection": {
+        "type": "even_asphere",
+        "radius": 14.0,
+        "a4": 4e-4,
+        "material": "1.9/17.0",
+    },
+}
+
+
+@pytest.mark.parametrize("last", LAST_SURFACES)
+def test_wavelengths_part_at_the_first_surface_they_meet(last):
+    lens, scene = singlet(LAST_SURFACES[last]), PlanarScene([3000.0], LINES)
+    for pitch in (0.0069, 0.6):
+        compare(lens, RayRenderer(Sensor(9, 20, pitch), 5), scene, texture(40))
+    if last == "total reflection":
+        ended = []
+        system, renderer = lens.system(), RayRenderer(Sensor(9, 20, 0.6), 5)
+        view = renderer._view(system, scene, 5, "reference")
+        ray, _ = renderer._samples(system, view, 0, 180)
+        for wavelength in LINES:
+            hit = lens.sensor_to_scene(Rays.from_components(ray, wavelength), first=3)
+            ended.append(hit.status == Status.TIR)
+        assert bool((ended[2] & ~ended[0]).any())
 
 
 def image_and_gradients(lens, backend, renderer, scene, textures, weight, seed=5):
@@ -188,3 +232,21 @@ def test_second_derivatives_are_an_error(wavefront_coding):
     (gradient,) = torch.autograd.grad(image.square().sum(), x3, create_graph=True)
     with pytest.raises(InputError, match="first derivatives only"):
         torch.autograd.grad(gradient, x3)
+
+
+def test_the_operators_are_what_pytorch_asks_of_one(wavefront_coding, monkeypatch):
+    # Schema, shapes without data, and registration of the derivative.
+    calls, lens = [], wavefront_coding(1e-5).requires_grad_()
+    lens.backend, operator = "cpu", rendering.render
+
+    def render(*arguments):
+        calls.append(arguments)
+        return operator(*arguments)
+
+    monkeypatch.setattr(rendering, "render", render)
+    RayRenderer(Sensor(3, 4, 0.0069), 2).render(lens, PlanarScene([6000.0], LINES), texture(12), 0)
+    detached = [a.detach() if isinstance(a, torch.Tensor) else a for a in calls[0]]
+    for index in (0, 1, 2, 3):
+        detached[index].requires_grad_()
+    tests = ("test_schema", "test_faketensor", "test_autograd_registration")
+    torch.library.opcheck(operator, tuple(detached), test_utils=tests)

@@ -7,6 +7,7 @@ from dolens.errors import InputError
 from dolens.imaging.psf import axial_point_spread_functions, splat
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.kernels import splatting
 
 LINES = (656.2725, 587.5618, 486.1327)
 
@@ -84,3 +85,9 @@ def test_second_derivatives_are_an_error():
     (gradient,) = torch.autograd.grad(image.square().sum(), rows, create_graph=True)
     with pytest.raises(InputError, match="first derivatives only"):
         torch.autograd.grad(gradient.sum(), rows)
+
+
+def test_the_operator_is_what_pytorch_asks_of_one():
+    given = [t.requires_grad_() for t in points(20, 9)]
+    tests = ("test_schema", "test_faketensor", "test_autograd_registration")
+    torch.library.opcheck(splatting.splat, (*given, 9), test_utils=tests)
