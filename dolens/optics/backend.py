@@ -61,11 +61,11 @@ def choose_backend(
         reason = f"there are no kernels for {device}"
     elif system.dtype not in _KERNEL_DTYPES:
         reason = f"kernels are of float32 and float64, not {system.dtype}"
+    elif device == "cuda" and not _has_triton():
+        reason = "triton is not installed"
     elif requested == "auto" and reason is None:
         if _transformed(chain(_tensors(system, rays), others)):
             reason = "kernels do not follow torch.func or forward mode"
-        elif device == "cuda" and not _has_triton():
-            reason = "triton is not installed"
     if requested != "auto":
         if device != requested:
             raise InputError(f"backend '{requested}' cannot trace a lens on {device}")
