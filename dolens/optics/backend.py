@@ -63,9 +63,12 @@ def choose_backend(
         reason = f"kernels are of float32 and float64, not {system.dtype}"
     elif device == "cuda" and not _has_triton():
         reason = "triton is not installed"
-    elif requested == "auto" and reason is None:
-        if _transformed(chain(_tensors(system, rays), others)):
-            reason = "kernels do not follow torch.func or forward mode"
+    elif (
+        requested == "auto"
+        and reason is None
+        and _transformed(chain(_tensors(system, rays), others))
+    ):
+        reason = "kernels do not follow torch.func or forward mode"
     if requested != "auto":
         if device != requested:
             raise InputError(f"backend '{requested}' cannot trace a lens on {device}")

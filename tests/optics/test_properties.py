@@ -15,7 +15,7 @@ from dolens.prescriptions import lens_from_prescription
 
 pytestmark = pytest.mark.usefixtures("backend")
 
-LENSES, RAYS = 150, 64
+LENSES, RAYS = 75, 64
 EPSILON = torch.finfo(torch.float64).eps
 CHECKED = settings(
     max_examples=LENSES, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
