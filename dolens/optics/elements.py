@@ -122,6 +122,12 @@ def rotation_matrix(tilt_x: Tensor, tilt_y: Tensor, tilt_z: Tensor) -> Tensor:
     return torch.stack([torch.stack(row) for row in rows])
 
 
+def carriers(spans: Sequence[tuple[int, int]], number: int) -> tuple[int, ...]:
+    """Which elements carry a surface, innermost first, from their first and last surfaces."""
+    inner_first = sorted(range(len(spans)), key=lambda e: (spans[e][1] - spans[e][0], e))
+    return tuple(e for e in inner_first if spans[e][0] <= number <= spans[e][1])
+
+
 def surface_axes(
     elements: Sequence[ElementState], vertices: Sequence[Tensor], surfaces: int
 ) -> list[Axes]:
@@ -132,14 +138,12 @@ def surface_axes(
         vertices: z of every vertex as designed, mm.
         surfaces: how many.
     """
-    inner_first = sorted(
-        range(len(elements)), key=lambda e: (elements[e].last - elements[e].first, e)
-    )
-    motions = {e: _motion(elements[e], vertices) for e in inner_first}
+    motions = [_motion(element, vertices) for element in elements]
+    spans = [(element.first, element.last) for element in elements]
     axes = []
     for number in range(1, surfaces + 1):
         z = vertices[number - 1]
-        carried = tuple(e for e in inner_first if elements[e].first <= number <= elements[e].last)
+        carried = carriers(spans, number)
         if not carried:
             axes.append(Axes((), z))
             continue

@@ -143,10 +143,12 @@ class Lens(nn.Module):
         surfaces = []
         for number, surface in self.surfaces.items():
             # Their own tables: `named_parameters` searches submodules, and takes ten times as long.
-            parameters = {
-                name: values.pop(f"surfaces.{number}.{name}", value)
-                for name, value in (*surface._parameters.items(), *surface._buffers.items())
-            }
+            parameters = {**surface._parameters, **surface._buffers}
+            if values:
+                parameters = {
+                    name: values.pop(f"surfaces.{number}.{name}", value)
+                    for name, value in parameters.items()
+                }
             surfaces.append(SurfaceState(type(surface), parameters, surface.aperture))
         thicknesses = [
             values.pop(f"thicknesses.{number}", gap) for number, gap in self.thicknesses.items()

@@ -5,141 +5,27 @@ gradients flow back through ordinary tensor operations, and derivatives by param
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
+from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import VariableMap
-from dolens.optics.elements import LENS_AXES, Axes, relative_axes
-from dolens.optics.surfaces.base import FAR, SurfaceState
-from dolens.optics.surfaces.clear_aperture import Circle
+from dolens.optics.elements import LENS_AXES, relative_axes
+from dolens.optics.materials import Medium
+from dolens.optics.records import Form, Records, Structure, records, tensor
 from dolens.optics.system import OpticalSystem
 
 Wavelength = float | Sequence[float] | Tensor
 
 
-class _Writer:
-    """Collects records: constants as numbers, and variables with where they are added."""
-
-    def __init__(self) -> None:
-        self.constants: list[float] = []
-        self.codes: list[list[int]] = []
-        self.extras: list[int] = []
-        self.scalars: list[Tensor] = []
-        self.places: list[int] = []
-        self.signs: list[float] = []
-        self.arrays: list[tuple[int, Tensor]] = []
-
-    def step(self, kind: Kind, before: int, after: int, sense: float, number: int) -> list[int]:
-        """Begin a record; its row of codes, to be filled in further."""
-        row = [0] * Code.ROW
-        row[Code.KIND], row[Code.OFFSET] = int(kind), len(self.constants)
-        row[Code.LENGTH] = Slot.HEADER
-        row[Code.BEFORE], row[Code.AFTER] = before, after
-        header = [0.0] * Slot.HEADER
-        header[Slot.SENSE], header[Slot.TAG] = sense, 4.0 * number
-        self.constants += header
-        self.codes.append(row)
-        return row
-
-    def add(self, place: int, value: Tensor | float, sign: float = 1.0) -> None:
-        """Add a number to one already written."""
-        if not isinstance(value, Tensor):
-            self.constants[place] += sign * float(value)
-        elif value.ndim == 0:
-            self.scalars.append(value)
-            self.places.append(place)
-            self.signs.append(sign)
-        else:
-            self.arrays.append((place, value))
-
-    def values(self, like: Tensor) -> Tensor:
-        """The records as one tensor."""
-        options = {"dtype": like.dtype, "device": like.device}
-        values = _tensor(self.constants, np.float64).to(**options)
-        if self.scalars:
-            places = _tensor(self.places, np.int64).to(like.device)
-            signs = _tensor(self.signs, np.float64).to(**options)
-            values = values.index_add(0, places, torch.stack(self.scalars) * signs)
-        if self.arrays:
-            lengths = [array.numel() for _, array in self.arrays]
-            places = torch.cat(
-                [torch.arange(p, p + n) for (p, _), n in zip(self.arrays, lengths, strict=True)]
-            )
-            flat = torch.cat([array.to(**options).reshape(-1) for _, array in self.arrays])
-            values = values.index_add(0, places.to(like.device), flat)
-        return values
-
-    def derivatives(self, variables: Sequence[Tensor]) -> VariableMap:
-        """How the records follow from variables: the very tensors that were added.
-
-        What was computed from variables, as the poses are, is differentiated by autograd.
-        """
-        first, column = {}, 0
-        for variable in variables:
-            first[id(variable)] = column
-            column += variable.numel()
-        places, columns, weights = [], [], []
-        functions: list[tuple[int, Tensor]] = []
-        for value, place, sign in zip(self.scalars, self.places, self.signs, strict=True):
-            if id(value) in first:
-                places.append(place)
-                columns.append(first[id(value)])
-                weights.append(sign)
-            elif value.grad_fn is not None:
-                functions.append((place, sign * value))
-        parts = [_entries(places, columns, weights)]
-        for place, value in self.arrays:
-            if id(value) in first:
-                steps = torch.arange(value.numel())
-                parts.append((steps + place, steps + first[id(value)], torch.ones(len(steps))))
-            elif value.grad_fn is not None:
-                functions.append((place, value))
-        if functions:
-            parts.append(_entries_of_functions(functions, variables, first))
-        return VariableMap(*(torch.cat(p) for p in zip(*parts, strict=True)), count=column)
-
-
-def _tensor(numbers: Sequence, dtype: type) -> Tensor:
-    """A tensor on the CPU; by way of NumPy, which reads lists several times faster."""
-    return torch.from_numpy(np.array(numbers, dtype=dtype))
-
-
-def _entries(
-    places: Sequence[int], columns: Sequence[int], weights: Sequence[float]
-) -> tuple[Tensor, Tensor, Tensor]:
-    return _tensor(places, np.int64), _tensor(columns, np.int64), _tensor(weights, np.float64)
-
-
-def _entries_of_functions(
-    functions: Sequence[tuple[int, Tensor]], variables: Sequence[Tensor], first: dict[int, int]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries of numbers that autograd can follow to the variables."""
-    flat = torch.cat([value.reshape(-1) for _, value in functions])
-    where = torch.cat([torch.arange(p, p + value.numel()) for p, value in functions])
-    found = torch.autograd.grad(
-        flat,
-        variables,
-        torch.eye(len(flat), dtype=flat.dtype),
-        is_grads_batched=True,
-        allow_unused=True,
-    )
-    parts = [_entries([], [], [])]
-    for variable, jacobian in zip(variables, found, strict=True):
-        if jacobian is not None:
-            jacobian = jacobian.reshape(len(flat), -1)
-            row, column = torch.nonzero(jacobian, as_tuple=True)
-            parts.append((where[row], column + first[id(variable)], jacobian[row, column].double()))
-    return tuple(torch.cat(p) for p in zip(*parts, strict=True))
-
-
 def unsupported(system: OpticalSystem) -> str | None:
     """Why the kernels cannot trace a lens, in words that name the surface; None where they can."""
     for number, surface in enumerate(system.surfaces, 1):
-        if surface.shape.packed(surface.parameters) is None:
+        if surface.shape.kernel is None:
             return f"surface {number} ({surface.shape.kind}) has no kernel"
     return None
 
@@ -165,8 +51,8 @@ def pack(
     Raises:
         InputError: a surface without a kernel.
     """
-    writer, media = _write(system, sense, first, last, to_sensor)
-    return _table(writer, system, wavelength, media)
+    layout, scalars, arrays = _lay_out(system, sense, first, last, to_sensor)
+    return _table(layout, system, wavelength, _values(layout, scalars, arrays))
 
 
 def pack_with_variables(
@@ -184,143 +70,148 @@ def pack_with_variables(
         The table, without a graph, and the map of all variables, in the order given.
     """
     with torch.enable_grad():
-        writer, media = _write(system, 1.0, 1, len(system.surfaces), True)
-        entries = writer.derivatives(variables)
+        layout, scalars, arrays = _lay_out(system, 1.0, 1, len(system.surfaces), True)
     with torch.no_grad():
-        return _table(writer, system, wavelengths, media), entries
+        table = _table(layout, system, tuple(wavelengths), _values(layout, scalars, arrays))
+    return table, _variable_map(layout, [*scalars, *arrays], variables)
+
+
+def _lay_out(
+    system: OpticalSystem, sense: float, first: int, last: int, to_sensor: bool
+) -> tuple[Records, list[Tensor], list[Tensor]]:
+    """The layout of the records, and the lens's numbers in its order: scalars, then arrays."""
+    scalars: list[Tensor] = []
+    arrays: list[Tensor] = []
+    forms, apertures = [], []
+    for number, surface in enumerate(system.surfaces, 1):
+        shape = surface.shape
+        if shape.kernel is None:
+            raise InputError(f"surface {number} ({shape.kind}) has no kernel")
+        numbers, count, columns, degree, extras = shape.packed(surface.parameters)
+        sizes = []
+        for value in numbers:
+            sizes.append(None if value is None else value.shape)
+            if value is not None:
+                (arrays if value.ndim else scalars).append(value)
+        forms.append(Form(shape.kernel, count, columns, degree, extras, tuple(sizes)))
+        apertures.append(surface.aperture)
+    scalars += (*system.thicknesses, system.sensor_distance)
+    layout = records(
+        Structure(
+            tuple(forms),
+            tuple(apertures),
+            tuple(system.materials),
+            tuple((element.first, element.last) for element in system.elements),
+            sense,
+            first,
+            last,
+            to_sensor,
+        )
+    )
+    if layout.turns:
+        axes = (LENS_AXES, *system.axes)
+        for now, then in layout.turns:
+            if then:
+                arrays += relative_axes(axes[now], axes[then])
+            else:
+                arrays += (axes[now].origin, axes[now].rotation)
+    return layout, scalars, arrays
+
+
+def _values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
+    """The records as one tensor."""
+    numbers = torch.stack(tuple(scalars))
+    options = {"dtype": numbers.dtype, "device": numbers.device}
+    if arrays:
+        numbers = torch.cat([numbers, *(array.to(**options).reshape(-1) for array in arrays)])
+    constants, signs = layout.constants.to(**options), layout.signs.to(**options)
+    places, sources = layout.places.to(numbers.device), layout.sources.to(numbers.device)
+    return constants.index_add(0, places, numbers.index_select(0, sources) * signs)
 
 
 def _table(
-    writer: _Writer, system: OpticalSystem, wavelength: Wavelength, media: Sequence[int]
+    layout: Records, system: OpticalSystem, wavelength: Wavelength, values: Tensor
 ) -> SurfaceTable:
-    like = system.sensor_distance
-    return SurfaceTable(
-        writer.values(like),
-        _indices(system, wavelength, media).to(like.device),
-        _tensor(writer.codes, np.int64).reshape(-1, Code.ROW),
-        _tensor([*writer.extras, 0], np.int64),
+    indices = _indices(system.materials, wavelength, layout.media, system.device)
+    return SurfaceTable(values, indices, layout.codes, layout.extras)
+
+
+def _variable_map(
+    layout: Records, numbers: Sequence[Tensor], variables: Sequence[Tensor]
+) -> VariableMap:
+    """How the records follow from variables: the very tensors that were packed.
+
+    What was computed from variables, as the poses are, is differentiated by autograd.
+    """
+    first, count = {}, 0
+    for variable in variables:
+        first[id(variable)] = count
+        count += variable.numel()
+    begins = np.cumsum([0, *(number.numel() for number in numbers)])
+    column = np.full(begins[-1], -1, dtype=np.int64)
+    functions = []
+    for number, begin in zip(numbers, begins.tolist(), strict=False):
+        if id(number) in first:
+            size = number.numel()
+            column[begin : begin + size] = first[id(number)] + np.arange(size)
+        elif number.grad_fn is not None:
+            functions.append((begin, number))
+    places, sources = layout.places.numpy(), layout.sources.numpy()
+    signs = layout.signs.numpy()
+    columns = column[sources]
+    kept = columns >= 0
+    parts = [(places[kept], columns[kept], signs[kept])]
+    if functions:
+        of, which, derivative = _derivatives(functions, variables, first)
+        entry, at = np.nonzero(sources[:, None] == of)
+        parts.append((places[entry], which[at], signs[entry] * derivative[at]))
+    return VariableMap(
+        *(torch.from_numpy(np.concatenate(part)) for part in zip(*parts, strict=True)), count=count
     )
 
 
-def _write(
-    system: OpticalSystem, sense: float, first: int, last: int, to_sensor: bool
-) -> tuple[_Writer, list[int]]:
-    """The records, and the media in the order of travel."""
-    numbers = list(range(first, last + 1))
-    if sense < 0.0:
-        numbers.reverse()
-    writer = _Writer()
-    places = system.axes if system.elements else [LENS_AXES] * len(system.surfaces)
-    axes, at = LENS_AXES, 1  # where the rays are: axes, and the vertex that z counts from
-    media: list[int] = []  # of the prescription, in the order of travel
-    for medium, number in enumerate(numbers):
-        surface, place = system.surfaces[number - 1], places[number - 1]
-        before, behind = (number - 1, number) if sense > 0.0 else (number, number - 1)
-        media.append(before)
-        shift = place.elements == axes.elements
-        if not shift:
-            _change_axes(writer, axes, place, medium, sense, number)
-        packed = surface.shape.packed(surface.parameters)
-        if packed is None:
-            raise InputError(f"surface {number} ({surface.shape.kind}) has no kernel")
-        row = writer.step(packed.kind, medium, medium + 1, sense, number)
-        if shift:
-            _shift(writer, system, at, number)
-        row[Code.REFRACTS] = int(system.materials[before] != system.materials[behind])
-        _aperture(writer, row, surface)
-        row[Code.COUNT], row[Code.COLUMNS] = packed.count, packed.columns
-        row[Code.DEGREE], row[Code.EXTRAS] = packed.degree, len(writer.extras)
-        writer.extras += packed.extras
-        for value in packed.numbers:
-            place_of_value = len(writer.constants)
-            size = value.numel() if isinstance(value, Tensor) else 1
-            writer.constants += [0.0] * size
-            writer.add(place_of_value, value)
-        row[Code.LENGTH] = len(writer.constants) - row[Code.OFFSET]
-        axes, at = place, number
-    media.append(numbers[-1] if sense > 0.0 else numbers[-1] - 1)
-    _leave(writer, system, axes, at, sense, len(numbers), to_sensor)
-    return writer, media
+def _derivatives(
+    functions: Sequence[tuple[int, Tensor]], variables: Sequence[Tensor], first: dict[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of numbers that autograd can follow to the variables: source, column and derivative."""
+    flat = torch.cat([value.reshape(-1) for _, value in functions])
+    source = torch.cat([torch.arange(b, b + value.numel()) for b, value in functions])
+    found = torch.autograd.grad(
+        flat,
+        variables,
+        torch.eye(len(flat), dtype=flat.dtype),
+        is_grads_batched=True,
+        allow_unused=True,
+    )
+    parts = []
+    for variable, jacobian in zip(variables, found, strict=True):
+        if jacobian is not None:
+            jacobian = jacobian.reshape(len(flat), -1)
+            row, column = torch.nonzero(jacobian, as_tuple=True)
+            derivative = jacobian[row, column].double()
+            parts.append((source[row], column + first[id(variable)], derivative))
+    none = (source[:0], source[:0], flat[:0].detach().double())
+    return tuple(torch.cat(part).numpy() for part in zip(none, *parts, strict=True))
 
 
-def _shift(writer: _Writer, system: OpticalSystem, at: int, number: int) -> None:
-    """z counts from the vertex of another surface (or of the sensor) from here on.
-
-    Gap by gap: the difference of two positions would have the rounding of both.
-    """
-    place = writer.codes[-1][Code.OFFSET] + Slot.SHIFT
-    gaps = (*system.thicknesses, system.sensor_distance)
-    low, high = sorted((at, number))
-    for gap in gaps[low - 1 : high - 1]:
-        writer.add(place, gap, -1.0 if number > at else 1.0)
-
-
-def _change_axes(
-    writer: _Writer, now: Axes, then: Axes, medium: int, sense: float, number: int
-) -> None:
-    row = writer.step(Kind.CHANGE_AXES, medium, medium, sense, number)
-    step, turn = relative_axes(now, then)
-    writer.add(row[Code.OFFSET] + Slot.STEP, step)
-    writer.add(row[Code.OFFSET] + Slot.TURN, turn)
-
-
-def _aperture(writer: _Writer, row: list[int], surface: SurfaceState) -> None:
-    record = row[Code.OFFSET]
-    writer.constants[record + Slot.LIMIT] = FAR * surface.semi_diameter
-    writer.constants[record + Slot.SCALE] = surface.semi_diameter
-    edge, hole = surface.aperture.edge, surface.aperture.obscuration
-    # A full circle is tested on the way; where there is none it is out of reach.
-    writer.constants[record + Slot.EDGE] = (2.0 * FAR * surface.semi_diameter) ** 2
-    if isinstance(edge, Circle):
-        row[Code.EDGE] = Outline.CIRCLE
-        writer.constants[record + Slot.EDGE] = edge.semi_diameter**2
-    else:
-        row[Code.EDGE] = Outline.RECTANGLE
-        writer.constants[record + Slot.HALF_X] = edge.half_width_x
-        writer.constants[record + Slot.HALF_Y] = edge.half_width_y
-    if isinstance(hole, Circle):
-        row[Code.HOLE] = Outline.CIRCLE
-        writer.constants[record + Slot.HOLE_X] = hole.semi_diameter**2
-    elif hole is not None:
-        row[Code.HOLE] = Outline.RECTANGLE
-        writer.constants[record + Slot.HOLE_X] = hole.half_width_x
-        writer.constants[record + Slot.HOLE_Y] = hole.half_width_y
-
-
-def _leave(
-    writer: _Writer,
-    system: OpticalSystem,
-    axes: Axes,
-    at: int,
-    sense: float,
-    medium: int,
-    to_sensor: bool,
-) -> None:
-    """From the last surface to the lens's axes, or to the sensor plane."""
-    sensor = len(system.surfaces) + 1
-    if axes.rotation is not None:
-        row = writer.step(Kind.LENS_AXES, medium, medium, sense, at)
-        writer.add(row[Code.OFFSET] + Slot.STEP, axes.origin)
-        writer.add(row[Code.OFFSET] + Slot.TURN, axes.rotation)
-        at = 1
-    if to_sensor:
-        writer.step(Kind.SENSOR, medium, medium, sense, sensor)
-        _shift(writer, system, at, sensor)
-        at = sensor
-    exit_z = len(writer.constants)
-    writer.constants.append(0.0)
-    for gap in (*system.thicknesses, system.sensor_distance)[: at - 1]:
-        writer.add(exit_z, gap)
-
-
-def _indices(system: OpticalSystem, wavelength: Wavelength, media: Sequence[int]) -> Tensor:
+def _indices(
+    materials: Sequence[Medium],
+    wavelength: Wavelength,
+    media: tuple[int, ...],
+    device: torch.device,
+) -> Tensor:
     """(media, wavelengths), in double precision whatever the lens's."""
+    used = tuple(materials[k] for k in media)
     if isinstance(wavelength, Tensor):
-        wavelength = wavelength.to(device=system.device, dtype=torch.float64).reshape(-1)
+        wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)
         one = torch.ones_like(wavelength)
-        found = {m: m.index(wavelength) * one for m in {system.materials[k] for k in media}}
-        return torch.stack([found[system.materials[k]] for k in media])
-    several = (wavelength,) if isinstance(wavelength, (int, float)) else wavelength
-    used = {system.materials[k] for k in media}
-    found = {medium: [float(medium.index(w)) for w in several] for medium in used}
-    return _tensor([found[system.materials[k]] for k in media], np.float64)
+        found = {medium: medium.index(wavelength) * one for medium in set(used)}
+        return torch.stack([found[medium] for medium in used])
+    several = (wavelength,) if isinstance(wavelength, (int, float)) else tuple(wavelength)
+    return tensor(_index_rows(used, several), np.float64).to(device)
+
+
+@lru_cache(maxsize=256)
+def _index_rows(media: tuple[Medium, ...], wavelengths: tuple[float, ...]) -> np.ndarray:
+    found = {medium: [float(medium.index(w)) for w in wavelengths] for medium in set(media)}
+    return np.array([found[medium] for medium in media], dtype=np.float64)

@@ -73,6 +73,7 @@ class BSpline(Surface):
     """
 
     kind = "b_spline"
+    kernel = Kind.B_SPLINE
     constants = ("knots_x", "knots_y")
     arrays = ("coefficients", "knots_x", "knots_y")
     optional = ("coefficients", "knots_x", "knots_y", "half_width", "half_width_x", "half_width_y")
@@ -113,11 +114,11 @@ class BSpline(Surface):
         return sag, sx, sy, torch.minimum(_inside(p["knots_x"], x), _inside(p["knots_y"], y))
 
     @classmethod
-    def packed(cls, p: Parameters) -> PackedShape | None:
+    def packed(cls, p: Parameters) -> PackedShape:
         """Knots in x, knots in y, coefficients."""
         rows, columns = p["coefficients"].shape
         numbers = (p["knots_x"], p["knots_y"], p["coefficients"])
-        return PackedShape(Kind.B_SPLINE, numbers, count=rows, columns=columns)
+        return PackedShape(numbers, count=rows, columns=columns)
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

@@ -7,7 +7,7 @@ reaches; their gradient is cut off where the trace ends.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -46,25 +46,22 @@ class Refraction(NamedTuple):
     transmitted: Tensor
 
 
-@dataclass(frozen=True)
-class PackedShape:
-    """A shape as the fast kernels take it.
+class PackedShape(NamedTuple):
+    """The numbers of a shape as its kernel takes them.
 
     Attributes:
-        kind: which kernel; it says what the numbers are, in which order.
-        numbers: scalars and arrays, the latter by rows.
+        numbers: scalars and arrays, the latter by rows; None: zero.
         count: coefficients of an asphere or a polynomial, or rows of a spline.
         columns: of a spline; 1 for a polynomial with a b·z² term.
         degree: highest power of x or y.
         extras: further integers.
     """
 
-    kind: Kind
-    numbers: Sequence[Tensor | float]
+    numbers: tuple[Tensor | None, ...]
     count: int = 0
     columns: int = 0
     degree: int = 0
-    extras: Sequence[int] = ()
+    extras: tuple[int, ...] = ()
 
 
 def safe_sqrt(squared: Tensor) -> Tensor:
@@ -139,12 +136,19 @@ class Surface(nn.Module):
         constants: names among the parameters that no optimizer varies (knots); they are buffers.
         arrays: names that a prescription gives as lists; every other is one number.
         optional: names that a prescription may leave out; every other is then zero.
+        kernel: what the fast kernels call it; None: they have none, and the reference traces.  It
+            is not inherited, since a subclass may have another sag.
     """
 
     kind: ClassVar[str] = ""
+    kernel: ClassVar[Kind | None] = None
     constants: ClassVar[tuple[str, ...]] = ()
     arrays: ClassVar[tuple[str, ...]] = ()
     optional: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.kernel = cls.__dict__.get("kernel")
 
     def __init__(
         self,
@@ -195,9 +199,9 @@ class Surface(nn.Module):
         raise NotImplementedError
 
     @classmethod
-    def packed(cls, p: Parameters) -> PackedShape | None:
-        """The shape for the fast kernels; None, as here, where there is no kernel for it."""
-        return None
+    def packed(cls, p: Parameters) -> PackedShape:
+        """The numbers that `kernel` takes; a shape without one is never asked."""
+        raise NotImplementedError
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

@@ -71,6 +71,7 @@ class Conic(Surface):
     """A conic of revolution with curvature c (1/mm) and conic constant k (S1 without a_2i)."""
 
     kind = "conic"
+    kernel = Kind.CONIC
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -125,9 +126,9 @@ class Conic(Surface):
         return nx * inverse, ny * inverse, nz * inverse
 
     @classmethod
-    def packed(cls, p: Parameters) -> PackedShape | None:
+    def packed(cls, p: Parameters) -> PackedShape:
         """c, k."""
-        return PackedShape(Kind.CONIC, (p["curvature"], p["conic"]))
+        return PackedShape((p["curvature"], p["conic"]))
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
@@ -144,6 +145,7 @@ class Sphere(Conic):
     """A sphere of curvature c = 1/R (1/mm); c = 0 is a plane whose curvature can move."""
 
     kind = "sphere"
+    kernel = Kind.SPHERE
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -173,6 +175,6 @@ class Sphere(Conic):
         return -c * x, -c * y, 1.0 - c * z
 
     @classmethod
-    def packed(cls, p: Parameters) -> PackedShape | None:
+    def packed(cls, p: Parameters) -> PackedShape:
         """c."""
-        return PackedShape(Kind.SPHERE, (p["curvature"],))
+        return PackedShape((p["curvature"],))

@@ -18,6 +18,7 @@ class EvenAsphere(Conic):
     """s(r) = conic + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power)."""
 
     kind = "even_asphere"
+    kernel = Kind.EVEN_ASPHERE
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -52,13 +53,13 @@ class EvenAsphere(Conic):
         return sag, 2.0 * x * slope, 2.0 * y * slope, exists
 
     @classmethod
-    def packed(cls, p: Parameters) -> PackedShape | None:
+    def packed(cls, p: Parameters) -> PackedShape:
         """c, k, a4, a6, ...: all powers up to the highest, in groups of four."""
         powers = [int(name[1:]) for name in p if _POWER.fullmatch(name)]
         count = -(-(max(powers, default=2) // 2 - 1) // 4) * 4
-        coefficients = [p.get(f"a{2 * i + 4}", 0.0) for i in range(count)]
+        coefficients = [p.get(f"a{2 * i + 4}") for i in range(count)]
         numbers = (p["curvature"], p["conic"], *coefficients)
-        return PackedShape(Kind.EVEN_ASPHERE, numbers, count=count)
+        return PackedShape(numbers, count=count)
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:

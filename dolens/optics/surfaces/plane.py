@@ -20,6 +20,7 @@ class Plane(Surface):
     """A flat refracting surface; it has no parameters."""
 
     kind = "plane"
+    kernel = Kind.PLANE
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -56,9 +57,9 @@ class Plane(Surface):
         return Refraction(ratio * l, ratio * m, sense * safe_sqrt(squared), squared.detach())
 
     @classmethod
-    def packed(cls, p: Parameters) -> PackedShape | None:
+    def packed(cls, p: Parameters) -> PackedShape:
         """No numbers."""
-        return PackedShape(Kind.PLANE, ())
+        return PackedShape(())
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
@@ -75,3 +76,4 @@ class Aperture(Plane):
     """A plane stop: it clips, and does not refract (except behind an `occluder` medium)."""
 
     kind = "aperture"
+    kernel = Kind.PLANE

@@ -30,6 +30,7 @@ class XYPolynomial(Surface):
     """
 
     kind = "xy_polynomial"
+    kernel = Kind.XY_POLYNOMIAL
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -49,17 +50,16 @@ class XYPolynomial(Surface):
         return 2.0 * polynomial / (1.0 + root), px / root, py / root, discriminant.detach()
 
     @classmethod
-    def packed(cls, p: Parameters) -> PackedShape | None:
+    def packed(cls, p: Parameters) -> PackedShape:
         """b, then the coefficients, and their powers as extras."""
         terms = [(powers, a) for n, a in p.items() if (powers := monomial_powers(n)) is not None]
         flat = [power for powers, _ in terms for power in powers]
         return PackedShape(
-            Kind.XY_POLYNOMIAL,
-            (p.get("b", 0.0), *(a for _, a in terms)),
+            (p.get("b"), *(a for _, a in terms)),
             count=len(terms),
             columns=int("b" in p),
             degree=max(flat, default=0),
-            extras=flat,
+            extras=tuple(flat),
         )
 
     @classmethod

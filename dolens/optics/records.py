@@ -1,0 +1,251 @@
+"""How a table's records follow from a lens's numbers: known from its structure alone.
+
+Structure is what stays while a lens is optimised: kinds of surfaces, apertures, media, which
+elements carry what.  So records are laid out once, and packing is then one gather and one sum.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.kernels.table import Code, Kind, Outline, Slot
+from dolens.optics.elements import carriers
+from dolens.optics.materials import Medium
+from dolens.optics.surfaces.base import FAR
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+
+
+class Form(NamedTuple):
+    """A shape without its numbers; see `PackedShape`.
+
+    Attributes:
+        kind: which kernel.
+        count: as in `PackedShape`, and the three that follow.
+        columns: of a spline; 1 for a polynomial with a b·z² term.
+        degree: highest power of x or y.
+        extras: further integers.
+        sizes: the shape of each number's tensor; None: the number is zero.
+    """
+
+    kind: Kind
+    count: int
+    columns: int
+    degree: int
+    extras: tuple[int, ...]
+    sizes: tuple[torch.Size | None, ...]
+
+
+class Structure(NamedTuple):
+    """What the layout of the records depends on.
+
+    Attributes:
+        forms: of all the lens's surfaces.
+        apertures: of all of them.
+        materials: before surface 1 and after each surface.
+        elements: first and last surface of each element.
+        sense: +1 from the object towards the sensor, -1 backwards.
+        first: number of the first surface that is packed, as the prescription counts.
+        last: number of the last.
+        to_sensor: go on to the sensor plane (forward only).
+    """
+
+    forms: tuple[Form, ...]
+    apertures: tuple[ClearAperture, ...]
+    materials: tuple[Medium, ...]
+    elements: tuple[tuple[int, int], ...]
+    sense: float
+    first: int
+    last: int
+    to_sensor: bool
+
+
+@dataclass(frozen=True)
+class Records:
+    """Records as constants plus signed numbers of the lens: values[places] += signs·x[sources].
+
+    The lens's numbers x come in this order: the scalars of all surfaces, the gaps and the sensor's
+    distance; the arrays of all surfaces; then step (3) and turn (9) of each change of axes.
+
+    Attributes:
+        constants: (V,), float64.
+        places: (E,), int64.
+        sources: (E,), int64.
+        signs: (E,), float64.
+        codes: (steps, Code.ROW), int64; shared, not to be written to.
+        extras: int64; likewise.
+        media: places in `materials`, in the order of travel.
+        turns: surfaces whose axes rays leave and enter; 0 stands for the lens's own axes, and a
+            last pair (number, 0) for rays that end in them.
+    """
+
+    constants: Tensor
+    places: Tensor
+    sources: Tensor
+    signs: Tensor
+    codes: Tensor
+    extras: Tensor
+    media: tuple[int, ...]
+    turns: tuple[tuple[int, int], ...]
+
+
+def tensor(numbers: Sequence, dtype: type) -> Tensor:
+    """A tensor on the CPU; by way of NumPy, which reads lists several times faster."""
+    return torch.from_numpy(np.array(numbers, dtype=dtype))
+
+
+@lru_cache(maxsize=256)
+def records(structure: Structure) -> Records:
+    """Lay out the steps of a lens in the order that light of this sense meets them."""
+    return _Writer(structure).write()
+
+
+class _Writer:
+    """Collects the records of one structure."""
+
+    def __init__(self, structure: Structure) -> None:
+        self.structure = structure
+        self.constants: list[float] = []
+        self.codes: list[list[int]] = []
+        self.extras: list[int] = []
+        self.entries: list[tuple[int, int, float]] = []  # place, source, sign
+        self.turns: list[tuple[int, int]] = []
+        # Where the numbers of each surface, the gaps, and those of the turns begin in x.
+        sizes = [[size for size in form.sizes if size is not None] for form in structure.forms]
+        self.scalar, self.array, place = [], [], 0
+        for of_surface in sizes:
+            self.scalar.append(place)
+            place += sum(size == () for size in of_surface)
+        self.gaps = place
+        place += len(structure.forms)
+        for of_surface in sizes:
+            self.array.append(place)
+            place += sum(size.numel() for size in of_surface if size != ())
+        self.of_turns = place
+
+    def write(self) -> Records:
+        """All records, and the last number, which is added to z of the rays that leave."""
+        s = self.structure
+        numbers = list(range(s.first, s.last + 1))
+        if s.sense < 0.0:
+            numbers.reverse()
+        carried: tuple[int, ...] = ()  # the elements whose axes the rays are in
+        now, at = 0, 1  # the surface that rays left last, and the vertex that z counts from
+        media = []
+        for medium, number in enumerate(numbers):
+            before, behind = (number - 1, number) if s.sense > 0.0 else (number, number - 1)
+            media.append(before)
+            then = carriers(s.elements, number)
+            if then != carried:
+                row = self.step(Kind.CHANGE_AXES, medium, medium, number)
+                self.turn(row, now, number)
+            row = self.step(s.forms[number - 1].kind, medium, medium + 1, number)
+            if then == carried:
+                self.shift(row, at, number)
+            row[Code.REFRACTS] = int(s.materials[before] != s.materials[behind])
+            self.aperture(row, s.apertures[number - 1])
+            self.shape(row, number)
+            carried, now, at = then, number, number
+        media.append(numbers[-1] if s.sense > 0.0 else numbers[-1] - 1)
+        self.leave(now if carried else 0, at, len(numbers))
+        places, sources, signs = zip(*self.entries, strict=True) if self.entries else ((), (), ())
+        return Records(
+            constants=tensor(self.constants, np.float64),
+            places=tensor(places, np.int64),
+            sources=tensor(sources, np.int64),
+            signs=tensor(signs, np.float64),
+            codes=tensor(self.codes, np.int64).reshape(-1, Code.ROW),
+            extras=tensor([*self.extras, 0], np.int64),
+            media=tuple(media),
+            turns=tuple(self.turns),
+        )
+
+    def step(self, kind: Kind, before: int, after: int, number: int) -> list[int]:
+        """Begin a record; its row of codes, to be filled in further."""
+        row = [0] * Code.ROW
+        row[Code.KIND], row[Code.OFFSET] = int(kind), len(self.constants)
+        row[Code.LENGTH] = Slot.HEADER
+        row[Code.BEFORE], row[Code.AFTER] = before, after
+        header = [0.0] * Slot.HEADER
+        header[Slot.SENSE], header[Slot.TAG] = self.structure.sense, 4.0 * number
+        self.constants += header
+        self.codes.append(row)
+        return row
+
+    def shape(self, row: list[int], number: int) -> None:
+        """The numbers of a surface's shape, after its header."""
+        form = self.structure.forms[number - 1]
+        row[Code.COUNT], row[Code.COLUMNS] = form.count, form.columns
+        row[Code.DEGREE], row[Code.EXTRAS] = form.degree, len(self.extras)
+        self.extras += form.extras
+        scalar, array = self.scalar[number - 1], self.array[number - 1]
+        for size in form.sizes:
+            count = 1 if size is None else size.numel()
+            if size is not None:
+                source = scalar if size == () else array
+                self.add(len(self.constants), source, count)
+                scalar, array = (scalar + 1, array) if size == () else (scalar, array + count)
+            self.constants += [0.0] * count
+        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET]
+
+    def add(self, place: int, source: int, count: int = 1, sign: float = 1.0) -> None:
+        """Neighbouring numbers of the lens are added to neighbouring places."""
+        self.entries += [(place + i, source + i, sign) for i in range(count)]
+
+    def shift(self, row: list[int], at: int, number: int) -> None:
+        """z counts from the vertex of another surface (or of the sensor) from here on.
+
+        Gap by gap: the difference of two positions would have the rounding of both.
+        """
+        low, high = sorted((at, number))
+        for gap in range(low - 1, high - 1):
+            sign = -1.0 if number > at else 1.0
+            self.add(row[Code.OFFSET] + Slot.SHIFT, self.gaps + gap, sign=sign)
+
+    def turn(self, row: list[int], now: int, then: int) -> None:
+        """Rays go from the axes of a surface to those of another."""
+        source = self.of_turns + 12 * len(self.turns)
+        self.add(row[Code.OFFSET] + Slot.STEP, source, 3)
+        self.add(row[Code.OFFSET] + Slot.TURN, source + 3, 9)
+        self.turns.append((now, then))
+
+    def aperture(self, row: list[int], aperture: ClearAperture) -> None:
+        """What of a surface light passes."""
+        values, record = self.constants, row[Code.OFFSET]
+        edge, hole = aperture.edge, aperture.obscuration
+        values[record + Slot.LIMIT] = FAR * edge.reach
+        values[record + Slot.SCALE] = edge.reach
+        # A full circle is tested on the way; where there is none it is out of reach.
+        values[record + Slot.EDGE] = (2.0 * FAR * edge.reach) ** 2
+        if isinstance(edge, Circle):
+            row[Code.EDGE] = Outline.CIRCLE
+            values[record + Slot.EDGE] = edge.semi_diameter**2
+        else:
+            row[Code.EDGE] = Outline.RECTANGLE
+            values[record + Slot.HALF_X] = edge.half_width_x
+            values[record + Slot.HALF_Y] = edge.half_width_y
+        if isinstance(hole, Circle):
+            row[Code.HOLE] = Outline.CIRCLE
+            values[record + Slot.HOLE_X] = hole.semi_diameter**2
+        elif hole is not None:
+            row[Code.HOLE] = Outline.RECTANGLE
+            values[record + Slot.HOLE_X] = hole.half_width_x
+            values[record + Slot.HOLE_Y] = hole.half_width_y
+
+    def leave(self, carried: int, at: int, medium: int) -> None:
+        """From the last surface, which an element may carry, to the lens's axes or the sensor."""
+        sensor = len(self.structure.forms) + 1
+        if carried:
+            self.turn(self.step(Kind.LENS_AXES, medium, medium, at), carried, 0)
+            at = 1
+        if self.structure.to_sensor:
+            self.shift(self.step(Kind.SENSOR, medium, medium, sensor), at, sensor)
+            at = sensor
+        exit_z = len(self.constants)
+        self.constants.append(0.0)
+        for gap in range(at - 1):
+            self.add(exit_z, self.gaps + gap)
