@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VariableMap:
     """d(values)/d(variables), a sparse matrix in lists of its entries.
 

@@ -6,6 +6,7 @@ gradients flow back through ordinary tensor operations, and derivatives by param
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -147,26 +148,40 @@ def _variable_map(
     for variable in variables:
         first[id(variable)] = count
         count += variable.numel()
-    begins = np.cumsum([0, *(number.numel() for number in numbers)])
-    column = np.full(begins[-1], -1, dtype=np.int64)
-    functions = []
-    for number, begin in zip(numbers, begins.tolist(), strict=False):
-        if id(number) in first:
-            size = number.numel()
-            column[begin : begin + size] = first[id(number)] + np.arange(size)
-        elif number.grad_fn is not None:
-            functions.append((begin, number))
-    places, sources = layout.places.numpy(), layout.sources.numpy()
-    signs = layout.signs.numpy()
-    columns = column[sources]
-    kept = columns >= 0
-    parts = [(places[kept], columns[kept], signs[kept])]
-    if functions:
-        of, which, derivative = _derivatives(functions, variables, first)
-        entry, at = np.nonzero(sources[:, None] == of)
-        parts.append((places[entry], which[at], signs[entry] * derivative[at]))
+    sizes = tuple(number.numel() for number in numbers)
+    known = _map_of_numbers(layout, sizes, tuple(first.get(id(n), -1) for n in numbers), count)
+    begins = accumulate(sizes, initial=0)
+    functions = [
+        (begin, number)
+        for begin, number in zip(begins, numbers, strict=False)
+        if number.grad_fn is not None
+    ]
+    if not functions:
+        return known
+    source, column, derivative = _derivatives(functions, variables, first)
+    entry, of = np.nonzero(layout.sources.numpy()[:, None] == source)
     return VariableMap(
-        *(torch.from_numpy(np.concatenate(part)) for part in zip(*parts, strict=True)), count=count
+        torch.cat([known.places, layout.places[entry]]),
+        torch.cat([known.columns, torch.from_numpy(column[of])]),
+        torch.cat([known.weights, layout.signs[entry] * torch.from_numpy(derivative[of])]),
+        count=count,
+    )
+
+
+@lru_cache(maxsize=256)
+def _map_of_numbers(
+    layout: Records, sizes: tuple[int, ...], columns: tuple[int, ...], count: int
+) -> VariableMap:
+    """The map of those of the lens's numbers that are variables, from the first column of each."""
+    column = np.concatenate(
+        [
+            np.full(size, -1) if first < 0 else first + np.arange(size)
+            for size, first in zip(sizes, columns, strict=True)
+        ]
+    )[layout.sources.numpy()]
+    kept = torch.from_numpy(column >= 0)
+    return VariableMap(
+        layout.places[kept], torch.from_numpy(column)[kept], layout.signs[kept], count=count
     )
 
 

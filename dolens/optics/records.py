@@ -64,7 +64,7 @@ class Structure(NamedTuple):
     to_sensor: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Records:
     """Records as constants plus signed numbers of the lens: values[places] += signs·x[sources].
 

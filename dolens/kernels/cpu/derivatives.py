@@ -1,6 +1,8 @@
 """Running the drivers of Jacobians and of least squares on tensors."""
 
 from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -125,47 +127,64 @@ class _Derivatives:
         job[Job.OUTPUTS], job[Job.VARIABLES], job[Job.CHUNK] = len(outputs), variables.count, chunk
         self._seeds = np.array([OUTPUT_ROWS[name] for name in outputs], dtype=np.int64)
         job[Job.OUTPUT_ROWS] = self._seeds.ctypes.data
-        self._set_entries(table, variables)
-
-    def _set_entries(self, table: SurfaceTable, variables: VariableMap) -> None:
-        """The map by steps; coefficients of splines are looked up by their place instead."""
-        codes, job = table.codes.numpy(), self.program.job
-        # The last number moves z of the rays only, which is no output.
-        kept = variables.places.numpy() < table.values.numel() - 1
-        places, columns, weights = (
-            array.numpy()[kept]
-            for array in (variables.places, variables.columns, variables.weights)
-        )
-        steps = np.searchsorted(codes[:, Code.OFFSET], places, side="right") - 1
-        rows = places - codes[steps, Code.OFFSET] + COTANGENT_HEADER
-        # A sweep ends at the first step that any variable belongs to.
-        job[Job.FIRST_STEP] = steps.min(initial=codes.shape[0])
-        local = (codes[steps, Code.KIND] == Kind.B_SPLINE) & (
-            rows >= COTANGENT_HEADER + Slot.HEADER
-        )
-        if local.any():
-            self._spline = np.full(table.values.numel(), -1, dtype=np.int64)
-            self._spline[places[local]] = columns[local]
-            job[Job.SPLINE_COLUMNS] = self._spline.ctypes.data
-        # By steps; after the last come columns that begin as zero: nothing overwrites them.
-        order = np.argsort(steps, kind="stable")
-        order = order[~local[order]]
-        rows, columns, weights, steps = (a[order] for a in (rows, columns, weights, steps))
-        # A sweep takes the entries last first: the last of a column is the one that comes first.
-        last = np.full(variables.count, -1, dtype=np.int64)
-        last[columns] = np.arange(len(columns))
-        empty = np.flatnonzero(last < 0)
-        is_first = np.zeros(len(columns), dtype=np.int64)
-        is_first[last[last >= 0]] = 1
-        end = len(columns) + len(empty)
-        padding = np.zeros_like(empty)
-        self._entries = (
-            np.append(np.searchsorted(steps, np.arange(codes.shape[0] + 1)), end),
-            np.append(rows, padding),
-            np.append(columns, empty),
-            np.append(weights, padding.astype(np.float64)),
-            np.append(is_first, padding + 1),
-        )
+        self._entries = _entries(table.codes.numpy().tobytes(), table.values.numel(), variables)
+        job[Job.FIRST_STEP] = self._entries.first_step
+        if self._entries.spline is not None:
+            job[Job.SPLINE_COLUMNS] = self._entries.spline.ctypes.data
         names = ("ENTRIES", "ENTRY_ROWS", "ENTRY_COLUMNS", "ENTRY_WEIGHTS", "ENTRY_FIRST")
-        for name, array in zip(names, self._entries, strict=True):
+        for name, array in zip(names, self._entries.arrays, strict=True):
             job[getattr(Job, name)] = array.ctypes.data
+
+
+class _Entries(NamedTuple):
+    """A map of variables as the drivers take it.
+
+    Attributes:
+        first_step: a sweep ends here, at the first step that any variable belongs to.
+        spline: for each number of the table its column, or -1; None without splines' coefficients.
+        arrays: where the entries of each step begin; then of each entry the row of the cotangents,
+            the column, the weight, and whether it is the first that a sweep brings to its column.
+    """
+
+    first_step: int
+    spline: np.ndarray | None
+    arrays: tuple[np.ndarray, ...]
+
+
+@lru_cache(maxsize=256)
+def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
+    """The map by steps; coefficients of splines are looked up by their place instead."""
+    codes = np.frombuffer(codes_, dtype=np.int64).reshape(-1, Code.ROW)
+    # The last number moves z of the rays only, which is no output.
+    kept = variables.places.numpy() < values - 1
+    places, columns, weights = (
+        array.numpy()[kept] for array in (variables.places, variables.columns, variables.weights)
+    )
+    steps = np.searchsorted(codes[:, Code.OFFSET], places, side="right") - 1
+    rows = places - codes[steps, Code.OFFSET] + COTANGENT_HEADER
+    first_step = int(steps.min(initial=codes.shape[0]))
+    local = (codes[steps, Code.KIND] == Kind.B_SPLINE) & (rows >= COTANGENT_HEADER + Slot.HEADER)
+    spline = None
+    if local.any():
+        spline = np.full(values, -1, dtype=np.int64)
+        spline[places[local]] = columns[local]
+    # By steps; after the last come columns that begin as zero: nothing overwrites them.
+    order = np.argsort(steps, kind="stable")
+    order = order[~local[order]]
+    rows, columns, weights, steps = (a[order] for a in (rows, columns, weights, steps))
+    # A sweep takes the entries last first: the last of a column is the one that comes first.
+    last = np.full(variables.count, -1, dtype=np.int64)
+    last[columns] = np.arange(len(columns))
+    empty = np.flatnonzero(last < 0)
+    is_first = np.zeros(len(columns), dtype=np.int64)
+    is_first[last[last >= 0]] = 1
+    end = len(columns) + len(empty)
+    padding = np.zeros_like(empty)
+    arrays = (
+        np.append(np.searchsorted(steps, np.arange(codes.shape[0] + 1)), end),
+        np.append(rows, padding),
+        np.append(columns, empty),
+        np.append(weights, padding.astype(np.float64)),
+        np.append(is_first, padding + 1),
+    )
+    return _Entries(first_step, spline, arrays)
