@@ -8,7 +8,7 @@ the relative stop coordinates and R the stop's semi-diameter: F(q) = 0, two equa
 
 It follows the solution along a homotopy: at t the field angle is t times the one asked for, and so
 is the point on the stop.  At t = 0 the axis is the solution, or nearly.  Each step is predicted
-along the tangent, dq/dt = -J⁻¹ ∂F/∂t with J = ∂F/∂q from derivatives of the trace in reverse mode, and
+along the tangent, dq/dt = -J⁻¹ ∂F/∂t with J = ∂F/∂q, both swept back through the trace, and
 corrected by Newton's iteration.  Corrections that do not halve F, or that lose the ray, send it
 back to the last solution with a quarter of the step: this is what damps Newton's iteration, and
 what keeps it on the branch that starts at the axis.  All of it runs outside the autograd graph; one
