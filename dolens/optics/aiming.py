@@ -8,7 +8,7 @@ the relative stop coordinates and R the stop's semi-diameter: F(q) = 0, two equa
 
 It follows the solution along a homotopy: at t the field angle is t times the one asked for, and so
 is the point on the stop.  At t = 0 the axis is the solution, or nearly.  Each step is predicted
-along the tangent, dq/dt = -J⁻¹ ∂F/∂t with J = ∂F/∂q from forward-mode derivatives of the trace, and
+along the tangent, dq/dt = -J⁻¹ ∂F/∂t with J = ∂F/∂q, both swept back through the trace, and
 corrected by Newton's iteration.  Corrections that do not halve F, or that lose the ray, send it
 back to the last solution with a quarter of the step: this is what damps Newton's iteration, and
 what keeps it on the branch that starts at the axis.  All of it runs outside the autograd graph; one
@@ -222,7 +222,7 @@ def _follow(problem: _Problem) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _evaluate(problem: _Problem, q: Tensor, t: Tensor) -> _Evaluation:
-    """F and its derivatives, by one trace of three copies of the rays with one tangent each."""
+    """F and its derivatives: a trace of two copies of the rays, swept back once, x and y apart."""
     system, wavelength, near, tangents, target = problem
     tangent = tangents.norm(dim=-1)
     angle = torch.atan(tangent)
@@ -232,16 +232,15 @@ def _evaluate(problem: _Problem, q: Tensor, t: Tensor) -> _Evaluation:
         turned = torch.tan(t * angle)[..., None] * azimuth
         return _miss(system, wavelength, near, turned, t[..., None] * target, q)
 
-    basis = torch.eye(3, dtype=q.dtype, device=q.device)
-    ones = (1,) * t.ndim
-    tangent_q = basis[:, :2].reshape(3, *ones, 2).expand(3, *q.shape).contiguous()
-    tangent_t = basis[:, 2].reshape(3, *ones).expand(3, *t.shape).contiguous()
-    copies = (q.expand(3, *q.shape).contiguous(), t.expand(3, *t.shape).contiguous())
-    residual, slopes, reached = torch.func.jvp(miss, copies, (tangent_q, tangent_t), has_aux=True)
+    copies = (q.expand(2, *q.shape).contiguous(), t.expand(2, *t.shape).contiguous())
+    residual, pull_back, reached = torch.func.vjp(miss, *copies, has_aux=True)
+    # Of the first copy the x is derived, of the second the y.
+    component = torch.eye(2, dtype=q.dtype, device=q.device).reshape(2, *(1,) * t.ndim, 2)
+    of_q, of_t = pull_back(component.expand(residual.shape))
     return _Evaluation(
         residual[0].detach(),
-        torch.stack((slopes[0], slopes[1]), -1).detach(),
-        slopes[2].detach(),
+        torch.stack((of_q[0], of_q[1]), -2).detach(),
+        torch.stack((of_t[0], of_t[1]), -1).detach(),
         reached[0],
     )
 

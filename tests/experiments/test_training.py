@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from experiments.training import run
 
 EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experiment").glob("*.yaml"))
 UNTESTED = ["test=false", "objective=train/loss"]
+UNPICTURED = ["callbacks.pictures=null"]
 WAVEFRONT_CODING = ["experiment=wavefront_coding", *TINY, *TINY_NETWORK]
 
 
@@ -96,7 +98,7 @@ def test_the_last_checkpoint_is_the_end_of_the_run_whichever_was_best(composed, 
 
 
 def test_training_moves_the_plate_and_the_final_prescription_holds_it(composed, tmp_path):
-    run(composed(*WAVEFRONT_CODING))
+    run(composed(*WAVEFRONT_CODING, *UNTESTED, *UNPICTURED))
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     initial = load_lens(tmp_path / "run" / "lens" / "initial.yaml", dtype=torch.float32)
     final = load_lens(tmp_path / "run" / "lens" / "final.yaml", dtype=torch.float32)
@@ -108,13 +110,17 @@ def test_training_moves_the_plate_and_the_final_prescription_holds_it(composed, 
 
 
 def test_the_baseline_keeps_its_plate_flat(composed, tmp_path):
-    run(composed("experiment=wavefront_coding_baseline", *TINY, *TINY_NETWORK))
+    run(
+        composed(
+            "experiment=wavefront_coding_baseline", *TINY, *TINY_NETWORK, *UNTESTED, *UNPICTURED
+        )
+    )
     lens = load_lens(tmp_path / "run" / "lens" / "final.yaml")
     assert all(float(p) == 0.0 for p in lens.surfaces["5"].parameters())
 
 
 def test_bounds_hold_by_projection(composed, tmp_path):
-    run(composed(*WAVEFRONT_CODING, "learning_rates.optics=100.0"))
+    run(composed(*WAVEFRONT_CODING, *UNTESTED, *UNPICTURED, "learning_rates.optics=100.0"))
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     plate = [v for name, v in metrics.items() if name.startswith("variables/")]
     assert max(abs(v) for v in plate) == pytest.approx(4e-5, rel=1e-6)
@@ -316,10 +322,18 @@ def test_a_pickled_object_is_no_checkpoint(composed, tmp_path):
         run(composed(*WAVEFRONT_CODING, f"ckpt_path={tmp_path / 'bad.ckpt'}"))
 
 
-@pytest.mark.parametrize("override", ["loss.tv_wieght=1", "lens.surfaces.1.material=ari"])
-def test_the_command_line_prints_one_line_and_fails(root, tmp_path, override):
-    done = train_py(root, *WAVEFRONT_CODING, override, f"hydra.run.dir={tmp_path}")
-    assert done.returncode == 1
-    errors = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(errors) == 1, done.stderr
-    assert override.split("=")[0].split(".")[-1] in errors[0] or "ari" in errors[0]
+def test_the_command_line_prints_one_line_and_fails(root, tmp_path):
+    # Hydra refuses the one and the lens the other; most of the time is that of importing.
+    mistakes = {"loss.tv_wieght=1": "tv_wieght", "lens.surfaces.1.material=ari": "'ari'"}
+
+    def refused(override):
+        folder = tmp_path / override.split("=")[0]
+        return train_py(root, *WAVEFRONT_CODING, override, f"hydra.run.dir={folder}")
+
+    with ThreadPoolExecutor() as together:
+        results = list(together.map(refused, mistakes))
+    for done, named in zip(results, mistakes.values(), strict=True):
+        assert done.returncode == 1
+        errors = [line for line in done.stderr.splitlines() if line.strip()]
+        assert len(errors) == 1, done.stderr
+        assert named in errors[0]

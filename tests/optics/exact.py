@@ -7,6 +7,7 @@ quadric or by bracketing, and derivatives are differences at 80 digits.  It take
 """
 
 import random
+from functools import lru_cache
 
 import mpmath
 import numpy as np
@@ -18,6 +19,8 @@ mp.dps = 80
 
 OK, VIGNETTED, TIR, MISSED = 0, 1, 2, 3
 SAMPLES = 24
+# Half the bracket about a distance that is known already, over the surface's semi-diameter.
+NEARBY = mp.mpf(10) ** -12
 SLOPE_STEP = mp.mpf(10) ** -25
 DERIVATIVE_STEP = mp.mpf(10) ** -18
 
@@ -38,8 +41,10 @@ def values_of(lens):
     return values
 
 
-def trace(lens, values, origin, direction, wavelength):
-    """Status, surface where it arose, sensor point and optical path of one ray.
+def trace(lens, values, origin, direction, wavelength, near=None):
+    """Status, surface where it arose, sensor point, optical path and distances of one ray.
+
+    The distances are those that it goes to each surface.
 
     Args:
         lens: what surfaces, media and elements there are.
@@ -47,10 +52,12 @@ def trace(lens, values, origin, direction, wavelength):
         origin: three numbers, mm.
         direction: three numbers; used as they are.
         wavelength: nm.
+        near: distances of nearly the same ray through nearly the same lens: where to look first.
     """
     p, d = mp.matrix(origin), mp.matrix(direction)
     status, surface_number, path = OK, 0, mp.mpf(0)
     z = mp.mpf(0)
+    distances = []
     indices = [mp.mpf(m.a) + mp.mpf(m.b) / mp.mpf(wavelength) ** 2 for m in lens.materials]
     for i, (number, surface) in enumerate(lens.surfaces.items()):
         own = {
@@ -58,33 +65,34 @@ def trace(lens, values, origin, direction, wavelength):
             for name, v in values.items()
             if name.startswith(f"surfaces.{number}.")
         }
-        own |= {name: [mp.mpf(float(k)) for k in b] for name, b in surface.named_buffers()}
+        own |= {name: tuple(mp.mpf(float(k)) for k in b) for name, b in surface.named_buffers()}
         rotation, vertex = _place(lens, values, i + 1, z)
         q, e = rotation.T * (p - vertex), rotation.T * d
-        t = _meet(surface.kind, own, surface.semi_diameter, q, e)
+        guess = None if near is None else near[i]
+        t, sx, sy = _meet(surface.kind, own, surface.semi_diameter, q, e, guess)
         if t is None:
-            return MISSED, i + 1, None, None
+            return MISSED, i + 1, None, None, None
+        distances.append(t)
         path += indices[i] * t
         q = q + t * e
         rho = mp.sqrt(q[0] ** 2 + q[1] ** 2)
         if rho >= surface.semi_diameter and status == OK:
             status, surface_number = VIGNETTED, i + 1
-        sx, sy = _slopes(surface.kind, own, q[0], q[1])
         normal = mp.matrix([-sx, -sy, 1]) / mp.sqrt(1 + sx**2 + sy**2)
         ratio = indices[i] / indices[i + 1]
         cosine = (e.T * normal)[0]
         squared = 1 - ratio**2 * (1 - cosine**2)
         if squared <= 0:
-            return TIR, i + 1, None, None
+            return TIR, i + 1, None, None, None
         e = ratio * e + (mp.sqrt(squared) - ratio * cosine) * normal
         p, d = rotation * q + vertex, rotation * e
         key = f"thicknesses.{number}"
         z += values.get(key, mp.mpf(0))
     z += values["sensor_distance"]
     if d[2] <= 0:
-        return MISSED, len(lens.surfaces) + 1, None, None
+        return MISSED, len(lens.surfaces) + 1, None, None, None
     t = (z - p[2]) / d[2]
-    return status, surface_number, p + t * d, path + indices[-1] * t
+    return status, surface_number, p + t * d, path + indices[-1] * t, distances
 
 
 def derivatives(function, values):
@@ -123,6 +131,7 @@ def _sag(kind, p, x, y):
     return sag + sum(a * r2 ** (int(n[1:]) // 2) for n, a in p.items() if n[0] == "a")
 
 
+@lru_cache(maxsize=4096)  # most derivatives leave the place on the surface where it was
 def _basis(knots, u):
     """Index → value of the cubic B-splines that do not vanish at u, by their definition."""
     value = {i: mp.mpf(1) for i in range(len(knots) - 1) if knots[i] <= u < knots[i + 1]}
@@ -146,22 +155,24 @@ def _slopes(kind, p, x, y):
     )
 
 
-def _meet(kind, p, semi_diameter, q, e):
-    """Distance to the point where the ray crosses the sag branch in the light's direction."""
+def _meet(kind, p, semi_diameter, q, e, guess):
+    """Distance to the point where the ray crosses the sag branch in the light's direction.
+
+    With the sag's slopes there; three times None where there is no such point.
+    """
     if kind in ("plane", "aperture"):
-        return None if e[2] <= 0 else -q[2] / e[2]
+        return (None,) * 3 if e[2] <= 0 else (-q[2] / e[2], mp.mpf(0), mp.mpf(0))
     roots = _quadric_roots if kind in ("sphere", "conic") else _bracketed_roots
     crossing = []
-    for t in roots(kind, p, semi_diameter, q, e):
-        x, y = q[0] + t * e[0], q[1] + t * e[1]
-        sx, sy = _slopes(kind, p, x, y)
+    for t in roots(kind, p, semi_diameter, q, e, guess):
+        sx, sy = _slopes(kind, p, q[0] + t * e[0], q[1] + t * e[1])
         if e[2] - e[0] * sx - e[1] * sy > 0:
-            crossing.append(t)
+            crossing.append((t, sx, sy))
     assert len(crossing) <= 1, "the case is ambiguous"
-    return crossing[0] if crossing else None
+    return crossing[0] if crossing else (None,) * 3
 
 
-def _quadric_roots(kind, p, semi_diameter, q, e):
+def _quadric_roots(kind, p, semi_diameter, q, e, guess):
     """Both zeros of c(x² + y² + (1+k)z²) - 2z that lie on the sag's sheet."""
     c, k = p["curvature"], p.get("conic", mp.mpf(0))
     if c == 0:
@@ -180,16 +191,27 @@ def _quadric_roots(kind, p, semi_diameter, q, e):
     return [t for t in roots if 1 - (1 + k) * c * (q[2] + t * e[2]) > 0]
 
 
-def _bracketed_roots(kind, p, semi_diameter, q, e):
+def _bracketed_roots(kind, p, semi_diameter, q, e, guess):
     """Zeros of z - sag along the ray within 1.2 apertures of the axis, by sampling and bracketing.
 
-    Surfaces must have their sag branch there.
+    Surfaces must have their sag branch there.  About a guess that a change of sign confirms, no
+    other is looked for.
     """
 
     def f(t):
         sag = _sag(kind, p, q[0] + t * e[0], q[1] + t * e[1])
         return None if sag is None else q[2] + t * e[2] - sag
 
+    def zero(low, high):
+        return mp.findroot(f, (low, high), solver="anderson", tol=mp.mpf(10) ** -140)
+
+    def bracketed(ends):
+        return None not in ends and (ends[0] < 0) != (ends[1] < 0)
+
+    if guess is not None:
+        around = (guess - NEARBY * semi_diameter, guess + NEARBY * semi_diameter)
+        if bracketed([f(t) for t in around]):
+            return [zero(*around)]
     reach = mp.mpf("1.2") * semi_diameter
     low, high = (-q[2] - 2 * reach) / e[2], (-q[2] + 2 * reach) / e[2]
     a = e[0] ** 2 + e[1] ** 2
@@ -202,11 +224,7 @@ def _bracketed_roots(kind, p, semi_diameter, q, e):
         high = min(high, (-b + mp.sqrt(inside)) / a)
     ts = [low + (high - low) * i / SAMPLES for i in range(SAMPLES + 1)]
     fs = [f(t) for t in ts]
-    return [
-        mp.findroot(f, (ts[i], ts[i + 1]), solver="anderson", tol=mp.mpf(10) ** -140)
-        for i in range(SAMPLES)
-        if None not in fs[i : i + 2] and (fs[i] < 0) != (fs[i + 1] < 0)
-    ]
+    return [zero(ts[i], ts[i + 1]) for i in range(SAMPLES) if bracketed(fs[i : i + 2])]
 
 
 def _place(lens, values, number, z):
@@ -230,7 +248,7 @@ def _place(lens, values, number, z):
     return rotation, vertex
 
 
-def sensitivity(function, values, draws=4):
+def sensitivity(function, values, base, draws=4):
     """How far each output moves when every input is off by one part in itself, at worst.
 
     Backward error analysis: arithmetic of relative precision ε cannot be asked for less than a few
@@ -239,11 +257,11 @@ def sensitivity(function, values, draws=4):
     Args:
         function: values → list of numbers.
         values: name → number.
+        base: what the function makes of them.
         draws: sign patterns tried.
     """
     generator = random.Random(0)
     h = mp.mpf(10) ** -20
-    base = function(values)
     worst = [abs(b) for b in base]
     for _ in range(draws):
         near = {n: v * (1 + generator.choice((-1, 1)) * h) for n, v in values.items()}

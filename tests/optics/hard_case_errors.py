@@ -71,12 +71,19 @@ def _exactly(case, number, dtype):
     numbers = [exact.mp.mpf(v) for v in (*origin, *direction)]
     inputs = stored | dict(zip(axes, numbers, strict=True))
 
-    def point(values):
+    def through(values, near=None):
         ray = [values[name] for name in axes]
         parameters = {n: v for n, v in values.items() if n not in axes}
-        status, _, p, _ = exact.trace(lens, parameters, ray[:3], ray[3:], WAVELENGTH)
+        status, _, p, _, distances = exact.trace(
+            lens, parameters, ray[:3], ray[3:], WAVELENGTH, near
+        )
         assert status == exact.OK, "the case must pass"
-        return p
+        return list(p), distances
+
+    base, distances = through(inputs)
+
+    def point(values):
+        return through(values, distances)[0]
 
     def weighted(values):
         p = point(values)
@@ -88,11 +95,12 @@ def _exactly(case, number, dtype):
         found = exact.derivatives(lambda some: weighted(some | fixed), parameters)
         return [found[name] for name in stored]
 
+    slopes = gradients(inputs)
     return Exact(
-        list(point(inputs))[:2],
-        exact.sensitivity(lambda v: list(point(v))[:2], inputs),
-        gradients(inputs),
-        exact.sensitivity(gradients, inputs, draws=2),
+        base[:2],
+        exact.sensitivity(lambda v: point(v)[:2], inputs, base[:2]),
+        slopes,
+        exact.sensitivity(gradients, inputs, slopes, draws=2),
     )
 
 

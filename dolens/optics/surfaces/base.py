@@ -310,8 +310,8 @@ class Surface(nn.Module):
 
 
 def _derivative(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """Derivative of an elementwise function, in forward mode: it may be nested."""
-    return lambda r: torch.func.jvp(function, (r,), (torch.ones_like(r),))[1]
+    """Derivative of an elementwise function, in reverse mode: it may be nested."""
+    return lambda r: torch.func.vjp(function, r)[1](torch.ones_like(r))[0]
 
 
 def _newton_step(shape: type[Surface], p: Parameters, ray: PlaneRay, t: Tensor) -> Tensor:
