@@ -3,6 +3,8 @@
 import multiprocessing
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 import torch
@@ -46,24 +48,75 @@ def test_torchs_number_of_threads_is_obeyed(threads):
     threads(3)
     assert thread_count(10**6) == 3
     assert thread_count(100) == 1
-    workers, pieces = [], []
+    prepared, pieces = [], []
+    together = threading.Barrier(3, timeout=60.0)
 
-    def task(worker, first, last):
-        workers.append(worker)
-        pieces.extend(range(first, last))
+    def prepare():
+        prepared.append(threading.get_ident())
+        together.wait()  # so that no thread finds all shares taken
+        return lambda first, last: pieces.extend(range(first, last))
 
-    spread(task, 10, 3)
-    assert sorted(workers) == [0, 1, 2] and sorted(pieces) == list(range(10))
+    spread(prepare, 1000, 3)
+    assert len(set(prepared)) == len(prepared) == 3
+    assert sorted(pieces) == list(range(1000))
     assert torch.get_num_threads() == 3
 
 
+def test_a_slow_core_gets_less_to_do():
+    """One thread sleeps through its first share; the other does all the rest meanwhile."""
+    done = {}
+    first_share = threading.Event()
+
+    def prepare():
+        mine = done.setdefault(threading.get_ident(), [])
+
+        def run(first, last):
+            mine.append(last - first)
+            if not first_share.is_set():
+                first_share.set()
+                time.sleep(0.5)
+
+        return run
+
+    spread(prepare, 1000, 2)
+    shares = sorted(done.values(), key=sum)
+    assert len(shares[0]) == 1 and sum(shares[0]) <= 250
+    assert sum(shares[0]) + sum(shares[1]) == 1000
+
+
 def test_an_error_in_a_worker_reaches_the_caller():
-    def task(worker, first, last):
-        if worker == 1:
+    caller = threading.get_ident()
+    together = threading.Barrier(2, timeout=60.0)
+
+    def prepare():
+        together.wait()
+        if threading.get_ident() != caller:
             raise ValueError("of a worker")
+        return lambda first, last: None
 
     with pytest.raises(ValueError, match="of a worker"):
-        spread(task, 2, 2)
+        spread(prepare, 2, 2)
+
+
+def test_nobody_writes_after_an_interruption():
+    """Ctrl-C in the calling thread: the arrays may go as soon as the error is out."""
+    caller = threading.get_ident()
+    working, finished = threading.Event(), threading.Event()
+
+    def prepare():
+        def run(first, last):
+            if threading.get_ident() == caller:
+                working.wait(60.0)
+                raise KeyboardInterrupt
+            working.set()
+            time.sleep(0.3)
+            finished.set()
+
+        return run
+
+    with pytest.raises(KeyboardInterrupt):
+        spread(prepare, 100, 2)
+    assert finished.is_set()
 
 
 class _Traces(Dataset):

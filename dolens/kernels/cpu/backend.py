@@ -206,16 +206,17 @@ class Program:
         step = self.table.values.element_size()
         size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
 
-        def task(worker: int, first: int, last: int) -> None:
+        def prepare() -> Callable[[int, int], None]:
             job, memory = self.job.copy(), scratch(size + _ALIGNMENT)
             address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
             for place, length in self._sizes.items():
                 job[place] = address
                 address += length * step
             job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
-            function(as_integers(job), first, last)
+            # The memory is held until the last share is done.
+            return lambda first, last, _memory=memory: function(as_integers(job), first, last)
 
-        spread(task, pieces, threads)
+        spread(prepare, pieces, threads)
 
 
 def trace(

@@ -6,8 +6,9 @@ process: a forked worker makes its own.
 
 import os
 import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import numpy as np
 import torch
@@ -42,21 +43,62 @@ def scratch(size: int) -> np.ndarray:
     return memory
 
 
-def spread(task: Callable[[int, int, int], None], pieces: int, threads: int) -> None:
-    """Run `task(worker, first, last)` over all pieces, cut evenly among the workers.
+def spread(prepare: Callable[[], Callable[[int, int], None]], pieces: int, threads: int) -> None:
+    """Run all pieces on this many threads, the calling one among them.
 
-    The calling thread is worker 0.
+    Each takes the next share when it has done one: cores are not equally fast, nor all ours.
+
+    Args:
+        prepare: called once in every thread; gives the function that runs pieces `first` to `last`.
+        pieces: how many.
+        threads: at most.
     """
     threads = min(threads, pieces)
-    bounds = [pieces * w // threads for w in range(threads + 1)] if threads else [0, 0]
+    shares = deque(_shares(pieces, threads))
+
+    def work() -> None:
+        run = prepare()
+        while shares:
+            try:
+                share = shares.popleft()
+            except IndexError:  # another thread took the last one
+                return
+            run(*share)
+
     if threads <= 1:
-        task(0, 0, pieces)
+        work()
         return
     pool = _pools.get((os.getpid(), threads))
     if pool is None:
         pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="dolens")
         _pools[os.getpid(), threads] = pool
-    others = [pool.submit(task, w, bounds[w], bounds[w + 1]) for w in range(1, threads)]
-    task(0, bounds[0], bounds[1])
+    others = [pool.submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        # Whatever stops this thread (Ctrl-C), nobody may write to memory that is given back.
+        shares.clear()
+        _wait([other for other in others if not other.cancel()])
     for other in others:
-        other.result()
+        if not other.cancelled():
+            other.result()
+
+
+def _shares(pieces: int, threads: int) -> list[tuple[int, int]]:
+    """Neighbouring pieces, first and end: large shares first, then smaller, to end together."""
+    shares, first = [], 0
+    least = max(1, pieces // (16 * max(threads, 1)))
+    while first < pieces:
+        size = pieces if threads <= 1 else max(least, (pieces - first) // (2 * threads))
+        shares.append((first, min(first + size, pieces)))
+        first += size
+    return shares
+
+
+def _wait(others: Sequence[Future]) -> None:
+    """Wait for the other threads, through any number of interruptions; then be interrupted."""
+    try:
+        wait(others)
+    except KeyboardInterrupt:
+        _wait(others)
+        raise

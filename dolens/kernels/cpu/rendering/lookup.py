@@ -69,8 +69,10 @@ def lookup(real: types.Type) -> Lookup:
         src, rows = carray(state, 1280), carray(scratch, 512)
         total = zero
         for i in range(128):
+            # Both are zero where nothing failed, and never negative.
+            failed = src[896 + i] + src[1024 + i]
             passes = one if src[640 + i] < zero else zero
-            passes = zero if src[896 + i] > zero or src[1024 + i] > zero else passes
+            passes = passes if failed == zero else zero
             rows[384 + i] = passes
             total += passes
         return total

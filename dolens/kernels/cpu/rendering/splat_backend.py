@@ -1,5 +1,7 @@
 """Running the splat on tensors."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -46,7 +48,7 @@ def _job(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> tuple[np.n
 def _run(driver: compiler.Factory, job: np.ndarray, chunks: int, like: Tensor) -> None:
     function = compiler.compile_driver(driver, REAL[like.dtype])
 
-    def task(worker: int, first: int, last: int) -> None:
-        function(as_integers(job), first, last)
+    def prepare() -> Callable[[int, int], None]:
+        return lambda first, last: function(as_integers(job), first, last)
 
-    spread(task, chunks, thread_count(like.numel()))
+    spread(prepare, chunks, thread_count(like.numel()))
