@@ -11,20 +11,18 @@ from functools import cache
 
 import torch
 from torch import Tensor
-from torch.func import jacfwd
 
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend, flat_rays, trace_rays
+from dolens.optics.backend import choose_backend, flat_rays
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack_with_variables
-from dolens.optics.rays import Components, Rays, TracedRays
+from dolens.optics.rays import Rays
+from dolens.optics.reference_jacobian import reference_jacobian, reference_sums
 from dolens.optics.system import OpticalSystem
 
 logger = logging.getLogger("dolens.kernels")
 
 OUTPUTS = ("x", "y", "path_length")
-# Numbers of a Jacobian that the reference holds at a time while it adds up normal equations.
-_NUMBERS = 1 << 21
 
 
 @dataclass(frozen=True)
@@ -135,7 +133,7 @@ def ray_jacobian(
     columns = _columns(parameters)
     system, leaves = _with_leaves(lens, parameters)
     if not _has_kernel(lens, system, rays):
-        values, derivatives, valid = _reference_jacobian(lens, rays, parameters, outputs)
+        values, derivatives, valid = reference_jacobian(lens, rays, parameters, outputs)
         return RayJacobian(outputs, columns, values, derivatives, valid)
     from dolens.kernels.cpu import derivatives as kernels  # compiles when first needed
 
@@ -208,7 +206,7 @@ def normal_equations(
             table, entries, outputs, rays_of_kernel, target, weight, group, groups
         )
     else:
-        sums = _reference_sums(lens, rays, parameters, outputs, target, weight, group, groups)
+        sums = reference_sums(lens, rays, parameters, outputs, target, weight, group, groups)
     head, jtr, jtj, by_group = sums
     found = NormalEquations(outputs, columns, head[0], head[1], jtr, jtj)
     if group is None:
@@ -281,69 +279,3 @@ def _has_kernel(lens: Lens, system: OpticalSystem, rays: Rays) -> bool:
 @cache
 def _say_reference() -> None:
     logger.info("Jacobians on a GPU: the reference in PyTorch")
-
-
-def _reference_jacobian(
-    lens: Lens, rays: Rays, parameters: Mapping[str, Tensor], outputs: tuple[str, ...]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """By PyTorch's forward mode, all columns at once."""
-    sizes = [p.numel() for p in parameters.values()]
-
-    def outputs_of(vector: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        parts = zip(parameters.items(), vector.split(sizes), strict=True)
-        system = lens.system({name: part.reshape(p.shape) for (name, p), part in parts})
-        hit = trace_rays(system, rays, "reference", 1.0, False, 1, None)
-        values = _select(hit, outputs)
-        values = torch.where(hit.valid[..., None], values, torch.zeros_like(values))
-        return values, (values.detach(), hit.valid)
-
-    vector = torch.cat([p.detach().reshape(-1) for p in parameters.values()])
-    with torch.no_grad():
-        jacobian, (values, valid) = jacfwd(outputs_of, has_aux=True)(vector)
-    return values, jacobian, valid
-
-
-def _select(hit: TracedRays, outputs: tuple[str, ...]) -> Tensor:
-    by_name = {"x": hit.position[..., 0], "y": hit.position[..., 1], "path_length": hit.path_length}
-    return torch.stack([by_name[name] for name in outputs], -1)
-
-
-def _reference_sums(
-    lens: Lens,
-    rays: Rays,
-    parameters: Mapping[str, Tensor],
-    outputs: tuple[str, ...],
-    target: Tensor,
-    weight: Tensor | None,
-    group: Tensor | None,
-    groups: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `normal_equations` of the kernels, from Jacobians of some rays at a time."""
-    ray = Components(*(c.reshape(-1) for c in rays.components()))
-    wavelength = rays.wavelength
-    if isinstance(wavelength, Tensor):
-        wavelength = wavelength.expand(rays.components().x.shape).reshape(-1)
-    p, k = sum(t.numel() for t in parameters.values()), len(outputs)
-    options = {"dtype": torch.float64, "device": lens.device}
-    head, jtr = torch.zeros(2, **options), torch.zeros(p, **options)
-    jtj = torch.zeros((p, p), **options)
-    by_group = torch.zeros((groups, 2 + k + k * p), **options)
-    size = max(1, _NUMBERS // max(1, k * p))
-    for first in range(0, len(target), size):
-        part = slice(first, first + size)
-        some = Rays.from_components(
-            Components(*(c[part] for c in ray)),
-            wavelength[part] if isinstance(wavelength, Tensor) else wavelength,
-        )
-        values, jacobian, valid = _reference_jacobian(lens, some, parameters, outputs)
-        residual = torch.where(valid[:, None], values - target[part], 0.0).double()
-        w = valid.double() if weight is None else torch.where(valid, weight[part], 0.0).double()
-        jacobian = jacobian.double()
-        weighted = w[:, None, None] * jacobian
-        head += torch.stack((valid.sum(), (w[:, None] * residual.square()).sum()))
-        jtr += torch.einsum("nkp,nk->p", weighted, residual)
-        jtj += torch.einsum("nkp,nkq->pq", weighted, jacobian)
-        if group is not None:
-            row = (valid[:, None], w[:, None], w[:, None] * residual, weighted.flatten(1))
-            by_group.index_add_(0, group[part], torch.cat([r.double() for r in row], 1))
-    return head, jtr, jtj, by_group

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dolens.kernels.cpu.backend import Program
 from dolens.kernels.cpu.jacobian import jacobian_driver
 from dolens.kernels.cpu.layout import BLOCK, COTANGENT_HEADER, Job
 from dolens.kernels.cpu.normal_equations import normal_equations_driver
+from dolens.kernels.cpu.program import Program
 from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.kernels.cpu.backend import Program
 from dolens.kernels.cpu.layout import BLOCK, Job
+from dolens.kernels.cpu.program import Program
 from dolens.kernels.cpu.rendering.layout import SCRATCH_ROWS, Length, Place
 from dolens.kernels.cpu.rendering.render import render_driver
 from dolens.kernels.cpu.rendering.render_adjoint import render_adjoint_driver

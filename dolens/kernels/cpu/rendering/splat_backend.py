@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.cpu import compiler
-from dolens.kernels.cpu.backend import REAL, as_integers
+from dolens.kernels.cpu.program import REAL, as_integers
 from dolens.kernels.cpu.rendering.splat import SplatJob, splat_adjoint_driver, splat_driver
 from dolens.kernels.cpu.threads import spread, thread_count
 

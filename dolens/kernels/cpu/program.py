@@ -1,0 +1,215 @@
+"""A surface table with its compiled steps, and how a driver runs over it."""
+
+import ctypes
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu.axes import (
+    change_axes_adjoint,
+    change_axes_forward,
+    lens_axes_adjoint,
+    lens_axes_forward,
+    sensor_forward,
+)
+from dolens.kernels.cpu.b_spline import b_spline_bend, b_spline_parameters, b_spline_sag
+from dolens.kernels.cpu.conic import conic_adjoint, conic_forward
+from dolens.kernels.cpu.even_asphere import (
+    even_asphere_bend,
+    even_asphere_parameters,
+    even_asphere_sag,
+)
+from dolens.kernels.cpu.explicit import explicit_adjoint, explicit_forward
+from dolens.kernels.cpu.layout import (
+    ADJOINT,
+    BEND,
+    BLOCK,
+    CODES,
+    COTANGENT_HEADER,
+    EXTRAS_ADDRESS,
+    FORWARD,
+    PARAMETERS,
+    SAG,
+    STATE,
+    STENCIL_ROWS,
+    WORK_ROWS,
+    Job,
+)
+from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
+from dolens.kernels.cpu.sphere import sphere_adjoint, sphere_forward
+from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
+from dolens.kernels.cpu.xy_polynomial import (
+    xy_polynomial_bend,
+    xy_polynomial_parameters,
+    xy_polynomial_sag,
+)
+from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
+
+_INTEGERS = ctypes.POINTER(ctypes.c_int64)
+REAL = {torch.float32: "float32", torch.float64: "float64"}
+_ALIGNMENT = 64  # bytes: a line of the cache
+
+_FORWARD = {
+    Kind.PLANE: plane_forward,
+    Kind.SPHERE: sphere_forward,
+    Kind.CONIC: conic_forward,
+    Kind.EVEN_ASPHERE: explicit_forward,
+    Kind.XY_POLYNOMIAL: explicit_forward,
+    Kind.B_SPLINE: explicit_forward,
+    Kind.CHANGE_AXES: change_axes_forward,
+    Kind.LENS_AXES: lens_axes_forward,
+    Kind.SENSOR: sensor_forward,
+}
+_ADJOINT = {
+    Kind.PLANE: plane_adjoint,
+    Kind.SPHERE: sphere_adjoint,
+    Kind.CONIC: conic_adjoint,
+    Kind.EVEN_ASPHERE: explicit_adjoint,
+    Kind.XY_POLYNOMIAL: explicit_adjoint,
+    Kind.B_SPLINE: explicit_adjoint,
+    Kind.CHANGE_AXES: change_axes_adjoint,
+    Kind.LENS_AXES: lens_axes_adjoint,
+    Kind.SENSOR: plane_adjoint,
+}
+_SAG = {
+    Kind.EVEN_ASPHERE: even_asphere_sag,
+    Kind.XY_POLYNOMIAL: xy_polynomial_sag,
+    Kind.B_SPLINE: b_spline_sag,
+}
+_DERIVATIVES = {
+    Kind.EVEN_ASPHERE: (even_asphere_bend, even_asphere_parameters),
+    Kind.XY_POLYNOMIAL: (xy_polynomial_bend, xy_polynomial_parameters),
+    Kind.B_SPLINE: (b_spline_bend, b_spline_parameters),
+}
+
+
+def as_integers(array: np.ndarray) -> Any:
+    """An array of int64 as a driver takes it."""
+    return array.ctypes.data_as(_INTEGERS)
+
+
+class Steps(NamedTuple):
+    """The steps of a lens, compiled.
+
+    Attributes:
+        codes: (steps, CODES), int64: the table's, and the addresses of the block functions.
+        longest: numbers of the longest record that has cotangents.
+        scratch: work rows that the shapes need.
+        clip: address of the test of apertures that are no full circles, or zero.
+    """
+
+    codes: np.ndarray
+    longest: int
+    scratch: int
+    clip: int
+
+
+@lru_cache(maxsize=256)
+def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
+    """Compile what the steps of a table need: a pure function of its codes."""
+    table = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW)
+    rows = np.zeros((max(len(table), 1), CODES), dtype=np.int64)
+    rows[: len(table), : Code.ROW] = table
+    longest, scratch = Slot.HEADER, 0
+    for row in rows[: len(table)]:
+        kind = Kind(row[Code.KIND])
+        row[FORWARD] = compiler.compile_block(_FORWARD[kind], real)
+        if kind in _SAG:
+            row[SAG] = compiler.compile_block(_SAG[kind], real)
+        if derivatives:
+            row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], real)
+            if kind in _DERIVATIVES:
+                bend, parameters = _DERIVATIVES[kind]
+                row[BEND] = compiler.compile_block(bend, real)
+                row[PARAMETERS] = compiler.compile_block(parameters, real)
+        length = int(row[Code.LENGTH])
+        if kind == Kind.B_SPLINE:
+            # Its stencil takes 17 rows of cotangents, whatever the number of its coefficients.
+            length, scratch = Slot.HEADER + 17, max(scratch, STENCIL_ROWS)
+        elif kind == Kind.XY_POLYNOMIAL:
+            scratch = max(scratch, 2 * (int(row[Code.DEGREE]) + 1))
+        longest = max(longest, length)
+    clips = (rows[:, Code.EDGE] == Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
+    address = compiler.compile_block(clip, real) if clips.any() else 0
+    return Steps(rows, longest, scratch, address)
+
+
+class Program:
+    """A surface table with its compiled steps, and the memory of each worker.
+
+    Args:
+        table: of contiguous tensors on the CPU.
+        derivatives: whether cotangents will be swept back.
+        outputs: sets of cotangents that a block holds.
+        columns: further rows of a block that a driver asks for.
+    """
+
+    def __init__(
+        self, table: SurfaceTable, derivatives: bool, outputs: int = 1, columns: int = 0
+    ) -> None:
+        self.real = REAL[table.values.dtype]
+        self.table = table
+        self.derivatives = derivatives
+        steps = _steps(table.codes.numpy().tobytes(), self.real, derivatives)
+        count = table.codes.shape[0]
+        self.codes = steps.codes.copy()
+        self.codes[:, EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * self.codes[:, Code.EXTRAS]
+        self.job = np.zeros(Job.LENGTH, dtype=np.int64)
+        self.job[Job.STEPS] = count
+        self.job[Job.CODES] = self.codes.ctypes.data
+        self.job[Job.VALUES] = table.values.data_ptr()
+        self.job[Job.VALUES_LENGTH] = table.values.numel()
+        self.job[Job.INDICES] = table.indices.data_ptr()
+        self.job[Job.WAVELENGTHS] = table.indices.shape[1]
+        last = table.values.numel() - 1
+        self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
+        self.job[Job.CLIP] = steps.clip
+        # All of them with derivatives, else two in turn; and some that a driver may keep.
+        states = count + 3 if derivatives else 5
+        cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
+        self.job[Job.COTANGENT_LENGTH] = cotangents
+        self._sizes = {
+            Job.STACK: states * STATE,
+            Job.COTANGENTS: outputs * cotangents,
+            Job.WORK: (WORK_ROWS + steps.scratch) * BLOCK,
+            Job.COLUMNS: columns * BLOCK,
+        }
+
+    def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
+        """Point to rays (N, 3) of any strides, and their wavelengths' places (N,), int32."""
+        for place, tensor in ((Job.POSITION, position), (Job.DIRECTION, direction)):
+            self.job[place] = tensor.data_ptr()
+            self.job[place + 1 : place + 3] = tensor.stride()
+        self.job[Job.RAYS] = position.shape[0]
+        self.job[Job.WHICH] = 0 if which is None else which.data_ptr()
+
+    def point(self, **tensors: Tensor | None) -> None:
+        """Point to contiguous tensors by the name of their place in `Job`."""
+        for name, tensor in tensors.items():
+            self.job[getattr(Job, name)] = 0 if tensor is None else tensor.data_ptr()
+
+    def run(
+        self, driver: Callable[[Any], Callable[..., None]], pieces: int, small: int = SMALL
+    ) -> None:
+        """Run a driver over all pieces, on torch's number of threads, or on one for few rays."""
+        function = compiler.compile_driver(driver, self.real)
+        threads = thread_count(int(self.job[Job.RAYS]), small)
+        step = self.table.values.element_size()
+        size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
+
+        def prepare() -> Callable[[int, int], None]:
+            job, memory = self.job.copy(), scratch(size + _ALIGNMENT)
+            address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
+            for place, length in self._sizes.items():
+                job[place] = address
+                address += length * step
+            job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
+            # The memory is held until the last share is done.
+            return lambda first, last, _memory=memory: function(as_integers(job), first, last)
+
+        spread(prepare, pieces, threads)

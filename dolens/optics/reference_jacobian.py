@@ -1,0 +1,108 @@
+"""Derivatives of every ray, and their sums for least squares, by PyTorch's forward mode.
+
+The reference that the kernels must equal.
+"""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+from torch.func import jacfwd
+
+from dolens.optics.backend import trace_rays
+from dolens.optics.lens import Lens
+from dolens.optics.rays import Components, Rays, TracedRays
+
+# Numbers of a Jacobian that are held at a time while normal equations are added up.
+_NUMBERS = 1 << 21
+
+
+def reference_jacobian(
+    lens: Lens, rays: Rays, parameters: Mapping[str, Tensor], outputs: tuple[str, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """All columns at once.
+
+    Args:
+        lens: whatever its backend.
+        rays: in front of the lens, of leading shape (...).
+        parameters: P columns.
+        outputs: K names, as in `RayJacobian`.
+
+    Returns:
+        values (..., K), derivatives (..., K, P) and valid (...); zero where not valid.
+    """
+    sizes = [p.numel() for p in parameters.values()]
+
+    def outputs_of(vector: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        parts = zip(parameters.items(), vector.split(sizes), strict=True)
+        system = lens.system({name: part.reshape(p.shape) for (name, p), part in parts})
+        hit = trace_rays(system, rays, "reference", 1.0, False, 1, None)
+        values = _select(hit, outputs)
+        values = torch.where(hit.valid[..., None], values, torch.zeros_like(values))
+        return values, (values.detach(), hit.valid)
+
+    vector = torch.cat([p.detach().reshape(-1) for p in parameters.values()])
+    with torch.no_grad():
+        jacobian, (values, valid) = jacfwd(outputs_of, has_aux=True)(vector)
+    return values, jacobian, valid
+
+
+def _select(hit: TracedRays, outputs: tuple[str, ...]) -> Tensor:
+    by_name = {"x": hit.position[..., 0], "y": hit.position[..., 1], "path_length": hit.path_length}
+    return torch.stack([by_name[name] for name in outputs], -1)
+
+
+def reference_sums(
+    lens: Lens,
+    rays: Rays,
+    parameters: Mapping[str, Tensor],
+    outputs: tuple[str, ...],
+    target: Tensor,
+    weight: Tensor | None,
+    group: Tensor | None,
+    groups: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """As `normal_equations` of the kernels, from Jacobians of some rays at a time.
+
+    Args:
+        lens: whatever its backend.
+        rays: N of them, of any leading shape.
+        parameters: P columns.
+        outputs: K names.
+        target: (N, K), mm.
+        weight: (N,), or None: one.
+        group: (N,), int64, from 0 to `groups` - 1, or None.
+        groups: G.
+
+    Returns:
+        All float64: number of rays and Σ w·r² (2,); Jᵀwr (P,); JᵀwJ (P, P); and by groups
+        (G, 2 + K + K·P): number of rays, Σ w, Σ w·r, Σ w·J.
+    """
+    ray = Components(*(c.reshape(-1) for c in rays.components()))
+    wavelength = rays.wavelength
+    if isinstance(wavelength, Tensor):
+        wavelength = wavelength.expand(rays.components().x.shape).reshape(-1)
+    p, k = sum(t.numel() for t in parameters.values()), len(outputs)
+    options = {"dtype": torch.float64, "device": lens.device}
+    head, jtr = torch.zeros(2, **options), torch.zeros(p, **options)
+    jtj = torch.zeros((p, p), **options)
+    by_group = torch.zeros((groups, 2 + k + k * p), **options)
+    size = max(1, _NUMBERS // max(1, k * p))
+    for first in range(0, len(target), size):
+        part = slice(first, first + size)
+        some = Rays.from_components(
+            Components(*(c[part] for c in ray)),
+            wavelength[part] if isinstance(wavelength, Tensor) else wavelength,
+        )
+        values, jacobian, valid = reference_jacobian(lens, some, parameters, outputs)
+        residual = torch.where(valid[:, None], values - target[part], 0.0).double()
+        w = valid.double() if weight is None else torch.where(valid, weight[part], 0.0).double()
+        jacobian = jacobian.double()
+        weighted = w[:, None, None] * jacobian
+        head += torch.stack((valid.sum(), (w[:, None] * residual.square()).sum()))
+        jtr += torch.einsum("nkp,nk->p", weighted, residual)
+        jtj += torch.einsum("nkp,nkq->pq", weighted, jacobian)
+        if group is not None:
+            row = (valid[:, None], w[:, None], w[:, None] * residual, weighted.flatten(1))
+            by_group.index_add_(0, group[part], torch.cat([r.double() for r in row], 1))
+    return head, jtr, jtj, by_group
