@@ -1,16 +1,20 @@
 """Threads and processes: the same numbers, however the work is spread."""
 
+import ctypes
 import multiprocessing
+import os
 import subprocess
 import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from dolens import Rays, load_lens
+from dolens.kernels.cpu import threads as threads_module
 from dolens.kernels.cpu.threads import spread, thread_count
 
 
@@ -44,78 +48,95 @@ def test_any_number_of_threads_gives_the_same_bits(root, threads):
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 
 
-def test_torchs_number_of_threads_is_obeyed(threads):
+DRIVER = ctypes.CFUNCTYPE(None, ctypes.POINTER(ctypes.c_int64), ctypes.c_int64, ctypes.c_int64)
+
+
+@pytest.fixture(params=["openmp", "pool"])
+def team(request, monkeypatch):
+    """Torch's own threads, and the pool of those who cannot have them."""
+    if request.param == "openmp":
+        assert threads_module.torchs_openmp() is not None and not threads_module.is_forked()
+    else:
+        monkeypatch.setattr(threads_module, "torchs_openmp", lambda: None)
+    return request.param
+
+
+def run(work, pieces, threads):
+    """Spread a function of (job, first, end) in Python, which any thread may call."""
+    driver = DRIVER(lambda job, first, end: work(job[0], first, end))
+    jobs = [np.array([number], dtype=np.int64) for number in range(threads)]
+    spread(ctypes.cast(driver, ctypes.c_void_p).value, jobs, pieces)
+
+
+def test_torchs_number_of_threads_is_obeyed(threads, team):
+    """Each with a job of its own, and every piece done once."""
     threads(3)
     assert thread_count(10**6) == 3
     assert thread_count(100) == 1
-    prepared, pieces = [], []
+    pieces, by_job = [], {}
     together = threading.Barrier(3, timeout=60.0)
 
-    def prepare():
-        prepared.append(threading.get_ident())
-        together.wait()  # so that no thread finds all shares taken
-        return lambda first, last: pieces.extend(range(first, last))
+    def work(job, first, end):
+        if job not in by_job:
+            by_job[job] = threading.get_native_id()
+            together.wait()  # so that no thread finds all shares taken
+        assert by_job[job] == threading.get_native_id()
+        pieces.extend(range(first, end))
 
-    spread(prepare, 1000, 3)
-    assert len(set(prepared)) == len(prepared) == 3
+    run(work, 1000, 3)
+    assert sorted(by_job) == [0, 1, 2] and len(set(by_job.values())) == 3
+    assert threading.get_native_id() in by_job.values()
     assert sorted(pieces) == list(range(1000))
     assert torch.get_num_threads() == 3
 
 
-def test_a_slow_core_gets_less_to_do():
+def test_kernels_run_on_torchs_own_threads(root, threads):
+    """Where torch waits for its next operation, threads of ours would share the cores with it."""
+    threads(2)
+    torch.ones(1_000_000).exp()
+    known = set(os.listdir("/proc/self/task"))
+    traced(root)
+    assert set(os.listdir("/proc/self/task")) == known
+
+
+def test_a_slow_core_gets_less_to_do(team):
     """One thread sleeps through its first share; the other does all the rest meanwhile."""
     done = {}
     first_share = threading.Event()
 
-    def prepare():
-        mine = done.setdefault(threading.get_ident(), [])
+    def work(job, first, end):
+        done.setdefault(job, []).append(end - first)
+        if not first_share.is_set():
+            first_share.set()
+            time.sleep(0.5)
 
-        def run(first, last):
-            mine.append(last - first)
-            if not first_share.is_set():
-                first_share.set()
-                time.sleep(0.5)
-
-        return run
-
-    spread(prepare, 1000, 2)
+    run(work, 1000, 2)
     shares = sorted(done.values(), key=sum)
     assert len(shares[0]) == 1 and sum(shares[0]) <= 250
     assert sum(shares[0]) + sum(shares[1]) == 1000
 
 
-def test_an_error_in_a_worker_reaches_the_caller():
-    caller = threading.get_ident()
-    together = threading.Barrier(2, timeout=60.0)
-
-    def prepare():
-        together.wait()
-        if threading.get_ident() != caller:
-            raise ValueError("of a worker")
-        return lambda first, last: None
-
-    with pytest.raises(ValueError, match="of a worker"):
-        spread(prepare, 2, 2)
-
-
-def test_nobody_writes_after_an_interruption():
-    """Ctrl-C in the calling thread: the arrays may go as soon as the error is out."""
+def test_nobody_writes_after_an_interruption(threads, monkeypatch):
+    """Ctrl-C in the calling thread of a pool: the arrays may go as soon as the error is out."""
+    monkeypatch.setattr(threads_module, "torchs_openmp", lambda: None)
     caller = threading.get_ident()
     working, finished = threading.Event(), threading.Event()
+    alone = threads_module.run_alone
 
-    def prepare():
-        def run(first, last):
-            if threading.get_ident() == caller:
-                working.wait(60.0)
-                raise KeyboardInterrupt
-            working.set()
-            time.sleep(0.3)
-            finished.set()
+    def interrupted(task):
+        if threading.get_ident() == caller:
+            working.wait(60.0)
+            raise KeyboardInterrupt
+        alone(task)
 
-        return run
+    def work(job, first, end):
+        working.set()
+        time.sleep(0.3)
+        finished.set()
 
+    monkeypatch.setattr(threads_module, "run_alone", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        spread(prepare, 100, 2)
+        run(work, 100, 2)
     assert finished.is_set()
 
 
@@ -131,7 +152,7 @@ class _Traces(Dataset):
 
 
 def test_workers_of_a_data_loader(root, threads):
-    """Forked after this process has used its own pool of threads."""
+    """Forked after this process has used its threads, which do not survive that."""
     threads(2)
     here = _path(root)
     loader = DataLoader(_Traces(root), num_workers=2, multiprocessing_context="fork", timeout=120)

@@ -48,17 +48,35 @@ def block_signature(real: types.Type) -> Any:
     return types.void(p, p, p, p, p, INTEGERS)
 
 
+def _call_address(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Code that calls the function at the address in the first argument with the others."""
+    kind = ir.FunctionType(ir.VoidType(), [a.type for a in arguments[1:]])
+    builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+    return context.get_dummy_value()
+
+
 @intrinsic
 def call_block(context, address, before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN201
     """Call a compiled block function by its address."""
     signature = types.void(address, before, after, cotangents, record, work, codes)
+    return signature, _call_address
+
+
+@intrinsic
+def call_driver(context, address, job, first, end):  # noqa: ANN001, ANN201
+    """Call a compiled driver by its address."""
+    return types.void(address, job, first, end), _call_address
+
+
+@intrinsic
+def fetch_add(context, base, place, amount):  # noqa: ANN001, ANN201
+    """Add to base[place], which other threads add to as well, and give what was there before."""
 
     def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
-        kind = ir.FunctionType(ir.VoidType(), [a.type for a in arguments[1:]])
-        builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
-        return context.get_dummy_value()
+        number = builder.gep(arguments[0], [arguments[1]])
+        return builder.atomic_rmw("add", number, arguments[2], "monotonic")
 
-    return signature, generate
+    return types.int64(base, types.int64, types.int64), generate
 
 
 @intrinsic
@@ -97,10 +115,16 @@ def compile_block(factory: Factory, real: str) -> int:
 
 
 @cache
-def compile_driver(factory: Factory, real: str) -> Any:
-    """A driver as a C function of (job, first, last), which runs without Python's lock."""
+def compile_driver(factory: Factory, real: str) -> int:
+    """Address of a driver, a C function of (job, first, end)."""
     signature = types.void(INTEGERS, types.int64, types.int64)
-    return _compiled(factory, real, signature).ctypes
+    return _compiled(factory, real, signature).address
+
+
+@cache
+def compile_team(factory: Factory) -> Any:
+    """What a thread of a team runs: a C function of its task, called without Python's lock."""
+    return _compiled(factory, "float64", types.void(INTEGERS)).ctypes
 
 
 @cache

@@ -1,6 +1,5 @@
 """A surface table with its compiled steps, and how a driver runs over it."""
 
-import ctypes
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -50,7 +49,6 @@ from dolens.kernels.cpu.xy_polynomial import (
 )
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
 
-_INTEGERS = ctypes.POINTER(ctypes.c_int64)
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 _ALIGNMENT = 64  # bytes: a line of the cache
 
@@ -86,11 +84,6 @@ _DERIVATIVES = {
     Kind.XY_POLYNOMIAL: (xy_polynomial_bend, xy_polynomial_parameters),
     Kind.B_SPLINE: (b_spline_bend, b_spline_parameters),
 }
-
-
-def as_integers(array: np.ndarray) -> Any:
-    """An array of int64 as a driver takes it."""
-    return array.ctypes.data_as(_INTEGERS)
 
 
 class Steps(NamedTuple):
@@ -198,18 +191,19 @@ class Program:
     ) -> None:
         """Run a driver over all pieces, on torch's number of threads, or on one for few rays."""
         function = compiler.compile_driver(driver, self.real)
-        threads = thread_count(int(self.job[Job.RAYS]), small)
+        threads = min(thread_count(int(self.job[Job.RAYS]), small), pieces)
         step = self.table.values.element_size()
         size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
+        # Memories are held until the last share is done.
+        memories = [scratch(size + _ALIGNMENT, worker) for worker in range(threads)]
+        spread(function, [self._job_of(memory, step) for memory in memories], pieces)
 
-        def prepare() -> Callable[[int, int], None]:
-            job, memory = self.job.copy(), scratch(size + _ALIGNMENT)
-            address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
-            for place, length in self._sizes.items():
-                job[place] = address
-                address += length * step
-            job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
-            # The memory is held until the last share is done.
-            return lambda first, last, _memory=memory: function(as_integers(job), first, last)
-
-        spread(prepare, pieces, threads)
+    def _job_of(self, memory: np.ndarray, step: int) -> np.ndarray:
+        """The job of a worker, which works in this memory; `step` is the bytes of a number."""
+        job = self.job.copy()
+        address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
+        for place, length in self._sizes.items():
+            job[place] = address
+            address += length * step
+        job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
+        return job

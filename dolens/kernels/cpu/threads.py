@@ -1,17 +1,29 @@
-"""Spreading a driver over threads: as many as torch is set to use, in a pool of this process's own.
+"""Spreading a driver over threads: as many as torch is set to use, and where possible torch's own.
 
-Drivers run without Python's lock.  The pool is made when it is first needed and belongs to one
-process: a forked worker makes its own.
+Torch's threads belong to OpenMP.  After each of its operations they wait for the next one without
+sleeping, for some milliseconds; threads of ours would have to share the cores with them.  So ours
+are OpenMP's too, where torch's OpenMP can be found.  They do not survive a fork: a forked process,
+and one without that OpenMP, has a pool of threads of its own.
+
+Drivers run without Python's lock.
 """
 
+import ctypes
+import logging
+import multiprocessing
 import os
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import cache
 
 import numpy as np
 import torch
+
+from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu.team import Task, team
+
+logger = logging.getLogger("dolens.kernels")
 
 # Fewer rays than this are traced sooner than another thread is woken.
 SMALL = 1 << 14
@@ -19,7 +31,12 @@ SMALL = 1 << 14
 # Memory that a thread keeps for its next task, bytes at most.
 _KEPT = 1 << 23
 
+# Runs a task on a number of threads, the calling one among them.
+Runner = Callable[[np.ndarray, int], None]
+
+_home = os.getpid()
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
+_own = threading.local()
 
 
 def thread_count(rays: int, small: int = SMALL) -> int:
@@ -27,72 +44,114 @@ def thread_count(rays: int, small: int = SMALL) -> int:
     return 1 if rays < small else max(1, torch.get_num_threads())
 
 
-_own = threading.local()
-
-
-def scratch(size: int) -> np.ndarray:
-    """Memory of at least this many bytes, of this thread's own, for the task that it runs now.
+def scratch(size: int, worker: int) -> np.ndarray:
+    """Memory of at least this many bytes for a worker of the task that the calling thread runs.
 
     Asking the system for fresh pages at every call would cost a tenth of a small trace.
     """
-    memory = getattr(_own, "memory", None)
+    kept = _own.__dict__.setdefault("memory", {})
+    memory = kept.get(worker)
     if memory is None or memory.nbytes < size:
         memory = np.empty(size, dtype=np.uint8)
         if size <= _KEPT:
-            _own.memory = memory
+            kept[worker] = memory
     return memory
 
 
-def spread(prepare: Callable[[], Callable[[int, int], None]], pieces: int, threads: int) -> None:
-    """Run all pieces on this many threads, the calling one among them.
-
-    Each takes the next share when it has done one: cores are not equally fast, nor all ours.
+def spread(driver: int, jobs: Sequence[np.ndarray], pieces: int) -> None:
+    """Run all pieces on as many threads as there are jobs.
 
     Args:
-        prepare: called once in every thread; gives the function that runs pieces `first` to `last`.
+        driver: address of a C function of (job, first, end) that runs these pieces; it keeps
+            whatever it writes for itself in its job.
+        jobs: int64 arrays, one for each thread.
         pieces: how many.
-        threads: at most.
     """
-    threads = min(threads, pieces)
-    shares = deque(_shares(pieces, threads))
-
-    def work() -> None:
-        run = prepare()
-        while shares:
-            try:
-                share = shares.popleft()
-            except IndexError:  # another thread took the last one
-                return
-            run(*share)
-
+    threads = min(len(jobs), pieces)
+    bounds = _shares(pieces, threads)
+    addresses = np.array([job.ctypes.data for job in jobs], dtype=np.int64)
+    task = np.zeros(Task.LENGTH, dtype=np.int64)
+    task[Task.SHARES], task[Task.DRIVER] = len(bounds), driver
+    task[Task.BOUNDS], task[Task.JOBS] = bounds.ctypes.data, addresses.ctypes.data
     if threads <= 1:
-        work()
-        return
+        run_alone(task)
+    elif (openmp := torchs_openmp()) is not None and not is_forked():
+        run_with_openmp(openmp, task, threads)
+    else:
+        run_in_pool(task, threads)
+
+
+def run_alone(task: np.ndarray) -> None:
+    """Run a task in the calling thread."""
+    compiler.compile_team(team)(_integers(task))
+
+
+def run_with_openmp(openmp: ctypes.CDLL, task: np.ndarray, threads: int) -> None:
+    """Run a task on a team of OpenMP's."""
+    function = ctypes.cast(compiler.compile_team(team), ctypes.c_void_p)
+    openmp.GOMP_parallel(function, ctypes.c_void_p(task.ctypes.data), threads, 0)
+
+
+def run_in_pool(task: np.ndarray, threads: int) -> None:
+    """Run a task in a pool that belongs to this process."""
     pool = _pools.get((os.getpid(), threads))
     if pool is None:
         pool = ThreadPoolExecutor(threads - 1, thread_name_prefix="dolens")
         _pools[os.getpid(), threads] = pool
-    others = [pool.submit(work) for _ in range(threads - 1)]
+    others = [pool.submit(run_alone, task) for _ in range(threads - 1)]
     try:
-        work()
+        run_alone(task)
     finally:
         # Whatever stops this thread (Ctrl-C), nobody may write to memory that is given back.
-        shares.clear()
+        task[Task.SHARES] = 0
         _wait([other for other in others if not other.cancel()])
-    for other in others:
-        if not other.cancelled():
-            other.result()
 
 
-def _shares(pieces: int, threads: int) -> list[tuple[int, int]]:
-    """Neighbouring pieces, first and end: large shares first, then smaller, to end together."""
+@cache
+def torchs_openmp() -> ctypes.CDLL | None:
+    """The OpenMP that torch runs on; None where it cannot be found, or has not gcc's interface.
+
+    Torch loads its libraries for all to see, and the OpenMP that obeys its setting is its own.
+    """
+    try:
+        symbols = ctypes.CDLL(None)
+        symbols.omp_get_max_threads.restype = ctypes.c_int
+        symbols.GOMP_parallel.restype = None
+        symbols.GOMP_parallel.argtypes = (
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+            ctypes.c_uint,
+            ctypes.c_uint,
+        )
+        if symbols.omp_get_max_threads() == torch.get_num_threads():
+            return symbols
+        reason = "another OpenMP is in the way"
+    except (AttributeError, OSError, TypeError) as error:
+        reason = str(error)
+    logger.info(
+        "kernels have a pool of threads of their own: torch's OpenMP not found (%s)", reason
+    )
+    return None
+
+
+def is_forked() -> bool:
+    """Whether this process may be a fork of one that had OpenMP's threads."""
+    return os.getpid() != _home or multiprocessing.parent_process() is not None
+
+
+def _integers(array: np.ndarray) -> "ctypes._Pointer":
+    return array.ctypes.data_as(ctypes.POINTER(ctypes.c_int64))
+
+
+def _shares(pieces: int, threads: int) -> np.ndarray:
+    """First and end of neighbouring pieces, (S, 2): large shares first, to end together."""
     shares, first = [], 0
     least = max(1, pieces // (16 * max(threads, 1)))
     while first < pieces:
         size = pieces if threads <= 1 else max(least, (pieces - first) // (2 * threads))
         shares.append((first, min(first + size, pieces)))
         first += size
-    return shares
+    return np.array(shares, dtype=np.int64).reshape(-1, 2)
 
 
 def _wait(others: Sequence[Future]) -> None:

@@ -1,13 +1,11 @@
 """Running the splat on tensors."""
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from dolens.kernels.cpu import compiler
-from dolens.kernels.cpu.program import REAL, as_integers
+from dolens.kernels.cpu.program import REAL
 from dolens.kernels.cpu.rendering.splat import SplatJob, splat_adjoint_driver, splat_driver
 from dolens.kernels.cpu.threads import spread, thread_count
 
@@ -47,8 +45,5 @@ def _job(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> tuple[np.n
 
 def _run(driver: compiler.Factory, job: np.ndarray, chunks: int, like: Tensor) -> None:
     function = compiler.compile_driver(driver, REAL[like.dtype])
-
-    def prepare() -> Callable[[int, int], None]:
-        return lambda first, last: function(as_integers(job), first, last)
-
-    spread(prepare, chunks, thread_count(like.numel()))
+    # Threads may share a job: it holds no memory to work in.
+    spread(function, [job] * thread_count(like.numel()), chunks)
