@@ -34,11 +34,7 @@ def last_state(folder: Path) -> dict:
 def train_py(root: Path, *arguments: str, **options) -> subprocess.CompletedProcess:
     return subprocess.run(
         [sys.executable, str(root / "train.py"), *arguments],
-        capture_output=True,
-        text=True,
-        cwd=root,
-        timeout=500,
-        **options,
+        **{"capture_output": True, "text": True, "cwd": root, "timeout": 500, **options},
     )
 
 
@@ -204,23 +200,34 @@ def test_the_paper_scale_composes_and_runs_two_steps(composed, tmp_path):
 
 
 def test_a_sweep_leaves_a_folder_for_each_job(root, tmp_path):
+    """Each under its own experiment's name, as the README's sweep over two of them."""
     done = train_py(
         root,
         "-m",
-        *WAVEFRONT_CODING,
+        "experiment=wavefront_coding,wavefront_coding_baseline",
+        # Keys of an experiment's own are unknown to Hydra before it has chosen one.
+        *("++" + entry if entry.startswith("module.") else entry for entry in WAVEFRONT_CODING[1:]),
         "trainer.max_epochs=1",
+        "test=false",
+        "objective=train/loss",
         "callbacks.pictures=null",
         "loss.tv_weight=0,1e-4",
-        f"hydra.sweep.dir={tmp_path}",
+        cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    losses = []
-    for job, weight in (("0", "0"), ("1", "0.0001")):
-        assert json.loads((tmp_path / job / "run.json").read_text())["status"] == "finished"
-        assert f"loss.tv_weight={weight}" in (tmp_path / job / ".hydra/overrides.yaml").read_text()
-        assert (tmp_path / job / "log.txt").exists()
-        losses.append(json.loads((tmp_path / job / "metrics.json").read_text())["train/loss"])
-    assert losses[0] < losses[1]
+    (several,) = (tmp_path / "outputs" / "several" / "sweeps").iterdir()
+    assert (several / "multirun.yaml").exists()
+    for name, jobs in (("wavefront_coding", "01"), ("wavefront_coding_baseline", "23")):
+        sweep = tmp_path / "outputs" / name / "sweeps" / several.name
+        assert sorted(path.name for path in sweep.iterdir()) == list(jobs)
+        losses = []
+        for job, weight in zip(jobs, ("0", "0.0001"), strict=True):
+            assert json.loads((sweep / job / "run.json").read_text())["status"] == "finished"
+            overrides = (sweep / job / ".hydra/overrides.yaml").read_text()
+            assert f"loss.tv_weight={weight}" in overrides
+            assert (sweep / job / "log.txt").exists()
+            losses.append(json.loads((sweep / job / "metrics.json").read_text())["train/loss"])
+        assert losses[0] < losses[1]
 
 
 def test_ctrl_c_keeps_the_last_checkpoint_and_says_how_to_resume(root, tmp_path):
