@@ -17,7 +17,7 @@ from dolens.kernels.table import Code, Kind, Outline, Slot
 from dolens.optics.elements import carriers
 from dolens.optics.materials import Medium
 from dolens.optics.surfaces.base import FAR
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optics.surfaces.clear_aperture import ClearAperture
 
 
 class Form(NamedTuple):
@@ -221,20 +221,14 @@ class _Writer:
         values[record + Slot.SCALE] = edge.reach
         # A full circle is tested on the way; where there is none it is out of reach.
         values[record + Slot.EDGE] = (2.0 * FAR * edge.reach) ** 2
-        if isinstance(edge, Circle):
-            row[Code.EDGE] = Outline.CIRCLE
-            values[record + Slot.EDGE] = edge.semi_diameter**2
+        row[Code.EDGE], first, second = edge.packed()
+        if row[Code.EDGE] == Outline.CIRCLE:
+            values[record + Slot.EDGE] = first
         else:
-            row[Code.EDGE] = Outline.RECTANGLE
-            values[record + Slot.HALF_X] = edge.half_width_x
-            values[record + Slot.HALF_Y] = edge.half_width_y
-        if isinstance(hole, Circle):
-            row[Code.HOLE] = Outline.CIRCLE
-            values[record + Slot.HOLE_X] = hole.semi_diameter**2
-        elif hole is not None:
-            row[Code.HOLE] = Outline.RECTANGLE
-            values[record + Slot.HOLE_X] = hole.half_width_x
-            values[record + Slot.HOLE_Y] = hole.half_width_y
+            values[record + Slot.HALF_X], values[record + Slot.HALF_Y] = first, second
+        if hole is not None:
+            row[Code.HOLE], *numbers = hole.packed()
+            values[record + Slot.HOLE_X], values[record + Slot.HOLE_Y] = numbers
 
     def leave(self, carried: int, at: int, medium: int) -> None:
         """From the last surface, which an element may carry, to the lens's axes or the sensor."""

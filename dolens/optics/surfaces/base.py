@@ -136,8 +136,9 @@ class Surface(nn.Module):
         constants: names among the parameters that no optimizer varies (knots); they are buffers.
         arrays: names that a prescription gives as lists; every other is one number.
         optional: names that a prescription may leave out; every other is then zero.
-        kernel: what the fast kernels call it; None: they have none, and the reference traces.  It
-            is not inherited, since a subclass may have another sag.
+        kernel: what the fast kernels call it; None: they have none, and the reference traces.
+        rotational: whether the sag looks the same from every azimuth, whatever the parameters.
+            Neither is inherited, since a subclass may have another sag.
     """
 
     kind: ClassVar[str] = ""
@@ -145,10 +146,12 @@ class Surface(nn.Module):
     constants: ClassVar[tuple[str, ...]] = ()
     arrays: ClassVar[tuple[str, ...]] = ()
     optional: ClassVar[tuple[str, ...]] = ()
+    rotational: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         cls.kernel = cls.__dict__.get("kernel")
+        cls.rotational = cls.__dict__.get("rotational", False)
 
     def __init__(
         self,

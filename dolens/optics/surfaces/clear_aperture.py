@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.table import Outline as OutlineKind
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,15 @@ class Circle:
     def extent(self) -> tuple[float, float]:
         """How far it reaches along x and along y, mm."""
         return self.semi_diameter, self.semi_diameter
+
+    @property
+    def rotational(self) -> bool:
+        """Whether it looks the same from every azimuth."""
+        return True
+
+    def packed(self) -> tuple[OutlineKind, float, float]:
+        """What the kernels know of it: kind, and two numbers; here r² (mm²) and nothing."""
+        return OutlineKind.CIRCLE, self.semi_diameter**2, 0.0
 
 
 @dataclass(frozen=True)
@@ -51,8 +61,46 @@ class Rectangle:
         """How far it reaches along x and along y, mm."""
         return self.half_width_x, self.half_width_y
 
+    @property
+    def rotational(self) -> bool:
+        """Whether it looks the same from every azimuth."""
+        return False
 
-Outline = Circle | Rectangle
+    def packed(self) -> tuple[OutlineKind, float, float]:
+        """What the kernels know of it: kind, and its half widths in mm."""
+        return OutlineKind.RECTANGLE, self.half_width_x, self.half_width_y
+
+
+@dataclass(frozen=True)
+class Unlimited:
+    """No edge at all: light passes wherever the surface is, as a search for a better lens needs it.
+
+    Attributes:
+        reach: mm, how far from the vertex light is expected; it sets the scale of tolerances.
+    """
+
+    reach: float
+
+    def margin(self, x: Tensor, y: Tensor) -> Tensor:
+        """Positive everywhere."""
+        return torch.ones_like(x * y)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """How far light is expected along x and along y, mm."""
+        return self.reach, self.reach
+
+    @property
+    def rotational(self) -> bool:
+        """Whether it looks the same from every azimuth."""
+        return True
+
+    def packed(self) -> tuple[OutlineKind, float, float]:
+        """What the kernels know of it: nothing."""
+        return OutlineKind.NONE, 0.0, 0.0
+
+
+Outline = Circle | Rectangle | Unlimited
 
 
 @dataclass(frozen=True)
@@ -77,6 +125,15 @@ class ClearAperture:
                 f"the obscuration reaches {self.obscuration.reach:g} mm from the vertex, the "
                 f"aperture only {self.edge.reach:g}"
             )
+
+    @property
+    def rotational(self) -> bool:
+        """Whether it looks the same from every azimuth."""
+        return self.edge.rotational and (self.obscuration is None or self.obscuration.rotational)
+
+    def opened(self) -> "ClearAperture":
+        """The same size with no edge and no obscuration: it clips nothing."""
+        return ClearAperture(Unlimited(self.edge.reach))
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """A number that is positive where light passes; no gradient."""

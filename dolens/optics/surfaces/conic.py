@@ -72,6 +72,7 @@ class Conic(Surface):
 
     kind = "conic"
     kernel = Kind.CONIC
+    rotational = True
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -146,6 +147,7 @@ class Sphere(Conic):
 
     kind = "sphere"
     kernel = Kind.SPHERE
+    rotational = True
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:

@@ -19,6 +19,7 @@ class EvenAsphere(Conic):
 
     kind = "even_asphere"
     kernel = Kind.EVEN_ASPHERE
+    rotational = True
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:

@@ -21,6 +21,7 @@ class Plane(Surface):
 
     kind = "plane"
     kernel = Kind.PLANE
+    rotational = True
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -77,3 +78,4 @@ class Aperture(Plane):
 
     kind = "aperture"
     kernel = Kind.PLANE
+    rotational = True
