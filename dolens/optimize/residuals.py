@@ -1,0 +1,80 @@
+"""What a least-squares optimizer asks of the thing that it makes small."""
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optimize.linear_model import LinearModel
+
+
+@runtime_checkable
+class Residuals(Protocol):
+    """Residuals r at a point.
+
+    A merit function of rays knows its Jacobian better than autograd does, and may never store it;
+    a closure may return such an object instead of a tensor of residuals.
+    """
+
+    def sum_of_squares(self) -> float:
+        """‖r‖²; `inf` or NaN where the point cannot be evaluated, as when rays fail."""
+        ...
+
+    def linear_model(self) -> LinearModel:
+        """R and b in the optimizer's variables, in the order of its parameters."""
+        ...
+
+
+class TensorResiduals:
+    """Residuals as a tensor with a graph; autograd sweeps back once for each of them.
+
+    Args:
+        residuals: r, of any shape.
+        variables: leaves that r was computed from; P numbers in all.
+    """
+
+    def __init__(self, residuals: Tensor, variables: Sequence[Tensor]) -> None:
+        self._residuals, self._variables = residuals.reshape(-1), list(variables)
+
+    def sum_of_squares(self) -> float:
+        """‖r‖²."""
+        return float(self._residuals.detach().double().square().sum())
+
+    def linear_model(self) -> LinearModel:
+        """R and b.
+
+        Raises:
+            InputError: the residuals have no graph.
+        """
+        if not self._residuals.requires_grad:
+            raise InputError("the closure's residuals have no gradient with respect to anything")
+        return LinearModel.of_rows(self._residuals, jacobian_of(self._residuals, self._variables))
+
+
+def jacobian_of(values: Tensor, variables: Sequence[Tensor]) -> Tensor:
+    """∂values/∂variables, (N, P), by one batch of N reverse sweeps.
+
+    Args:
+        values: (N,), with a graph.
+        variables: leaves; P numbers in all, each tensor by rows.
+    """
+    count = len(values)
+    found = torch.autograd.grad(
+        values,
+        list(variables),
+        torch.eye(count, dtype=values.dtype, device=values.device),
+        is_grads_batched=True,
+        allow_unused=True,
+        retain_graph=True,
+    )
+    return torch.cat(
+        [
+            values.new_zeros(count, variable.numel())
+            if jacobian is None
+            else jacobian.reshape(count, -1)
+            for variable, jacobian in zip(variables, found, strict=True)
+        ],
+        1,
+    )

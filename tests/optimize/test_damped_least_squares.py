@@ -1,0 +1,225 @@
+"""Damped least squares on problems whose solutions others have certified."""
+
+import pytest
+import torch
+
+from dolens.errors import InputError
+from dolens.optimize import DampedLeastSquares
+from tests.optimize.standard_problems import CERTIFIED, MORE
+
+# From these two of NIST's harder starts SciPy's three methods end elsewhere too: a first step of
+# Gauss and Newton leads to where the exponential is flat (see `scripts/least_squares.py`).
+HARDEST = {("BoxBOD", 0), ("MGH10", 0)}
+STARTS = [
+    (name, k)
+    for name, problem in CERTIFIED.items()
+    for k in range(len(problem.starts))
+    if (name, k) not in HARDEST
+]
+
+
+def minimise(residuals, start, steps=2000, dtype=torch.float64, lower=None, upper=None, **options):
+    """The variables and the optimizer when it stops."""
+    u = torch.tensor(start, dtype=dtype, requires_grad=True)
+    optimizer = DampedLeastSquares([{"params": [u], "lower": lower, "upper": upper}], **options)
+    for _ in range(steps):
+        optimizer.step(lambda: residuals(u))
+        if optimizer.stopped:
+            break
+    return u.detach(), optimizer
+
+
+@pytest.mark.parametrize("name, k", STARTS)
+def test_certified_regressions(name, k):
+    """NIST's sums of squares, and its parameters to the digits that the sums' rounding leaves."""
+    problem = CERTIFIED[name]
+    u, optimizer = minimise(problem.residuals, problem.starts[k], merit_tolerance=0.0)
+    assert optimizer.stopped
+    assert optimizer.last.merit == pytest.approx(problem.minima[0], rel=1e-10)
+    for found, certified in zip(u.tolist(), problem.solution, strict=True):
+        assert found == pytest.approx(certified, rel=1e-7)
+
+
+@pytest.mark.parametrize("damping", ["multiplicative", "identity"])
+@pytest.mark.parametrize("name", MORE)
+def test_problems_of_more_garbow_and_hillstrom(name, damping):
+    problem = MORE[name]
+    _, optimizer = minimise(problem.residuals, problem.starts[0], damping=damping, steps=5000)
+    merit = optimizer.last.merit
+    assert any(
+        merit <= 1e-14 if minimum == 0.0 else merit == pytest.approx(minimum, rel=5e-6)
+        for minimum in problem.minima
+    ), (merit, optimizer.stopped)
+
+
+def rosenbrock(u):
+    return torch.stack([10.0 * (u[1] - u[0] ** 2), 1.0 - u[0]])
+
+
+@pytest.mark.parametrize(("bounds", "error"), [("active", 1e-8), ("projected", 1e-4)])
+def test_a_bound_that_the_minimum_lies_behind(bounds, error):
+    """With u₁ ≤ 0.5 the least sum of squares is at (0.5, 0.25): 0.25 + 100·(u₂ - 0.25)².
+
+    Half of the merit's digits is what it tells of the variables; projection gains ever less.
+    """
+    u, optimizer = minimise(rosenbrock, (-1.2, 1.0), upper=torch.tensor([0.5, 2.0]), bounds=bounds)
+    assert optimizer.stopped
+    assert u.tolist() == pytest.approx([0.5, 0.25], rel=error)
+    assert optimizer.last.merit == pytest.approx(0.25, abs=100.0 * error**2)
+
+
+def test_active_bounds_take_fewer_iterations_than_projection():
+    """A narrow valley along which the step must turn once a variable is stopped."""
+    generator = torch.Generator().manual_seed(5)
+    turn = torch.linalg.qr(torch.randn(12, 12, generator=generator, dtype=torch.float64)).Q
+    rows = turn @ torch.diag(torch.logspace(0, -3, 12, dtype=torch.float64)) @ turn.T
+    target = torch.randn(12, generator=generator, dtype=torch.float64)
+
+    def residuals(u):
+        return rows @ (u - target)
+
+    found = {}
+    for bounds in ("active", "projected"):
+        steps = 0
+
+        def counted(u):
+            nonlocal steps
+            steps += u.requires_grad and torch.is_grad_enabled()
+            return residuals(u)
+
+        _, optimizer = minimise(counted, (0.0,) * 12, lower=-0.5, upper=0.5, bounds=bounds)
+        found[bounds] = (optimizer.last.merit, steps)
+    assert found["active"][0] <= found["projected"][0] * (1.0 + 1e-9)
+    assert 3 * found["active"][1] < found["projected"][1]
+
+
+def test_starts_on_and_beyond_a_bound():
+    for start in (2.0, 5.0):
+        u, optimizer = minimise(lambda u: u - 1.0, (start,), lower=-3.0, upper=2.0)
+        assert float(u) == pytest.approx(1.0, rel=1e-12)
+        assert "fallen" in optimizer.stopped or "zero" in optimizer.stopped
+    u, optimizer = minimise(lambda u: u - 1.0, (2.0,), lower=2.0, upper=3.0)
+    assert float(u) == 2.0
+    assert optimizer.stopped == "every variable is pressed against its bound"
+
+
+def test_rank_deficient_problems_end_at_a_minimum():
+    """Two variables that only their sum matters for, and one that nothing depends on."""
+
+    def residuals(u):
+        return torch.stack([u[0] + u[1] - 3.0, 2.0 * (u[0] + u[1]) - 6.5, u[0] * 0.0])
+
+    u, optimizer = minimise(residuals, (0.0, 0.0, 7.0))
+    assert optimizer.stopped
+    assert float(u[0] + u[1]) == pytest.approx(3.2, rel=1e-9)
+    assert float(u[0]) == pytest.approx(float(u[1]), rel=1e-9)
+    assert float(u[2]) == 7.0
+
+
+@pytest.mark.parametrize("damping", ["multiplicative", "identity"])
+def test_residuals_that_turn_nan_shrink_the_step(damping):
+    """√u ends at zero: the first step of Gauss and Newton would leap beyond it."""
+    u, optimizer = minimise(
+        lambda u: torch.stack([u[0].sqrt() - 0.1, 0.01 * (u[0] - 0.01)]), (4.0,), damping=damping
+    )
+    assert float(u) == pytest.approx(0.01, rel=1e-6)
+    assert optimizer.stopped
+
+
+def test_failed_trials_are_counted_and_the_start_must_be_finite():
+    u = torch.tensor([4.0], dtype=torch.float64, requires_grad=True)
+    optimizer = DampedLeastSquares([u], initial_damping=1e-12)
+    optimizer.step(lambda: u.sqrt() - 0.1)
+    assert optimizer.last.failed_trials > 0 and optimizer.last.merit < optimizer.last.merit_before
+    with torch.no_grad():
+        u.fill_(-1.0)
+    with pytest.raises(InputError, match="least squares cannot begin: the merit is nan"):
+        optimizer.step(lambda: u.sqrt())
+    assert float(u.detach()) == -1.0
+
+
+def test_when_nothing_helps_it_says_what_it_tried():
+    """A merit that is finite at one point only."""
+    start = 3.0
+
+    def residuals(u):
+        return u if float(u.detach()) == start else u / 0.0
+
+    u, optimizer = minimise(residuals, (start,), max_trials=7)
+    assert float(u) == start
+    assert optimizer.stopped == "no step lowers the merit: 7 were tried, 7 failed"
+    again = optimizer.step(lambda: pytest.fail("it had stopped"))
+    assert float(again) == start**2
+    optimizer.restart()
+    assert optimizer.stopped is None
+
+
+def test_multiplicative_damping_does_not_care_about_units():
+    """The same problem in metres and in micrometres takes the same steps."""
+    problem = MORE["Bard"]
+    unit = torch.tensor([1e-6, 1.0, 1e4], dtype=torch.float64)
+    merits = []
+    for scale in (torch.ones(3, dtype=torch.float64), unit):
+        u = (torch.ones(3, dtype=torch.float64) / scale).requires_grad_()
+        optimizer = DampedLeastSquares([u])
+        merits.append(
+            [float(optimizer.step(lambda u=u, s=scale: problem.residuals(u * s))) for _ in range(8)]
+        )
+    assert merits[0] == pytest.approx(merits[1], rel=1e-9)
+
+
+def test_groups_and_resuming_from_a_checkpoint(tmp_path):
+    """Saved as plain tensors after five iterations, it goes on to the bit."""
+
+    def setup():
+        a = torch.tensor([-1.2], dtype=torch.float64, requires_grad=True)
+        b = torch.tensor([1.0], dtype=torch.float64, requires_grad=True)
+        optimizer = DampedLeastSquares(
+            [{"params": [a], "upper": 0.9}, {"params": [b], "lower": 0.0}]
+        )
+        return a, b, optimizer, lambda: rosenbrock(torch.cat([a, b]))
+
+    a, b, optimizer, closure = setup()
+    for _ in range(5):
+        optimizer.step(closure)
+    torch.save({"optimizer": optimizer.state_dict(), "u": (a, b)}, tmp_path / "state.ckpt")
+    expected = [float(optimizer.step(closure)) for _ in range(5)]
+    a, b, optimizer, closure = setup()
+    state = torch.load(tmp_path / "state.ckpt", weights_only=True)
+    optimizer.load_state_dict(state["optimizer"])
+    with torch.no_grad():
+        a.copy_(state["u"][0])
+        b.copy_(state["u"][1])
+    assert [float(optimizer.step(closure)) for _ in range(5)] == expected
+
+
+def test_float32_variables_reach_their_own_precision():
+    u, optimizer = minimise(rosenbrock, (-1.2, 1.0), dtype=torch.float32)
+    assert optimizer.stopped
+    assert u.tolist() == pytest.approx([1.0, 1.0], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"damping": "additive"}, "damping must be one of multiplicative, identity"),
+        ({"bounds": "soft"}, "bounds must be one of active, projected"),
+        ({"merit_tolerance": -1.0}, "merit_tolerance must be at least 0 and below 1"),
+        ({"initial_damping": 0.0}, "initial_damping must be positive"),
+        ({"max_trials": 0}, "max_trials must be at least 1"),
+        ({"lower": 2.0, "upper": 1.0}, "variable 0: lower bound 2 exceeds upper 1"),
+    ],
+)
+def test_bad_settings_are_refused(options, said):
+    with pytest.raises(InputError, match=said):
+        minimise(rosenbrock, (-1.2, 1.0), **options)
+
+
+def test_a_jacobian_that_is_not_finite_is_refused():
+    with pytest.raises(InputError, match="the Jacobian is not finite"):
+        minimise(lambda u: torch.where(u > 0.0, u, (-u).sqrt()), (1.0,))
+
+
+def test_residuals_without_a_gradient_are_refused():
+    with pytest.raises(InputError, match="no gradient"):
+        minimise(lambda u: u.detach(), (1.0,))
