@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optimize.dependents import Dependent, dependent
+from dolens.optimize.residuals import jacobian_of
 
 _KEYS = ("scale", "initial", "lower", "upper")
 
@@ -19,10 +21,20 @@ class DesignVariables(nn.Module):
     A parameter that is an array (the coefficients of a B-spline) counts as many variables, with
     one scale and the same bounds for all its elements.
 
+    A parameter may also follow from others: a pickup or a solve (see `dependents`).  Patterns leave
+    such parameters out.
+
     Args:
         lens: where the parameters live; it is not changed.
         variables: name or pattern → settings: `scale` (default 1), `initial` (default: the
-            lens's own value), `lower` and `upper` (default: none), all in the parameter's unit.
+            lens's own value), `lower` and `upper` (default: none), all in the parameter's unit;
+            or name → `pickup` or `solve` with their settings.
+
+    Attributes:
+        names: of the parameters that are varied.
+        scaled: u, P numbers.
+        dependents: the parameters that follow from others, in the order of their settings.
+        best_focus: whether a merit function is to keep the sensor at the best focus.
 
     Raises:
         InputError: an unknown parameter or setting, a scale that is not positive, or an initial
@@ -32,16 +44,26 @@ class DesignVariables(nn.Module):
     def __init__(self, lens: Lens, variables: Mapping[str, Mapping[str, Any] | None]) -> None:
         super().__init__()
         self.names: list[str] = []
+        # In a tuple, so that the lens's parameters are not this module's too.
+        self._of = (lens,)
         self._shapes: list[torch.Size] = []
+        self.dependents, self.best_focus = _dependents(lens, variables)
+        following = {parameter.name for parameter in self.dependents}
+        if self.best_focus:
+            following.add("sensor_distance")
         scaled, scale, lower, upper = [], [], [], []
         for pattern, settings in variables.items():
             settings = dict(settings or {})
+            if pattern in following:
+                continue
             for key in settings:
                 if key not in _KEYS:
                     raise InputError(
                         f"variable '{pattern}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
                     )
             for name, parameter in lens.variables([pattern]).items():
+                if name in following:
+                    continue
                 if name in self.names:
                     raise InputError(f"variable '{name}' is named twice (by '{pattern}' too)")
                 s = _setting(settings, "scale", 1.0, pattern)
@@ -74,12 +96,43 @@ class DesignVariables(nn.Module):
         return len(self.names)
 
     def forward(self) -> dict[str, Tensor]:
-        """The parameters θ = scale·u by name, to be traced with instead of the stored ones."""
+        """The parameters θ = scale·u by name, and those that follow from them.
+
+        They are to be traced with instead of the stored ones.
+        """
         parts = (self.scale * self.scaled).split([shape.numel() for shape in self._shapes])
-        return {
+        values = {
             name: part.reshape(shape)
             for name, part, shape in zip(self.names, parts, self._shapes, strict=True)
         }
+        for parameter in self.dependents:
+            values[parameter.name] = parameter.value(self._of[0], values)
+        return values
+
+    def derivatives(self) -> tuple[list[str], Tensor]:
+        """How the lens's parameters change with u.
+
+        Returns:
+            Names of all parameters that change, in the lens's own order, and ∂θ/∂u, (Q, P), in
+            double precision, a row for every number of theirs.
+        """
+        with torch.enable_grad():
+            values = self()
+            names = list(self._of[0].variables(list(values)))
+            if self.dependents:
+                flat = torch.cat([values[name].reshape(-1) for name in names])
+                return names, jacobian_of(flat, [self.scaled]).double()
+        first, place = {}, 0
+        for name, shape in zip(self.names, self._shapes, strict=True):
+            first[name] = place
+            place += shape.numel()
+        columns = torch.cat(
+            [first[name] + torch.arange(values[name].numel()) for name in names]
+            or [torch.zeros(0, dtype=torch.int64)]
+        )
+        matrix = torch.zeros(place, place, dtype=torch.float64)
+        matrix[torch.arange(place), columns] = self.scale.double().cpu()[columns]
+        return names, matrix
 
     @torch.no_grad()
     def project(self) -> None:
@@ -92,6 +145,21 @@ class DesignVariables(nn.Module):
         parameters = dict(lens.named_parameters())
         for name, value in self().items():
             parameters[name].copy_(value)
+
+
+def _dependents(
+    lens: Lens, variables: Mapping[str, Mapping[str, Any] | None]
+) -> tuple[list[Dependent], bool]:
+    found, best_focus = [], False
+    for name, settings in variables.items():
+        if settings and ("pickup" in settings or "solve" in settings):
+            lens.variables([name])
+            made = dependent(name, settings, lens)
+            if made is None:
+                best_focus = True
+            else:
+                found.append(made)
+    return found, best_focus
 
 
 def _setting(settings: Mapping[str, Any], key: str, default: float, pattern: str) -> float:

@@ -1,0 +1,167 @@
+"""Parameters that follow from others: pickups and solves.
+
+A pickup copies another parameter; a solve holds a first-order property at its value.  Both are
+functions of the values that are varied, differentiable, so that a search knows of them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import first_order, surface_matrix
+
+SOLVES = ("efl", "paraxial_focus", "best_focus")
+
+
+class Dependent(Protocol):
+    """A parameter as a function of the others."""
+
+    name: str
+
+    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+        """From the lens and the values that are known so far, by name."""
+        ...
+
+
+@dataclass(frozen=True)
+class Pickup:
+    """factor · another parameter + offset, as two radii that must be equal.
+
+    Attributes:
+        name: the parameter that follows.
+        source: the one that it follows, of the same shape.
+        factor: without a unit.
+        offset: in the parameter's unit.
+    """
+
+    name: str
+    source: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+        """From the source's own value."""
+        source = values.get(self.source)
+        if source is None:
+            source = lens.variables([self.source])[self.source].detach()
+        return self.factor * source + self.offset
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """The curvature of a surface that gives the lens its focal length.
+
+    Power is linear in the curvature of any one surface, P(c) = P(0) + c·(P(1) - P(0)), because it
+    enters one matrix of the product; so two evaluations solve for it.
+
+    Attributes:
+        name: `surfaces.<n>.curvature`.
+        efl: mm.
+        wavelength: nm.
+    """
+
+    name: str
+    efl: float
+    wavelength: float
+
+    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+        """c where P(c) = 1/EFL, 1/mm."""
+        stored = lens.variables([self.name])[self.name].detach()
+
+        def power(curvature: float) -> Tensor:
+            trial = {**values, self.name: stored.new_tensor(curvature)}
+            system = lens.system(trial)
+            return -surface_matrix(system, self.wavelength, 1, len(system.surfaces))[1, 0]
+
+        flat = power(0.0)
+        return (1.0 / self.efl - flat) / (power(1.0) - flat)
+
+
+@dataclass(frozen=True)
+class ParaxialFocus:
+    """The sensor at the paraxial image of the axis.
+
+    Attributes:
+        wavelength: nm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        defocus: mm from there on.
+    """
+
+    wavelength: float
+    object_distance: float | None = None
+    defocus: float = 0.0
+    name: str = "sensor_distance"
+
+    def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
+        """From the last vertex, mm."""
+        system = lens.system({n: v for n, v in values.items() if n != self.name})
+        image = first_order(system, self.wavelength, self.object_distance).image
+        return image - system.vertices[len(system.surfaces) - 1] + self.defocus
+
+
+def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent | None:
+    """A pickup or a solve as a configuration gives it.
+
+    Args:
+        name: the parameter that follows.
+        settings: `pickup` with `factor` and `offset`; or `solve` with `target` (of `efl`) or
+            `defocus` (of `paraxial_focus`).
+        lens: whose wavelength and object distance count.
+
+    Returns:
+        None for `solve: best_focus`, which needs rays: a merit function of spots does it.
+
+    Raises:
+        InputError: unknown or missing settings, or a solve for a parameter that it cannot move.
+    """
+    wavelength = lens.reference_wavelength or 587.5618
+    if "pickup" in settings:
+        _check(name, settings, ("pickup", "factor", "offset"))
+        source = str(settings["pickup"])
+        pair = {**lens.variables([name]), **lens.variables([source])}
+        if source == name or set(pair) != {name, source}:
+            raise InputError(f"variable '{name}': pickup must name one other parameter")
+        if pair[name].shape != pair[source].shape:
+            raise InputError(f"variable '{name}': pickup '{source}' has another shape")
+        return Pickup(
+            name,
+            source,
+            _number(name, settings, "factor", 1.0),
+            _number(name, settings, "offset", 0.0),
+        )
+    solve = settings["solve"]
+    if solve == "efl":
+        _check(name, settings, ("solve", "target"))
+        if not name.endswith(".curvature") or settings.get("target") is None:
+            raise InputError(f"variable '{name}': solve 'efl' moves a curvature, to a target in mm")
+        return FocalLength(name, _number(name, settings, "target", 0.0), wavelength)
+    if solve not in SOLVES:
+        raise InputError(
+            f"variable '{name}': solve '{solve}' is unknown (allowed: {', '.join(SOLVES)})"
+        )
+    if name != "sensor_distance":
+        raise InputError(f"variable '{name}': solve '{solve}' moves sensor_distance only")
+    if solve == "best_focus":
+        _check(name, settings, ("solve",))
+        return None
+    _check(name, settings, ("solve", "defocus"))
+    return ParaxialFocus(wavelength, lens.object_distance, _number(name, settings, "defocus", 0.0))
+
+
+def _check(name: str, settings: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
+    for key in settings:
+        if key not in allowed:
+            raise InputError(
+                f"variable '{name}': unknown key '{key}' (allowed: {', '.join(allowed)})"
+            )
+
+
+def _number(name: str, settings: Mapping[str, Any], key: str, default: float) -> float:
+    try:
+        return float(settings.get(key, default))
+    except (TypeError, ValueError):
+        raise InputError(f"variable '{name}': {key} must be a number") from None

@@ -1,0 +1,251 @@
+"""What a lens should be besides sharp: focal lengths, thicknesses, angles, distortion.
+
+An operand is a property of the lens, one number or several of a kind, with a target or with limits.
+A target t contributes (weight·(v - t))² to the merit function, a limit only the part of v that is
+beyond it.  Its derivatives come from autograd: these are a few numbers, each one reverse sweep.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.aiming import aim
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import first_order
+from dolens.optics.rays import Components
+from dolens.optics.surfaces.base import SurfaceState
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane
+
+_KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
+
+
+@dataclass(frozen=True)
+class View:
+    """A lens at the values of a search, as operands see it.
+
+    Attributes:
+        system: with a graph to the variables.
+        wavelength: nm, the reference wavelength.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+    """
+
+    system: OpticalSystem
+    wavelength: float
+    object_distance: float | None
+
+
+@dataclass(frozen=True)
+class Operand:
+    """A property of a lens with a target or limits.
+
+    Attributes:
+        kind: a name in `KINDS`.
+        target: what it should be; None where only limits are given.
+        low: the least that costs nothing; None for no limit.
+        high: the most that costs nothing.
+        weight: factor of the residual: merit counts (weight·deviation)².
+        field: (x, y) of the chief ray, degrees or mm, of operands that have one.
+        gaps: numbers of the gaps, of operands that have them; None for all of their kind.
+    """
+
+    kind: str
+    target: float | None = None
+    low: float | None = None
+    high: float | None = None
+    weight: float = 1.0
+    field: tuple[float, float] = (0.0, 0.0)
+    gaps: tuple[int, ...] | None = None
+
+    def values(self, view: View) -> dict[str, Tensor]:
+        """Label → value, a scalar with a graph, in the property's own unit."""
+        return KINDS[self.kind](self, view)
+
+    def deviation(self, value: Tensor) -> Tensor:
+        """What is amiss: value - target, or the part of it beyond the limits, with its sign."""
+        if self.target is not None:
+            return value - self.target
+        below = 0.0 if self.low is None else (value - self.low).clamp(max=0.0)
+        above = 0.0 if self.high is None else (value - self.high).clamp(min=0.0)
+        return below + above
+
+
+def operand(settings: Mapping[str, Any], lens: Lens) -> Operand:
+    """An operand as a configuration gives it.
+
+    Args:
+        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`.
+        lens: that it is meant for.
+
+    Raises:
+        InputError: an unknown key or kind, no target and no limit, or both, a weight that is not
+            positive, or a gap that the lens does not have.
+    """
+    kind = settings.get("kind")
+    if kind not in KINDS:
+        raise InputError(f"operand: kind '{kind}' is unknown (allowed: {', '.join(KINDS)})")
+    for key in settings:
+        if key not in _KEYS:
+            raise InputError(f"operand '{kind}': unknown key '{key}' (allowed: {', '.join(_KEYS)})")
+    numbers = {
+        key: None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
+        for key in ("target", "min", "max")
+    }
+    limits = numbers["min"] is not None or numbers["max"] is not None
+    if limits == (numbers["target"] is not None):
+        raise InputError(f"operand '{kind}': give a target, or limits (min, max), one of the two")
+    if None not in (numbers["min"], numbers["max"]) and numbers["min"] > numbers["max"]:
+        raise InputError(f"operand '{kind}': min exceeds max")
+    weight = _number(settings.get("weight", 1.0), f"{kind}: weight")
+    if not weight > 0.0:
+        raise InputError(f"operand '{kind}': weight must be positive, not {weight:g}")
+    field = tuple(_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0))
+    if len(field) != 2:
+        raise InputError(f"operand '{kind}': field is x and y, not {field}")
+    gaps = settings.get("gaps")
+    count = len(lens.thicknesses)
+    if gaps is not None:
+        gaps = tuple(int(gap) for gap in gaps)
+        for gap in gaps:
+            if not 1 <= gap <= count:
+                raise InputError(f"operand '{kind}': the lens has gaps 1 to {count}, not {gap}")
+    return Operand(kind, numbers["target"], numbers["min"], numbers["max"], weight, field, gaps)
+
+
+def _number(value: object, what: str) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"operand '{what}' must be a number, not {value!r}") from None
+
+
+# -------------------------------------------------------------------- first order
+
+
+def _first_order(name: str) -> Callable[[Operand, View], dict[str, Tensor]]:
+    def value(operand: Operand, view: View) -> dict[str, Tensor]:
+        found = first_order(view.system, view.wavelength, view.object_distance)
+        return {operand.kind: getattr(found, name)}
+
+    return value
+
+
+# -------------------------------------------------------------------- lengths
+
+
+def _total_track(operand: Operand, view: View) -> dict[str, Tensor]:
+    """From the first vertex to the sensor, mm."""
+    return {"total_track": view.system.vertices[-1]}
+
+
+def _gaps(operand: Operand, view: View, glass: bool) -> Sequence[int]:
+    """Numbers of the gaps that an operand means: its own, or all those of glass, or of air."""
+    if operand.gaps is not None:
+        return operand.gaps
+    indices = view.system.indices(view.wavelength)
+    gaps = range(1, len(view.system.thicknesses) + 1)
+    return [gap for gap in gaps if (float(indices[gap]) > _GLASS) == glass]
+
+
+# Media of a smaller index are air.
+_GLASS = 1.1
+
+
+def _at_centre(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
+    def values(operand: Operand, view: View) -> dict[str, Tensor]:
+        return {
+            f"{operand.kind}/{gap}": view.system.thicknesses[gap - 1]
+            for gap in _gaps(operand, view, glass)
+        }
+
+    return values
+
+
+def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
+    def values(operand: Operand, view: View) -> dict[str, Tensor]:
+        """Along the axis from rim to rim, each surface at the edge of its own aperture."""
+        found = {}
+        for gap in _gaps(operand, view, glass):
+            at_centre = view.system.thicknesses[gap - 1]
+            front, back = (
+                _rim_sag(view.system.surfaces[number], at_centre) for number in (gap - 1, gap)
+            )
+            found[f"{operand.kind}/{gap}"] = at_centre + back - front
+        return found
+
+    return values
+
+
+def _rim_sag(surface: SurfaceState, like: Tensor) -> Tensor:
+    height = torch.full_like(like, surface.semi_diameter)
+    sag, *_ = surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(like), height)
+    return sag
+
+
+# -------------------------------------------------------------------- real chief rays
+
+
+def _chief_ray(operand: Operand, view: View) -> Components:
+    """The real chief ray of the operand's field on the sensor plane."""
+    system = view.system
+    options = {"dtype": system.dtype, "device": system.device}
+    field = torch.tensor(operand.field, **options)
+    if view.object_distance is None:
+        field = torch.deg2rad(field)
+    aimed = aim(system, field, torch.zeros(2, **options), view.wavelength, view.object_distance)
+    if not bool(aimed.converged):
+        raise UnreachableField(operand.field)
+    ray, _ = enter_lens(system, aimed, 1, 1.0)
+    traced = trace_surfaces(system, ray, view.wavelength, 1.0)
+    return trace_to_plane(system, traced, system.vertices[-1], view.wavelength, 1.0).ray
+
+
+class UnreachableField(ArithmeticError):
+    """The chief ray of a field does not reach the stop: the lens cannot be judged."""
+
+
+def _chief_ray_angle(operand: Operand, view: View) -> dict[str, Tensor]:
+    """Between the chief ray and the sensor's normal, degrees."""
+    ray = _chief_ray(operand, view)
+    across = torch.hypot(ray.l, ray.m)
+    return {_labelled(operand): torch.rad2deg(torch.atan2(across, ray.n))}
+
+
+def _distortion(operand: Operand, view: View) -> dict[str, Tensor]:
+    """How far the chief ray lands from its paraxial image height, per cent of this height."""
+    ray = _chief_ray(operand, view)
+    found = first_order(view.system, view.wavelength, view.object_distance)
+    field = torch.tensor(operand.field, dtype=view.system.dtype, device=view.system.device)
+    if view.object_distance is None:
+        ideal = found.efl * torch.tan(torch.deg2rad(field))
+    else:
+        ideal = found.magnification * field
+    along = ideal.detach() / ideal.detach().norm()
+    height, real = (ideal * along).sum(), ray.x * along[0] + ray.y * along[1]
+    return {_labelled(operand): 100.0 * (real - height) / height}
+
+
+def _labelled(operand: Operand) -> str:
+    x, y = operand.field
+    return f"{operand.kind}/{x:g},{y:g}"
+
+
+# Each gives label → value of an operand: mm, degrees or per cent.
+KINDS: dict[str, Callable[[Operand, View], dict[str, Tensor]]] = {
+    "efl": _first_order("efl"),
+    "bfd": _first_order("bfd"),
+    "f_number": _first_order("f_number"),
+    "working_f_number": _first_order("working_f_number"),
+    "magnification": _first_order("magnification"),
+    "total_track": _total_track,
+    "centre_thickness": _at_centre(glass=True),
+    "air_gap": _at_centre(glass=False),
+    "edge_thickness": _at_edge(glass=True),
+    "edge_air_gap": _at_edge(glass=False),
+    "chief_ray_angle": _chief_ray_angle,
+    "distortion": _distortion,
+}

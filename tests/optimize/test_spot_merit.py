@@ -1,0 +1,266 @@
+"""Merit functions of spots: their rays, their residuals, and derivatives against differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dolens import Rays, load_lens
+from dolens.errors import InputError
+from dolens.imaging.spot_rays import (
+    gaussian_quadrature,
+    is_rotationally_symmetric,
+    square_grid,
+    with_chief_rays,
+)
+from dolens.optimize import DesignVariables, MeritSettings
+from dolens.optimize.spot_residuals import SpotResiduals, without_edges
+
+LINES = (656.2725, 587.5618, 486.1327)
+
+
+@pytest.fixture
+def triplet(root):
+    return load_lens(root / "conf/lens/cooke_triplet.yaml")
+
+
+@pytest.fixture
+def nikon(root):
+    return load_lens(root / "conf/lens/nikon.yaml", index_model="do")
+
+
+def rms_radii(lens, spots):
+    """As the definition says, spot by spot."""
+    hit = lens.trace(spots.rays)
+    assert bool(hit.valid.all())
+    radii = []
+    for spot in range(spots.count):
+        mine = spots.spot == spot
+        points, weight = hit.position[mine, :2].detach(), spots.weight[mine]
+        assert float(weight.sum()) == pytest.approx(1.0, rel=1e-12)
+        mean = (weight[:, None] * points).sum(0)
+        mean = torch.where(spots.centred[spot], 0.0, mean)
+        radii.append(math.sqrt(float((weight * (points - mean).square().sum(-1)).sum())))
+    return np.array(radii)
+
+
+def test_the_square_grid_gives_the_reference_s_spots(triplet, reference):
+    """RMS radii of tests/reference: 31×31 rays through the first vertex plane, 28 digits."""
+    entries = reference("rms_triplet__dfc.json")["entries"]
+    for entry in entries:
+        spots = square_grid(
+            triplet, [(float(entry["view_deg"]), 0.0)], [float(entry["wavelength"])]
+        )
+        assert len(spots.weight) == entry["n_valid"] and spots.launched == 961
+        assert rms_radii(triplet, spots)[0] == pytest.approx(float(entry["rms"]), rel=1e-9)
+
+
+def test_the_published_nikon_start(nikon):
+    """Table II without its aspheres: 28.06 µm on average over twelve spots (reference/README)."""
+    with torch.no_grad():
+        aspheres = ["surfaces.1[78].a*", "surfaces.1[78].conic"]
+        for parameter in nikon.variables(aspheres).values():
+            parameter.zero_()
+    spots = square_grid(nikon, nikon.fields.points, nikon.wavelengths)
+    assert spots.launched == 12 * 961 and len(spots.weight) < 0.15 * spots.launched
+    assert 1e3 * rms_radii(nikon, spots).mean() == pytest.approx(28.06, abs=0.005)
+
+
+@pytest.mark.parametrize("field", [(0.0, 0.0), (0.0, 10.0), (0.0, 20.0), (7.0, 14.0)])
+def test_quadrature_agrees_with_a_fine_sampling(triplet, field):
+    """Few rays by Gauss give what many on a fine polar grid give, whatever clips the light."""
+    few = rms_radii(triplet, gaussian_quadrature(triplet, [field], [587.5618], 6, 24))[0]
+    many = rms_radii(triplet, gaussian_quadrature(triplet, [field], [587.5618], 40, 160))[0]
+    assert few == pytest.approx(many, rel=3e-3)
+
+
+def test_symmetry_saves_rays_and_nothing_else(triplet):
+    """Half of the arms for a field along y, one for the axis: the radii stay."""
+    assert is_rotationally_symmetric(triplet)
+    fields = [(0.0, 0.0), (0.0, 12.0)]
+    spots = gaussian_quadrature(triplet, fields, LINES, 5, 16)
+    assert len(spots.weight) == 3 * (5 + 5 * 8)
+    assert spots.centred.tolist() == [[True, True]] * 3 + [[True, False]] * 3
+    turned = gaussian_quadrature(triplet, [(12.0, 0.0)], LINES, 5, 16)
+    assert len(turned.weight) == 3 * 5 * 16
+    assert rms_radii(triplet, spots)[3:] == pytest.approx(rms_radii(triplet, turned), rel=1e-6)
+
+
+def test_a_field_without_light_is_an_error_that_names_it(triplet):
+    with pytest.raises(InputError, match=r"field \(0.0, 80.0\)"):
+        gaussian_quadrature(triplet, [(0.0, 80.0)], LINES)
+    with pytest.raises(InputError, match=r"field \(0.0, 80.0\)"):
+        square_grid(triplet, [(0.0, 80.0)], LINES, half_width=5.0)
+
+
+def merit_of(lens, variables=None, **settings):
+    variables = DesignVariables(lens, variables or {"surfaces.*.curvature": None})
+    options = {"fields": [(0.0, 0.0), (0.0, 12.0)], "wavelengths": LINES, **settings}
+    options.setdefault("sampling_options", {"rings": 3, "arms": 6})
+    return MeritSettings(**options).build(lens, variables), variables
+
+
+def gradient_by_differences(merit, scaled, step=1e-6):
+    start, gradient = scaled.detach().clone(), []
+    for k in range(len(start)):
+        ends = []
+        for sign in (1.0, -1.0):
+            with torch.no_grad():
+                scaled.copy_(start)
+                scaled[k] += sign * step
+            ends.append(merit().sum_of_squares())
+        gradient.append((ends[0] - ends[1]) / (4.0 * step))
+    with torch.no_grad():
+        scaled.copy_(start)
+    return torch.tensor(gradient, dtype=torch.float64)
+
+
+OPERANDS = [
+    {"kind": "efl", "target": 49.0, "weight": 30.0},
+    {"kind": "bfd", "min": 50.0, "weight": 2.0},
+    {"kind": "f_number", "max": 4.0, "weight": 100.0},
+    {"kind": "total_track", "target": 55.0},
+    {"kind": "centre_thickness", "min": 2.0, "weight": 5.0},
+    {"kind": "air_gap", "max": 5.0},
+    {"kind": "edge_thickness", "min": 3.0},
+    {"kind": "edge_air_gap", "min": 3.0},
+    {"kind": "chief_ray_angle", "max": 10.0, "field": [0, 18]},
+    {"kind": "distortion", "target": 0.0, "field": [0, 18], "weight": 20.0},
+]
+CASES = {
+    "centroid": {},
+    "chief ray": {"reference": "chief"},
+    "grid": {"sampling": "square_grid", "sampling_options": {"count": 15}},
+    "weights": {"field_weights": [1.0, 3.0], "wavelength_weights": [1.0, 2.0, 0.5]},
+    "operands": {"operands": OPERANDS},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {"surfaces.*.curvature": {"scale": 0.01}, "thicknesses.*": None, "sensor_distance": None},
+        {
+            "surfaces.*.curvature": {"scale": 0.01},
+            "surfaces.5.curvature": {"pickup": "surfaces.1.curvature", "factor": -0.5},
+            "surfaces.6.curvature": {"solve": "efl", "target": 50.0},
+            "sensor_distance": {"solve": "paraxial_focus", "defocus": -0.1},
+        },
+        {"surfaces.[1-4].curvature": {"scale": 0.01}, "sensor_distance": {"solve": "best_focus"}},
+    ],
+    ids=["free", "pickup and solves", "best focus"],
+)
+def test_the_gradient_is_that_of_differences(triplet, case, variables):
+    """Of everything together; the Jacobian's model must have it too."""
+    settings = dict(CASES[case])
+    if variables.get("sensor_distance", None) == {"solve": "best_focus"} and case == "operands":
+        # Of total track the model does not know how the focus moves.
+        settings["operands"] = [o for o in OPERANDS if o["kind"] in ("efl", "bfd", "f_number")]
+    merit, design = merit_of(triplet, variables, **settings)
+    value = merit()
+    model = value.linear_model()
+    assert model.sum_of_squares == pytest.approx(value.sum_of_squares(), rel=1e-9)
+    expected = gradient_by_differences(merit, design.scaled)
+    assert torch.allclose(
+        model.gradient, expected, rtol=2e-5, atol=1e-6 * float(expected.abs().max())
+    )
+
+
+def test_the_jacobian_is_that_of_forward_mode(triplet):
+    """JᵀJ of the kernels' sweeps against jacfwd through the reference."""
+    merit, design = merit_of(triplet)
+    model = merit().linear_model()
+    spots, lens = merit.spots.spots, merit.lens
+    names = list(design())
+
+    def residuals(theta):
+        values = dict(zip(names, theta.unbind(), strict=True))
+        from dolens.optics.backend import trace_rays
+
+        hit = trace_rays(lens.system(values), spots.rays, "reference", 1.0, False, 1, None)
+        points = hit.position[:, :2]
+        means = torch.zeros(spots.count, 2, dtype=points.dtype)
+        means = means.index_add(0, spots.spot, spots.weight[:, None] * points)
+        means = torch.where(spots.centred, 0.0, means)
+        root = (spots.weight * merit.spots.weights[spots.spot]).sqrt()
+        return 1e3 * (root[:, None] * (points - means[spots.spot])).reshape(-1)
+
+    theta = torch.stack(list(design().values())).detach()
+    jacobian = torch.func.jacfwd(residuals)(theta)
+    scale = jacobian.square().sum(0).sqrt()
+    found = model.root.T @ model.root / scale / scale[:, None]
+    expected = jacobian.T @ jacobian / scale / scale[:, None]
+    assert torch.allclose(found, expected, atol=1e-10)
+
+
+def test_sums_serve_where_rows_would_not_fit(triplet, monkeypatch):
+    from dolens.optimize import spot_residuals
+
+    merit, _ = merit_of(triplet, sampling="square_grid", sampling_options={"count": 21})
+    rows = merit().linear_model()
+    monkeypatch.setattr(spot_residuals, "MOST_STORED", 0)
+    sums = merit().linear_model()
+    assert torch.allclose(sums.gradient, rows.gradient, rtol=1e-8)
+    assert torch.allclose(sums.root.T @ sums.root, rows.root.T @ rows.root, rtol=1e-8)
+
+
+def test_opened_apertures_clip_nothing_and_change_nothing_else(triplet):
+    opened = without_edges(triplet)
+    position = torch.tensor([[0.0, 0.0, -5.0], [0.0, 3.0, -5.0], [0.0, 8.0, -5.0]]).double()
+    rays = Rays(position, torch.tensor([0.0, 0.0, 1.0]).double().expand(3, 3), 587.5618)
+    for backend in ("reference", "cpu"):
+        triplet.backend = opened.backend = backend
+        here, there = triplet.trace(rays), opened.trace(rays)
+        assert here.valid.tolist() == [True, True, False]
+        assert there.valid.tolist() == [True, True, True]
+        assert torch.equal(here.position, there.position)
+    assert float(opened.first_order().f_number) == float(triplet.first_order().f_number)
+
+
+def test_chief_rays_weigh_nothing(triplet):
+    spots = gaussian_quadrature(triplet, [(0.0, 0.0), (0.0, 15.0)], LINES, 3, 6)
+    with_chief = with_chief_rays(triplet, spots)
+    assert with_chief.weight[with_chief.chief].tolist() == [0.0] * 6
+    assert rms_radii(triplet, with_chief) == pytest.approx(rms_radii(triplet, spots), rel=1e-12)
+    chief = SpotResiduals(with_chief, torch.ones(6).double() / 6, "chief").values(triplet)
+    centroid = SpotResiduals(spots, torch.ones(6).double() / 6).values(triplet)
+    assert bool((chief.mean_squares >= centroid.mean_squares).all())
+    with pytest.raises(InputError, match="hold no chief rays"):
+        SpotResiduals(spots, torch.ones(6).double() / 6, "chief")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"kind": "efg", "target": 1.0}, "kind 'efg' is unknown"),
+        ({"kind": "efl"}, "give a target, or limits"),
+        ({"kind": "efl", "target": 1.0, "min": 0.5}, "give a target, or limits"),
+        ({"kind": "efl", "min": 2.0, "max": 1.0}, "min exceeds max"),
+        ({"kind": "efl", "target": 50.0, "weight": 0.0}, "weight must be positive"),
+        ({"kind": "efl", "target": "long"}, "must be a number"),
+        ({"kind": "air_gap", "min": 0.1, "gaps": [9]}, "gaps 1 to 5, not 9"),
+        ({"kind": "efl", "target": 50.0, "wieght": 2.0}, "unknown key 'wieght'"),
+    ],
+)
+def test_bad_operands_are_refused(triplet, settings, said):
+    with pytest.raises(InputError, match=said):
+        merit_of(triplet, operands=[settings])
+
+
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        ({"surfaces.1.curvature": {"pickup": "surfaces.9.curvature"}}, "no parameter"),
+        ({"surfaces.1.curvature": {"pickup": "surfaces.1.curvature"}}, "one other parameter"),
+        ({"surfaces.1.curvature": {"solve": "focus"}}, "solve 'focus' is unknown"),
+        ({"surfaces.1.curvature": {"solve": "best_focus"}}, "moves sensor_distance only"),
+        ({"thicknesses.1": {"solve": "efl", "target": 3.0}}, "moves a curvature"),
+        ({"surfaces.1.curvature": {"solve": "efl"}}, "to a target"),
+        ({"surfaces.1.curvature": {"solve": "efl", "targt": 3.0}}, "unknown key 'targt'"),
+    ],
+)
+def test_bad_pickups_and_solves_are_refused(triplet, variables, said):
+    with pytest.raises(InputError, match=said):
+        DesignVariables(triplet, variables)
