@@ -90,13 +90,14 @@ def test_torchs_number_of_threads_is_obeyed(threads, team):
     assert torch.get_num_threads() == 3
 
 
-def test_kernels_run_on_torchs_own_threads(root, threads):
+def test_kernels_run_on_torchs_own_threads(root, threads, monkeypatch):
     """Where torch waits for its next operation, threads of ours would share the cores with it."""
+    monkeypatch.setattr(threads_module, "run_in_pool", lambda *_: pytest.fail("a pool"))
     threads(2)
     torch.ones(1_000_000).exp()
     known = set(os.listdir("/proc/self/task"))
     traced(root)
-    assert set(os.listdir("/proc/self/task")) == known
+    assert set(os.listdir("/proc/self/task")) <= known
 
 
 def test_a_slow_core_gets_less_to_do(team):
