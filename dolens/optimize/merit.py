@@ -40,7 +40,7 @@ class MeritFunction:
     """Σ W_s·(RMS radius of spot s, µm)² + Σ (weight·deviation of an operand)².
 
     Args:
-        lens: the lens; not changed.
+        lens: the lens; not changed, and not looked at again.
         variables: of it.
         spots: residuals of its rays, or None for operands alone.
         operands: what else it should be.
@@ -55,14 +55,19 @@ class MeritFunction:
     ) -> None:
         self.lens, self.opened = copy.deepcopy(lens), without_edges(lens)
         self.variables, self.spots, self.operands = variables, spots, tuple(operands)
+        self._last: tuple[Tensor, MeritValue] | None = None
 
     def __call__(self) -> "MeritValue":
         """The merit at the variables' values; what a `DampedLeastSquares` takes as closure."""
-        return MeritValue(self)
+        point = self.variables.scaled.detach()
+        # A step begins where the last trial of the one before it ended.
+        if self._last is None or not torch.equal(self._last[0], point):
+            self._last = point.clone(), MeritValue(self)
+        return self._last[1]
 
 
 class MeritValue:
-    """A merit function at the point where its variables are; it is not to outlive their next move.
+    """A merit function where its variables are; it is not to outlive their next move.
 
     Attributes:
         spots: values of the spots, or None without spots.
@@ -130,6 +135,8 @@ class MeritValue:
 
 def _operands(merit: MeritFunction) -> list[tuple[Operand, str, Tensor]] | None:
     """Every operand with its labels and values; None where one cannot be evaluated."""
+    if not merit.operands:
+        return []
     lens = merit.lens
     view = View(
         lens.system(merit.variables()), lens.reference_wavelength or 587.5618, lens.object_distance
