@@ -1,7 +1,7 @@
 """Planar scenes: textured planes at a few depths, and what an ideal pinhole sees of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -45,9 +45,8 @@ class PlanarScene:
     def check(self, system: OpticalSystem) -> None:
         """Raise `InputError` where a depth is not in front of the whole lens."""
         surface = system.surfaces[0]
-        edge = torch.tensor(surface.semi_diameter, dtype=torch.float64)
-        parameters = {name: p.detach().cpu().double() for name, p in surface.parameters.items()}
-        sag = surface.shape.sag_and_gradient(parameters, edge, torch.zeros_like(edge))[0]
+        exact = {name: p.detach().cpu().double() for name, p in surface.parameters.items()}
+        sag = replace(surface, parameters=exact).rim_sag(torch.zeros((), dtype=torch.float64))
         front = max(0.0, -float(sag))
         for depth in self.depths:
             if not depth > front:

@@ -97,10 +97,7 @@ def square_grid(
 def first_semi_diameter(lens: Lens, tangent: float) -> float:
     """Half-width (mm) of a beam that fills the first surface, in the plane of its vertex."""
     surface = lens.system().surfaces[0]
-    radius = surface.semi_diameter
-    edge = torch.tensor(radius, dtype=lens.dtype, device=lens.device)
-    sag, *_ = surface.shape.sag_and_gradient(surface.parameters, edge, torch.zeros_like(edge))
-    return radius + tangent * float(sag.detach())
+    return surface.semi_diameter + tangent * float(surface.rim_sag(lens.sensor_distance.detach()))
 
 
 def gaussian_quadrature(
@@ -166,16 +163,14 @@ class _Light:
 
     def __init__(self, lens: Lens, field: Sequence[float], object_distance: float | None) -> None:
         self.lens, self.field, self.object_distance = lens, field, object_distance
-        self.wavelength = lens.reference_wavelength or 587.5618
+        self.wavelength = lens.primary_wavelength
 
-    @torch.no_grad()
     def aim(self, pupil: Tensor) -> Rays:
         return self.lens.aim(self.field, pupil, self.wavelength, self.object_distance)
 
     def passes(self, pupil: Tensor) -> Tensor:
         """(...), bool, of stop coordinates (..., 2) over its semi-diameter."""
-        with torch.no_grad():
-            return self.lens.trace(self.aim(pupil)).valid.cpu()
+        return self.lens.trace(self.aim(pupil)).valid.cpu()
 
     def centre(self, symmetric: bool) -> Tensor:
         """(2,): the middle of the light, from where every arm can be followed to its edge."""
@@ -283,9 +278,7 @@ def with_chief_rays(lens: Lens, spots: SpotRays, object_distance: float | None =
     Raises:
         InputError: a chief ray does not reach the stop.
     """
-    chief = lens.chief_ray(
-        spots.fields.to(lens.dtype), lens.reference_wavelength or 587.5618, object_distance
-    )
+    chief = lens.chief_ray(spots.fields.to(lens.dtype), lens.primary_wavelength, object_distance)
     if not bool(chief.converged.all()):
         at = int(torch.nonzero(~chief.converged)[0])
         raise InputError(f"the chief ray of field {spots.fields[at].tolist()} misses the stop")

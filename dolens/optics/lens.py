@@ -113,6 +113,11 @@ class Lens(nn.Module):
         """Where the parameters live."""
         return self.sensor_distance.device
 
+    @property
+    def primary_wavelength(self) -> float:
+        """nm: the reference wavelength, or the d line of helium where the prescription has none."""
+        return self.reference_wavelength or 587.5618
+
     def variables(self, patterns: Sequence[str]) -> dict[str, nn.Parameter]:
         """Parameters by name or shell pattern, in the order of the lens.
 

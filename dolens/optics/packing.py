@@ -18,6 +18,7 @@ from dolens.kernels.variable_map import VariableMap
 from dolens.optics.elements import LENS_AXES, relative_axes
 from dolens.optics.materials import Medium
 from dolens.optics.records import Form, Records, Structure, records, tensor
+from dolens.optics.row_jacobian import jacobian_of
 from dolens.optics.system import OpticalSystem
 
 Wavelength = float | Sequence[float] | Tensor
@@ -158,7 +159,7 @@ def _variable_map(
     ]
     if not functions:
         return known
-    source, column, derivative = _derivatives(functions, variables, first)
+    source, column, derivative = _derivatives(functions, variables)
     entry, of = np.nonzero(layout.sources.numpy()[:, None] == source)
     return VariableMap(
         torch.cat([known.places, layout.places[entry]]),
@@ -186,27 +187,14 @@ def _map_of_numbers(
 
 
 def _derivatives(
-    functions: Sequence[tuple[int, Tensor]], variables: Sequence[Tensor], first: dict[int, int]
+    functions: Sequence[tuple[int, Tensor]], variables: Sequence[Tensor]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of numbers that autograd can follow to the variables: source, column and derivative."""
     flat = torch.cat([value.reshape(-1) for _, value in functions])
     source = torch.cat([torch.arange(b, b + value.numel()) for b, value in functions])
-    found = torch.autograd.grad(
-        flat,
-        variables,
-        torch.eye(len(flat), dtype=flat.dtype),
-        is_grads_batched=True,
-        allow_unused=True,
-    )
-    parts = []
-    for variable, jacobian in zip(variables, found, strict=True):
-        if jacobian is not None:
-            jacobian = jacobian.reshape(len(flat), -1)
-            row, column = torch.nonzero(jacobian, as_tuple=True)
-            derivative = jacobian[row, column].double()
-            parts.append((source[row], column + first[id(variable)], derivative))
-    none = (source[:0], source[:0], flat[:0].detach().double())
-    return tuple(torch.cat(part).numpy() for part in zip(none, *parts, strict=True))
+    jacobian = jacobian_of(flat, variables)
+    row, column = torch.nonzero(jacobian, as_tuple=True)
+    return source[row].numpy(), column.numpy(), jacobian[row, column].double().numpy()
 
 
 def _indices(

@@ -78,7 +78,7 @@ def bounded_step(model: LinearModel, damping: Tensor, lower: Tensor, upper: Tens
         state = state.clone()
         state[low], state[high], state[release] = -1, 1, 0
     # Only rounding can bring us here: what remains wrong is below it.
-    return BoundedStep(torch.maximum(lower, torch.minimum(step, upper)), state)
+    return BoundedStep(step.clamp(lower, upper), state)
 
 
 def projected_step(
@@ -87,7 +87,7 @@ def projected_step(
     """The minimum without bounds, put back onto them variable by variable (S17)."""
     step = damped_step(model, damping)
     active = (step > upper).to(torch.int8) - (step < lower).to(torch.int8)
-    return BoundedStep(torch.maximum(lower, torch.minimum(step, upper)), active)
+    return BoundedStep(step.clamp(lower, upper), active)
 
 
 def _solve(model: LinearModel, damping: Tensor, held: Tensor, free: Tensor) -> Tensor:

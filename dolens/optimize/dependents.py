@@ -118,7 +118,7 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
     Raises:
         InputError: unknown or missing settings, or a solve for a parameter that it cannot move.
     """
-    wavelength = lens.reference_wavelength or 587.5618
+    wavelength = lens.primary_wavelength
     if "pickup" in settings:
         _check(name, settings, ("pickup", "factor", "offset"))
         source = str(settings["pickup"])

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
+from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.operands import Operand, UnreachableField, View
-from dolens.optimize.residuals import jacobian_of
 from dolens.optimize.spot_residuals import SpotResiduals, SpotValues, without_edges
 from dolens.optimize.variables import DesignVariables
 
@@ -53,7 +53,8 @@ class MeritFunction:
         spots: SpotResiduals | None,
         operands: Sequence[Operand] = (),
     ) -> None:
-        self.lens, self.opened = copy.deepcopy(lens), without_edges(lens)
+        self.lens = copy.deepcopy(lens)
+        self.opened = without_edges(self.lens)
         self.variables, self.spots, self.operands = variables, spots, tuple(operands)
         self._last: tuple[Tensor, MeritValue] | None = None
 
@@ -80,11 +81,13 @@ class MeritValue:
         with torch.no_grad():
             merit.variables.write_to(merit.lens)
             self.spots: SpotValues | None = None
+            self._slopes: Tensor | None = None
             if merit.spots is not None:
                 self.spots = merit.spots.values(merit.lens)
                 if merit.variables.best_focus:
-                    shift = merit.spots.best_focus(self.spots)
-                    self.spots = merit.spots.refocused(self.spots, shift)
+                    self._slopes = merit.spots.slopes(self.spots)
+                    shift = merit.spots.best_focus(self.spots, self._slopes)
+                    self.spots = merit.spots.refocused(self.spots, self._slopes, shift)
                     merit.lens.sensor_distance += shift
             self.sensor_distance = float(merit.lens.sensor_distance)
             found = _operands(merit)
@@ -115,11 +118,7 @@ class MeritValue:
         merit, models = self._merit, []
         if merit.spots is not None:
             names, matrix = merit.variables.derivatives()
-            with torch.no_grad():
-                merit.variables.write_to(merit.opened)
-                merit.opened.sensor_distance.fill_(self.sensor_distance)
-            undone = self.spots.slopes if merit.variables.best_focus else None
-            of_lens = merit.spots.linear_model(merit.opened, names, undone)
+            of_lens = merit.spots.linear_model(merit.opened, names, self._slopes)
             models.append(of_lens.scaled(MICROMETRES).of_variables(matrix))
         if merit.operands:
             with torch.enable_grad():
@@ -138,9 +137,7 @@ def _operands(merit: MeritFunction) -> list[tuple[Operand, str, Tensor]] | None:
     if not merit.operands:
         return []
     lens = merit.lens
-    view = View(
-        lens.system(merit.variables()), lens.reference_wavelength or 587.5618, lens.object_distance
-    )
+    view = View(lens.system(merit.variables()), lens.primary_wavelength, lens.object_distance)
     try:
         return [
             (operand, label, value)

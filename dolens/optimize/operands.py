@@ -17,7 +17,6 @@ from dolens.optics.aiming import aim
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 from dolens.optics.rays import Components
-from dolens.optics.surfaces.base import SurfaceState
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane
 
@@ -172,18 +171,12 @@ def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
         for gap in _gaps(operand, view, glass):
             at_centre = view.system.thicknesses[gap - 1]
             front, back = (
-                _rim_sag(view.system.surfaces[number], at_centre) for number in (gap - 1, gap)
+                view.system.surfaces[number].rim_sag(at_centre) for number in (gap - 1, gap)
             )
             found[f"{operand.kind}/{gap}"] = at_centre + back - front
         return found
 
     return values
-
-
-def _rim_sag(surface: SurfaceState, like: Tensor) -> Tensor:
-    height = torch.full_like(like, surface.semi_diameter)
-    sag, *_ = surface.shape.sag_and_gradient(surface.parameters, torch.zeros_like(like), height)
-    return sag
 
 
 # -------------------------------------------------------------------- real chief rays

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.linear_model import LinearModel
 
 
@@ -51,30 +51,3 @@ class TensorResiduals:
         if not self._residuals.requires_grad:
             raise InputError("the closure's residuals have no gradient with respect to anything")
         return LinearModel.of_rows(self._residuals, jacobian_of(self._residuals, self._variables))
-
-
-def jacobian_of(values: Tensor, variables: Sequence[Tensor]) -> Tensor:
-    """∂values/∂variables, (N, P), by one batch of N reverse sweeps.
-
-    Args:
-        values: (N,), with a graph.
-        variables: leaves; P numbers in all, each tensor by rows.
-    """
-    count = len(values)
-    found = torch.autograd.grad(
-        values,
-        list(variables),
-        torch.eye(count, dtype=values.dtype, device=values.device),
-        is_grads_batched=True,
-        allow_unused=True,
-        retain_graph=True,
-    )
-    return torch.cat(
-        [
-            values.new_zeros(count, variable.numel())
-            if jacobian is None
-            else jacobian.reshape(count, -1)
-            for variable, jacobian in zip(variables, found, strict=True)
-        ],
-        1,
-    )

@@ -21,12 +21,13 @@ MOST_STORED = 50_000_000
 
 
 def without_edges(lens: Lens) -> Lens:
-    """A copy of a lens whose apertures clip nothing, so that a ray ends only where it must.
+    """A lens whose apertures clip nothing, with the very parameters of this one.
 
     A search for a better lens follows the same rays all the way: one that slips out of an aperture
     would otherwise leave its spot, and make it smaller.
     """
-    opened = copy.deepcopy(lens)
+    shared = {id(tensor): tensor for tensor in (*lens.parameters(), *lens.buffers())}
+    opened = copy.deepcopy(lens, shared)
     for surface in opened.surfaces.values():
         surface.aperture = surface.aperture.opened()
     return opened
@@ -37,17 +38,15 @@ class SpotValues:
     """Spots of a lens.
 
     Attributes:
-        points: (N, 2), mm, of every ray on the sensor, double precision.
-        deviations: (N, 2), mm, from the reference point of the ray's spot.
-        slopes: (N, 2), how fast the deviations grow with the distance of the sensor.
+        deviations: (N, 2), mm, from the reference point of the ray's spot, double precision.
+        tangents: (N, 2), l/n and m/n of every ray on the sensor.
         mean_squares: (S,), mm²: Σ w·|deviation|² of each spot, its RMS radius squared.
         failed: rays that miss a surface or are reflected totally; the rest then says nothing.
         vignetted: the largest share of a spot that the apertures clip; its rays still count.
     """
 
-    points: Tensor
     deviations: Tensor
-    slopes: Tensor
+    tangents: Tensor
     mean_squares: Tensor
     failed: int
     vignetted: float
@@ -91,35 +90,37 @@ class SpotResiduals:
         spots = self.spots
         with torch.no_grad():
             hit = lens.trace(spots.rays)
-        points, direction = hit.position[:, :2].double(), hit.direction.double()
-        deviations = self._deviations(points.T).T
-        slopes = self._deviations((direction[:, :2] / direction[:, 2:]).T).T
+        deviations = self._deviations(hit.position[:, :2].double().T).T
+        direction = hit.direction.double()
         failed = (hit.status == Status.TIR) | (hit.status == Status.MISSED)
         clipped = spots.weight * (hit.status == Status.VIGNETTED)
         shares = clipped.new_zeros(spots.count).index_add(0, spots.spot, clipped)
         return SpotValues(
-            points,
             deviations,
-            slopes,
+            direction[:, :2] / direction[:, 2:],
             self._mean_squares(deviations),
             int(failed.sum()),
             float(shares.amax()),
         )
 
-    def best_focus(self, values: SpotValues) -> float:
+    def slopes(self, values: SpotValues) -> Tensor:
+        """(N, 2), how fast the deviations grow with the distance of the sensor."""
+        return self._deviations(values.tangents.T).T
+
+    def best_focus(self, values: SpotValues, slopes: Tensor) -> float:
         """How far to move the sensor (mm) to where the sum of squares is least.
 
         Rays are straight behind the lens, so that deviations d + k·δz are linear: δz = -d·k/k·k.
         """
         weight = (self._weights * self.spots.weight)[:, None]
-        square = float((weight * values.slopes.square()).sum())
+        square = float((weight * slopes.square()).sum())
         if square == 0.0 or values.failed:
             return 0.0
-        return -float((weight * values.deviations * values.slopes).sum()) / square
+        return -float((weight * values.deviations * slopes).sum()) / square
 
-    def refocused(self, values: SpotValues, shift: float) -> SpotValues:
+    def refocused(self, values: SpotValues, slopes: Tensor, shift: float) -> SpotValues:
         """The spots on a sensor that stands farther from the lens by `shift` (mm)."""
-        deviations = values.deviations + shift * values.slopes
+        deviations = values.deviations + shift * slopes
         return replace(values, deviations=deviations, mean_squares=self._mean_squares(deviations))
 
     def sum_of_squares(self, values: SpotValues) -> float:

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.dependents import Dependent, dependent
-from dolens.optimize.residuals import jacobian_of
 
 _KEYS = ("scale", "initial", "lower", "upper")
 
@@ -142,9 +142,9 @@ class DesignVariables(nn.Module):
     @torch.no_grad()
     def write_to(self, lens: Lens) -> None:
         """Store the current values in a lens."""
-        parameters = dict(lens.named_parameters())
-        for name, value in self().items():
-            parameters[name].copy_(value)
+        values = self()
+        for name, parameter in lens.variables(list(values)).items():
+            parameter.copy_(values[name])
 
 
 def _dependents(

@@ -113,7 +113,7 @@ def close_stop(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
     target = as_positive(prescription[key], f"'{key}'")
     with torch.no_grad():
         exact = copy.deepcopy(lens).to(torch.float64)
-        first = exact.first_order(lens.reference_wavelength or 587.5618)
+        first = exact.first_order(lens.primary_wavelength)
     if key == "f_number":
         target = abs(float(first.efl)) / target
     surface = lens.surfaces[str(lens.stop)]

@@ -339,6 +339,11 @@ class SurfaceState:
     parameters: Parameters
     aperture: ClearAperture
 
+    def rim_sag(self, like: Tensor) -> Tensor:
+        """Sag (mm) at the aperture's reach along x, in the precision of another tensor."""
+        reach = torch.full_like(like, self.semi_diameter)
+        return self.shape.sag_and_gradient(self.parameters, reach, torch.zeros_like(like))[0]
+
     @property
     def semi_diameter(self) -> float:
         """Distance of the clear aperture's farthest point from the vertex, mm."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from dolens.kernels.table import Outline as OutlineKind
 class Circle:
     """A circle about the vertex; lengths in mm."""
 
+    rotational: ClassVar[bool] = True  # it looks the same from every azimuth
     semi_diameter: float
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
@@ -30,11 +32,6 @@ class Circle:
         """How far it reaches along x and along y, mm."""
         return self.semi_diameter, self.semi_diameter
 
-    @property
-    def rotational(self) -> bool:
-        """Whether it looks the same from every azimuth."""
-        return True
-
     def packed(self) -> tuple[OutlineKind, float, float]:
         """What the kernels know of it: kind, and two numbers; here r² (mm²) and nothing."""
         return OutlineKind.CIRCLE, self.semi_diameter**2, 0.0
@@ -44,6 +41,7 @@ class Circle:
 class Rectangle:
     """A rectangle about the vertex, its sides along the surface's x and y; lengths in mm."""
 
+    rotational: ClassVar[bool] = False
     half_width_x: float
     half_width_y: float
 
@@ -61,11 +59,6 @@ class Rectangle:
         """How far it reaches along x and along y, mm."""
         return self.half_width_x, self.half_width_y
 
-    @property
-    def rotational(self) -> bool:
-        """Whether it looks the same from every azimuth."""
-        return False
-
     def packed(self) -> tuple[OutlineKind, float, float]:
         """What the kernels know of it: kind, and its half widths in mm."""
         return OutlineKind.RECTANGLE, self.half_width_x, self.half_width_y
@@ -79,6 +72,7 @@ class Unlimited:
         reach: mm, how far from the vertex light is expected; it sets the scale of tolerances.
     """
 
+    rotational: ClassVar[bool] = True
     reach: float
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
@@ -89,11 +83,6 @@ class Unlimited:
     def extent(self) -> tuple[float, float]:
         """How far light is expected along x and along y, mm."""
         return self.reach, self.reach
-
-    @property
-    def rotational(self) -> bool:
-        """Whether it looks the same from every azimuth."""
-        return True
 
     def packed(self) -> tuple[OutlineKind, float, float]:
         """What the kernels know of it: nothing."""
