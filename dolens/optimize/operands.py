@@ -7,6 +7,8 @@ beyond it.  Its derivatives come from autograd: these are a few numbers, each on
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -15,12 +17,16 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.aiming import aim
 from dolens.optics.lens import Lens
-from dolens.optics.paraxial import first_order
+from dolens.optics.paraxial import FirstOrder, first_order
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane
 
 _KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
+
+
+class UnreachableField(ArithmeticError):
+    """The chief ray of a field does not reach the stop: the lens cannot be judged."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,36 @@ class View:
     system: OpticalSystem
     wavelength: float
     object_distance: float | None
+    _chief_rays: dict[tuple[float, float], Components] = dataclass_field(default_factory=dict)
+
+    @cached_property
+    def first_order(self) -> FirstOrder:
+        """Computed once for all operands."""
+        return first_order(self.system, self.wavelength, self.object_distance)
+
+    def chief_ray(self, field: tuple[float, float]) -> Components:
+        """The real chief ray of a field on the sensor plane, aimed once for all operands.
+
+        Raises:
+            UnreachableField: it does not reach the stop.
+        """
+        if field not in self._chief_rays:
+            self._chief_rays[field] = self._traced_chief_ray(field)
+        return self._chief_rays[field]
+
+    def _traced_chief_ray(self, field: tuple[float, float]) -> Components:
+        system = self.system
+        options = {"dtype": system.dtype, "device": system.device}
+        angles = torch.tensor(field, **options)
+        if self.object_distance is None:
+            angles = torch.deg2rad(angles)
+        pupil = torch.zeros(2, **options)
+        aimed = aim(system, angles, pupil, self.wavelength, self.object_distance)
+        if not bool(aimed.converged):
+            raise UnreachableField(field)
+        ray, _ = enter_lens(system, aimed, 1, 1.0)
+        traced = trace_surfaces(system, ray, self.wavelength, 1.0)
+        return trace_to_plane(system, traced, system.vertices[-1], self.wavelength, 1.0).ray
 
 
 @dataclass(frozen=True)
@@ -127,8 +163,7 @@ def _number(value: object, what: str) -> float:
 
 def _first_order(name: str) -> Callable[[Operand, View], dict[str, Tensor]]:
     def value(operand: Operand, view: View) -> dict[str, Tensor]:
-        found = first_order(view.system, view.wavelength, view.object_distance)
-        return {operand.kind: getattr(found, name)}
+        return {operand.kind: getattr(view.first_order, name)}
 
     return value
 
@@ -182,41 +217,21 @@ def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
 # -------------------------------------------------------------------- real chief rays
 
 
-def _chief_ray(operand: Operand, view: View) -> Components:
-    """The real chief ray of the operand's field on the sensor plane."""
-    system = view.system
-    options = {"dtype": system.dtype, "device": system.device}
-    field = torch.tensor(operand.field, **options)
-    if view.object_distance is None:
-        field = torch.deg2rad(field)
-    aimed = aim(system, field, torch.zeros(2, **options), view.wavelength, view.object_distance)
-    if not bool(aimed.converged):
-        raise UnreachableField(operand.field)
-    ray, _ = enter_lens(system, aimed, 1, 1.0)
-    traced = trace_surfaces(system, ray, view.wavelength, 1.0)
-    return trace_to_plane(system, traced, system.vertices[-1], view.wavelength, 1.0).ray
-
-
-class UnreachableField(ArithmeticError):
-    """The chief ray of a field does not reach the stop: the lens cannot be judged."""
-
-
 def _chief_ray_angle(operand: Operand, view: View) -> dict[str, Tensor]:
     """Between the chief ray and the sensor's normal, degrees."""
-    ray = _chief_ray(operand, view)
+    ray = view.chief_ray(operand.field)
     across = torch.hypot(ray.l, ray.m)
     return {_labelled(operand): torch.rad2deg(torch.atan2(across, ray.n))}
 
 
 def _distortion(operand: Operand, view: View) -> dict[str, Tensor]:
     """How far the chief ray lands from its paraxial image height, per cent of this height."""
-    ray = _chief_ray(operand, view)
-    found = first_order(view.system, view.wavelength, view.object_distance)
+    ray = view.chief_ray(operand.field)
     field = torch.tensor(operand.field, dtype=view.system.dtype, device=view.system.device)
     if view.object_distance is None:
-        ideal = found.efl * torch.tan(torch.deg2rad(field))
+        ideal = view.first_order.efl * torch.tan(torch.deg2rad(field))
     else:
-        ideal = found.magnification * field
+        ideal = view.first_order.magnification * field
     along = ideal.detach() / ideal.detach().norm()
     height, real = (ideal * along).sum(), ray.x * along[0] + ray.y * along[1]
     return {_labelled(operand): 100.0 * (real - height) / height}
