@@ -1,0 +1,31 @@
+"""Data of an experiment that has none: a lens is all that its steps look at."""
+
+import lightning
+from torch.utils.data import DataLoader
+
+from dolens.errors import InputError
+
+
+class IterationData(lightning.LightningDataModule):
+    """Numbers of the iterations of an epoch; for a test, one.
+
+    Args:
+        iterations: steps in an epoch.
+
+    Raises:
+        InputError: fewer than one.
+    """
+
+    def __init__(self, iterations: int = 1) -> None:
+        super().__init__()
+        if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
+            raise InputError(f"data.iterations: {iterations!r}; allowed: an integer of 1 or more")
+        self.iterations = iterations
+
+    def train_dataloader(self) -> DataLoader:
+        """0, 1, 2, ..."""
+        return DataLoader(range(self.iterations), batch_size=None)
+
+    def test_dataloader(self) -> DataLoader:
+        """One step."""
+        return DataLoader(range(1), batch_size=None)
