@@ -22,7 +22,7 @@ from dolens.optics.system import OpticalSystem
 
 logger = logging.getLogger("dolens.kernels")
 
-OUTPUTS = ("x", "y", "path_length")
+OUTPUTS = ("x", "y", "path_length", "l", "m", "n")
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,10 @@ class RayJacobian:
         outputs: names, of `OUTPUTS`.
         columns: name of a variable → its columns, in the order of the lens's parameters; an array
             (`surfaces.2.coefficients`) has a column for every entry, row after row.
-        values: (..., K): x and y on the sensor and the path length Σ n·t, mm.
-        derivatives: (..., K, P): ∂values/∂variables, mm over the parameter's unit (radians for
-            tilts).  In memory the rays of one output and column are neighbours.
+        values: (..., K): x and y on the sensor and the path length Σ n·t, mm; direction cosines
+            l, m, n behind the lens.
+        derivatives: (..., K, P): ∂values/∂variables, mm or 1 over the parameter's unit (radians
+            for tilts).  In memory the rays of one output and column are neighbours.
         valid: (...), bool, as in `TracedRays`; values and derivatives of the others are zero.
     """
 
@@ -123,7 +124,7 @@ def ray_jacobian(
         lens: its `backend` says what traces, as in `Lens.trace`.
         rays: in front of the lens, of any leading shape.
         variables: names or patterns, as `Lens.variables` takes them.
-        outputs: any of `x`, `y` and `path_length`.
+        outputs: any of `OUTPUTS`.
 
     Raises:
         InputError: no such parameter or output, or a backend that cannot serve.

@@ -48,7 +48,11 @@ def reference_jacobian(
 
 
 def _select(hit: TracedRays, outputs: tuple[str, ...]) -> Tensor:
-    by_name = {"x": hit.position[..., 0], "y": hit.position[..., 1], "path_length": hit.path_length}
+    by_name = {
+        **dict(zip(("x", "y"), hit.position.unbind(-1)[:2], strict=True)),
+        **dict(zip(("l", "m", "n"), hit.direction.unbind(-1), strict=True)),
+        "path_length": hit.path_length,
+    }
     return torch.stack([by_name[name] for name in outputs], -1)
 
 

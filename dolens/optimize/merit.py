@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.row_jacobian import jacobian_of
+from dolens.optimize.image_quality import ImageQuality, QualityValues, without_edges
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.operands import Operand, UnreachableField, View
-from dolens.optimize.spot_residuals import SpotResiduals, SpotValues, without_edges
 from dolens.optimize.variables import DesignVariables
-
-# Residuals of spots are in µm, so that operands of some tenths of a millimetre weigh like spots.
-MICROMETRES = 1e3
 
 
 @dataclass(frozen=True)
@@ -37,25 +35,35 @@ class OperandValue:
 
 
 class MeritFunction:
-    """Σ W_s·(RMS radius of spot s, µm)² + Σ (weight·deviation of an operand)².
+    """How sharp a lens is + Σ (weight·deviation of an operand)².
+
+    The first is Σ W_s·(RMS radius of spot s, µm)², or what else an `ImageQuality` sums up.
 
     Args:
         lens: the lens; not changed, and not looked at again.
         variables: of it.
-        spots: residuals of its rays, or None for operands alone.
+        quality: residuals of its rays, or None for operands alone.
         operands: what else it should be.
+
+    Raises:
+        InputError: a best focus is asked for, and the image quality knows none.
     """
 
     def __init__(
         self,
         lens: Lens,
         variables: DesignVariables,
-        spots: SpotResiduals | None,
+        quality: ImageQuality | None,
         operands: Sequence[Operand] = (),
     ) -> None:
         self.lens = copy.deepcopy(lens)
         self.opened = without_edges(self.lens)
-        self.variables, self.spots, self.operands = variables, spots, tuple(operands)
+        self.variables, self.quality, self.operands = variables, quality, tuple(operands)
+        if variables.best_focus and (quality is None or not quality.focusable):
+            raise InputError(
+                "variable 'sensor_distance': solve 'best_focus' goes with the merit's spots or "
+                "wavefronts; vary sensor_distance instead"
+            )
         self._last: tuple[Tensor, MeritValue] | None = None
 
     def __call__(self) -> "MeritValue":
@@ -71,7 +79,7 @@ class MeritValue:
     """A merit function where its variables are; it is not to outlive their next move.
 
     Attributes:
-        spots: values of the spots, or None without spots.
+        quality: values of the rays, or None without them.
         operands: values of all operands, or None where a field's chief ray cannot be found.
         sensor_distance: mm, where it stands.
     """
@@ -80,21 +88,21 @@ class MeritValue:
         self._merit = merit
         with torch.no_grad():
             merit.variables.write_to(merit.lens)
-            self.spots: SpotValues | None = None
+            self.quality: QualityValues | None = None
             self._slopes: Tensor | None = None
-            if merit.spots is not None:
-                self.spots = merit.spots.values(merit.lens)
+            if merit.quality is not None:
+                self.quality = merit.quality.values(merit.lens)
                 if merit.variables.best_focus:
-                    self._slopes = merit.spots.slopes(self.spots)
-                    shift = merit.spots.best_focus(self.spots, self._slopes)
-                    self.spots = merit.spots.refocused(self.spots, self._slopes, shift)
+                    self._slopes = merit.quality.slopes(self.quality)
+                    shift = merit.quality.best_focus(self.quality, self._slopes)
+                    self.quality = merit.quality.refocused(self.quality, self._slopes, shift)
                     merit.lens.sensor_distance += shift
             self.sensor_distance = float(merit.lens.sensor_distance)
             found = _operands(merit)
         self.operands: list[OperandValue] | None = None
         if found is not None:
             self.operands = [
-                OperandValue(label, float(value), float(operand.deviation(value)), operand.weight)
+                OperandValue(label, value.item(), operand.deviation(value).item(), operand.weight)
                 for operand, label, value in found
             ]
 
@@ -109,17 +117,36 @@ class MeritValue:
         if self.operands is None:
             return math.inf
         total = sum((item.weight * item.deviation) ** 2 for item in self.operands)
-        if self.spots is not None:
-            total += MICROMETRES**2 * self._merit.spots.sum_of_squares(self.spots)
+        if self.quality is not None:
+            if not self._merit.quality.is_usable(self.quality):
+                return math.inf
+            total += self.quality.merit
         return total
+
+    def loss(self) -> Tensor:
+        """The merit with a graph to the variables, for an optimizer that takes gradients.
+
+        The best focus has no graph: there the merit does not change with the focus.
+        """
+        merit = self._merit
+        parameters = merit.variables()
+        parts = []
+        if merit.quality is not None:
+            values = dict(parameters)
+            if merit.variables.best_focus:
+                values["sensor_distance"] = merit.lens.sensor_distance.detach()
+            parts.append(merit.quality.loss(merit.opened, values))
+        for operand, _, value in _operands(merit) or []:
+            parts.append((operand.weight * operand.deviation(value)).square().reshape(()))
+        return torch.stack([part.double() for part in parts]).sum()
 
     def linear_model(self) -> LinearModel:
         """R and b in the variables u."""
         merit, models = self._merit, []
-        if merit.spots is not None:
+        if merit.quality is not None:
             names, matrix = merit.variables.derivatives()
-            of_lens = merit.spots.linear_model(merit.opened, names, self._slopes)
-            models.append(of_lens.scaled(MICROMETRES).of_variables(matrix))
+            of_lens = merit.quality.linear_model(merit.opened, names, self._slopes)
+            models.append(of_lens.of_variables(matrix))
         if merit.operands:
             with torch.enable_grad():
                 rows = [

@@ -10,15 +10,25 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature, square_grid, with_chief_rays
 from dolens.optics.lens import Lens
+from dolens.optimize.image_quality import ImageQuality
+from dolens.optimize.landing_losses import EncircledEnergy, Modulation, SpotSize
+from dolens.optimize.loss_residuals import LossResiduals
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import operand
 from dolens.optimize.spot_residuals import SpotResiduals
 from dolens.optimize.variables import DesignVariables
+from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
 SAMPLINGS: dict[str, Callable[..., SpotRays]] = {
     "gaussian_quadrature": gaussian_quadrature,
     "square_grid": square_grid,
 }
+# Residuals of rays, and losses of the points where they land.
+RESIDUALS: dict[str, type[ImageQuality]] = {
+    "spots": SpotResiduals,
+    "wavefront": WavefrontResiduals,
+}
+LOSSES = {"spot_size": SpotSize, "modulation": Modulation, "encircled_energy": EncircledEnergy}
 
 
 @dataclass(frozen=True)
@@ -32,10 +42,13 @@ class MeritSettings:
         wavelength_weights: likewise.
         sampling: `gaussian_quadrature` or `square_grid`.
         sampling_options: what that function takes: `rings` and `arms`, or `count` and `half_width`.
+        quality: `spots`: RMS radii, µm; `wavefront`: RMS wavefront errors, wavelengths; a loss of
+            landing points: `modulation`, `encircled_energy` or `spot_size`; None: operands alone.
+        quality_options: of a loss, see `dolens.optimize.landing_losses`.
         reference: deviations count from the spot's `centroid` or its `chief` ray.
-        most_vignetted: share of a spot that apertures may clip; see `SpotResiduals`.
+        colours: wavelengths have references `apart`, or one for each field `together`.
+        most_vignetted: share of a spot that apertures may clip; see `ImageQuality`.
         operands: settings of each, as `dolens.optimize.operands.operand` takes them.
-        spots: whether spots count at all.
     """
 
     fields: Sequence[Sequence[float]] | None = None
@@ -44,10 +57,12 @@ class MeritSettings:
     wavelength_weights: Sequence[float] | None = None
     sampling: str = "gaussian_quadrature"
     sampling_options: Mapping[str, Any] = field(default_factory=dict)
+    quality: str | None = "spots"
+    quality_options: Mapping[str, Any] = field(default_factory=dict)
     reference: str = "centroid"
+    colours: str = "apart"
     most_vignetted: float = 0.2
     operands: Sequence[Mapping[str, Any]] = ()
-    spots: bool = True
 
     def rays(self, lens: Lens) -> SpotRays:
         """The rays of all spots that pass the lens as it is now.
@@ -63,11 +78,23 @@ class MeritSettings:
         wavelengths = self.wavelengths if self.wavelengths is not None else lens.wavelengths
         if not wavelengths:
             raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
+        options = dict(self.sampling_options)
+        if self.sampling == "gaussian_quadrature":
+            options.setdefault("object_distance", lens.object_distance)
+            # A loss sees all of a spot, not one half that stands for both.
+            options.setdefault("symmetry", self.quality not in LOSSES)
+        elif lens.object_distance is not None:
+            raise InputError(
+                f"merit.sampling: '{self.sampling}' is for objects at infinity; lens "
+                f"'{lens.name}' has object_distance {lens.object_distance:g} mm"
+            )
         try:
-            rays = SAMPLINGS[self.sampling](lens, fields, wavelengths, **self.sampling_options)
+            rays = SAMPLINGS[self.sampling](lens, fields, wavelengths, **options)
         except TypeError as error:
             raise InputError(f"merit.sampling_options: {error}") from None
-        return with_chief_rays(lens, rays) if self.reference == "chief" else rays
+        if self.reference == "chief":
+            return with_chief_rays(lens, rays, lens.object_distance)
+        return rays
 
     def weights(self, rays: SpotRays) -> Tensor:
         """(S,), of every spot; they sum to one."""
@@ -78,15 +105,33 @@ class MeritSettings:
         return weights / weights.sum()
 
     def build(self, lens: Lens, variables: DesignVariables) -> MeritFunction:
-        """The merit function, over rays that pass the lens as it is now."""
-        spots = None
-        if self.spots:
-            rays = self.rays(lens)
-            spots = SpotResiduals(rays, self.weights(rays), self.reference, self.most_vignetted)
+        """The merit function, over rays that pass the lens as it is now.
+
+        Raises:
+            InputError: an unknown quality or option, or nothing that counts.
+        """
         operands = [operand(settings, lens) for settings in self.operands]
-        if spots is None and not operands:
-            raise InputError("merit: there are neither spots nor operands")
-        return MeritFunction(lens, variables, spots, operands)
+        if self.quality is None and not operands:
+            raise InputError("merit: there are neither a quality nor operands")
+        return MeritFunction(lens, variables, self.image_quality(lens), operands)
+
+    def image_quality(self, lens: Lens) -> ImageQuality | None:
+        """The term of the rays."""
+        if self.quality is None:
+            return None
+        allowed = (*RESIDUALS, *LOSSES)
+        if self.quality not in allowed:
+            raise InputError(
+                f"merit.quality: '{self.quality}' is unknown (allowed: {', '.join(allowed)})"
+            )
+        rays = self.rays(lens)
+        common = (rays, self.weights(rays), self.reference, self.colours, self.most_vignetted)
+        try:
+            if self.quality in RESIDUALS:
+                return RESIDUALS[self.quality](*common, **self.quality_options)
+            return LossResiduals(*common, LOSSES[self.quality](**self.quality_options))
+        except TypeError as error:
+            raise InputError(f"merit.quality_options: {error}") from None
 
 
 def _fields(lens: Lens) -> Sequence[Sequence[float]]:

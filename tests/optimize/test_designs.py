@@ -23,7 +23,7 @@ def design(lens, variables, merit, iterations, **options):
 
 
 def mean_rms_um(value):
-    return 1e3 * float(value.spots.rms_radii.mean())
+    return 1e3 * float(value.quality.rms.mean())
 
 
 def test_the_asphere_of_table_1(root):

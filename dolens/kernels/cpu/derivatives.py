@@ -16,7 +16,7 @@ from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 
 # Where an output lies among a state's rows, and so where its cotangent is one.
-OUTPUT_ROWS = {"x": 0, "y": 1, "path_length": 6}
+OUTPUT_ROWS = {"x": 0, "y": 1, "l": 3, "m": 4, "n": 5, "path_length": 6}
 # Fewer rays than this are differentiated sooner than another thread is woken.
 _SMALL = 1 << 10
 # Sums are kept for this many chunks, or fewer where they would take more numbers than that.
