@@ -176,7 +176,7 @@ class ImageQuality(ABC):
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
-    ) -> LinearModel:
+    ) -> tuple[LinearModel, Tensor | None]:
         """R and b in parameters of a lens, columns in the lens's own order.
 
         Args:
@@ -186,16 +186,23 @@ class ImageQuality(ABC):
                 is least, as the focus is: what it can undo is taken out of the derivatives
                 (variable projection: Golub and Pereyra 1973, in Kaufman's approximation, which
                 keeps the gradient exact).
+
+        Returns:
+            The model; and (P,), how the best focus moves with the parameters, or None.
         """
         root = self.ray_weights.sqrt()
         rows = (self._rows(lens, names) * (self.scale * root)).reshape(
             -1, self._numbers * len(root)
         )
+        focus = None
         if without is not None:
             undone = (without.T * root).reshape(-1)
-            undone = undone / undone.norm()
-            rows = rows - torch.outer(rows @ undone, undone)
-        return LinearModel.of_rows(rows[0], rows[1:].T)
+            norm = undone.norm()
+            undone = undone / norm
+            along = rows @ undone
+            focus = -along[1:] / (self.scale * norm)
+            rows = rows - torch.outer(along, undone)
+        return LinearModel.of_rows(rows[0], rows[1:].T), focus
 
     # ---------------------------------------------------------------- weights and references
 

@@ -79,7 +79,7 @@ class LossResiduals(ImageQuality):
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
-    ) -> LinearModel:
+    ) -> tuple[LinearModel, Tensor | None]:
         """R and b; ‖b‖² is not the loss, whose value a merit function asks for apart."""
         rows = self._rows(lens, names)
         points, jacobian = rows[0], rows[1:].flatten(1).T
@@ -90,7 +90,8 @@ class LossResiduals(ImageQuality):
         model = LinearModel.of_rows(own, root[:, None] * jacobian)
         curvature = self._curvature(model, jacobian, root, second, points)
         scaled = model.scaled(curvature**0.5)
-        return LinearModel(scaled.sum_of_squares, scaled.root, model.right / curvature**0.5)
+        right = model.right / curvature**0.5
+        return LinearModel(scaled.sum_of_squares, scaled.root, right), None
 
     def _derivatives(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """∂L/∂p (2, N), and L's second derivative along a displacement (2, N) of the rays."""

@@ -86,6 +86,7 @@ class MeritValue:
 
     def __init__(self, merit: MeritFunction) -> None:
         self._merit = merit
+        self._derivatives: Tensor | None = None
         with torch.no_grad():
             merit.variables.write_to(merit.lens)
             self.quality: QualityValues | None = None
@@ -126,7 +127,8 @@ class MeritValue:
     def loss(self) -> Tensor:
         """The merit with a graph to the variables, for an optimizer that takes gradients.
 
-        The best focus has no graph: there the merit does not change with the focus.
+        A best focus has no graph: there the sharpness does not change with the focus.  Operands
+        that do are seen as if the sensor stood still.
         """
         merit = self._merit
         parameters = merit.variables()
@@ -142,29 +144,66 @@ class MeritValue:
 
     def linear_model(self) -> LinearModel:
         """R and b in the variables u."""
-        merit, models = self._merit, []
+        merit, models, focus = self._merit, [], None
         if merit.quality is not None:
             names, matrix = merit.variables.derivatives()
-            of_lens = merit.quality.linear_model(merit.opened, names, self._slopes)
-            models.append(of_lens.of_variables(matrix))
+            model, of_lens = merit.quality.linear_model(merit.opened, names, self._slopes)
+            models.append(model.of_variables(matrix))
+            focus = None if of_lens is None else of_lens @ matrix
         if merit.operands:
-            with torch.enable_grad():
-                rows = [
-                    operand.weight * operand.deviation(value)
-                    for operand, _, value in _operands(merit) or []
-                ]
-                residuals = torch.stack([row.reshape(()) for row in rows])
-                jacobian = jacobian_of(residuals, [merit.variables.scaled])
-            models.append(LinearModel.of_rows(residuals, jacobian))
+            values, jacobian = self._operand_rows(focus)
+            operands = [operand for operand, _, _ in values]
+            deviations = torch.stack(
+                [operand.deviation(value).reshape(()) for operand, _, value in values]
+            ).detach()
+            weight = torch.tensor([operand.weight for operand in operands], dtype=torch.float64)
+            # A limit that is kept has no slope.
+            targets = torch.tensor([operand.target is not None for operand in operands])
+            matters = weight * ((deviations != 0.0) | targets)
+            models.append(
+                LinearModel.of_rows(weight * deviations, matters[:, None] * jacobian.double())
+            )
         return LinearModel.join(models)
 
+    def operand_derivatives(self) -> Tensor:
+        """(n, P): of every operand's value by the variables u, in the order of `operands`.
 
-def _operands(merit: MeritFunction) -> list[tuple[Operand, str, Tensor]] | None:
+        Known once the linear model is; before that, the focus counts as fixed.
+        """
+        if self._derivatives is None:
+            self._operand_rows(None)
+        return self._derivatives
+
+    def _operand_rows(
+        self, focus: Tensor | None
+    ) -> tuple[list[tuple[Operand, str, Tensor]], Tensor]:
+        """Operands, and the derivatives of their values; `focus` (P,) is that of a best focus."""
+        merit = self._merit
+        with torch.enable_grad():
+            sensor = merit.lens.sensor_distance.detach().clone().requires_grad_()
+            found = _operands(merit, sensor if focus is not None else None) or []
+            scaled = merit.variables.scaled
+            if not found:
+                self._derivatives = scaled.new_zeros(0, scaled.numel())
+                return found, self._derivatives
+            values = torch.stack([value.reshape(()) for _, _, value in found])
+            rows = jacobian_of(values, [scaled, sensor]).double().cpu()
+        self._derivatives = rows[:, :-1]
+        if focus is not None:
+            self._derivatives = self._derivatives + torch.outer(rows[:, -1], focus)
+        return found, self._derivatives
+
+
+def _operands(
+    merit: MeritFunction, sensor_distance: Tensor | None = None
+) -> list[tuple[Operand, str, Tensor]] | None:
     """Every operand with its labels and values; None where one cannot be evaluated."""
     if not merit.operands:
         return []
-    lens = merit.lens
-    view = View(lens.system(merit.variables()), lens.primary_wavelength, lens.object_distance)
+    lens, parameters = merit.lens, merit.variables()
+    if sensor_distance is not None:
+        parameters["sensor_distance"] = sensor_distance
+    view = View(lens.system(parameters), lens.primary_wavelength, lens.object_distance)
     try:
         return [
             (operand, label, value)

@@ -42,12 +42,12 @@ class SpotResiduals(ImageQuality):
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
-    ) -> LinearModel:
+    ) -> tuple[LinearModel, Tensor | None]:
         """R and b; see `ImageQuality.linear_model`.  Very many rays are summed, never stored."""
         columns = sum(parameter.numel() for parameter in lens.variables(names).values())
         many = 2 * len(self.spots.weight) * columns > MOST_STORED
         if many and without is None and self._sums_suffice:
-            return self._summed(lens, names)
+            return self._summed(lens, names), None
         return super().linear_model(lens, names, without)
 
     @property
