@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -78,6 +78,9 @@ class DampedLeastSquares(torch.optim.Optimizer):
     Raises:
         InputError: an unknown choice, a tolerance out of range, or bounds that exclude each other.
     """
+
+    # Its closure returns residuals, unlike every other optimizer's.
+    takes_residuals: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -24,8 +24,8 @@ class IterationData(lightning.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader:
         """0, 1, 2, ..."""
-        return DataLoader(range(self.iterations), batch_size=None)
+        return DataLoader(range(self.iterations), batch_size=1)
 
     def test_dataloader(self) -> DataLoader:
         """One step."""
-        return DataLoader(range(1), batch_size=None)
+        return DataLoader(range(1), batch_size=1)

@@ -1,0 +1,57 @@
+"""Where a search begins, when that is not where the prescription is."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+_KEYS = ("multiply", "add", "relative", "absolute")
+
+
+def start_values(
+    lens: Lens, settings: Mapping[str, float | Mapping[str, Any]], generator: torch.Generator
+) -> dict[str, Tensor]:
+    """Parameters of a lens to begin with; the lens is not changed.
+
+    Args:
+        lens: whose parameters are named.
+        settings: pattern → a number; or `multiply` and `add`, applied in this order; or `relative`
+            and `absolute`, standard deviations of normal errors, of the parameter and in its unit.
+            Later patterns go on from what earlier ones made.
+        generator: of the errors.
+
+    Returns:
+        name → value, of the parameters that a pattern names.
+
+    Raises:
+        InputError: an unknown pattern or key, or a value that is no number.
+    """
+    found: dict[str, Tensor] = {}
+    for pattern, change in settings.items():
+        numbers = _numbers(pattern, change)
+        for name, parameter in lens.variables([pattern]).items():
+            value = found.get(name, parameter.detach().clone())
+            if "value" in numbers:
+                found[name] = torch.full_like(value, numbers["value"])
+                continue
+            errors = torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value)
+            value = value * numbers.get("multiply", 1.0) + numbers.get("add", 0.0)
+            spread = numbers.get("relative", 0.0) * value + numbers.get("absolute", 0.0)
+            found[name] = value + spread * errors
+    return found
+
+
+def _numbers(pattern: str, change: object) -> dict[str, float]:
+    given = dict(change) if isinstance(change, Mapping) else {"value": change}
+    for key, value in given.items():
+        if key not in (*_KEYS, "value"):
+            raise InputError(
+                f"start '{pattern}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
+            )
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"start '{pattern}': {key} must be a number, not {value!r}")
+    return {key: float(value) for key, value in given.items()}

@@ -1,0 +1,373 @@
+"""Classical design as a Lightning module: a lens, its variables, a merit function, an optimizer."""
+
+import copy
+import logging
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
+from dolens.optimize.merit import MeritValue
+from dolens.optimize.start import start_values
+from dolens.prescriptions import lens_from_prescription
+from experiments.search import Progress, gradient_iteration, least_squares_iteration
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SpotTable:
+    """RMS spot radii of a lens.
+
+    Attributes:
+        radii: label of the spot, as `0,14/588nm`, → µm, about its reference.
+        mean: of all, with the merit's weights.
+        rays: that passed.
+    """
+
+    radii: dict[str, float]
+    mean: float
+    rays: int
+
+
+class DesignModule(lightning.LightningModule):
+    """Looks for the lens of the least merit.
+
+    A step is an iteration of the optimizer.  An epoch is a round: it begins by choosing the rays
+    that pass the lens as it then is, and ends when the optimizer says that nothing is to be gained,
+    or after as many iterations as the data give.  The lens of the best round is kept.
+
+    Args:
+        lens: the lens; `start` moves it first.
+        experiment: name of the experiment; a checkpoint of another one is refused.
+        variables: settings of `DesignVariables`.
+        merit: the merit function.
+        optimizer: parameter groups → optimizer; one that takes residuals, as `DampedLeastSquares`,
+            gets them, every other one the gradient of the merit.
+        start: settings of `start_values`; None begins at the prescription.
+        published: a prescription to compare with, or None.
+        evaluation: what RMS spot radii are reported of; None: the merit's own rays.
+        round_tolerance: a round that lowers the merit by a smaller part is the last.
+        seed: of the errors in `start`.
+
+    Attributes:
+        initial: the lens where the search began.
+        history: a row of numbers for every iteration.
+
+    Raises:
+        InputError: a setting that is out of range, or no variables.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        experiment: str,
+        variables: Mapping[str, Mapping[str, Any] | None],
+        merit: MeritSettings,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        start: Mapping[str, Any] | None = None,
+        published: Mapping[str, Any] | None = None,
+        evaluation: MeritSettings | None = None,
+        round_tolerance: float = 1e-3,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.lens = lens.requires_grad_(False)
+        generator = torch.Generator().manual_seed(seed)
+        values = start_values(lens, start or {}, generator)
+        with torch.no_grad():
+            for name, parameter in lens.variables(list(values)).items():
+                parameter.copy_(values[name])
+        self.variables = DesignVariables(lens, variables)
+        if not len(self.variables):
+            raise InputError("variables: there are none; name a parameter, as surfaces.*.curvature")
+        self.variables.project()
+        self.variables.write_to(self.lens)
+        # In a tuple, so that checkpoints do not hold them.
+        self._initial = (copy.deepcopy(self.lens),)
+        self.published = None
+        if published is not None:
+            model = {"index_model": lens.index_model}
+            self.published = lens_from_prescription(
+                {**published, **model}, lens.dtype, where="published", backend=lens.backend
+            )
+        self.experiment, self.merit_settings = experiment, merit
+        self.evaluation = evaluation or replace(
+            merit, quality="spots", quality_options={}, operands=()
+        )
+        self.optimizer, self.round_tolerance = optimizer, round_tolerance
+        if not 0.0 <= round_tolerance < 1.0:
+            raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
+        self.merit: MeritFunction | None = None
+        self.history: list[dict[str, float]] = []
+        self.operand_rows: list[dict[str, Any]] = []
+        self._stopped: str | None = None
+        # Where the round began, so that a resumed one has its rays; and the best round's end.
+        for name in ("round_start", "best"):
+            self.register_buffer(name, self.variables.scaled.detach().clone())
+        for name in ("round_start_focus", "best_focus"):
+            self.register_buffer(name, self.lens.sensor_distance.detach().clone())
+        self.register_buffer("best_merit", torch.tensor(math.inf, dtype=torch.float64))
+        self.selection_seconds: list[float] = []
+        self._fit_seconds = 0.0
+
+    @property
+    def initial(self) -> Lens:
+        """The lens where the search began."""
+        return self._initial[0]
+
+    # ---------------------------------------------------------------- rounds
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """One group, with its bounds."""
+        v = self.variables
+        group = {"params": [v.scaled], "lower": v.lower.clone(), "upper": v.upper.clone()}
+        return self.optimizer([group])
+
+    def on_fit_start(self) -> None:
+        """Start the clock."""
+        self._fit_started = time.perf_counter()
+
+    def on_train_start(self) -> None:
+        """Choose the rays of the first round, or of the one that a checkpoint was in."""
+        lens = copy.deepcopy(self.lens)
+        with torch.no_grad():
+            now = self.variables.scaled.clone()
+            self.variables.scaled.copy_(self.round_start)
+            self.variables.write_to(lens)
+            lens.sensor_distance.copy_(self.round_start_focus)
+            self.variables.scaled.copy_(now)
+        self.merit = self._build(lens)
+        if math.isinf(float(self.best_merit)):
+            self._keep_if_better(self.merit())
+            if not math.isfinite(float(self.best_merit)):
+                raise InputError(
+                    "the search cannot begin: rays fail, or apertures clip more than "
+                    "merit.most_vignetted of a spot"
+                )
+        logger.info(
+            "%d variables, %d rays of %d launched, merit %.6g",
+            self.variables.scaled.numel(),
+            self.rays,
+            self.rays_launched,
+            float(self.best_merit),
+        )
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> int | None:
+        """End the round when nothing is to be gained."""
+        return -1 if self._stopped else None
+
+    def training_step(self, batch: Any, batch_idx: int) -> None:
+        """One iteration."""
+        started = time.perf_counter()
+        optimizer = self.optimizers()
+        bare = optimizer.optimizer
+        if getattr(bare, "takes_residuals", False):
+            progress = least_squares_iteration(bare, optimizer.step, self.merit)
+        else:
+            progress = gradient_iteration(bare, optimizer.step, self.merit, self.variables)
+        self._stopped = progress.stopped
+        self._record(progress, time.perf_counter() - started)
+
+    def on_train_epoch_end(self) -> None:
+        """Look at the lens with the rays that pass it now, and decide whether to go on."""
+        if self._stopped:
+            logger.info(
+                "Round %d: %s after %d iterations in all",
+                self.current_epoch,
+                self._stopped,
+                len(self.history),
+            )
+        before = float(self.best_merit)
+        started = time.perf_counter()
+        self.merit().write_to(self.lens)
+        try:
+            self.merit = self._build(self.lens)
+            value = self.merit()
+            reached = value.sum_of_squares()
+            self._keep_if_better(value)
+        except InputError as problem:
+            # The best lens is kept; say why this one is not.
+            logger.warning("Round %d ends with a lens that fails: %s", self.current_epoch, problem)
+            reached = math.inf
+        self.selection_seconds.append(time.perf_counter() - started)
+        self.log("val/merit", reached)
+        with torch.no_grad():
+            self.round_start.copy_(self.variables.scaled)
+            self.round_start_focus.copy_(self.lens.sensor_distance)
+        optimizer = self.optimizers().optimizer
+        if not before - reached > self.round_tolerance * before:
+            self.trainer.should_stop = True
+        elif hasattr(optimizer, "restart"):
+            optimizer.restart()
+        self._stopped = None
+
+    def on_fit_end(self) -> None:
+        """Leave the lens of the best round."""
+        self._fit_seconds = time.perf_counter() - self._fit_started
+        with torch.no_grad():
+            self.variables.scaled.copy_(self.best)
+            self.variables.write_to(self.lens)
+            self.lens.sensor_distance.copy_(self.best_focus)
+
+    def _build(self, lens: Lens) -> MeritFunction:
+        return self.merit_settings.build(lens, self.variables)
+
+    def _keep_if_better(self, value: MeritValue) -> None:
+        merit = value.sum_of_squares()
+        if merit < float(self.best_merit):
+            with torch.no_grad():
+                self.best_merit.fill_(merit)
+                self.best.copy_(self.variables.scaled)
+                self.best_focus.fill_(value.sensor_distance)
+
+    # ---------------------------------------------------------------- what is logged
+
+    @property
+    def rays(self) -> int:
+        """That one evaluation of the merit traces."""
+        quality = None if self.merit is None else self.merit.quality
+        return 0 if quality is None else len(quality.spots.weight)
+
+    @property
+    def rays_launched(self) -> int:
+        """That were tried to find them."""
+        quality = None if self.merit is None else self.merit.quality
+        return 0 if quality is None else quality.spots.launched
+
+    def _record(self, progress: Progress, seconds: float) -> None:
+        value = progress.value
+        row = {
+            "train/merit": value.sum_of_squares(),
+            **{f"train/{name}": number for name, number in progress.numbers.items()},
+            "cost/iteration_s": seconds,
+            "cost/jacobian_s": progress.cost.jacobian_s,
+            "cost/iteration_rays": float(progress.cost.rays),
+            "cost/evaluations": float(progress.cost.evaluations),
+        }
+        if value.quality is not None:
+            row["train/quality"] = value.quality.merit
+            scale, unit = self.merit.quality.scale, self.merit.quality.unit
+            if unit:
+                for label, rms in zip(self._labels(), value.quality.rms.tolist(), strict=True):
+                    row[f"spot_{unit}/{label}"] = scale * rms
+        if value.operands:
+            slopes = value.operand_derivatives().norm(dim=1).tolist()
+            for item, slope in zip(value.operands, slopes, strict=True):
+                row[f"operand/{item.label}"] = item.value
+                row[f"operand_slope/{item.label}"] = slope
+                row[f"merit/{item.label}"] = (item.weight * item.deviation) ** 2
+        self.history.append(row)
+        self.log("train/merit", row["train/merit"], prog_bar=True, logger=False)
+        # Straight to the loggers: Lightning's own bookkeeping costs more than many an iteration.
+        if self.global_step % self.trainer.log_every_n_steps == 0:
+            for entry in self.loggers:
+                entry.log_metrics(row, step=self.global_step)
+
+    def _labels(self) -> list[str]:
+        return spot_labels(self.merit.quality.spots)
+
+    # ---------------------------------------------------------------- evaluation
+
+    def spot_table(self, lens: Lens, finer: bool = False) -> SpotTable:
+        """RMS spot radii of a lens, over the rays that pass it.
+
+        Args:
+            lens: initial, published or final.
+            finer: twice the rays in each direction, to see what the sampling costs.
+        """
+        settings = self.evaluation
+        if finer:
+            settings = replace(settings, sampling_options=_doubled(settings))
+        quality = settings.image_quality(lens)
+        rms = 1e3 * quality.values(lens).rms
+        mean = float((quality.weights.to(rms) * rms).sum())
+        radii = dict(zip(spot_labels(quality.spots), rms.tolist(), strict=True))
+        return SpotTable(radii, mean, len(quality.spots.weight))
+
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        """RMS spot radii before and after, and of the published design."""
+        final = self.spot_table(self.lens)
+        tables = {"initial": self.spot_table(self.initial), "final": final}
+        if self.published is not None:
+            tables["published"] = self.spot_table(self.published)
+        for name, table in tables.items():
+            self.log(f"rms_spot_um/{name}", table.mean)
+        for label, radius in final.radii.items():
+            self.log(f"rms_spot_um/final/{label}", radius)
+        self.log("error/sampling_um", abs(self.spot_table(self.lens, finer=True).mean - final.mean))
+        logger.info(
+            "RMS spot radius, mean of %d: %s µm",
+            len(final.radii),
+            ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items()),
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Numbers about the whole run, for metrics.json."""
+        numbers = {"cost/iterations": float(len(self.history)), "cost/rays": float(self.rays)}
+        numbers["cost/rays_launched"] = float(self.rays_launched)
+        if math.isfinite(float(self.best_merit)):
+            numbers["train/merit"] = float(self.best_merit)
+        for name in ("iteration_s", "jacobian_s"):
+            if self.history:
+                numbers[f"cost/{name}"] = statistics.median(r[f"cost/{name}"] for r in self.history)
+        if self.history:
+            work = sum(row["cost/iteration_s"] for row in self.history)
+            numbers["cost/step_s"] = numbers["cost/iteration_s"]
+            numbers["cost/fit_s"] = self._fit_seconds
+            rest = self._fit_seconds - work - sum(self.selection_seconds)
+            numbers["cost/trainer_s"] = rest / len(self.history)
+        return numbers
+
+    # ---------------------------------------------------------------- checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say which design it is, and what has been done."""
+        checkpoint["dolens"] = self._identity()
+        checkpoint["history"] = self.history
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another design.
+
+        Raises:
+            InputError: it is one.
+        """
+        found, own = checkpoint.get("dolens"), self._identity()
+        for key, value in own.items():
+            if not isinstance(found, dict) or found.get(key) != value:
+                raise InputError(
+                    f"ckpt_path: the checkpoint's {key} is not this run's, {value!r}; resume with "
+                    "the experiment and settings that wrote it"
+                )
+        self.history = list(checkpoint.get("history", []))
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "experiment": self.experiment,
+            "lens": self.lens.name,
+            "variables": list(self.variables.names),
+        }
+
+
+def spot_labels(spots: Any) -> list[str]:
+    """`x,y/588nm` of every spot."""
+    fields, waves = spots.fields.tolist(), spots.wavelengths.tolist()
+    return [f"{x:g},{y:g}/{w:.0f}nm" for (x, y), w in zip(fields, waves, strict=True)]
+
+
+def _doubled(settings: MeritSettings) -> dict[str, Any]:
+    """Sampling options with twice the rays along each direction."""
+    default = {"gaussian_quadrature": {"rings": 6, "arms": 12}, "square_grid": {"count": 31}}
+    options = {**default[settings.sampling], **settings.sampling_options}
+    counts = ("rings", "arms", "count")
+    return {key: 2 * value if key in counts else value for key, value in options.items()}

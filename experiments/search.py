@@ -1,0 +1,161 @@
+"""One iteration of a design, by least squares or by a gradient."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.optimize import DampedLeastSquares, DesignVariables, MeritFunction
+from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.merit import MeritValue
+
+# How often a step of a gradient that makes rays fail is halved before it is taken back.
+_HALVINGS = 30
+
+
+@dataclass
+class Cost:
+    """What an iteration took.
+
+    Attributes:
+        rays: traced, those of Jacobians and gradients too.
+        jacobian_s: seconds in Jacobians or gradients.
+        evaluations: of the merit.
+    """
+
+    rays: int = 0
+    jacobian_s: float = 0.0
+    evaluations: int = 0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What an iteration reached.
+
+    Attributes:
+        value: the merit where it ended.
+        numbers: of the optimizer, by the names that they are logged under.
+        cost: of the iteration.
+        stopped: why nothing more can be gained, or None.
+    """
+
+    value: MeritValue
+    numbers: dict[str, float]
+    cost: Cost
+    stopped: str | None = None
+
+
+@dataclass
+class _CountedValue:
+    """A merit's value that writes down what its Jacobian costs."""
+
+    value: MeritValue
+    rays: int
+    cost: Cost
+
+    def sum_of_squares(self) -> float:
+        return self.value.sum_of_squares()
+
+    def linear_model(self) -> LinearModel:
+        started = time.perf_counter()
+        model = self.value.linear_model()
+        self.cost.jacobian_s += time.perf_counter() - started
+        self.cost.rays += self.rays
+        return model
+
+
+@dataclass
+class CountedMerit:
+    """A merit function that counts its evaluations."""
+
+    merit: MeritFunction
+    cost: Cost = field(default_factory=Cost)
+    _last: MeritValue | None = None
+
+    @property
+    def rays(self) -> int:
+        """Of one evaluation."""
+        return 0 if self.merit.quality is None else len(self.merit.quality.spots.weight)
+
+    def __call__(self) -> _CountedValue:
+        """The value at the variables."""
+        value = self.merit()
+        if value is not self._last:
+            self._last = value
+            self.cost.rays += self.rays
+            self.cost.evaluations += 1
+        return _CountedValue(value, self.rays, self.cost)
+
+
+def least_squares_iteration(
+    optimizer: DampedLeastSquares, step: Callable[..., Any], merit: MeritFunction
+) -> Progress:
+    """A step that takes residuals.
+
+    Args:
+        optimizer: knows what its last step did.
+        step: of the optimizer, as the training loop wants it called.
+        merit: of its variables.
+    """
+    counted = CountedMerit(merit)
+    step(counted)
+    last = optimizer.last
+    numbers = {}
+    if last is not None:
+        numbers = {
+            "damping": last.damping,
+            "step_norm": last.step_norm,
+            "gain_ratio": last.gain_ratio,
+            "active_bounds": float(last.active_bounds),
+            "trials": float(last.trials),
+            "failed_trials": float(last.failed_trials),
+        }
+    return Progress(merit(), numbers, counted.cost, optimizer.stopped)
+
+
+def gradient_iteration(
+    optimizer: torch.optim.Optimizer,
+    step: Callable[..., Any],
+    merit: MeritFunction,
+    variables: DesignVariables,
+) -> Progress:
+    """A step that takes a gradient, put back within the bounds (S17).
+
+    Where it makes rays fail, half of it is taken, or a quarter, and so on.
+    """
+    counted = CountedMerit(merit)
+    before = variables.scaled.detach().clone()
+
+    def closure() -> Tensor:
+        value = counted().value
+        started = time.perf_counter()
+        optimizer.zero_grad()
+        loss = value.loss()
+        loss.backward()
+        counted.cost.jacobian_s += time.perf_counter() - started
+        counted.cost.rays += counted.rays
+        return loss
+
+    step(closure)
+    variables.project()
+    failed = 0
+    while not math.isfinite(counted().sum_of_squares()):
+        failed += 1
+        with torch.no_grad():
+            half = 0.5 * (before + variables.scaled)
+            variables.scaled.copy_(before if failed >= _HALVINGS else half)
+        if failed >= _HALVINGS:
+            break
+    moved = variables.scaled.detach() - before
+    at_bound = (variables.scaled <= variables.lower) | (variables.scaled >= variables.upper)
+    numbers = {
+        "step_norm": float(moved.norm()),
+        "active_bounds": float(at_bound.sum()),
+        "learning_rate": float(optimizer.param_groups[0].get("lr", math.nan)),
+        "failed_trials": float(failed),
+    }
+    return Progress(merit(), numbers, counted.cost)
