@@ -15,13 +15,19 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
+from dolens.optimize.rims import fitted_semi_diameters
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
 from experiments.search import Progress, gradient_iteration, least_squares_iteration
 
 logger = logging.getLogger(__name__)
+
+SEMI_DIAMETERS = ("fixed", "follow")
+# Rings of the quadrature that tells where the edges of the beams are.
+_EDGE_RINGS = 40
 
 
 @dataclass(frozen=True)
@@ -31,12 +37,12 @@ class SpotTable:
     Attributes:
         radii: label of the spot, as `0,14/588nm`, → µm, about its reference.
         mean: of all, with the merit's weights.
-        rays: that passed.
+        light: share of the beams that passes, mean of all; see `SpotRays.light`.
     """
 
     radii: dict[str, float]
     mean: float
-    rays: int
+    light: float
 
 
 class DesignModule(lightning.LightningModule):
@@ -56,6 +62,9 @@ class DesignModule(lightning.LightningModule):
         start: settings of `start_values`; None begins at the prescription.
         published: a prescription to compare with, or None.
         evaluation: what RMS spot radii are reported of; None: the merit's own rays.
+        semi_diameters: `fixed`: light passes where the prescription lets it; or `follow`: the rays
+            that pass the lens where the search begins are kept, and in the end every edge, and the
+            stop's, is put where they pass.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
 
@@ -77,6 +86,7 @@ class DesignModule(lightning.LightningModule):
         start: Mapping[str, Any] | None = None,
         published: Mapping[str, Any] | None = None,
         evaluation: MeritSettings | None = None,
+        semi_diameters: str = "fixed",
         round_tolerance: float = 1e-3,
         seed: int = 0,
     ) -> None:
@@ -106,6 +116,14 @@ class DesignModule(lightning.LightningModule):
             merit, quality="spots", quality_options={}, operands=()
         )
         self.optimizer, self.round_tolerance = optimizer, round_tolerance
+        if semi_diameters not in SEMI_DIAMETERS:
+            raise InputError(
+                f"semi_diameters: '{semi_diameters}' is unknown (allowed: "
+                f"{', '.join(SEMI_DIAMETERS)})"
+            )
+        self.follow = semi_diameters == "follow"
+        if self.follow:
+            self.merit_settings = replace(merit, most_vignetted=1.0)
         if not 0.0 <= round_tolerance < 1.0:
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
         self.merit: MeritFunction | None = None
@@ -120,6 +138,7 @@ class DesignModule(lightning.LightningModule):
         self.register_buffer("best_merit", torch.tensor(math.inf, dtype=torch.float64))
         self.selection_seconds: list[float] = []
         self._fit_seconds = 0.0
+        self.initial_light: Tensor | None = None
 
     @property
     def initial(self) -> Lens:
@@ -148,6 +167,8 @@ class DesignModule(lightning.LightningModule):
             lens.sensor_distance.copy_(self.round_start_focus)
             self.variables.scaled.copy_(now)
         self.merit = self._build(lens)
+        quality = self.merit_settings.image_quality(self.initial)
+        self.initial_light = None if quality is None else quality.spots.light
         if math.isinf(float(self.best_merit)):
             self._keep_if_better(self.merit())
             if not math.isfinite(float(self.best_merit)):
@@ -194,6 +215,7 @@ class DesignModule(lightning.LightningModule):
         try:
             self.merit = self._build(self.lens)
             value = self.merit()
+            self._check_light()
             reached = value.sum_of_squares()
             self._keep_if_better(value)
         except InputError as problem:
@@ -219,9 +241,39 @@ class DesignModule(lightning.LightningModule):
             self.variables.scaled.copy_(self.best)
             self.variables.write_to(self.lens)
             self.lens.sensor_distance.copy_(self.best_focus)
+        if self.follow:
+            self._fit_edges()
 
     def _build(self, lens: Lens) -> MeritFunction:
-        return self.merit_settings.build(lens, self.variables)
+        return self.merit_settings.build(self.initial if self.follow else lens, self.variables)
+
+    def _fit_edges(self) -> None:
+        settings = replace(
+            self.merit_settings,
+            sampling="gaussian_quadrature",
+            sampling_options={"rings": _EDGE_RINGS, "arms": 2 * _EDGE_RINGS, "symmetry": True},
+        )
+        edges = fitted_semi_diameters(self.lens, settings.rays(self.initial))
+        for number, semi_diameter in edges.items():
+            self.lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
+
+    def _check_light(self) -> None:
+        """A round takes its rays from the lens as it is; without this, every one could lose some.
+
+        Raises:
+            InputError: a spot has lost more of its light than it may.
+        """
+        quality = self.merit.quality
+        if quality is None or self.follow:
+            return
+        least = self.initial_light * (1.0 - quality.most_vignetted)
+        lost = quality.spots.light < least.to(quality.spots.light)
+        if bool(lost.any()):
+            label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
+            raise InputError(
+                f"spot {label} has lost more than merit.most_vignetted = "
+                f"{quality.most_vignetted:g} of the light that it had at first"
+            )
 
     def _keep_if_better(self, value: MeritValue) -> None:
         merit = value.sum_of_squares()
@@ -293,7 +345,7 @@ class DesignModule(lightning.LightningModule):
         rms = 1e3 * quality.values(lens).rms
         mean = float((quality.weights.to(rms) * rms).sum())
         radii = dict(zip(spot_labels(quality.spots), rms.tolist(), strict=True))
-        return SpotTable(radii, mean, len(quality.spots.weight))
+        return SpotTable(radii, mean, float(quality.spots.light.mean()))
 
     def test_step(self, batch: Any, batch_idx: int) -> None:
         """RMS spot radii before and after, and of the published design."""
@@ -303,6 +355,7 @@ class DesignModule(lightning.LightningModule):
             tables["published"] = self.spot_table(self.published)
         for name, table in tables.items():
             self.log(f"rms_spot_um/{name}", table.mean)
+            self.log(f"light/{name}", table.light)
         for label, radius in final.radii.items():
             self.log(f"rms_spot_um/final/{label}", radius)
         self.log("error/sampling_um", abs(self.spot_table(self.lens, finer=True).mean - final.mean))

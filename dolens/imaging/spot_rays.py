@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -36,6 +37,8 @@ class SpotRays:
         centred: (S, 2), bool: the spot's mean in x, or in y, is zero by symmetry, because the rays
             stand for their mirror images too; it must not be taken from these rays.
         launched: rays that were tried to find these.
+        light: (S,), float64, how much of a spot's beam passes: area over that of the whole stop, as
+            the quadrature measures it, or rays over those of the whole grid.
         chief: (S,), int64, which of the rays is the spot's chief ray; they weigh nothing.  None
             where there are none.
     """
@@ -47,6 +50,7 @@ class SpotRays:
     wavelengths: Tensor
     centred: Tensor
     launched: int
+    light: Tensor
     chief: Tensor | None = None
 
     @property
@@ -80,7 +84,7 @@ def square_grid(
     axis = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
     unit = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
 
-    def launch(field: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
+    def launch(field: tuple[float, float]) -> Launched:
         tangents = [math.tan(math.radians(angle)) for angle in field]
         tangent = torch.tensor(tangents, dtype=torch.float64)
         width = half_width
@@ -89,7 +93,7 @@ def square_grid(
         position = torch.cat([unit * width, torch.zeros_like(unit[:, :1])], 1)
         direction = torch.cat([tangent, torch.ones(1, dtype=torch.float64)])
         direction = (direction / direction.norm()).expand(position.shape)
-        return position, direction, torch.ones(len(unit), dtype=torch.float64)
+        return Launched(position, direction, torch.ones(len(unit), dtype=torch.float64), len(unit))
 
     return _passing(lens, fields, wavelengths, launch)
 
@@ -140,7 +144,7 @@ def gaussian_quadrature(
     shares = torch.from_numpy(0.5 * shares)
     symmetric = symmetry and is_rotationally_symmetric(lens)
 
-    def launch(field: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
+    def launch(field: tuple[float, float]) -> Launched:
         x, y = field
         if symmetric and x == 0.0 and y == 0.0:
             azimuths = torch.tensor([0.25 * math.pi], dtype=torch.float64)
@@ -156,7 +160,7 @@ def gaussian_quadrature(
         points = centre + (radii[:, None] * reach)[..., None] * arm
         weight = shares[:, None] * reach.square()
         aimed = light.aim(points.reshape(-1, 2))
-        return aimed.position, aimed.direction, weight.reshape(-1)
+        return Launched(aimed.position, aimed.direction, weight.reshape(-1), len(azimuths))
 
     return _passing(lens, fields, wavelengths, launch, symmetric)
 
@@ -221,7 +225,18 @@ def is_rotationally_symmetric(lens: Lens) -> bool:
     return surfaces and not system.elements
 
 
-Launch = Callable[[tuple[float, float]], tuple[Tensor, Tensor, Tensor]]
+class Launched(NamedTuple):
+    """Rays of a field before the lens: positions, directions, weights, and what these would sum up
+    to if all of the beam passed.
+    """
+
+    position: Tensor
+    direction: Tensor
+    weight: Tensor
+    whole: float
+
+
+Launch = Callable[[tuple[float, float]], Launched]
 
 
 @torch.no_grad()
@@ -234,17 +249,18 @@ def _passing(
 ) -> SpotRays:
     """The rays that pass, of every field and wavelength, in the lens's precision."""
     options = {"dtype": lens.dtype, "device": lens.device}
-    pieces, launched, launches = [], 0, {}
+    pieces, launched, launches, light = [], 0, {}, []
     for spot, (field, wavelength) in enumerate(product(map(tuple, fields), wavelengths)):
         if field not in launches:
             launches[field] = launch(field)
-        position, direction, weight = launches[field]
+        position, direction, weight, whole = launches[field]
         position, direction = position.to(**options), direction.to(**options)
         valid = lens.trace(Rays(position, direction, wavelength)).valid
         launched += valid.numel()
         if not bool(valid.any()):
             raise InputError(f"no ray of field {field} and {wavelength:g} nm passes the lens")
         weight = weight.to(valid.device)[valid]
+        light.append(float(weight.sum()) / whole)
         pieces.append(
             (
                 position[valid],
@@ -271,6 +287,7 @@ def _passing(
         points[:, 2],
         centred.to(spot.device),
         launched,
+        torch.tensor(light, dtype=torch.float64),
     )
 
 
