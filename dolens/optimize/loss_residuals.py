@@ -6,9 +6,14 @@ residuals g/(2·√(κ·w)) the step of damped least squares minimises
     L + g·Jδ + κ·Σ w·|(J - J̄)δ|²,
 
 the loss's own gradient with the curvature of the spots' size (Côté, Tseng and Heide, "Generalized
-transverse ray aberrations", ACM Trans. Graph. 2026).  κ is the loss's own second derivative along
-the step that it leads to, over that of the spots' size, so that model and loss curve alike there.
-For the squared spot radius κ = 1, and the step is the classical one.
+transverse ray aberrations", ACM Trans. Graph. 2026).  κ says how much more the loss curves than the
+spots' size does.  There are two choices for it:
+
+- `step`: one κ, the ratio of both second derivatives along the step that it leads to;
+- `directions`: a κ for each of P directions of the variables, in which the loss's second
+  derivative over the landing points, seen through J, and the spots' size are both diagonal.
+
+For the squared spot radius every κ is 1, and the step is the classical one.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,14 +23,16 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.optics.rays import TracedRays
 from dolens.optimize.image_quality import ImageQuality
 from dolens.optimize.linear_model import LinearModel
 
-# κ is kept within these of what makes the gradient's own step as long as the spots are wide.
-_LEAST_CURVATURE = 1e-3
+CURVATURES = ("directions", "step")
+# Directions that move rays less than this part of what the strongest does are left out.
+_LEAST_MOVE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -57,12 +64,24 @@ class LossResiduals(ImageQuality):
 
     Args:
         landing_loss: of deviations from the reference.
+        curvature: `directions` or `step`, see above.
+
+    Raises:
+        InputError: an unknown curvature.
     """
 
     landing_loss: LandingPointLoss | Callable[[Tensor, Spots], Tensor] | None = None
+    curvature: str = "directions"
 
     unit: ClassVar[str] = "loss"
     focusable: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.curvature not in CURVATURES:
+            raise InputError(
+                f"curvature must be one of {', '.join(CURVATURES)}, not '{self.curvature}'"
+            )
 
     def _traced(self, lens: Lens, hit: TracedRays) -> tuple[Tensor, Tensor]:
         direction = hit.direction.double()
@@ -88,48 +107,46 @@ class LossResiduals(ImageQuality):
         # Rays that weigh nothing (chief rays) are no rows.
         own = torch.where(root > 0.0, 0.5 * gradient.reshape(-1) / root, 0.0)
         model = LinearModel.of_rows(own, root[:, None] * jacobian)
-        curvature = self._curvature(model, jacobian, root, second, points)
-        scaled = model.scaled(curvature**0.5)
-        right = model.right / curvature**0.5
-        return LinearModel(scaled.sum_of_squares, scaled.root, right), None
+        width = float((root * points.reshape(-1)).norm())
+        # The model in coordinates z = SVᵀδ, whose unit vectors move the spots by their unit size.
+        left, moves, right = torch.linalg.svd(model.root, full_matrices=False)
+        kept = moves > _LEAST_MOVE * moves[0].clamp(min=torch.finfo(moves.dtype).tiny)
+        left, moves, right = left[:, kept], moves[kept], right[kept]
+        slope = left.T @ model.right
+        if not bool(kept.any()):
+            return model, None
+        if self.curvature == "step":
+            along = slope / slope.norm().clamp(min=1e-300)
+            moved = (jacobian @ (right.T @ (along / moves))).reshape(1, 2, -1)
+            own = 0.5 * (second(moved) * moved).sum()
+            directions = torch.eye(len(moves), dtype=moves.dtype)
+            # Where the loss is flat or concave, no step is longer than the spots are wide.
+            curvature = (own if own > 0.0 else slope.norm() / max(width, 1e-300)).expand_as(moves)
+        else:
+            moved = (jacobian @ (right.T / moves)).T.reshape(len(moves), 2, -1)
+            square = 0.5 * torch.einsum("iaj,kaj->ik", moved, second(moved))
+            values, directions = torch.linalg.eigh(0.5 * (square + square.T))
+            # A saddle is left downhill both ways; no step is longer than the spots are wide.
+            longest = (directions.T @ slope).abs() / max(width, 1e-300)
+            curvature = torch.maximum(values.abs(), longest)
+        curvature = curvature.clamp(min=1e-12 * float(curvature.amax()) + 1e-300)
+        rows = curvature.sqrt()[:, None] * (directions.T @ (moves[:, None] * right))
+        right = (directions.T @ slope) / curvature.sqrt()
+        return LinearModel(float(right @ right), rows, right), None
 
     def _derivatives(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """∂L/∂p (2, N), and L's second derivative along a displacement (2, N) of the rays."""
+        """∂L/∂p (2, N), and the product of ∂²L/∂p² with displacements (D, 2, N) of the rays."""
         points = points.detach().requires_grad_()
         with torch.enable_grad():
-            loss = self._loss(points)
-            (gradient,) = torch.autograd.grad(loss, points, create_graph=True)
+            (gradient,) = torch.autograd.grad(self._loss(points), points, create_graph=True)
 
-        def along(displacement: Tensor) -> Tensor:
-            (product,) = torch.autograd.grad(gradient, points, displacement, retain_graph=True)
-            return (product * displacement).sum()
+        def product(displacements: Tensor) -> Tensor:
+            (found,) = torch.autograd.grad(
+                gradient, points, displacements, is_grads_batched=True, retain_graph=True
+            )
+            return found
 
-        return gradient.detach(), along
-
-    def _curvature(
-        self,
-        model: LinearModel,
-        jacobian: Tensor,
-        root: Tensor,
-        second: Callable[[Tensor], Tensor],
-        points: Tensor,
-    ) -> float:
-        """κ along the step of Gauss and Newton with κ = 1, whose direction does not depend on κ."""
-        norms = model.column_norms.clamp(min=1e-30)
-        # Weakly damped, or directions that move no ray would rule.
-        damped = torch.cat([model.root, torch.diag(1e-4 * norms)])
-        right = torch.cat([model.right, torch.zeros_like(norms)])
-        step = -torch.linalg.lstsq(damped, right[:, None]).solution.squeeze(1)
-        moved = jacobian @ step
-        size = float((root * moved).square().sum())
-        slope = -float(model.gradient @ step)
-        if size == 0.0 or slope <= 0.0:
-            return 1.0
-        own = 0.5 * float(second(moved.reshape(2, -1))) / size
-        # Where the loss is flat or concave along it, no step is longer than the spots are wide.
-        width = float((root * points.reshape(-1)).square().sum())
-        least = slope / max((size * width) ** 0.5, 1e-300)
-        return max(own, _LEAST_CURVATURE * least) if own > 0.0 else least
+        return gradient.detach(), product
 
     def _loss(self, deviations: Tensor) -> Tensor:
         weight, group = self.group_shares, self.group

@@ -44,7 +44,8 @@ class MeritSettings:
         sampling_options: what that function takes: `rings` and `arms`, or `count` and `half_width`.
         quality: `spots`: RMS radii, µm; `wavefront`: RMS wavefront errors, wavelengths; a loss of
             landing points: `modulation`, `encircled_energy` or `spot_size`; None: operands alone.
-        quality_options: of a loss, see `dolens.optimize.landing_losses`.
+        quality_options: of a loss, see `dolens.optimize.landing_losses`, and its `curvature`, see
+            `dolens.optimize.loss_residuals`.
         reference: deviations count from the spot's `centroid` or its `chief` ray.
         colours: wavelengths have references `apart`, or one for each field `together`.
         most_vignetted: share of a spot that apertures may clip; see `ImageQuality`.
@@ -129,7 +130,9 @@ class MeritSettings:
         try:
             if self.quality in RESIDUALS:
                 return RESIDUALS[self.quality](*common, **self.quality_options)
-            return LossResiduals(*common, LOSSES[self.quality](**self.quality_options))
+            options = dict(self.quality_options)
+            curvature = options.pop("curvature", "directions")
+            return LossResiduals(*common, LOSSES[self.quality](**options), curvature)
         except TypeError as error:
             raise InputError(f"merit.quality_options: {error}") from None
 
