@@ -35,8 +35,7 @@ def rms_against_field(
     wavelengths: Sequence[float] | Tensor,
     field: Sequence[float] | None = None,
     count: int = 15,
-    rings: int = 12,
-    arms: int = 6,
+    rays: int = 4000,
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> RMSCurves:
@@ -47,8 +46,7 @@ def rms_against_field(
         wavelengths: (W,), nm.
         field: the edge, (x, y) in degrees or mm; None for the largest of the lens's own fields.
         count: fields, with the axis and the edge.
-        rings: of the points on the stop, see `even_points`.
-        arms: points of the innermost ring.
+        rays: of each spot, an even number, before apertures clip any.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of the polychromatic spot, of any sum; None for equal ones.
 
@@ -60,7 +58,7 @@ def rms_against_field(
         raise InputError(f"count must be at least 2 fields, not {count}")
     edge = torch.tensor(_largest(lens, object_distance) if field is None else tuple(field))
     fields = torch.linspace(0.0, 1.0, count, dtype=torch.float64)[:, None] * edge.double()
-    return _curves(lens, fields, wavelengths, rings, arms, object_distance, wavelength_weights)
+    return _curves(lens, fields, wavelengths, rays, object_distance, wavelength_weights)
 
 
 def rms_against_wavelength(
@@ -68,8 +66,7 @@ def rms_against_wavelength(
     fields: Sequence[Sequence[float]] | Tensor,
     interval: tuple[float, float] | None = None,
     count: int = 15,
-    rings: int = 12,
-    arms: int = 6,
+    rays: int = 4000,
     object_distance: float | None = None,
 ) -> RMSCurves:
     """RMS spot radii at evenly spaced wavelengths.
@@ -79,8 +76,7 @@ def rms_against_wavelength(
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         interval: shortest and longest wavelength, nm; None for those of the lens.
         count: wavelengths, with both ends.
-        rings: of the points on the stop, see `even_points`.
-        arms: points of the innermost ring.
+        rays: of each spot, an even number, before apertures clip any.
         object_distance: mm in front of the first vertex; None for an object at infinity.
 
     Raises:
@@ -94,21 +90,18 @@ def rms_against_wavelength(
             raise InputError(f"lens '{lens.name}' names no wavelengths: give an interval")
         interval = min(lens.wavelengths), max(lens.wavelengths)
     wavelengths = torch.linspace(*interval, count, dtype=torch.float64)
-    return _curves(lens, fields, wavelengths, rings, arms, object_distance, None)
+    return _curves(lens, fields, wavelengths, rays, object_distance, None)
 
 
 def _curves(
     lens: Lens,
     fields: Sequence[Sequence[float]] | Tensor,
     wavelengths: Sequence[float] | Tensor,
-    rings: int,
-    arms: int,
+    rays: int,
     object_distance: float | None,
     wavelength_weights: Sequence[float] | None,
 ) -> RMSCurves:
-    spots = spot_diagram(
-        lens, fields, wavelengths, rings, arms, object_distance, wavelength_weights
-    )
+    spots = spot_diagram(lens, fields, wavelengths, rays, object_distance, wavelength_weights)
     return RMSCurves(
         spots.fields, spots.wavelengths, spots.rms, spots.polychromatic_rms, spots.airy_radius
     )

@@ -71,8 +71,7 @@ def spot_diagram(
     lens: Lens,
     fields: Sequence[Sequence[float]] | Tensor,
     wavelengths: Sequence[float] | Tensor,
-    rings: int = 12,
-    arms: int = 6,
+    rays: int = 2000,
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> SpotDiagram:
@@ -82,16 +81,17 @@ def spot_diagram(
         lens: the lens.
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         wavelengths: (W,), nm.
-        rings: of the points on the stop, see `even_points`.
-        arms: points of the innermost ring; there are arms·rings² in all.
+        rays: of each spot, an even number, before apertures clip any.  RMS radii of two
+            thousand err by some 1e-4 of themselves where only the stop clips, and by one or two
+            hundredths at the edge of a field that has lost half of its light.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of any sum; None for equal ones.
 
     Raises:
-        InputError: no fields or wavelengths, or weights that do not fit them.
+        InputError: no fields or wavelengths, weights that do not fit, or an odd number of rays.
     """
     lens = in_double_precision(lens)
-    pupil, weight = even_points(rings, arms)
+    pupil, weight = even_points(rays)
     landings = land(lens, fields, wavelengths, pupil, object_distance)
     points, valid = landings.points, landings.valid
     spectrum = spectral_shares(wavelength_weights, points.shape[1])
@@ -146,7 +146,9 @@ def spectral_shares(weights: Sequence[float] | None, count: int) -> Tensor:
         return torch.full((count,), 1.0 / count, dtype=torch.float64)
     shares = torch.as_tensor(weights, dtype=torch.float64)
     if shares.shape != (count,) or bool((shares < 0.0).any()) or not float(shares.sum()) > 0.0:
-        raise InputError(f"wavelength_weights must be {count} weights, none negative, not {weights}")
+        raise InputError(
+            f"wavelength_weights must be {count} weights, none negative, not {weights}"
+        )
     return shares / shares.sum()
 
 

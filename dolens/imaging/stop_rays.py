@@ -25,6 +25,8 @@ _DEGREE = 8
 _RINGS, _AZIMUTHS = _DEGREE // 2, 2 * _DEGREE + 1
 # The rim of the stop, where a ray is still inside although the fit is not exact.
 _RIM = 1.0 - 2e-4
+_RIM_POINTS = 72
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True)
@@ -43,29 +45,33 @@ class Landings:
     chief: Tensor
 
 
-def even_points(rings: int, arms: int) -> tuple[Tensor, Tensor]:
+def even_points(count: int) -> tuple[Tensor, Tensor]:
     """Points that share the unit disc evenly, and its rim.
 
-    The disc is cut into `rings` annuli of one width and these into arms·(2k - 1) cells of one
-    area, k from 1.  Each has a point, at the radius whose square is the annulus's mean, so that the
-    mean of ρ² is 1/2 exactly; that of ρ⁶ errs by 1/(3·rings²) of 1/4 or so.
+    Two mirror images of a spiral fill the halves x > 0 and x < 0: ρ² grows evenly and the azimuth
+    by the golden section of the half turn (Vogel, Math. Biosciences 44, 179, 1979).  No two points
+    of a half lie on one circle or one line, so that an aperture that clips the light takes its
+    share of them, wherever its edge runs; points on rings would come and go by whole rings.
+
+    Args:
+        count: points that weigh; an even number.
 
     Returns:
-        Points (N, 2), arms·rings² of them and 6·rings on the rim, and weights (N,) of sum one.
-        Those on the rim weigh nothing: they are for extents.
+        Points (count + 72, 2) and weights (count + 72,) of sum one.  The last 72 lie on the rim and
+        weigh nothing: they are for extents.
 
     Raises:
-        InputError: fewer than one ring or three arms.
+        InputError: the number is odd or not positive.
     """
-    if rings < 1 or arms < 3:
-        raise InputError(f"rings must be at least 1 and arms 3, not {rings} and {arms}")
-    pieces = []
-    for ring in range(1, rings + 1):
-        radius = math.sqrt(0.5 * (ring**2 + (ring - 1) ** 2)) / rings
-        pieces.append(radius * _circle(arms * (2 * ring - 1), 0.5))
-    inner = torch.cat(pieces)
-    rim = _RIM * _circle(6 * rings, 0.0)
-    weight = torch.cat([inner.new_full((len(inner),), 1.0 / len(inner)), rim.new_zeros(len(rim))])
+    if count < 2 or count % 2:
+        raise InputError(f"rays must be a positive even number, not {count}")
+    index = torch.arange(count // 2, dtype=torch.float64)
+    radius = ((index + 0.5) / len(index)).sqrt()
+    angle = math.pi * ((index * _GOLDEN).frac() - 0.5)
+    half = torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
+    inner = torch.cat([half, half * half.new_tensor([-1.0, 1.0])])
+    rim = _RIM * _circle(_RIM_POINTS, 0.0)
+    weight = torch.cat([inner.new_full((count,), 1.0 / count), inner.new_zeros(_RIM_POINTS)])
     return torch.cat([inner, rim]), weight
 
 
