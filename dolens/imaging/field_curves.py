@@ -17,6 +17,7 @@ class RMSCurves:
 
     Attributes:
         fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
         wavelengths: (W,), nm.
         rms: (F, W), mm, about each spot's own centroid.
         polychromatic: (F,), mm, of all wavelengths together about their common centroid.
@@ -24,6 +25,7 @@ class RMSCurves:
     """
 
     fields: Tensor
+    field_unit: str
     wavelengths: Tensor
     rms: Tensor
     polychromatic: Tensor
@@ -103,7 +105,12 @@ def _curves(
 ) -> RMSCurves:
     spots = spot_diagram(lens, fields, wavelengths, rays, object_distance, wavelength_weights)
     return RMSCurves(
-        spots.fields, spots.wavelengths, spots.rms, spots.polychromatic_rms, spots.airy_radius
+        spots.fields,
+        spots.field_unit,
+        spots.wavelengths,
+        spots.rms,
+        spots.polychromatic_rms,
+        spots.airy_radius,
     )
 
 

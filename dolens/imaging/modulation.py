@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.spots import spectral_shares, working_f_numbers
-from dolens.imaging.stop_rays import even_points, in_double_precision, land
+from dolens.imaging.stop_rays import even_points, field_unit, in_double_precision, land
 from dolens.optics.aiming import field_tangents
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
@@ -31,6 +31,7 @@ class Modulation:
 
     Attributes:
         fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
         wavelengths: (W,), nm.
         frequencies: (Q,), cycles/mm on the sensor.
         tangential: (F, Q), of a pattern that varies along the field's own direction, y for one in
@@ -40,6 +41,7 @@ class Modulation:
     """
 
     fields: Tensor
+    field_unit: str
     wavelengths: Tensor
     frequencies: Tensor
     tangential: Tensor
@@ -156,7 +158,15 @@ def modulation(
     )
     numbers = working_f_numbers(lens, waves, object_distance)
     limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
-    return Modulation(field, waves, frequency, tangential, sagittal, spectrum @ limits)
+    return Modulation(
+        field,
+        field_unit(object_distance),
+        waves,
+        frequency,
+        tangential,
+        sagittal,
+        spectrum @ limits,
+    )
 
 
 def _radial(field: Tensor, object_distance: float | None) -> Tensor:

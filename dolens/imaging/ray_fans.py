@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.stop_rays import land
+from dolens.imaging.stop_rays import field_unit, land
 from dolens.optics.lens import Lens
 
 # A ray that crosses the very rim is outside the stop's aperture.
@@ -20,6 +20,7 @@ class RayFans:
 
     Attributes:
         fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
         wavelengths: (W,), nm.
         reference_wavelength: nm, of the chief rays.
         coordinate: (P,), from -1 to 1, over the stop's semi-diameter.
@@ -29,6 +30,7 @@ class RayFans:
     """
 
     fields: Tensor
+    field_unit: str
     wavelengths: Tensor
     reference_wavelength: float
     coordinate: Tensor
@@ -67,6 +69,7 @@ def ray_fans(
     deviation = 1e3 * (landings.points - landings.chief[:, None, None])
     return RayFans(
         fields=torch.as_tensor(fields, dtype=torch.float64).cpu(),
+        field_unit=field_unit(object_distance),
         wavelengths=torch.as_tensor(wavelengths, dtype=torch.float64).cpu(),
         reference_wavelength=lens.primary_wavelength,
         coordinate=coordinate,

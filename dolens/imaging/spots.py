@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.stop_rays import even_points, in_double_precision, land
+from dolens.imaging.stop_rays import even_points, field_unit, in_double_precision, land
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 
@@ -24,6 +24,7 @@ class SpotDiagram:
 
     Attributes:
         fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
         wavelengths: (W,), nm.
         reference_wavelength: nm, of the chief rays.
         landing: (F, W, N, 2), mm on the sensor; NaN for rays that do not pass.
@@ -41,6 +42,7 @@ class SpotDiagram:
     """
 
     fields: Tensor
+    field_unit: str
     wavelengths: Tensor
     reference_wavelength: float
     landing: Tensor
@@ -104,6 +106,7 @@ def spot_diagram(
     waves = torch.as_tensor(wavelengths, dtype=torch.float64).cpu()
     return SpotDiagram(
         fields=torch.as_tensor(fields, dtype=torch.float64).cpu(),
+        field_unit=field_unit(object_distance),
         wavelengths=waves,
         reference_wavelength=lens.primary_wavelength,
         landing=points,

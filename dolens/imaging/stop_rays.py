@@ -137,6 +137,11 @@ def land(
     )
 
 
+def field_unit(object_distance: float | None) -> str:
+    """What fields are measured in: `°` for an object at infinity, else `mm`."""
+    return "°" if vergence(object_distance) == 0.0 else "mm"
+
+
 def in_double_precision(lens: Lens) -> Lens:
     """The lens, or a copy of it in double precision where it is not."""
     return lens if lens.dtype == torch.float64 else copy.deepcopy(lens).to(torch.float64)

@@ -88,7 +88,7 @@ def layout_figure(
 
 
 def drawn_height(z_limits: tuple[float, float], half_height: float, legend: bool) -> float:
-    """Inches that a layout takes in a figure of the usual width, so that equal scales leave no gaps."""
+    """Inches that a layout of the usual width takes, so that equal scales leave no gaps."""
     # What axes and legend take beside the drawing.
     beside = 0.75 + (0.8 if legend else 0.0)
     drawn = (WIDTH - beside) * 2.0 * half_height / (z_limits[1] - z_limits[0])
