@@ -113,7 +113,7 @@ def modulation(
     fields: Sequence[Sequence[float]] | Tensor,
     wavelengths: Sequence[float] | Tensor,
     frequencies: Sequence[float] | Tensor,
-    rays: int = 2000,
+    rays: int = 6000,
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> Modulation:
@@ -126,8 +126,8 @@ def modulation(
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         wavelengths: (W,), nm.
         frequencies: (Q,), cycles/mm.
-        rays: of each field and wavelength, an even number, before apertures clip any.  N rays leave
-            a noise of less than 1/√N where the contrast is gone.
+        rays: of each field and wavelength, an even number, before apertures clip any.  What is
+            left of contrast far beyond the first zero is noise of 1/√rays or less.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of any sum; None for equal ones.
 
@@ -147,15 +147,16 @@ def modulation(
     field = torch.as_tensor(fields, dtype=torch.float64).cpu()
     along = _radial(field, object_distance)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
-    tangential, sagittal = (
-        torch.stack(
-            [
-                modulation_transfer(*one, frequency, towards)
-                for *one, towards in zip(points, light, direction, strict=True)
-            ]
+    curves = []
+    for spot, share, tangential, sagittal in zip(points, light, along, across, strict=True):
+        lit = share > 0.0
+        passing = (spot[lit], share[lit], frequency)
+        curves.append(
+            torch.stack([modulation_transfer(*passing, way) for way in (tangential, sagittal)])
+            if bool(lit.any())
+            else frequency.new_full((2, len(frequency)), math.nan)
         )
-        for direction in (along, across)
-    )
+    tangential, sagittal = torch.stack(curves, 1)
     numbers = working_f_numbers(lens, waves, object_distance)
     limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
     return Modulation(

@@ -51,7 +51,7 @@ def history_figure(
         axes.set_ylabel(label, fontsize=SMALL + 1)
         ruled_axes(axes)
     grid[-1].set_xlabel("iteration", fontsize=SMALL + 1)
-    grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10)))
     figure.align_ylabels()
     if title:
         grid[0].set_title(title, fontsize=TITLE)

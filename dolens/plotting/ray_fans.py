@@ -38,7 +38,11 @@ def ray_fans_figure(fans: RayFans, title: str | None = "Ray fans") -> Figure:
             for line, wavelength in zip(fan[row], fans.wavelengths, strict=True):
                 colour = spectral_colour(float(wavelength))
                 axes.plot(coordinate, line, color=colour, linewidth=1.3, gid="fan", zorder=3)
-            axes.set(xlim=(-1.0, 1.0), ylim=(-1.08 * reach, 1.08 * reach))
+            axes.set(
+                xlim=(-1.0, 1.0),
+                xticks=(-1.0, -0.5, 0.0, 0.5, 1.0),
+                ylim=(-1.08 * reach, 1.08 * reach),
+            )
             ruled_axes(axes)
             if np.isnan(fan[row]).all():
                 axes.text(0.0, 0.5 * reach, "no light passes", ha="center", fontsize=SMALL)

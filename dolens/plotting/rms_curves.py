@@ -45,7 +45,6 @@ def rms_curves_figure(
     grid = figure.subplots(1, len(given), squeeze=False, sharey=True)
     for axes, (curves, draw) in zip(grid[0], given, strict=True):
         draw(axes, curves)
-        axes.set_ylim(bottom=0.0)
         ruled_axes(axes)
         axes.legend(
             loc="upper center",
@@ -54,6 +53,8 @@ def rms_curves_figure(
             frameon=False,
             fontsize=SMALL,
         )
+    # Both share one scale, which is known when both are drawn.
+    grid[0, 0].set_ylim(bottom=0.0)
     grid[0, 0].set_ylabel("RMS spot radius (µm)", fontsize=SMALL + 1)
     if title:
         figure.suptitle(title, fontsize=TITLE)

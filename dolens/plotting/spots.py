@@ -7,13 +7,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 
 from dolens.imaging.spots import SpotDiagram
 from dolens.plotting.style import (
     SMALL,
     TITLE,
     field_label,
-    open_axes,
+    ruled_axes,
     spectral_colour,
     wavelength_handles,
 )
@@ -56,7 +57,7 @@ def spots_figure(
     figure = Figure(
         figsize=(
             max(_PANEL * columns + (0.55 if overlaid else 0.75), 4.2),
-            (_PANEL + (0.22 if overlaid else 0.08)) * rows + 1.25,
+            (_PANEL + (0.5 if overlaid else 0.08)) * rows + (0.75 if overlaid else 1.25),
         ),
         layout="constrained",
     )
@@ -66,7 +67,8 @@ def spots_figure(
         label = field_label(spots.fields[field], spots.field_unit)
         if overlaid:
             axes = grid[divmod(field, columns)]
-            for wave in range(waves):
+            # The widest first, so that none hides another.
+            for wave in spots.rms[field].nan_to_num(0.0).argsort(descending=True).tolist():
                 _scatter(axes, points[field, wave], float(spots.wavelengths[wave]))
             _marks(axes, chief[field], np.zeros(2), airy[nearest])
             radius = float(spots.polychromatic_rms[field])
@@ -93,7 +95,7 @@ def spots_figure(
 def _half_width(points: np.ndarray, airy: np.ndarray) -> float:
     """µm from the centre to the edge of every panel: everything, with room for the numbers."""
     reach = max(float(np.nanmax(np.abs(points), initial=0.0)), float(airy.max()))
-    return 1.3 * reach
+    return 1.2 * reach
 
 
 def _scatter(axes: Axes, points: np.ndarray, wavelength: float) -> None:
@@ -118,16 +120,14 @@ def _marks(axes: Axes, chief: np.ndarray, middle: np.ndarray, radius: float) -> 
         axes.add_patch(circle)
         circle.set_zorder(4)
     if np.isfinite(chief).all():
-        style = {"markersize": 6, "markeredgewidth": 0.8, "color": "0.35"}
-        axes.plot(*chief, marker="+", linestyle="none", gid="chief", zorder=2, **style)
+        style = {"markersize": 6, "markeredgewidth": 0.8, "color": "black"}
+        axes.plot(*chief, marker="+", linestyle="none", gid="chief", zorder=5, **style)
 
 
 def _radii(axes: Axes, rms: float, geo: float) -> None:
     """Numbers in a panel's upper corner; both radii come in mm."""
-    text = "no light passes" if math.isnan(rms) else f"RMS {1e3 * rms:.3g}\nGEO {1e3 * geo:.3g} µm"
-    axes.text(
-        0.04, 0.965, text, va="top", fontsize=SMALL - 1, transform=axes.transAxes, linespacing=1.1
-    )
+    text = "no light passes" if math.isnan(rms) else f"RMS {1e3 * rms:.3g}, GEO {1e3 * geo:.3g} µm"
+    axes.text(0.03, 0.985, text, va="top", fontsize=SMALL - 1, transform=axes.transAxes)
 
 
 def _label(grid: np.ndarray, fields: int, half: float, overlaid: bool) -> None:
@@ -136,9 +136,9 @@ def _label(grid: np.ndarray, fields: int, half: float, overlaid: bool) -> None:
             axes.set_visible(False)
             grid.flat[number - grid.shape[1]].tick_params(labelbottom=True)
         axes.set(xlim=(-half, half), ylim=(-half, half), box_aspect=1.0)
-        axes.grid(True, color="0.93", linewidth=0.5)
-        axes.set_axisbelow(True)
-        open_axes(axes)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+        ruled_axes(axes)
     for axes in grid[-1]:
         axes.set_xlabel("x (µm)", fontsize=SMALL + 1)
     if overlaid:
@@ -147,13 +147,11 @@ def _label(grid: np.ndarray, fields: int, half: float, overlaid: bool) -> None:
 
 
 def _legend(figure: Figure, spots: SpotDiagram, overlaid: bool) -> None:
-    style = {"linestyle": "none", "markersize": 6, "markeredgewidth": 0.8}
+    style = {"linestyle": "none", "markersize": 6, "markeredgewidth": 0.8, "color": "black"}
     handles = wavelength_handles(spots.wavelengths) if overlaid else []
     handles += [
-        Line2D(
-            [], [], marker="o", markerfacecolor="none", color="black", label="Airy disc", **style
-        ),
-        Line2D([], [], marker="+", color="0.35", label="chief ray", **style),
+        Line2D([], [], marker="o", markerfacecolor="none", label="Airy disc", **style),
+        Line2D([], [], marker="+", label="chief ray", **style),
     ]
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
