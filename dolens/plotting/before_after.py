@@ -46,7 +46,9 @@ def before_after_figure(
     half_height = max(drawing.half_height for drawing in drawings)
     legend = any(drawing.needs_legend for drawing in drawings)
     height = min(drawn_height(z_limits, half_height, legend), 4.2)
-    figure = Figure(figsize=(WIDTH, 2.0 * height), layout="constrained")
+    # The upper drawing has no numbers below.  Were there height to spare, constrained layout would
+    # widen axes of equal scales until their labels leave the figure.
+    figure = Figure(figsize=(WIDTH, 2.0 * height - 0.5), layout="constrained")
     grid = figure.subplots(2, 1, sharex=True, sharey=True)
     for number, (axes, lens, drawing) in enumerate(zip(grid, lenses, drawings, strict=True)):
         draw_layout(axes, drawing, z_limits, half_height)

@@ -54,7 +54,9 @@ def matrix_figure(
     picture = axes.imshow(
         shown, cmap="RdBu_r", vmin=-reach, vmax=reach, aspect="auto", interpolation="nearest"
     )
-    axes.set_xticks(range(columns), column_labels, rotation=90, fontsize=SMALL - 1)
+    axes.set_xticks(
+        range(columns), column_labels, rotation=90 if letters[1] > 3 else 0, fontsize=SMALL - 1
+    )
     axes.set_yticks(range(rows), row_labels, fontsize=SMALL - 1)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)

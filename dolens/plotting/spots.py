@@ -57,7 +57,7 @@ def spots_figure(
     figure = Figure(
         figsize=(
             max(_PANEL * columns + (0.55 if overlaid else 0.75), 4.2),
-            (_PANEL + (0.5 if overlaid else 0.08)) * rows + (0.75 if overlaid else 1.25),
+            (_PANEL + (0.5 if overlaid else 0.08)) * rows + (0.6 if overlaid else 1.25),
         ),
         layout="constrained",
     )

@@ -51,4 +51,4 @@ def ruled_axes(axes: Axes) -> None:
 def open_axes(axes: Axes) -> None:
     """Leave only the left and bottom spines, and make the numbers small."""
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=SMALL)
+    axes.tick_params(which="both", labelsize=SMALL)
