@@ -48,7 +48,7 @@ def rms_against_field(
         wavelengths: (W,), nm.
         field: the edge, (x, y) in degrees or mm; None for the largest of the lens's own fields.
         count: fields, with the axis and the edge.
-        rays: of each spot, an even number, before apertures clip any.
+        rays: of each spot, a multiple of four, before apertures clip any.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of the polychromatic spot, of any sum; None for equal ones.
 
@@ -78,7 +78,7 @@ def rms_against_wavelength(
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         interval: shortest and longest wavelength, nm; None for those of the lens.
         count: wavelengths, with both ends.
-        rays: of each spot, an even number, before apertures clip any.
+        rays: of each spot, a multiple of four, before apertures clip any.
         object_distance: mm in front of the first vertex; None for an object at infinity.
 
     Raises:

@@ -126,13 +126,13 @@ def modulation(
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         wavelengths: (W,), nm.
         frequencies: (Q,), cycles/mm.
-        rays: of each field and wavelength, an even number, before apertures clip any.  What is
+        rays: of each field and wavelength, a multiple of four, before apertures clip any.  What is
             left of contrast far beyond the first zero is noise of 1/√rays or less.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of any sum; None for equal ones.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, or an odd number of rays.
+        InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
     """
     lens = in_double_precision(lens)
     pupil, weight = even_points(rays)

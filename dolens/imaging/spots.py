@@ -83,14 +83,14 @@ def spot_diagram(
         lens: the lens.
         fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
         wavelengths: (W,), nm.
-        rays: of each spot, an even number, before apertures clip any.  RMS radii of two
-            thousand err by some 1e-4 of themselves where only the stop clips, and by one or two
-            hundredths at the edge of a field that has lost half of its light.
+        rays: of each spot, a multiple of four, before apertures clip any.  RMS radii of two
+            thousand err by some 1e-4 of themselves where only the stop clips, and by a few
+            hundredths at the edge of a field that has lost most of its light.
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of any sum; None for equal ones.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, or an odd number of rays.
+        InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
     """
     lens = in_double_precision(lens)
     pupil, weight = even_points(rays)

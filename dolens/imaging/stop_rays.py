@@ -48,28 +48,30 @@ class Landings:
 def even_points(count: int) -> tuple[Tensor, Tensor]:
     """Points that share the unit disc evenly, and its rim.
 
-    Two mirror images of a spiral fill the halves x > 0 and x < 0: ρ² grows evenly and the azimuth
-    by the golden section of the half turn (Vogel, Math. Biosciences 44, 179, 1979).  No two points
-    of a half lie on one circle or one line, so that an aperture that clips the light takes its
-    share of them, wherever its edge runs; points on rings would come and go by whole rings.
+    A spiral fills the quadrant x, y > 0, and its mirror images the others, so that odd moments are
+    exactly zero: ρ² grows evenly and the azimuth by the golden section of the quarter turn (after
+    Vogel, Math. Biosciences 44, 179, 1979).  No two points of a quadrant lie on one circle or one
+    line, so that an aperture that clips the light takes its share of them, wherever its edge runs;
+    points on rings would come and go by whole rings.
 
     Args:
-        count: points that weigh; an even number.
+        count: points that weigh; a multiple of four.
 
     Returns:
         Points (count + 72, 2) and weights (count + 72,) of sum one.  The last 72 lie on the rim and
         weigh nothing: they are for extents.
 
     Raises:
-        InputError: the number is odd or not positive.
+        InputError: the number is not positive or no multiple of four.
     """
-    if count < 2 or count % 2:
-        raise InputError(f"rays must be a positive even number, not {count}")
-    index = torch.arange(count // 2, dtype=torch.float64)
+    if count < 4 or count % 4:
+        raise InputError(f"rays must be a positive multiple of four, not {count}")
+    index = torch.arange(count // 4, dtype=torch.float64)
     radius = ((index + 0.5) / len(index)).sqrt()
-    angle = math.pi * ((index * _GOLDEN).frac() - 0.5)
-    half = torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
-    inner = torch.cat([half, half * half.new_tensor([-1.0, 1.0])])
+    angle = 0.5 * math.pi * (index * _GOLDEN).frac()
+    quadrant = torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
+    signs = quadrant.new_tensor([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    inner = (signs[:, None] * quadrant).flatten(0, 1)
     rim = _RIM * _circle(_RIM_POINTS, 0.0)
     weight = torch.cat([inner.new_full((count,), 1.0 / count), inner.new_zeros(_RIM_POINTS)])
     return torch.cat([inner, rim]), weight
