@@ -106,7 +106,7 @@ def test_five_overlaid_fields_wrap():
     )  # fmt: skip
     figure = spots_figure(many, overlaid=True)
     shown = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title() for axes in shown[:2]] == ["(0, 1) mm", "(2, 3) mm"]
+    assert [axes.get_title() for axes in shown[:2]] == ["1 mm", "(2, 3) mm"]
     assert len(shown) == 5 and shown[4].get_subplotspec().rowspan.start == 1
 
 
