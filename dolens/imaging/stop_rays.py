@@ -1,0 +1,206 @@
+"""Where the light of many fields and wavelengths lands, by points of the stop.
+
+Aiming a ray at a point of the stop costs far more than tracing it.  A few dozen rays are therefore
+aimed, the points where they start are fitted by a polynomial in the stop coordinates, and thousands
+start where the polynomial says.  Each is exactly a ray of its field: what the fit leaves is where
+it crosses the stop, by some 1e-4 of the stop's semi-diameter or less.
+"""
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.aiming import AimedRays, field_tangents, launch
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import vergence
+from dolens.optics.rays import Rays, Status
+
+_DEGREE = 8
+# Rings and azimuths of the points that are aimed at; they determine a polynomial of that degree.
+_RINGS, _AZIMUTHS = _DEGREE // 2, 2 * _DEGREE + 1
+# The rim of the stop, where a ray is still inside although the fit is not exact.
+_RIM = 1.0 - 2e-4
+_RIM_POINTS = 72
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True)
+class Landings:
+    """Rays of F fields and W wavelengths through N points of the stop, on the sensor.
+
+    Attributes:
+        points: (F, W, N, 2), mm, double precision; NaN where a ray does not pass.
+        valid: (F, W, N), bool.
+        chief: (F, 2), mm, where the chief rays of the reference wavelength land, whether apertures
+            clip them or not; NaN where one does not reach the sensor.
+    """
+
+    points: Tensor
+    valid: Tensor
+    chief: Tensor
+
+
+def even_points(count: int) -> tuple[Tensor, Tensor]:
+    """Points that share the unit disc evenly, and its rim.
+
+    A spiral fills the quadrant x, y > 0, and its mirror images the others, so that odd moments are
+    exactly zero: ρ² grows evenly and the azimuth by the golden section of the quarter turn (after
+    Vogel, Math. Biosciences 44, 179, 1979).  No two points of a quadrant lie on one circle or one
+    line, so that an aperture that clips the light takes its share of them, wherever its edge runs;
+    points on rings would come and go by whole rings.
+
+    Args:
+        count: points that weigh; a multiple of four.
+
+    Returns:
+        Points (count + 72, 2) and weights (count + 72,) of sum one.  The last 72 lie on the rim and
+        weigh nothing: they are for extents.
+
+    Raises:
+        InputError: the number is not positive or no multiple of four.
+    """
+    if count < 4 or count % 4:
+        raise InputError(f"rays must be a positive multiple of four, not {count}")
+    index = torch.arange(count // 4, dtype=torch.float64)
+    radius = ((index + 0.5) / len(index)).sqrt()
+    angle = 0.5 * math.pi * (index * _GOLDEN).frac()
+    quadrant = torch.stack((radius * angle.cos(), radius * angle.sin()), -1)
+    signs = quadrant.new_tensor([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    inner = (signs[:, None] * quadrant).flatten(0, 1)
+    rim = _RIM * _circle(_RIM_POINTS, 0.0)
+    weight = torch.cat([inner.new_full((count,), 1.0 / count), inner.new_zeros(_RIM_POINTS)])
+    return torch.cat([inner, rim]), weight
+
+
+@torch.no_grad()
+def land(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    pupil: Tensor,
+    object_distance: float | None = None,
+    exact: bool = False,
+) -> Landings:
+    """Aim rays at points of the stop, every wavelength by itself, and trace them in one go.
+
+    Args:
+        lens: of any precision; the rays are traced in double precision.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        pupil: (N, 2), x and y on the stop over its semi-diameter, in the unit disc.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        exact: aim every ray, rather than to fit a few.
+
+    Raises:
+        InputError: no fields or wavelengths, or fields that are not pairs.
+    """
+    lens = in_double_precision(lens)
+    options = {"dtype": torch.float64, "device": lens.device}
+    field = torch.as_tensor(fields, **options)
+    if field.ndim != 2 or field.shape[-1] != 2 or len(field) == 0:
+        raise InputError(f"fields must be pairs (x, y), at least one, not {fields}")
+    waves = torch.as_tensor(wavelengths, **options)
+    if waves.ndim != 1 or len(waves) == 0:
+        raise InputError(f"wavelengths must be numbers (nm), at least one, not {wavelengths}")
+    pupil = pupil.to(**options)
+    count = len(waves)
+    # The chief ray of the reference wavelength is always one of the rays.
+    reference = torch.nonzero(waves == lens.primary_wavelength).flatten()
+    at = int(reference[0]) if len(reference) else count
+    if at == count:
+        waves = torch.cat([waves, waves.new_tensor([lens.primary_wavelength])])
+
+    centre = pupil.new_zeros(1, 2)
+    nodes = torch.cat([centre, pupil]) if exact else _nodes().to(**options)
+    aimed = lens.aim(field[:, None, None], nodes, waves[:, None], object_distance)
+    chief_rays = Rays(aimed.position[:, at, 0], aimed.direction[:, at, 0], waves[at])
+    if exact:
+        rays = Rays(
+            aimed.position[:, :count, 1:], aimed.direction[:, :count, 1:], waves[:count, None]
+        )
+        started = aimed.converged[:, :count, 1:]
+    else:
+        rays, started = _fitted(lens, field, aimed, nodes, pupil, object_distance)
+        rays = Rays(rays.position[:, :count], rays.direction[:, :count], waves[:count, None])
+        started = started[:, :count, None]
+    hit, chief = lens.trace(rays), lens.trace(chief_rays)
+    valid = hit.valid & started
+    reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
+    reached = reached & aimed.converged[:, at, 0]
+    return Landings(
+        hit.position[..., :2].where(valid[..., None], math.nan).cpu(),
+        valid.cpu(),
+        chief.position[..., :2].where(reached[..., None], math.nan).cpu(),
+    )
+
+
+def field_unit(object_distance: float | None) -> str:
+    """What fields are measured in: `°` for an object at infinity, else `mm`."""
+    return "°" if vergence(object_distance) == 0.0 else "mm"
+
+
+def in_double_precision(lens: Lens) -> Lens:
+    """The lens, or a copy of it in double precision where it is not."""
+    return lens if lens.dtype == torch.float64 else copy.deepcopy(lens).to(torch.float64)
+
+
+def _fitted(
+    lens: Lens,
+    field: Tensor,
+    aimed: AimedRays,
+    nodes: Tensor,
+    pupil: Tensor,
+    object_distance: float | None,
+) -> tuple[Rays, Tensor]:
+    """Rays (F, W, N) by a fit of aimed ones (F, W, nodes), and (F, W): whether there is a fit."""
+    near = vergence(object_distance)
+    tangents, _ = field_tangents(torch.deg2rad(field) if near == 0.0 else field, object_distance)
+    tangents = tangents[:, None, None]
+    line = torch.cat([tangents, torch.ones_like(tangents[..., :1])], -1)
+    line = line / line.norm(dim=-1, keepdim=True)
+    # Where the rays cross the plane that faces the field, in its axes: the inverse of `launch`.
+    tilt = line[..., :2] / (1.0 + line[..., 2:])
+    start = aimed.position[..., :2] - tilt * aimed.position[..., 2:]
+
+    basis, wanted = _basis(nodes), _basis(pupil)
+    ok = aimed.converged
+    if bool(ok.all()):
+        coefficients = torch.linalg.pinv(basis) @ start
+    else:
+        # Rays that a lens does not let reach the stop are left out; the least norm fills in.
+        part = basis * ok[..., None]
+        coefficients = torch.linalg.pinv(part, rtol=1e-10) @ torch.where(ok[..., None], start, 0.0)
+    found = ok.sum(-1) > 0
+    ray = launch(tangents, near, wanted @ coefficients)
+    return Rays.from_components(ray, aimed.wavelength), found
+
+
+def _nodes() -> Tensor:
+    """(1 + rings·azimuths, 2): the centre, and rings that crowd towards the rim as Chebyshev's."""
+    rings = [torch.zeros(1, 2, dtype=torch.float64)]
+    for ring in range(_RINGS):
+        radius = math.cos(0.5 * math.pi * ring / (_RINGS + 0.5))
+        # Every other ring is turned by half a step, so that no azimuth is met by all.
+        rings.append(radius * _circle(_AZIMUTHS, 0.5 * (ring % 2)))
+    return torch.cat(rings)
+
+
+def _basis(points: Tensor) -> Tensor:
+    """(N, terms): products of Chebyshev's polynomials in x and y up to the degree, in all."""
+    angle = torch.arccos(points.clamp(-1.0, 1.0))[..., None]
+    along_x, along_y = torch.cos(angle * torch.arange(_DEGREE + 1).to(points)).unbind(1)
+    terms = [
+        along_x[:, i] * along_y[:, j] for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)
+    ]
+    return torch.stack(terms, -1)
+
+
+def _circle(count: int, offset: float) -> Tensor:
+    """(count, 2), points of the unit circle; the first is `offset` steps from +x."""
+    angle = (torch.arange(count, dtype=torch.float64) + offset) * (2.0 * math.pi / count)
+    return torch.stack((angle.cos(), angle.sin()), -1)

@@ -1,0 +1,61 @@
+"""A lens before and after it was changed."""
+
+from collections.abc import Sequence
+
+import torch
+from matplotlib.figure import Figure
+
+from dolens.optics.lens import Lens
+from dolens.plotting.drawing import draw_layout, layout_drawing
+from dolens.plotting.layout import WIDTH, drawn_height, layout_title
+from dolens.plotting.style import TITLE
+
+
+@torch.no_grad()
+def before_after_figure(
+    before: Lens,
+    after: Lens,
+    wavelength: float | Sequence[float] = 587.5618,
+    fields_deg: Sequence[float] = (0.0,),
+    rays: int = 7,
+    object_distance: float | None = None,
+    titles: tuple[str, str] | None = None,
+) -> Figure:
+    """Two layouts one above the other, of one scale and with their first vertices in one line.
+
+    Args:
+        before: drawn above.
+        after: drawn below.
+        wavelength: nm, as for `layout_figure`.
+        fields_deg: degrees, as for `layout_figure`.
+        rays: a field.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        titles: of the two; None for `before` and `after` with their names and focal lengths.
+
+    Raises:
+        InputError: as `layout_figure` does.
+    """
+    lenses = (before, after)
+    drawings = [
+        layout_drawing(lens, wavelength, fields_deg, rays, object_distance) for lens in lenses
+    ]
+    z_limits = (
+        min(drawing.z_limits[0] for drawing in drawings),
+        max(drawing.z_limits[1] for drawing in drawings),
+    )
+    half_height = max(drawing.half_height for drawing in drawings)
+    legend = any(drawing.needs_legend for drawing in drawings)
+    height = min(drawn_height(z_limits, half_height, legend), 4.2)
+    # The upper drawing has no numbers below.  Were there height to spare, constrained layout would
+    # widen axes of equal scales until their labels leave the figure.
+    figure = Figure(figsize=(WIDTH, 2.0 * height - 0.5), layout="constrained")
+    grid = figure.subplots(2, 1, sharex=True, sharey=True)
+    for number, (axes, lens, drawing) in enumerate(zip(grid, lenses, drawings, strict=True)):
+        draw_layout(axes, drawing, z_limits, half_height)
+        if titles is None:
+            name = layout_title(lens, drawing.system, drawing.fans[0].wavelength)
+            axes.set_title(f"{('before', 'after')[number]}: {name}", fontsize=TITLE)
+        else:
+            axes.set_title(titles[number], fontsize=TITLE)
+    grid[0].set_xlabel("")
+    return figure

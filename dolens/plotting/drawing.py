@@ -1,0 +1,243 @@
+"""What a layout shows, and how it is drawn into axes."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.system import OpticalSystem
+from dolens.plotting.section import (
+    Profile,
+    axis_angle,
+    element_edges,
+    obscuration_profile,
+    surface_profile,
+    trace_fan,
+)
+from dolens.plotting.style import SMALL, colours, open_axes, spectral_colour
+
+# Rays start this far in front of the lens, in units of the distance from lens to sensor.
+_LEAD = 0.1
+_GLASS = "#D9E8F2"
+_EDGE = "#2B3A42"
+
+
+class Fan(NamedTuple):
+    """Rays of one field (degrees) and wavelength (nm): (rays, points, 3) in mm."""
+
+    field: float
+    wavelength: float
+    paths: np.ndarray
+
+
+class LayoutDrawing(NamedTuple):
+    """A lens in section with its rays, mm.
+
+    Attributes:
+        system: the lens.
+        profiles: of every surface, in the plane x = 0.
+        fans: of every field and wavelength.
+        height: the largest of the surfaces and of the sensor, from the axis.
+        sensor: half of the sensor.
+        z_limits: of axes that hold everything.
+        half_height: of axes that hold everything.
+    """
+
+    system: OpticalSystem
+    profiles: Sequence[Profile]
+    fans: Sequence[Fan]
+    height: float
+    sensor: float
+    z_limits: tuple[float, float]
+    half_height: float
+
+    @property
+    def needs_legend(self) -> bool:
+        """Whether colours are to be told apart, or a field has no rays."""
+        return len(self.fans) > 1 or not len(self.fans[0].paths)
+
+
+def layout_drawing(
+    lens: Lens,
+    wavelength: float | Sequence[float],
+    fields_deg: Sequence[float],
+    rays: int,
+    object_distance: float | None = None,
+    values: Mapping[str, Tensor] | None = None,
+) -> LayoutDrawing:
+    """Cut a lens and trace its rays; arguments and errors are those of `layout_figure`."""
+    lines = [wavelength] if isinstance(wavelength, int | float) else list(wavelength)
+    _check(fields_deg, rays, lines)
+    system = lens.system(values)
+    profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
+    sensor_z = float(system.vertices[-1])
+    front = min((float(z.min()) for z, _ in profiles if len(z)), default=0.0)
+    start = front - _LEAD * (sensor_z - min(front, 0.0))
+    fans = [
+        Fan(field, line, trace_fan(system, line, field, rays, object_distance, start))
+        for field in fields_deg
+        for line in lines
+    ]
+    height = max((float(np.abs(y).max()) for _, y in profiles if len(y)), default=1.0)
+    height = max(height, 0.5 * (lens.sensor_diameter or 0.0))
+    reach = max(
+        [height, *(float(np.abs(fan.paths[..., 1]).max()) for fan in fans if len(fan.paths))]
+    )
+    margin = 0.04 * (sensor_z - start)
+    return LayoutDrawing(
+        system,
+        profiles,
+        fans,
+        height,
+        0.5 * lens.sensor_diameter if lens.sensor_diameter else reach,
+        (start - margin, sensor_z + margin),
+        1.06 * max(reach, _stop_bar(system.stop, profiles, height)),
+    )
+
+
+def draw_layout(
+    axes: Axes,
+    drawing: LayoutDrawing,
+    z_limits: tuple[float, float],
+    half_height: float,
+    legend: bool = True,
+) -> None:
+    """Draw into axes of the given limits (mm), at equal scales."""
+    system, profiles = drawing.system, drawing.profiles
+    _draw_axis(axes, *z_limits)
+    _draw_glass(axes, system, profiles)
+    _draw_rays(axes, drawing.fans, legend)
+    _draw_stop(axes, system, profiles, drawing.height)
+    _draw_obscurations(axes, system)
+    z, half = float(system.vertices[-1]), drawing.sensor
+    axes.plot([z, z], [-half, half], color="black", linewidth=2.5, gid="sensor", zorder=4)
+    axes.set(aspect="equal", xlim=z_limits, ylim=(-half_height, half_height))
+    axes.set_xlabel("z (mm)", fontsize=SMALL + 1)
+    axes.set_ylabel("y (mm)", fontsize=SMALL + 1)
+    open_axes(axes)
+
+
+def _check(fields_deg: Sequence[float], rays: int, lines: Sequence[float]) -> None:
+    if not lines:
+        raise InputError("layout: at least one wavelength, not none")
+    if rays < 1 or not fields_deg:
+        raise InputError(f"layout: at least one field and one ray, not {len(fields_deg)}, {rays}")
+    for field in fields_deg:
+        if not abs(field) < 90.0:
+            raise InputError(f"layout: fields must be within ±90 degrees, not {field:g}")
+
+
+def _draw_axis(axes: Axes, z_low: float, z_high: float) -> None:
+    axes.plot(
+        [z_low, z_high],
+        [0.0, 0.0],
+        color="0.55",
+        linewidth=0.7,
+        dashes=(12, 3, 2, 3),
+        gid="axis",
+        zorder=1,
+    )
+
+
+def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) -> None:
+    """Fill and outline every element; surfaces that bound no glass (stops) have no curve."""
+    bounding: set[int] = set()
+    for number in range(1, len(profiles)):
+        if _is_glass(system, number):
+            bounding |= {number, number + 1}
+            faces = profiles[number - 1], profiles[number]
+            if not (len(faces[0][0]) and len(faces[1][0])):
+                continue
+            top, bottom = element_edges(system, number, *faces)
+            front, back = (np.stack(p, -1) for p in profiles[number - 1 : number + 1])
+            outline = np.concatenate([front, top[1:-1], back[::-1], bottom[1:-1][::-1]])
+            gid = f"glass {number}"
+            axes.add_patch(Polygon(outline, facecolor=_GLASS, edgecolor="none", gid=gid, zorder=0))
+            for edge in (top, bottom):
+                axes.plot(*edge.T, color=_EDGE, linewidth=0.9, gid="edge", zorder=2)
+    for number, (z, y) in enumerate(profiles, 1):
+        refracts = system.materials[number - 1] != system.materials[number]
+        if number in bounding or (refracts and number != system.stop):
+            axes.plot(z, y, color=_EDGE, linewidth=1.0, gid=f"surface {number}", zorder=2)
+
+
+def _is_glass(system: OpticalSystem, number: int) -> bool:
+    return system.materials[number].name not in ("air", "occluder")
+
+
+def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:
+    lines = sorted({fan.wavelength for fan in fans})
+    by_wavelength = len(lines) > 1
+    keys = lines if by_wavelength else list(dict.fromkeys(fan.field for fan in fans))
+    shades = [spectral_colour(line) for line in lines] if by_wavelength else colours(len(keys))
+    colour_of = dict(zip(keys, shades, strict=True))
+    passing = dict.fromkeys(keys, False)
+    for fan in fans:
+        key = fan.wavelength if by_wavelength else fan.field
+        passing[key] |= len(fan.paths) > 0
+        for path in fan.paths:
+            axes.plot(
+                path[:, 2], path[:, 1], color=colour_of[key], linewidth=0.7, gid="ray", zorder=3
+            )
+    if not legend or (len(keys) == 1 and passing[keys[0]]):
+        return
+    unit = " nm" if by_wavelength else "°"
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=colour_of[key],
+            linewidth=1.2,
+            label=f"{key:g}{unit}" if passing[key] else f"{key:g}{unit} (no ray passes)",
+        )
+        for key in keys
+    ]
+    axes.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        frameon=False,
+        fontsize=SMALL,
+        title="wavelength" if by_wavelength else "field",
+        title_fontsize=SMALL,
+    )
+
+
+def _stop_bar(stop: int, profiles: Sequence[Profile], height: float) -> float:
+    """How far from the axis the stop's bars end, mm."""
+    y = profiles[stop - 1][1]
+    return (float(np.abs(y).max()) if len(y) else 0.0) + 0.2 * height
+
+
+def _draw_stop(
+    axes: Axes, system: OpticalSystem, profiles: Sequence[Profile], height: float
+) -> None:
+    """Bars outside the stop's rim, in its own plane, with a tick along its axis at the rim."""
+    z, y = profiles[system.stop - 1]
+    if not len(z):
+        return
+    angle = axis_angle(system, system.stop)
+    along = np.array([math.cos(angle), math.sin(angle)])
+    outwards = np.array([-along[1], along[0]])
+    tick = 0.025 * height * along
+    length = _stop_bar(system.stop, profiles, height) - float(np.abs(y).max())
+    for end, side in ((-1, 1.0), (0, -1.0)):
+        rim = np.array([z[end], y[end]])
+        bar = np.stack([rim, rim + side * length * outwards]).T
+        axes.plot(*bar, color="black", linewidth=2.0, solid_capstyle="butt", gid="stop", zorder=4)
+        ends = np.stack([rim - tick, rim + tick]).T
+        axes.plot(*ends, color="black", linewidth=1.2, gid="stop tick", zorder=4)
+
+
+def _draw_obscurations(axes: Axes, system: OpticalSystem) -> None:
+    for number in range(1, len(system.surfaces) + 1):
+        profile = obscuration_profile(system, number)
+        if profile is not None and len(profile[0]):
+            axes.plot(*profile, color="black", linewidth=2.5, gid="obscuration", zorder=4)

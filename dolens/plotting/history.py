@@ -1,0 +1,58 @@
+"""How a design came about."""
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from dolens.errors import InputError
+from dolens.plotting.style import PALETTE, SMALL, TITLE, ruled_axes
+
+_FEW = 40
+
+
+def history_figure(
+    merit: Sequence[float],
+    damping: Sequence[float] | None = None,
+    iterations: Sequence[float] | None = None,
+    title: str | None = "History of the design",
+    merit_label: str = "merit",
+    damping_label: str = "damping",
+) -> Figure:
+    """Merit against iteration, on a logarithmic axis, with the damping below.
+
+    Values that are not positive leave gaps.
+
+    Args:
+        merit: one value an iteration.
+        damping: as many, or None for no axes below.
+        iterations: as many; None counts from zero.
+        title: above.
+        merit_label: of the axis, with its unit.
+        damping_label: of the axis below, with its unit.
+
+    Raises:
+        InputError: the numbers of values differ.
+    """
+    numbers = range(len(merit)) if iterations is None else iterations
+    for name, values in (("damping", damping), ("iterations", numbers)):
+        if values is not None and len(values) != len(merit):
+            raise InputError(f"{len(merit)} values of merit and {len(values)} of {name}")
+    rows = [(merit_label, merit, PALETTE[0])]
+    if damping is not None:
+        rows.append((damping_label, damping, PALETTE[1]))
+    ratios = (2.2, 1.0)[: len(rows)]
+    figure = Figure(figsize=(6.4, 3.2 + 1.4 * (len(rows) - 1)), layout="constrained")
+    grid = figure.subplots(len(rows), 1, squeeze=False, sharex=True, height_ratios=ratios)[:, 0]
+    marker = "o" if len(merit) <= _FEW else None
+    for axes, (label, values, colour) in zip(grid, rows, strict=True):
+        axes.plot(numbers, values, color=colour, linewidth=1.4, marker=marker, markersize=3)
+        axes.set_yscale("log", nonpositive="mask")
+        axes.set_ylabel(label, fontsize=SMALL + 1)
+        ruled_axes(axes)
+    grid[-1].set_xlabel("iteration", fontsize=SMALL + 1)
+    grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10)))
+    figure.align_ylabels()
+    if title:
+        grid[0].set_title(title, fontsize=TITLE)
+    return figure

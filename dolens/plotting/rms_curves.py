@@ -1,0 +1,97 @@
+"""RMS spot radii against field and against wavelength."""
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dolens.errors import InputError
+from dolens.imaging.field_curves import RMSCurves
+from dolens.plotting.style import (
+    SMALL,
+    TITLE,
+    colours,
+    field_label,
+    ruled_axes,
+    spectral_colour,
+)
+
+
+def rms_curves_figure(
+    against_field: RMSCurves | None = None,
+    against_wavelength: RMSCurves | None = None,
+    title: str | None = "RMS spot radius",
+) -> Figure:
+    """RMS spot radii, µm: at the left over the field, at the right over the wavelength.
+
+    Over the field every wavelength has a line, and all together a black one; over the wavelength
+    every field has a line.  Airy's radius is dashed: over the field, that of the middle wavelength.
+
+    Args:
+        against_field: None to leave its axes out.
+        against_wavelength: None to leave its axes out.
+        title: above all.
+
+    Raises:
+        InputError: neither is given.
+    """
+    given = [
+        (curves, draw)
+        for curves, draw in ((against_field, _over_field), (against_wavelength, _over_wavelength))
+        if curves is not None
+    ]
+    if not given:
+        raise InputError("rms_curves_figure needs curves against field or against wavelength")
+    figure = Figure(figsize=(5.2 * len(given), 4.0), layout="constrained")
+    grid = figure.subplots(1, len(given), squeeze=False, sharey=True)
+    for axes, (curves, draw) in zip(grid[0], given, strict=True):
+        draw(axes, curves)
+        ruled_axes(axes)
+        axes.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.14),
+            ncols=3,
+            frameon=False,
+            fontsize=SMALL,
+        )
+    # Both share one scale, which is known when both are drawn.
+    grid[0, 0].set_ylim(bottom=0.0)
+    grid[0, 0].set_ylabel("RMS spot radius (µm)", fontsize=SMALL + 1)
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def _over_field(axes: Axes, curves: RMSCurves) -> None:
+    length = curves.fields.norm(dim=-1).numpy()
+    for wave, wavelength in enumerate(curves.wavelengths):
+        axes.plot(
+            length,
+            1e3 * curves.rms[:, wave].numpy(),
+            color=spectral_colour(float(wavelength)),
+            linewidth=1.3,
+            label=f"{float(wavelength):g} nm",
+        )
+    if len(curves.wavelengths) > 1:
+        together = 1e3 * curves.polychromatic.numpy()
+        axes.plot(length, together, color="black", linewidth=1.8, label="polychromatic")
+    airy = 1e3 * float(torch.median(curves.airy_radius))
+    axes.plot(length, [airy] * len(length), color="0.5", linestyle="--", label="Airy radius")
+    unit = "degrees" if curves.field_unit == "°" else curves.field_unit
+    axes.set_xlabel(f"field ({unit})", fontsize=SMALL + 1)
+    axes.set_xlim(length.min(), length.max())
+
+
+def _over_wavelength(axes: Axes, curves: RMSCurves) -> None:
+    waves = curves.wavelengths.numpy()
+    for number, colour in enumerate(colours(len(curves.fields))):
+        axes.plot(
+            waves,
+            1e3 * curves.rms[number].numpy(),
+            color=colour,
+            linewidth=1.5,
+            label=field_label(curves.fields[number], curves.field_unit),
+        )
+    airy = 1e3 * curves.airy_radius.numpy()
+    axes.plot(waves, airy, color="0.5", linestyle="--", label="Airy radius")
+    axes.set_xlabel("wavelength (nm)", fontsize=SMALL + 1)
+    axes.set_xlim(waves.min(), waves.max())
