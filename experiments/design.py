@@ -128,7 +128,6 @@ class DesignModule(lightning.LightningModule):
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
         self.merit: MeritFunction | None = None
         self.history: list[dict[str, float]] = []
-        self.operand_rows: list[dict[str, Any]] = []
         self._stopped: str | None = None
         # Where the round began, so that a resumed one has its rays; and the best round's end.
         for name in ("round_start", "best"):
@@ -325,6 +324,29 @@ class DesignModule(lightning.LightningModule):
         if self.global_step % self.trainer.log_every_n_steps == 0:
             for entry in self.loggers:
                 entry.log_metrics(row, step=self.global_step)
+
+    def operand_table(self) -> list[dict[str, Any]]:
+        """A row for every operand at the end: value, deviation, and derivatives by the variables.
+
+        Derivatives are those of the value by each variable in its own unit.
+        """
+        if self.merit is None:
+            return []
+        value = self.merit()
+        if not value.operands:
+            return []
+        slopes = (value.operand_derivatives() / self.variables.scale.cpu()).tolist()
+        labels = self.variables.labels()
+        return [
+            {
+                "operand": item.label,
+                "value": item.value,
+                "deviation": item.deviation,
+                "weight": item.weight,
+                **dict(zip(labels, row, strict=True)),
+            }
+            for item, row in zip(value.operands, slopes, strict=True)
+        ]
 
     def _labels(self) -> list[str]:
         return spot_labels(self.merit.quality.spots)

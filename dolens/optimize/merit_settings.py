@@ -65,6 +65,29 @@ class MeritSettings:
     most_vignetted: float = 0.2
     operands: Sequence[Mapping[str, Any]] = ()
 
+    def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
+        """(x, y) of every field that counts, degrees or mm.
+
+        Raises:
+            InputError: neither the settings nor the lens name any.
+        """
+        if self.fields is not None:
+            return self.fields
+        if lens.fields is None:
+            raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")
+        return lens.fields.points
+
+    def wavelengths_of(self, lens: Lens) -> Sequence[float]:
+        """Of every colour that counts, nm.
+
+        Raises:
+            InputError: neither the settings nor the lens name any.
+        """
+        wavelengths = self.wavelengths if self.wavelengths is not None else lens.wavelengths
+        if not wavelengths:
+            raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
+        return wavelengths
+
     def rays(self, lens: Lens) -> SpotRays:
         """The rays of all spots that pass the lens as it is now.
 
@@ -75,10 +98,7 @@ class MeritSettings:
             raise InputError(
                 f"merit.sampling: '{self.sampling}' is unknown (allowed: {', '.join(SAMPLINGS)})"
             )
-        fields = self.fields if self.fields is not None else _fields(lens)
-        wavelengths = self.wavelengths if self.wavelengths is not None else lens.wavelengths
-        if not wavelengths:
-            raise InputError(f"merit.wavelengths: lens '{lens.name}' names none; give some (nm)")
+        fields, wavelengths = self.fields_of(lens), self.wavelengths_of(lens)
         options = dict(self.sampling_options)
         if self.sampling == "gaussian_quadrature":
             options.setdefault("object_distance", lens.object_distance)
@@ -135,12 +155,6 @@ class MeritSettings:
             return LossResiduals(*common, LOSSES[self.quality](**options), curvature)
         except TypeError as error:
             raise InputError(f"merit.quality_options: {error}") from None
-
-
-def _fields(lens: Lens) -> Sequence[Sequence[float]]:
-    if lens.fields is None:
-        raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")
-    return lens.fields.points
 
 
 def _weights(what: str, given: Sequence[float] | None, count: int) -> Tensor:

@@ -95,6 +95,14 @@ class DesignVariables(nn.Module):
         """How many parameters; an array is one."""
         return len(self.names)
 
+    def labels(self) -> list[str]:
+        """P names: those of the parameters, with a number for every element of an array."""
+        labels = []
+        for name, shape in zip(self.names, self._shapes, strict=True):
+            count = shape.numel()
+            labels += [name] if not shape else [f"{name}[{place}]" for place in range(count)]
+        return labels
+
     def forward(self) -> dict[str, Tensor]:
         """The parameters θ = scale·u by name, and those that follow from them.
 
