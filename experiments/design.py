@@ -80,7 +80,7 @@ class DesignModule(lightning.LightningModule):
         self,
         lens: Lens,
         experiment: str,
-        variables: Mapping[str, Mapping[str, Any] | None],
+        variables: Mapping[str, Mapping[str, Any] | None] | None,
         merit: MeritSettings,
         optimizer: Callable[..., torch.optim.Optimizer],
         start: Mapping[str, Any] | None = None,
@@ -98,7 +98,7 @@ class DesignModule(lightning.LightningModule):
         with torch.no_grad():
             for name, parameter in lens.variables(list(values)).items():
                 parameter.copy_(values[name])
-        self.variables = DesignVariables(lens, variables)
+        self.variables = DesignVariables(lens, variables or {})
         if not len(self.variables):
             raise InputError("variables: there are none; name a parameter, as surfaces.*.curvature")
         self.variables.project()

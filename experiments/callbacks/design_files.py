@@ -9,17 +9,22 @@ from typing import Any
 import lightning
 
 from dolens.errors import InputError
-from dolens.prescriptions import save_lens
+from dolens.optics.lens import Lens
+from dolens.prescriptions import lens_from_prescription, prescription_of, save_lens
 from experiments.design import DesignModule
 
 logger = logging.getLogger(__name__)
+
+_ZEMAX_MODEL = "dfc"
 
 
 class DesignFiles(lightning.Callback):
     """The prescription for other programs, and tables of the search.
 
-    `lens/final.zmx`; `history.csv`: a row of numbers for every iteration; `operands.csv`: every
-    operand's value at the end and its derivative by every variable.
+    `lens/final.zmx`, whose glasses are always those of the index model `dfc`: a lens designed with
+    another one is a little different there, which the log then says; `history.csv`: a row of
+    numbers for every iteration; `operands.csv`: every operand's value at the end, and its
+    derivative by every variable.
 
     Args:
         folder: of the run.
@@ -35,10 +40,24 @@ class DesignFiles(lightning.Callback):
         write_table(self.folder / "operands.csv", module.operand_table())
         try:
             (self.folder / "lens").mkdir(parents=True, exist_ok=True)
-            save_lens(module.lens, self.folder / "lens" / "final.zmx")
+            save_lens(_with_catalogue_lines(module.lens), self.folder / "lens" / "final.zmx")
         except InputError as problem:
             # Not every surface has a form there; the YAML file holds the lens whole.
             logger.warning("No .zmx file of this lens: %s", problem)
+
+
+def _with_catalogue_lines(lens: Lens) -> Lens:
+    """The lens with the indices that a .zmx file means by nd and Vd."""
+    if lens.index_model == _ZEMAX_MODEL:
+        return lens
+    logger.warning(
+        "lens/final.zmx: indices of model '%s' have no form there; its glasses are nd/Vd of model "
+        "'%s', so that its spots differ from those reported",
+        lens.index_model,
+        _ZEMAX_MODEL,
+    )
+    prescription = {**prescription_of(lens), "index_model": _ZEMAX_MODEL}
+    return lens_from_prescription(prescription, lens.dtype, where="lens/final.zmx")
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -30,6 +30,8 @@ from experiments.design import DesignModule
 logger = logging.getLogger(__name__)
 
 _FREQUENCIES = 51
+# Beyond this over the RMS radius a spot's modulation is nearly nothing.
+_BLURRED = 1.5
 
 
 class DesignPictures(lightning.Callback):
@@ -40,7 +42,7 @@ class DesignPictures(lightning.Callback):
     Args:
         folder: where PNG files go; made when needed.
         most_frequency: cycles/mm, where the modulation's curves end; None: at half of what
-            diffraction lets through.
+            diffraction lets through, or where the final lens's spots leave nothing.
     """
 
     def __init__(self, folder: str, most_frequency: float | None = None) -> None:
@@ -91,6 +93,8 @@ def design_drawings(
             wave = torch.tensor([lens.primary_wavelength], dtype=torch.float64)
             number = float(working_f_numbers(lens, wave, distance)[0])
             most = 0.5 / (1e-6 * lens.primary_wavelength * number)
+            blur = 1e-3 * module.spot_table(lens).mean
+            most = min(most, _BLURRED / max(blur, 1e-12))
         frequencies = torch.linspace(0.0, most, _FREQUENCIES, dtype=torch.float64)
         found = modulation(of, fields, waves, frequencies, object_distance=distance)
         return modulation_figure(found, title=f"Geometric MTF, {title}")
