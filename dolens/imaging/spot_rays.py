@@ -107,6 +107,7 @@ def gaussian_quadrature(
     rings: int = 6,
     arms: int = 12,
     object_distance: float | None = None,
+    symmetry: bool = True,
 ) -> SpotRays:
     """Rays on rings and arms across the part of the stop that a field fills, by Gauss's weights.
 
@@ -125,6 +126,7 @@ def gaussian_quadrature(
         rings: radii.
         arms: azimuths of the whole pupil, an even number.
         object_distance: mm in front of the first vertex; None for an object at infinity.
+        symmetry: whether a lens's symmetry may save rays; not where the lens is to be perturbed.
 
     Raises:
         InputError: a field whose light does not pass, or rings and arms out of range.
@@ -135,7 +137,7 @@ def gaussian_quadrature(
     # Gauss and Legendre's nodes in ρ², on which an area's element is even.
     radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))
     shares = torch.from_numpy(0.5 * shares)
-    symmetric = is_rotationally_symmetric(lens)
+    symmetric = symmetry and is_rotationally_symmetric(lens)
 
     def launch(field: tuple[float, float]) -> tuple[Tensor, Tensor, Tensor]:
         x, y = field

@@ -43,7 +43,8 @@ def test_every_experiment_composes_and_resolves(composed, name, tmp_path):
     overrides = [f"data.root={tmp_path}"] if name.endswith("paper") else []
     cfg = composed(f"experiment={name}", *overrides)
     assert cfg.module.experiment == name
-    assert cfg.lens.surfaces["5"].type == "xy_polynomial"
+    if name.startswith("wavefront_coding"):
+        assert cfg.lens.surfaces["5"].type == "xy_polynomial"
 
 
 def test_a_run_leaves_the_whole_run_folder(composed, tmp_path):
