@@ -1,5 +1,6 @@
 """What becomes of a lens when it is made: sensitivities, tolerances, yield."""
 
+from dolens.tolerancing.analysis import Outcome, ToleranceAnalysis, analyse_tolerances
 from dolens.tolerancing.linear_spots import LinearSpots, linear_spots
 from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed
 from dolens.tolerancing.perturbations import Tolerances, tightened, tolerances_from
@@ -12,10 +13,13 @@ __all__ = [
     "Contributions",
     "FocusCurves",
     "LinearSpots",
+    "Outcome",
     "PerturbedSpots",
     "Sensitivities",
+    "ToleranceAnalysis",
     "Tolerances",
     "Yield",
+    "analyse_tolerances",
     "contributions",
     "linear_spots",
     "quantiles",

@@ -84,10 +84,7 @@ def linear_spots(lens: Lens, spots: SpotRays, names: Sequence[str]) -> LinearSpo
     means = rows.new_zeros(spots.count, 2, width).index_add_(0, spot, weight[:, None, None] * rows)
     rows = weight.sqrt()[:, None, None] * (rows - means[spot])
     products = torch.stack(
-        [
-            mine.T @ mine
-            for mine in (rows[spot == s].reshape(-1, width) for s in range(spots.count))
-        ]
+        [mine.T @ mine for mine in (rows[spot == s].reshape(-1, width) for s in range(spots.count))]
     )
     return LinearSpots(tuple(names), means[..., 0], means[..., 1:-1], products)
 

@@ -71,9 +71,7 @@ class Tolerances:
             count: lenses.
             generator: on the CPU; the same state gives the same lenses.
         """
-        shares = torch.rand(
-            (count, len(self.names)), generator=generator, dtype=torch.float64
-        )
+        shares = torch.rand((count, len(self.names)), generator=generator, dtype=torch.float64)
         centred = 2.0 * shares - 1.0
         # By the inverse of the distribution function, so that each error takes one number.
         inside = math.sqrt(2.0) / _TRUNCATION * torch.erfinv(_INSIDE * centred)
@@ -86,9 +84,7 @@ class Tolerances:
         return f"± {100.0 * number if unit == '%' else number:g} {unit}".strip()
 
 
-def tolerances_from(
-    lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
-) -> Tolerances:
+def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0) -> Tolerances:
     """Read tolerances as a configuration gives them.
 
     Args:
