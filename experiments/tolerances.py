@@ -70,7 +70,7 @@ class TolerancesModule(lightning.LightningModule):
         tolerance_factor: float = 1.0,
         weights: Sequence[float] | None = None,
         rings: int = 4,
-        arms: int = 10,
+        arms: int = 12,
         yield_at_um: Sequence[float] = (),
         chunk_size: int | None = None,
         seed: int = 0,
@@ -138,7 +138,8 @@ class TolerancesModule(lightning.LightningModule):
         spots = self.analysis.spots
         unit = "°" if self.lens.object_distance is None else " mm"
         pairs = zip(spots.fields.tolist(), spots.wavelengths.tolist(), strict=True)
-        return [f"({x:g}, {y:g}){unit}  {wave:.0f} nm" for (x, y), wave in pairs]
+        labels = [f"({x:g}, {y:g}){unit}  {wave:.0f} nm" for (x, y), wave in pairs]
+        return [label.replace("-", "−") for label in labels]
 
     def _analyse(self) -> ToleranceAnalysis:
         # Squares of small differences need double precision, whatever the lens is kept in.

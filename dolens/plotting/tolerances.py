@@ -73,7 +73,6 @@ def matrix_figure(
 def yield_figure(
     panels: Mapping[str, Mapping[str, Tensor]],
     nominal: Mapping[str, float],
-    limits: Sequence[float] = (),
     title: str | None = None,
 ) -> Figure:
     """The share of lenses within an RMS radius, against the radius.
@@ -82,7 +81,6 @@ def yield_figure(
         panels: what the radius is → label → RMS of every lens, mm, ascending, infinite where a
             lens fails.  Labels in pairs share a colour: the second of each is dashed.
         nominal: what the radius is → that of the lens as designed, mm.
-        limits: RMS radii to mark, µm.
         title: above all.
     """
     figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")
@@ -113,8 +111,6 @@ def yield_figure(
             fontsize=SMALL - 1,
             color="0.3",
         )
-        for limit in limits:
-            axes.axvline(limit, color="0.85", linewidth=0.8, zorder=0)
         near = 1e3 * nominal[name]
         if far > near:
             axes.set_xlim(near - 0.1 * (far - near), far)
@@ -163,9 +159,12 @@ def offenders_figure(
             label=label,
         )
     right.set_xlabel("growth of the RMS radius\nby the whole tolerance, µm", fontsize=SMALL + 1)
-    right.legend(frameon=False, fontsize=SMALL, loc="lower right")
+    handles, labels = right.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, frameon=False, fontsize=SMALL, loc="outside lower right", ncols=len(labels)
+    )
     left.set_yticks(places, names)
-    left.invert_yaxis()
+    left.set_ylim(len(names) - 0.4, -0.6)
     for axes in (left, right):
         open_axes(axes)
         axes.grid(True, axis="x", color="0.9", linewidth=0.6)
@@ -199,7 +198,7 @@ def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:
                 name,
                 (0.0, row + 0.5 * (count - 1)),
                 xycoords=("axes fraction", "data"),
-                xytext=(-112, 0),
+                xytext=(-88, 0),
                 textcoords="offset points",
                 ha="center",
                 va="center",

@@ -28,7 +28,8 @@ class PerturbedSpots:
         curves: RMS² through focus, (K, S); infinite where a ray of the lens fails.
         centroids: (K, S, 2), mm, on the sensor where it stands.
         failed: (K,), the share of a lens's rays that miss a surface or are reflected totally.
-        vignetted: (K,), the share of the light that apertures clip, over all spots.
+        vignetted: (K,), the share of the light that apertures clip, over all spots.  A quadrature
+            has no rays at the very rim, and sees nothing of a small share.
     """
 
     curves: FocusCurves

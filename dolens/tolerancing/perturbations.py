@@ -44,8 +44,11 @@ class Tolerances:
 
     @property
     def steps(self) -> Tensor:
-        """(P,), the half-ranges in the lens's units; positive."""
-        return self.half_range * self.unit.abs()
+        """(P,), the half-ranges in the lens's units.
+
+        A relative one has the sign of the value: up is away from zero.
+        """
+        return self.half_range * self.unit
 
     @property
     def variance(self) -> Tensor:

@@ -113,7 +113,6 @@ def _yields(module: TolerancesModule) -> Figure:
             mean: float((design @ module.weights).sqrt()),
             worst: float(design[module.weights > 0.0].amax().sqrt()),
         },
-        module.yield_at_um,
         f"{module.lens.name}: {module.lenses} lenses drawn from the tolerances",
     )
 
