@@ -56,18 +56,27 @@ def contributions(
         tolerances: P of them.
         weights: (S,), W of each spot, which sum to one.
         refocused: whether every lens is put at its best focus.  The focus is one more column of
-            the least-squares problem; what it can undo is projected out of all others.
+            the least-squares problem, about the best focus of the lens as designed; what it can
+            undo is projected out of all others.
     """
-    products = torch.einsum("s,spq->pq", weights, model.products)
-    form, focus, steep = products[:-1, :-1], products[:-1, -1], products[-1, -1]
+    points, mixed, tangents = (
+        torch.einsum("s,spq->pq", weights, form)
+        for form in (model.points, model.mixed, model.tangents)
+    )
+    steep = tangents[0, 0]
     if refocused and float(steep) > 0.0:
-        form = form - torch.outer(focus, focus) / steep
-    gradient, curvature = form[0, 1:], form.diagonal()[1:]
+        shift = -mixed[0, 0] / steep
+        points = points + shift * (mixed + mixed.T) + shift.square() * tangents
+        mixed = mixed + shift * tangents
+        # Half the derivative of RMS² by the focus, as the errors change it: zero for the design.
+        focus = torch.cat([mixed[:1, 0], mixed[1:, 0] + mixed[0, 1:]])
+        points = points - torch.outer(focus, focus) / steep
+    gradient, curvature = points[0, 1:], points.diagonal()[1:]
     variance = tolerances.variance
     excess = (tolerances.fourth_moment - variance.square()).clamp(min=0.0)
     return Contributions(
         model.names,
-        float(form[0, 0]),
+        float(points[0, 0]),
         curvature * variance,
         (4.0 * gradient.square() * variance + curvature.square() * excess).sqrt(),
     )
