@@ -83,6 +83,9 @@ class TolerancesModule(lightning.LightningModule):
         self.experiment = experiment
         self.fields = [_numbers("fields", field, 2) for field in fields]
         self.wavelengths = _numbers("wavelengths", wavelengths)
+        for key, given in (("fields", self.fields), ("wavelengths", self.wavelengths)):
+            if not given:
+                raise InputError(f"{key}: none is given")
         self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
         self.weights = self._weights(weights)
         self.folder = Path(folder)
