@@ -73,7 +73,10 @@ def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:
         ),
         "rms_by_tolerance": matrix_figure(
             {
-                "to first order, µm": (1e3 * s.rms_jacobian * s.steps, with_tolerance),
+                "growth of RMS to first order, not refocused, µm": (
+                    1e3 * s.rms_jacobian * s.steps,
+                    with_tolerance,
+                ),
                 "RMS² at the worse end less that as designed, refocused, µm²": (
                     1e6 * ends.amax(0).T,
                     with_tolerance,

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from dolens import InputError
+from dolens import InputError, load_lens
+from dolens.imaging.spot_rays import gaussian_quadrature
 from dolens.tolerancing import (
     Outcome,
     Yield,
@@ -28,6 +29,20 @@ def test_each_lens_of_the_batch_is_the_lens_itself_traced_by_the_kernel(
         lens.backend = "cpu"
         centroids, radii = traced_spots(lens, spots)
         torch.testing.assert_close(found.centroids[row], centroids, rtol=0.0, atol=1e-11)
+        torch.testing.assert_close(found.curves.at()[row].sqrt(), radii, rtol=1e-9, atol=0.0)
+
+
+def test_a_batch_of_aspheres_too(root, moved, traced_spots):
+    """Newton's iteration serves all lenses of the batch at once."""
+    lens = load_lens(root / "conf/lens/asphere.yaml")
+    spots = gaussian_quadrature(lens, [(0.0, 1.0)], [587.5618], 2, 6, symmetry=False)
+    names = list(lens.variables(["surfaces.*.curvature", "surfaces.*.a4", "thicknesses.1"]))
+    generator = torch.Generator().manual_seed(0)
+    scale = torch.tensor([p.item() for p in lens.variables(names).values()]).double()
+    errors = 1e-3 * scale * torch.randn((4, len(names)), generator=generator, dtype=torch.float64)
+    found = trace_perturbed(lens, spots, names, errors)
+    for row, error in enumerate(errors.tolist()):
+        radii = traced_spots(moved(lens, dict(zip(names, error, strict=True))), spots)[1]
         torch.testing.assert_close(found.curves.at()[row].sqrt(), radii, rtol=1e-9, atol=0.0)
 
 
@@ -66,14 +81,20 @@ def test_the_compensator_removes_a_shift_of_the_sensor_exactly(triplet, spots):
     torch.testing.assert_close(same, same[:1].expand(30), rtol=0.0, atol=1e-12)
 
 
-def test_the_size_of_the_chunks_changes_nothing(triplet, spots, settings):
+def test_neither_chunks_nor_threads_change_anything(triplet, spots, settings):
     tolerances = tolerances_from(triplet, settings)
-    errors = tolerances.draw(7, torch.Generator().manual_seed(0))
-    whole, parts = (
-        trace_perturbed(triplet, spots, tolerances.names, errors, chunk).curves.at()
-        for chunk in (None, 3)
-    )
-    torch.testing.assert_close(whole, parts, rtol=1e-12, atol=0.0)
+    errors = tolerances.draw(17, torch.Generator().manual_seed(0))
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads, chunk in ((1, None), (1, 3), (2, 3), (2, 1)):
+            torch.set_num_threads(threads)
+            traced = trace_perturbed(triplet, spots, tolerances.names, errors, chunk)
+            found.append(traced.curves.at())
+            assert torch.get_num_threads() == threads and not found[-1].requires_grad
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        torch.testing.assert_close(found[0], other, rtol=1e-12, atol=0.0)
 
 
 def test_a_lens_whose_rays_fail_counts_as_failing(triplet, spots, moved):
