@@ -58,8 +58,10 @@ def matrix_figure(
         axes.grid(True, which="minor", axis="x", color="0.85", linewidth=0.4)
         axes.tick_params(which="minor", length=0)
         _part(axes, groups, place == 0)
+        # `pad` is a share of the matrix's height; the gap is to be the same for few rows and many.
+        gap = 0.16 / (len(rows) * _CELL_HEIGHT)
         bar = figure.colorbar(
-            image, ax=axes, orientation="horizontal", pad=0.02, shrink=0.9, aspect=30
+            image, ax=axes, orientation="horizontal", pad=gap, shrink=0.9, aspect=30
         )
         bar.set_label(name, fontsize=SMALL)
         bar.ax.tick_params(labelsize=SMALL - 1)
