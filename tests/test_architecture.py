@@ -16,6 +16,7 @@ ALLOWED = {
     "prescriptions": {"errors", "optics"},
     "imaging": {"errors", "optics", "kernels"},
     "optimize": {"errors", "optics", "imaging"},
+    "tolerancing": {"errors", "optics", "imaging"},
     "reconstruction": {"errors", "optics", "imaging"},
     "plotting": {"errors", "optics", "imaging"},
 }

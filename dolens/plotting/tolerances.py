@@ -1,0 +1,210 @@
+"""What tolerances do to a lens: Jacobians as matrices, yields as curves, offenders as bars."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.plotting.style import PALETTE, SMALL, TITLE, open_axes
+
+_CELL_WIDTH, _CELL_HEIGHT = 0.26, 0.17
+# Inches for the labels of rows, and for those of columns with titles and colour bars.
+_LEFT, _BOTTOM = 1.7, 2.3
+_COLOUR_MAP = "RdBu_r"
+
+
+def matrix_figure(
+    panels: Mapping[str, tuple[Tensor, Sequence[str]]],
+    rows: Sequence[str],
+    groups: Sequence[tuple[str, int]] = (),
+    title: str | None = None,
+) -> Figure:
+    """Matrices side by side, red where positive and blue where negative, each on its own scale.
+
+    Args:
+        panels: what the numbers are, with their unit → matrix (R, C) and names of its columns.
+        rows: R labels, shared by all panels.
+        groups: name and number of rows of each block of rows, from the top; lines part them.
+        title: above all.
+
+    Returns:
+        A figure; a colour bar under every panel says its scale.
+    """
+    for name, (matrix, columns) in panels.items():
+        if matrix.shape != (len(rows), len(columns)):
+            raise InputError(
+                f"panel '{name}': {len(rows)} rows and {len(columns)} columns are named, "
+                f"the matrix is {tuple(matrix.shape)}"
+            )
+    widths = [max(len(columns), 5) * _CELL_WIDTH for _, columns in panels.values()]
+    size = (sum(widths) + 0.35 * len(panels) + _LEFT, len(rows) * _CELL_HEIGHT + _BOTTOM)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.add_gridspec(1, len(panels), width_ratios=widths)
+    for place, (name, (matrix, columns)) in enumerate(panels.items()):
+        axes = figure.add_subplot(grid[0, place])
+        values = matrix.detach().cpu().double().numpy()
+        limit = float(np.abs(values).max()) or 1.0
+        image = axes.imshow(
+            values, cmap=_COLOUR_MAP, vmin=-limit, vmax=limit, aspect="auto", interpolation="none"
+        )
+        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=SMALL)
+        axes.set_yticks(range(len(rows)), rows if place == 0 else [], fontsize=SMALL - 1)
+        axes.tick_params(length=0)
+        axes.set_xticks(np.arange(1, len(columns)) - 0.5, minor=True)
+        axes.grid(True, which="minor", axis="x", color="0.85", linewidth=0.4)
+        axes.tick_params(which="minor", length=0)
+        _part(axes, groups, place == 0)
+        # `pad` is a share of the matrix's height; the gap is to be the same for few rows and many.
+        gap = 0.16 / (len(rows) * _CELL_HEIGHT)
+        bar = figure.colorbar(
+            image, ax=axes, orientation="horizontal", pad=gap, shrink=0.9, aspect=30
+        )
+        bar.set_label(name, fontsize=SMALL)
+        bar.ax.tick_params(labelsize=SMALL - 1)
+        bar.ax.locator_params(nbins=5 if len(columns) > 8 else 3)
+        bar.outline.set_linewidth(0.4)
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def yield_figure(
+    panels: Mapping[str, Mapping[str, Tensor]],
+    nominal: Mapping[str, float],
+    title: str | None = None,
+) -> Figure:
+    """The share of lenses within an RMS radius, against the radius.
+
+    Args:
+        panels: what the radius is → label → RMS of every lens, mm, ascending, infinite where a
+            lens fails.  Labels in pairs share a colour: the second of each is dashed.
+        nominal: what the radius is → that of the lens as designed, mm.
+        title: above all.
+    """
+    figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")
+    legend = None
+    for place, (name, series) in enumerate(panels.items()):
+        axes = figure.add_subplot(1, len(panels), place + 1)
+        far = 0.0
+        for turn, (label, radii) in enumerate(series.items()):
+            shares = (torch.arange(len(radii)).double() + 1.0) / len(radii)
+            axes.plot(
+                *(1e3 * radii, 100.0 * shares),
+                label=label,
+                color=PALETTE[turn // 2],
+                linestyle="--" if turn % 2 else "-",
+                linewidth=1.1 if turn % 2 else 2.2,
+                alpha=1.0 if turn % 2 else 0.6,
+            )
+            finite = radii[radii.isfinite()]
+            if len(finite):
+                far = max(far, 1e3 * float(finite[min(int(0.998 * len(radii)), len(finite) - 1)]))
+        axes.axvline(1e3 * nominal[name], color="0.3", linewidth=0.9, linestyle=":")
+        axes.annotate(
+            "as designed, refocused ",
+            (1e3 * nominal[name], 50.0),
+            rotation=90,
+            ha="right",
+            va="center",
+            fontsize=SMALL - 1,
+            color="0.3",
+        )
+        near = 1e3 * nominal[name]
+        if far > near:
+            axes.set_xlim(near - 0.1 * (far - near), far)
+        axes.set_ylim(0.0, 101.0)
+        axes.set_yticks([0, 20, 40, 60, 80, 90, 100])
+        axes.set_xlabel(f"{name}, µm", fontsize=SMALL + 1)
+        axes.set_ylabel("lenses within, %" if place == 0 else "", fontsize=SMALL + 1)
+        axes.grid(True, axis="y", color="0.9", linewidth=0.6)
+        axes.set_axisbelow(True)
+        open_axes(axes)
+        legend = axes.get_legend_handles_labels()
+    figure.legend(
+        *legend, loc="outside lower center", ncols=len(legend[1]), frameon=False, fontsize=SMALL
+    )
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def offenders_figure(
+    names: Sequence[str],
+    shares: Sequence[float],
+    increases: Mapping[str, Sequence[float]],
+    title: str | None = None,
+) -> Figure:
+    """Bars, the worst offender on top.
+
+    Args:
+        names: with their tolerances, the worst first.
+        shares: of the average rise of the mean square radius, 0 to 1.
+        increases: label → growth of the RMS radius by a whole tolerance, mm.
+        title: above all.
+    """
+    figure = Figure(figsize=(8.6, 0.27 * len(names) + 1.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    places = np.arange(len(names))
+    left.barh(places, 100.0 * np.asarray(shares), height=0.7, color=PALETTE[0])
+    left.set_xlabel("share of the average rise of RMS²\n(refocused), %", fontsize=SMALL + 1)
+    height = 0.8 / max(len(increases), 1)
+    for turn, (label, values) in enumerate(increases.items()):
+        right.barh(
+            places + (turn - 0.5 * (len(increases) - 1)) * height,
+            1e3 * np.asarray(values),
+            height=0.95 * height,
+            color=PALETTE[turn],
+            label=label,
+        )
+    right.set_xlabel("growth of the RMS radius\nby the whole tolerance, µm", fontsize=SMALL + 1)
+    handles, labels = right.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, frameon=False, fontsize=SMALL, loc="outside lower right", ncols=len(labels)
+    )
+    left.set_yticks(places, names)
+    left.set_ylim(len(names) - 0.4, -0.6)
+    for axes in (left, right):
+        open_axes(axes)
+        axes.grid(True, axis="x", color="0.9", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.tick_params(axis="y", length=0)
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def parameter_label(name: str) -> str:
+    """A parameter as a figure names it: `front tilt x`, `curvature 3`, `thickness 1`."""
+    first, *rest = name.split(".")
+    if first == "elements":
+        return f"{rest[0]} {rest[1].replace('_', ' ')}"
+    if first == "surfaces":
+        return f"{rest[1]} {rest[0]}"
+    if first == "thicknesses":
+        return f"thickness {rest[0]}"
+    return name.replace("_", " ")
+
+
+def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:
+    """Lines between blocks of rows, and their names at the left."""
+    row = 0
+    for name, count in groups:
+        if row:
+            axes.axhline(row - 0.5, color="0.2", linewidth=0.9)
+        if named:
+            axes.annotate(
+                name,
+                (0.0, row + 0.5 * (count - 1)),
+                xycoords=("axes fraction", "data"),
+                xytext=(-88, 0),
+                textcoords="offset points",
+                ha="center",
+                va="center",
+                fontsize=TITLE,
+                fontweight="bold",
+            )
+        row += count

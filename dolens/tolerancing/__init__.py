@@ -1,0 +1,32 @@
+"""What becomes of a lens when it is made: sensitivities, tolerances, yield."""
+
+from dolens.tolerancing.analysis import Outcome, ToleranceAnalysis, analyse_tolerances
+from dolens.tolerancing.linear_spots import LinearSpots, linear_spots
+from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed
+from dolens.tolerancing.perturbations import Tolerances, tightened, tolerances_from
+from dolens.tolerancing.prediction import Contributions, contributions
+from dolens.tolerancing.sensitivity import Sensitivities, sensitivities
+from dolens.tolerancing.through_focus import FocusCurves, spot_weights
+from dolens.tolerancing.yields import Yield, quantiles, share_within
+
+__all__ = [
+    "Contributions",
+    "FocusCurves",
+    "LinearSpots",
+    "Outcome",
+    "PerturbedSpots",
+    "Sensitivities",
+    "ToleranceAnalysis",
+    "Tolerances",
+    "Yield",
+    "analyse_tolerances",
+    "contributions",
+    "linear_spots",
+    "quantiles",
+    "sensitivities",
+    "share_within",
+    "spot_weights",
+    "tightened",
+    "tolerances_from",
+    "trace_perturbed",
+]

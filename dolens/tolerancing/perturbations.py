@@ -1,0 +1,191 @@
+"""Tolerances: how far the parameters of a lens that is made may lie from those of the design."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.elements import TILTS
+from dolens.optics.lens import Lens
+
+DISTRIBUTIONS = ("uniform", "normal")
+_KEYS = ("half_range", "distribution", "relative")
+# A normal distribution ends where its tolerance does, at so many standard deviations.
+_TRUNCATION = 2.0
+_DENSITY = math.exp(-0.5 * _TRUNCATION**2) / math.sqrt(2.0 * math.pi)
+# Chance that a normal number lies within the truncation.
+_INSIDE = math.erf(_TRUNCATION / math.sqrt(2.0))
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """P parameters of a lens, and how far each may be off.  All errors are independent.
+
+    Attributes:
+        names: of the parameters, in the order of the lens.
+        nominal: (P,), float64, their values as designed, in the lens's units (radians for tilts).
+        half_range: (P,), as written: degrees for tilts, shares of the value for relative ones.
+        unit: (P,), the lens's units in one as written: π/180, the value itself, or 1.
+        unit_names: `deg`, `%` (the half-range is still a share), `mm`, `1/mm` or nothing.
+        normal: (P,), bool: normally distributed with a standard deviation of half the half-range,
+            and truncated there; the others are uniform over ± the half-range.
+    """
+
+    names: tuple[str, ...]
+    nominal: Tensor
+    half_range: Tensor
+    unit: Tensor
+    unit_names: tuple[str, ...]
+    normal: Tensor
+
+    @property
+    def steps(self) -> Tensor:
+        """(P,), the half-ranges in the lens's units.
+
+        A relative one has the sign of the value: up is away from zero.
+        """
+        return self.half_range * self.unit
+
+    @property
+    def variance(self) -> Tensor:
+        """(P,), E[ε²] in the lens's units squared.
+
+        h²/3 of a uniform one; of a normal one truncated at ±a = 2 standard deviations σ = h/2,
+        σ²·(1 - 2a·φ(a)/(2Φ(a) - 1)).
+        """
+        inside = (1.0 - 2.0 * _TRUNCATION * _DENSITY / _INSIDE) / _TRUNCATION**2
+        return self.steps.square() * torch.where(self.normal, inside, 1.0 / 3.0)
+
+    @property
+    def fourth_moment(self) -> Tensor:
+        """(P,), E[ε⁴]: h⁴/5, or σ⁴·(3 - 2(a³ + 3a)·φ(a)/(2Φ(a) - 1))."""
+        a = _TRUNCATION
+        inside = (3.0 - 2.0 * (a**3 + 3.0 * a) * _DENSITY / _INSIDE) / a**4
+        return self.steps**4 * torch.where(self.normal, inside, 0.2)
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Errors of lenses, (count, P), float64, in the lens's units.
+
+        Args:
+            count: lenses.
+            generator: on the CPU; the same state gives the same lenses.
+        """
+        shares = torch.rand((count, len(self.names)), generator=generator, dtype=torch.float64)
+        centred = 2.0 * shares - 1.0
+        # By the inverse of the distribution function, so that each error takes one number.
+        inside = math.sqrt(2.0) / _TRUNCATION * torch.erfinv(_INSIDE * centred)
+        return self.steps * torch.where(self.normal, inside, centred)
+
+    def label(self, column: int) -> str:
+        """A tolerance as one reads it: `± 0.05 deg`."""
+        number = float(self.half_range[column])
+        unit = self.unit_names[column]
+        return f"± {100.0 * number if unit == '%' else number:g} {unit}".strip()
+
+
+def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0) -> Tolerances:
+    """Read tolerances as a configuration gives them.
+
+    Args:
+        lens: whose parameters they are of, and whose present values are the design.
+        settings: name or pattern → half-range (degrees for tilts, mm, 1/mm), uniform; or → a
+            mapping of `half_range`, `distribution` (`uniform` or `normal`) and `relative` (the
+            half-range is a share of the value); None leaves a pattern out.
+        factor: multiplies every half-range.
+
+    Raises:
+        InputError: one line that names the key: an unknown parameter, key or distribution, a
+            half-range that is not positive, a parameter named twice or that is an array, or a
+            relative range of zero.
+    """
+    if not isinstance(settings, Mapping):
+        raise InputError(f"tolerances: must map parameters to half-ranges, not {settings!r}")
+    if not _is_number(factor) or not 0.0 < factor < math.inf:
+        raise InputError(f"tolerance_factor: must be a positive number, not {factor!r}")
+    rows: dict[str, tuple[float, bool, bool]] = {}
+    for pattern, given in settings.items():
+        if given is None:
+            continue
+        row = _row(pattern, given)
+        for name, parameter in lens.variables([pattern]).items():
+            if name in rows:
+                raise InputError(f"tolerances.{pattern}: '{name}' has a tolerance already")
+            if parameter.dim() > 0:
+                raise InputError(
+                    f"tolerances.{pattern}: '{name}' is an array; tolerances are of single numbers"
+                )
+            if row[2] and float(parameter.detach()) == 0.0:
+                raise InputError(
+                    f"tolerances.{pattern}: '{name}' is zero, and so is any share of it; "
+                    "give its half_range without relative"
+                )
+            rows[name] = row
+    if not rows:
+        raise InputError("tolerances: none is given")
+    names = [name for name in lens.variables(list(rows)) if name in rows]
+    nominal = torch.stack([p.detach().double().cpu() for p in lens.variables(names).values()])
+    return Tolerances(
+        tuple(names),
+        nominal,
+        factor * torch.tensor([rows[n][0] for n in names], dtype=torch.float64),
+        torch.tensor(
+            [_unit(n, rows[n][2], float(v)) for n, v in zip(names, nominal, strict=True)],
+            dtype=torch.float64,
+        ),
+        tuple("%" if rows[n][2] else unit_name(n) for n in names),
+        torch.tensor([rows[n][1] for n in names]),
+    )
+
+
+def unit_name(name: str) -> str:
+    """The unit that files give a parameter in; nothing where it depends on the surface."""
+    last = name.rsplit(".", 1)[-1]
+    if last in TILTS:
+        return "deg"
+    if last == "curvature":
+        return "1/mm"
+    if name.startswith(("elements.", "thicknesses.")) or name == "sensor_distance":
+        return "mm"
+    return ""
+
+
+def tightened(tolerances: Tolerances, factor: float) -> Tolerances:
+    """The same tolerances with every half-range multiplied by a factor."""
+    return replace(tolerances, half_range=factor * tolerances.half_range)
+
+
+def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
+    """Half-range, whether normal, whether relative."""
+    where = f"tolerances.{pattern}"
+    if not isinstance(given, Mapping):
+        given = {"half_range": given}
+    for key in given:
+        if key not in _KEYS:
+            raise InputError(f"{where}: unknown key '{key}' (allowed: {', '.join(_KEYS)})")
+    half_range = given.get("half_range")
+    if not _is_number(half_range) or not 0.0 < half_range < math.inf:
+        raise InputError(f"{where}: half_range must be a positive number, not {half_range!r}")
+    distribution = given.get("distribution", "uniform")
+    if distribution not in DISTRIBUTIONS:
+        raise InputError(
+            f"{where}: distribution '{distribution}' is unknown "
+            f"(allowed: {', '.join(DISTRIBUTIONS)})"
+        )
+    relative = given.get("relative", False)
+    if not isinstance(relative, bool):
+        raise InputError(f"{where}: relative must be true or false, not {relative!r}")
+    return float(half_range), distribution == "normal", relative
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _unit(name: str, relative: bool, nominal: float) -> float:
+    if relative:
+        return nominal
+    return math.pi / 180.0 if name.rsplit(".", 1)[-1] in TILTS else 1.0

@@ -1,0 +1,134 @@
+"""Pictures of a tolerance analysis when it is done."""
+
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from dolens.plotting import figure_to_image, save_figure
+from dolens.plotting.tolerances import (
+    matrix_figure,
+    offenders_figure,
+    parameter_label,
+    yield_figure,
+)
+from experiments.tolerance_tables import per_unit
+from experiments.tolerances import TolerancesModule
+
+_MOST_OFFENDERS = 20
+_UNIT_WORDS = {"deg": "µm per degree", "mm": "µm per mm", "%": "µm per %", "1/mm": "µm per 1/mm"}
+
+
+class TolerancePictures(lightning.Callback):
+    """Jacobians as matrices, yield curves, and the worst offenders, as PNG files.
+
+    Args:
+        folder: where they go; made when needed.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Write the files, and log them to TensorBoard."""
+        for name, figure in tolerance_figures(pl_module).items():
+            save_figure(figure, self.folder / f"{name}.png")
+            for logger in trainer.loggers:
+                if isinstance(logger, TensorBoardLogger):
+                    logger.experiment.add_image(name, figure_to_image(figure), global_step=0)
+
+
+def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:
+    """Figures of an analysis by name."""
+    found, name = module.analysis, module.lens.name
+    s, t, c = found.sensitivities, found.tolerances, found.contributions
+    spots = module.spot_labels()
+    blocks = [("x", len(spots)), ("y", len(spots))]
+    motion = s.centroid_jacobian.transpose(0, 1).flatten(0, 1)
+    labels = [parameter_label(parameter) for parameter in t.names]
+    with_tolerance = [f"{label}  {t.label(p)}" for p, label in enumerate(labels)]
+    scale = 1e3 * per_unit(t)
+    first = c.order[:_MOST_OFFENDERS]
+    ends = s.rms_at_ends_refocused.square() - s.rms_refocused.square()
+    return {
+        "centroid_jacobian": matrix_figure(
+            _by_unit(motion * scale, labels, t.unit_names),
+            spots * 2,
+            blocks,
+            f"{name}: how spots move (Jacobian of their centroids)",
+        ),
+        "centroid_by_tolerance": matrix_figure(
+            {"µm": (1e3 * motion * s.steps, with_tolerance)},
+            spots * 2,
+            blocks,
+            f"{name}: how far a whole tolerance moves spots",
+        ),
+        "rms_jacobian": matrix_figure(
+            _by_unit(s.rms_jacobian * scale, labels, t.unit_names),
+            spots,
+            title=f"{name}: Jacobian of the spots' RMS radii",
+        ),
+        "rms_by_tolerance": matrix_figure(
+            {
+                "growth of RMS to first order, not refocused, µm": (
+                    1e3 * s.rms_jacobian * s.steps,
+                    with_tolerance,
+                ),
+                "RMS² at the worse end less that as designed, refocused, µm²": (
+                    1e6 * ends.amax(0).T,
+                    with_tolerance,
+                ),
+            },
+            spots,
+            title=f"{name}: what a whole tolerance does to the spots' RMS radii",
+        ),
+        "yield": _yields(module),
+        "worst_offenders": offenders_figure(
+            [with_tolerance[p] for p in first],
+            c.share[first].tolist(),
+            {
+                "refocused": s.increase()[first].tolist(),
+                "not refocused": s.increase(refocused=False)[first].tolist(),
+            },
+            f"{name}: worst offenders",
+        ),
+    }
+
+
+def _yields(module: TolerancesModule) -> Figure:
+    found = module.analysis
+    outcomes = {
+        f"{how}, {stage}": outcome.found(stage == "refocused")
+        for stage in ("refocused", "not refocused")
+        for how, outcome in (("Monte Carlo", found.traced), ("linear", found.linear))
+    }
+    design = found.sensitivities.rms_refocused.square()
+    mean, worst = "RMS radius over all spots", "RMS radius of the worst spot"
+    return yield_figure(
+        {
+            mean: {label: radii.rms for label, radii in outcomes.items()},
+            worst: {label: radii.worst for label, radii in outcomes.items()},
+        },
+        {
+            mean: float((design @ module.weights).sqrt()),
+            worst: float(design[module.weights > 0.0].amax().sqrt()),
+        },
+        f"{module.lens.name}: {module.lenses} lenses drawn from the tolerances",
+    )
+
+
+def _by_unit(
+    matrix: Tensor, labels: list[str], units: tuple[str, ...]
+) -> dict[str, tuple[Tensor, list[str]]]:
+    """A panel for each unit: numbers of several units share no scale."""
+    panels = {}
+    for unit in dict.fromkeys(units):
+        columns = [p for p, other in enumerate(units) if other == unit]
+        panels[_UNIT_WORDS.get(unit, "µm per unit")] = (
+            matrix[:, torch.tensor(columns)],
+            [labels[p] for p in columns],
+        )
+    return panels

@@ -1,0 +1,149 @@
+"""The tolerances of a lens as a run: tables, metrics, figures, and bad input."""
+
+import csv
+import json
+import math
+
+import pytest
+import torch
+
+from dolens import InputError, load_lens
+from dolens.imaging.spot_rays import gaussian_quadrature
+from experiments.training import run
+
+# The whole path, with few rays; the fields are aimed one by one, which takes most of the time.
+SMALL = [
+    "experiment=cooke_sensitivity",
+    "fields=[[0,0],[0,20],[-14,0]]",
+    "wavelengths=[587.5618]",
+    "lenses=200",
+    "module.rings=3",
+    "module.arms=6",
+    "+trainer.enable_progress_bar=false",
+]
+AXIAL = [*SMALL, "fields=[[0,0]]", "lenses=20", "callbacks.pictures=null"]
+FIGURES = (
+    "centroid_jacobian",
+    "centroid_by_tolerance",
+    "rms_jacobian",
+    "rms_by_tolerance",
+    "yield",
+    "worst_offenders",
+)
+
+
+def table(folder, name):
+    with (folder / f"{name}.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_leaves_tables_figures_and_metrics_that_agree(composed, tmp_path):
+    objective = run(composed(*SMALL, "lens.sensor.distance=42.3"))
+    folder = tmp_path / "run"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["tolerance/rms_um/p90"] == objective
+    assert json.loads((folder / "run.json").read_text())["status"] == "finished"
+    for name in FIGURES:
+        assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000, name
+    assert list((folder / "tensorboard").glob("events.out.tfevents.*"))
+
+    lenses = table(folder, "monte_carlo")
+    radii = sorted(float(row["rms_um"]) for row in lenses)
+    assert len(radii) == 200
+    assert radii[179] == pytest.approx(objective, rel=1e-8)
+    within = sum(radius <= 14.0 for radius in radii) / 200
+    assert metrics["tolerance/yield_at_14um"] == pytest.approx(within)
+    assert metrics["cost/rays"] == 200 * 3 * 3 * 6
+    assert metrics["tolerance/failed_lenses"] == 0.0
+    assert metrics["error/linear_p90"] < 0.01
+    assert metrics["tolerance/rms_um/p90"] < metrics["tolerance/before_refocus/rms_um/p90"]
+
+    offenders = table(folder, "worst_offenders")
+    shares = [float(row["share_of_increase"]) for row in offenders]
+    assert sum(shares) == pytest.approx(1.0) and shares == sorted(shares, reverse=True)
+    assert len(offenders) == 24 and len(table(folder, "sensitivities")) == 24 * 3
+    for row in offenders:
+        name = f"sensitivity/rms_um/{row['parameter']}"
+        assert metrics[name] == pytest.approx(float(row["rms_increase_um"]), rel=1e-6, abs=1e-9)
+    check_first_lens(folder, lenses[0])
+
+
+def check_first_lens(folder, row):
+    """A row of the table, made by hand from its errors in the units of files, and traced."""
+    lens = load_lens(folder / "lens" / "initial.yaml")
+    fields, lines = [(0.0, 0.0), (0.0, 20.0), (-14.0, 0.0)], [587.5618]
+    spots = gaussian_quadrature(lens, fields, lines, 3, 6, symmetry=False)
+    for column, text in row.items():
+        if "[" not in column:
+            continue
+        name, unit = column.rstrip("]").split(" [")
+        with torch.no_grad():
+            parameter = lens.variables([name])[name]
+            error = float(text)
+            if unit == "%":
+                parameter.mul_(1.0 + error / 100.0)
+            else:
+                parameter.add_(math.radians(error) if unit == "deg" else error)
+
+    def rms_um():
+        points = lens.trace(spots.rays).position[:, :2].detach()
+        weight, total = spots.weight[:, None], 0.0
+        for spot in range(3):
+            mine = spots.spot == spot
+            centroid = (weight * points)[mine].sum(0)
+            total += float((weight * (points - centroid).square())[mine].sum()) / 3
+        return 1e3 * math.sqrt(total)
+
+    assert rms_um() == pytest.approx(float(row["not_refocused_rms_um"]), rel=1e-6)
+    with torch.no_grad():
+        lens.sensor_distance += 1e-3 * float(row["refocus_um"])
+    assert rms_um() == pytest.approx(float(row["rms_um"]), rel=1e-6)
+
+
+def test_the_seed_decides_which_lenses_are_drawn(composed):
+    first, again, other = (
+        run(composed(*AXIAL, f"seed={seed}", folder=folder))
+        for seed, folder in ((1, "a"), (1, "b"), (2, "c"))
+    )
+    assert first == again != other
+
+
+def test_tighter_tolerances_and_a_single_field_s_weight(composed, tmp_path):
+    weighted = ["fields=[[0,0],[0,14]]", "field_weights=[1,0]", "tolerance_factor=1e-6"]
+    run(composed(*AXIAL, *weighted, "lens_dtype=float32"))
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    nominal = metrics["tolerance/rms_um/nominal"]
+    assert metrics["tolerance/rms_um/p98"] == pytest.approx(nominal, rel=1e-4)
+    # The only spot that counts is the worst one.
+    assert metrics["tolerance/worst_rms_um/nominal"] == pytest.approx(nominal, rel=1e-6)
+
+
+BAD_INPUT = {
+    "unknown parameter": (
+        ["+tolerances={elements.back.tilt_x: 0.1}"],
+        "no parameter 'elements.back.tilt_x'",
+    ),
+    "negative half-range": (["+tolerances={thicknesses.2: -1}"], "tolerances.thicknesses.2"),
+    "no lenses": (["lenses=0"], "lenses: 0; allowed: an integer of 1 or more"),
+    "half a field": (["fields=[[0]]"], "fields: 2 numbers are needed, not 1"),
+    "no field": (["fields=[]"], "fields: none is given"),
+    "weights": (["field_weights=[1]"], "weights: 9 numbers are needed, not 1"),
+    "factor": (["tolerance_factor=0"], "tolerance_factor: must be a positive number"),
+    "a wavelength that is none": (["wavelengths=[red]"], "wavelengths: must be numbers"),
+    "limits": (["yield_at_um=[wide]"], "yield_at_um: must be numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_input_gives_one_clear_line(composed, case):
+    overrides, expected = BAD_INPUT[case]
+    with pytest.raises(Exception) as caught:
+        run(composed("experiment=cooke_sensitivity", *overrides))
+    error = caught.value.__cause__ or caught.value
+    assert isinstance(error, InputError), error
+    assert expected in str(error) and "\n" not in str(error)
+
+
+def test_without_its_test_the_run_has_no_objective(composed):
+    with pytest.raises(InputError, match="objective: 'tolerance/rms_um/p90' is not among"):
+        run(composed(*SMALL, "test=false"))

@@ -1,0 +1,67 @@
+import math
+
+import pytest
+import torch
+
+from dolens.errors import InputError
+from dolens.plotting.tolerances import (
+    matrix_figure,
+    offenders_figure,
+    parameter_label,
+    yield_figure,
+)
+
+
+def test_a_matrix_keeps_its_numbers_rows_and_columns():
+    left = torch.tensor([[1.0, -4.0], [0.0, 2.0], [3.0, 0.5]])
+    panels = {"µm": (left, ["a", "b"]), "nm": (torch.zeros(3, 1), ["c"])}
+    figure = matrix_figure(panels, ["p", "q", "r"], [("x", 1), ("y", 2)], "Title")
+    first, second = (axes for axes in figure.axes if axes.images)
+    assert (first.images[0].get_array() == left.numpy()).all()
+    # White is zero, whatever the numbers.
+    assert first.images[0].get_clim() == (-4.0, 4.0)
+    assert second.images[0].get_clim() == (-1.0, 1.0)
+    assert [t.get_text() for t in first.get_yticklabels()] == ["p", "q", "r"]
+    assert [t.get_text() for t in first.get_xticklabels()] == ["a", "b"]
+    bars = [axes for axes in figure.axes if not axes.images]
+    assert [axes.get_xlabel() for axes in bars] == ["µm", "nm"]
+    figure.draw_without_rendering()
+
+
+def test_a_matrix_of_another_shape_is_refused():
+    with pytest.raises(InputError, match=r"panel 'µm': 1 rows and 2 columns"):
+        matrix_figure({"µm": (torch.zeros(2, 2), ["a", "b"])}, ["p"])
+
+
+def test_yield_rises_to_the_share_of_lenses_that_do_not_fail():
+    radii = torch.tensor([0.001, 0.002, 0.004, math.inf])
+    figure = yield_figure({"RMS": {"traced": radii, "linear": radii}}, {"RMS": 0.001})
+    line = figure.axes[0].get_lines()[0]
+    assert list(line.get_ydata()) == [25.0, 50.0, 75.0, 100.0]
+    assert list(line.get_xdata())[:3] == pytest.approx([1.0, 2.0, 4.0])
+    low, high = figure.axes[0].get_xlim()
+    assert low < 1.0 and high == pytest.approx(4.0)
+    figure.draw_without_rendering()
+
+
+def test_bars_are_in_per_cent_and_micrometres_the_worst_on_top():
+    figure = offenders_figure(["tilt", "shift"], [0.7, 0.3], {"refocused": [1e-3, 2e-3]})
+    left, right = figure.axes
+    assert [bar.get_width() for bar in left.patches] == pytest.approx([70.0, 30.0])
+    assert [bar.get_width() for bar in right.patches] == pytest.approx([1.0, 2.0])
+    bottom, top = left.get_ylim()
+    assert top < bottom
+    figure.draw_without_rendering()
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("elements.front.tilt_x", "front tilt x"),
+        ("surfaces.3.curvature", "curvature 3"),
+        ("thicknesses.1", "thickness 1"),
+        ("sensor_distance", "sensor distance"),
+    ],
+)
+def test_parameters_in_words(name, label):
+    assert parameter_label(name) == label
