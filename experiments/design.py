@@ -26,6 +26,8 @@ from experiments.search import Progress, gradient_iteration, least_squares_itera
 logger = logging.getLogger(__name__)
 
 SEMI_DIAMETERS = ("fixed", "follow")
+# So many iterations are logged one by one; history.csv holds all.
+_LOGGED_FIRST = 20
 # Rings of the quadrature that tells where the edges of the beams are.
 _EDGE_RINGS = 40
 
@@ -135,8 +137,8 @@ class DesignModule(lightning.LightningModule):
         for name in ("round_start_focus", "best_focus"):
             self.register_buffer(name, self.lens.sensor_distance.detach().clone())
         self.register_buffer("best_merit", torch.tensor(math.inf, dtype=torch.float64))
-        self.selection_seconds: list[float] = []
-        self._fit_seconds = 0.0
+        self._fit_seconds = self._left = 0.0
+        self._between: list[float] = []
         self.initial_light: Tensor | None = None
 
     @property
@@ -190,6 +192,8 @@ class DesignModule(lightning.LightningModule):
     def training_step(self, batch: Any, batch_idx: int) -> None:
         """One iteration."""
         started = time.perf_counter()
+        if self._left:
+            self._between.append(started - self._left)
         optimizer = self.optimizers()
         bare = optimizer.optimizer
         if getattr(bare, "takes_residuals", False):
@@ -197,7 +201,10 @@ class DesignModule(lightning.LightningModule):
         else:
             progress = gradient_iteration(bare, optimizer.step, self.merit, self.variables)
         self._stopped = progress.stopped
-        self._record(progress, time.perf_counter() - started)
+        done = time.perf_counter()
+        self._record(progress, done - started)
+        # What lies between two iterations is the training loop's, and the loggers'.
+        self._left = done
 
     def on_train_epoch_end(self) -> None:
         """Look at the lens with the rays that pass it now, and decide whether to go on."""
@@ -209,7 +216,6 @@ class DesignModule(lightning.LightningModule):
                 len(self.history),
             )
         before = float(self.best_merit)
-        started = time.perf_counter()
         self.merit().write_to(self.lens)
         try:
             self.merit = self._build(self.lens)
@@ -221,7 +227,6 @@ class DesignModule(lightning.LightningModule):
             # The best lens is kept; say why this one is not.
             logger.warning("Round %d ends with a lens that fails: %s", self.current_epoch, problem)
             reached = math.inf
-        self.selection_seconds.append(time.perf_counter() - started)
         self.log("val/merit", reached)
         with torch.no_grad():
             self.round_start.copy_(self.variables.scaled)
@@ -231,7 +236,7 @@ class DesignModule(lightning.LightningModule):
             self.trainer.should_stop = True
         elif hasattr(optimizer, "restart"):
             optimizer.restart()
-        self._stopped = None
+        self._stopped, self._left = None, 0.0
 
     def on_fit_end(self) -> None:
         """Leave the lens of the best round."""
@@ -321,7 +326,8 @@ class DesignModule(lightning.LightningModule):
         self.history.append(row)
         self.log("train/merit", row["train/merit"], prog_bar=True, logger=False)
         # Straight to the loggers: Lightning's own bookkeeping costs more than many an iteration.
-        if self.global_step % self.trainer.log_every_n_steps == 0:
+        count = len(self.history)
+        if count <= _LOGGED_FIRST or count % self.trainer.log_every_n_steps == 0:
             for entry in self.loggers:
                 entry.log_metrics(row, step=self.global_step)
 
@@ -397,11 +403,10 @@ class DesignModule(lightning.LightningModule):
             if self.history:
                 numbers[f"cost/{name}"] = statistics.median(r[f"cost/{name}"] for r in self.history)
         if self.history:
-            work = sum(row["cost/iteration_s"] for row in self.history)
             numbers["cost/step_s"] = numbers["cost/iteration_s"]
             numbers["cost/fit_s"] = self._fit_seconds
-            rest = self._fit_seconds - work - sum(self.selection_seconds)
-            numbers["cost/trainer_s"] = rest / len(self.history)
+        if self._between:
+            numbers["cost/trainer_s"] = statistics.median(self._between)
         return numbers
 
     # ---------------------------------------------------------------- checkpoints

@@ -8,6 +8,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -206,7 +207,7 @@ class ImageQuality(ABC):
 
     # ---------------------------------------------------------------- weights and references
 
-    @property
+    @cached_property
     def ray_weights(self) -> Tensor:
         """(N,): W·w of every ray, the spot's weight times the ray's share."""
         return self.weights.to(self.spots.weight)[self.spots.spot] * self.spots.weight
@@ -216,7 +217,7 @@ class ImageQuality(ABC):
         """K."""
         return 2
 
-    @property
+    @cached_property
     def group(self) -> Tensor:
         """(N,), int64: which rays have one reference: those of a spot, or of a field."""
         spots = self.spots
@@ -225,7 +226,7 @@ class ImageQuality(ABC):
         _, field = spots.fields.unique(dim=0, return_inverse=True)
         return field.to(spots.spot.device)[spots.spot]
 
-    @property
+    @cached_property
     def group_shares(self) -> Tensor:
         """(N,): w of every ray in its group; they sum to one over each."""
         weight, group = self.ray_weights, self.group
@@ -246,7 +247,7 @@ class ImageQuality(ABC):
         centred = spots.centred[spots.spot].T
         return torch.where(centred, 0.0, means[..., group])
 
-    @property
+    @cached_property
     def _chief_of_rays(self) -> Tensor:
         """(N,), int64: each ray's chief ray; that of the middle wavelength where colours join."""
         spots = self.spots
