@@ -1,0 +1,103 @@
+"""Finished designs, traced again by a second ray tracer in 80-digit arithmetic.
+
+    python scripts/retrace.py outputs/nikon/<date_time> [...] [--every 10]
+
+The tracer of `tests/optics/exact.py` shares nothing with dolens but the meaning of a prescription.
+It traces the rays of a run's spots through `lens/final.yaml`, which is then judged by what it
+finds, at some 3 ms for a ray and surface; `--every n` takes one ray in n of every spot, for both.
+"""
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+
+import torch
+import yaml
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from dolens import load_lens
+from dolens.imaging.spot_rays import SpotRays
+from dolens.optics.lens import Lens
+from dolens.optimize import MeritSettings
+from tests.optics import exact
+
+
+def main() -> None:
+    """Print a line for every run folder."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--every", type=int, default=1, help="one ray in so many of each spot")
+    arguments = parser.parse_args()
+    print("design | spots | rays | RMS µm | traced again µm | largest difference µm | s")
+    for folder in arguments.folders:
+        print(" | ".join(compared(folder, arguments.every)), flush=True)
+
+
+def compared(folder: Path, every: int) -> list[str]:
+    """The row of one run folder."""
+    lens = load_lens(folder / "lens" / "final.yaml", dtype=torch.float64)
+    spots = evaluated_spots(folder, lens)
+    chosen = [
+        ray
+        for spot in range(spots.count)
+        for ray in torch.nonzero(spots.spot == spot).flatten().tolist()[::every]
+    ]
+    own = lens.trace(spots.rays).position[:, :2].detach()[chosen]
+    started = time.perf_counter()
+    values = exact.values_of(lens)
+    again = torch.tensor([landing(lens, values, spots, ray) for ray in chosen])
+    seconds = time.perf_counter() - started
+    of_ray, weight = spots.spot[chosen], spots.weight[chosen]
+    pairs = [rms_um(points, of_ray, weight, spots) for points in (own, again)]
+    return [
+        f"{folder.parent.name}",
+        f"{spots.count}",
+        f"{len(chosen)}",
+        f"{sum(pairs[0]) / spots.count:.9g}",
+        f"{sum(pairs[1]) / spots.count:.9g}",
+        f"{max(abs(a - b) for a, b in zip(*pairs, strict=True)):.1e}",
+        f"{seconds:.0f}",
+    ]
+
+
+def evaluated_spots(folder: Path, lens: Lens) -> SpotRays:
+    """The rays that the run's RMS radii are of, selected through the lens as dolens sees it."""
+    config = yaml.safe_load((folder / ".hydra" / "resolved.yaml").read_text())
+    settings = dict(config["evaluation"] or config["merit"])
+    settings.pop("_target_")
+    settings |= {"quality": "spots", "quality_options": {}, "operands": ()}
+    return MeritSettings(**settings).rays(lens)
+
+
+def landing(lens: Lens, values: dict, spots: SpotRays, ray: int) -> list[float]:
+    """Where a ray lands, mm."""
+    status, _, point, *_ = exact.trace(
+        lens,
+        values,
+        spots.rays.position[ray].tolist(),
+        spots.rays.direction[ray].tolist(),
+        float(spots.rays.wavelength[ray]),
+    )
+    if status != exact.OK:
+        raise SystemExit(f"ray {ray} does not pass the lens when it is traced again")
+    return [float(point[0]), float(point[1])]
+
+
+def rms_um(
+    points: torch.Tensor, of_ray: torch.Tensor, weight: torch.Tensor, spots: SpotRays
+) -> list[float]:
+    """RMS radius of each spot about its centroid, by the definition."""
+    radii = []
+    for spot in range(spots.count):
+        mine = of_ray == spot
+        share = (weight[mine] / weight[mine].sum())[:, None]
+        mean = torch.where(spots.centred[spot], 0.0, (share * points[mine]).sum(0))
+        radii.append(1e3 * math.sqrt(float((share * (points[mine] - mean).square()).sum())))
+    return radii
+
+
+if __name__ == "__main__":
+    main()
