@@ -48,7 +48,8 @@ def compared(folder: Path, every: int) -> list[str]:
     own = lens.trace(spots.rays).position[:, :2].detach()[chosen]
     started = time.perf_counter()
     values = exact.values_of(lens)
-    again = torch.tensor([landing(lens, values, spots, ray) for ray in chosen])
+    found = [landing(lens, values, spots, ray) for ray in chosen]
+    again = torch.tensor(found, dtype=torch.float64)
     seconds = time.perf_counter() - started
     of_ray, weight = spots.spot[chosen], spots.weight[chosen]
     pairs = [rms_um(points, of_ray, weight, spots) for points in (own, again)]
