@@ -448,6 +448,7 @@ def spot_labels(spots: Any) -> list[str]:
 def _doubled(settings: MeritSettings) -> dict[str, Any]:
     """Sampling options with twice the rays along each direction."""
     default = {"gaussian_quadrature": {"rings": 6, "arms": 12}, "square_grid": {"count": 31}}
-    options = {**default[settings.sampling], **settings.sampling_options}
+    given = {key: value for key, value in settings.sampling_options.items() if value is not None}
+    options = {**default[settings.sampling], **given}
     counts = ("rings", "arms", "count")
     return {key: 2 * value if key in counts else value for key, value in options.items()}

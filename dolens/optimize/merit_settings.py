@@ -41,7 +41,8 @@ class MeritSettings:
         field_weights: one for each field; None: all equal.
         wavelength_weights: likewise.
         sampling: `gaussian_quadrature` or `square_grid`.
-        sampling_options: what that function takes: `rings` and `arms`, or `count` and `half_width`.
+        sampling_options: what that function takes: `rings` and `arms`, or `count` and `half_width`;
+            None leaves one at its default, in all options.
         quality: `spots`: RMS radii, µm; `wavefront`: RMS wavefront errors, wavelengths; a loss of
             landing points: `modulation`, `encircled_energy` or `spot_size`; None: operands alone.
         quality_options: of a loss, see `dolens.optimize.landing_losses`, and its `curvature`, see
@@ -99,7 +100,7 @@ class MeritSettings:
                 f"merit.sampling: '{self.sampling}' is unknown (allowed: {', '.join(SAMPLINGS)})"
             )
         fields, wavelengths = self.fields_of(lens), self.wavelengths_of(lens)
-        options = dict(self.sampling_options)
+        options = _given(self.sampling_options)
         if self.sampling == "gaussian_quadrature":
             options.setdefault("object_distance", lens.object_distance)
             # A loss sees all of a spot, not one half that stands for both.
@@ -147,14 +148,19 @@ class MeritSettings:
             )
         rays = self.rays(lens)
         common = (rays, self.weights(rays), self.reference, self.colours, self.most_vignetted)
+        options = _given(self.quality_options)
         try:
             if self.quality in RESIDUALS:
-                return RESIDUALS[self.quality](*common, **self.quality_options)
-            options = dict(self.quality_options)
+                return RESIDUALS[self.quality](*common, **options)
             curvature = options.pop("curvature", "directions")
             return LossResiduals(*common, LOSSES[self.quality](**options), curvature)
         except TypeError as error:
             raise InputError(f"merit.quality_options: {error}") from None
+
+
+def _given(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Without those that are None, which stand for a default."""
+    return {key: value for key, value in options.items() if value is not None}
 
 
 def _weights(what: str, given: Sequence[float] | None, count: int) -> Tensor:
