@@ -1,4 +1,4 @@
-"""Derivatives of a few numbers by the tensors that they were computed from."""
+"""Derivatives of numbers by the tensors that they were computed from."""
 
 from collections.abc import Sequence
 
@@ -31,3 +31,38 @@ def jacobian_of(values: Tensor, variables: Sequence[Tensor]) -> Tensor:
         ],
         1,
     )
+
+
+def jacobian_by_columns(values: Tensor, variables: Sequence[Tensor]) -> Tensor:
+    """The same for many numbers of few variables: P sweeps, whatever N.
+
+    The reverse sweep g(v) = Jᵀv is linear in v, so that its own reverse sweep with a unit vector
+    e_k is a column, J·e_k: forward mode from reverse mode.
+
+    Args:
+        values: (N,), with a graph, which is kept, of operations that can be differentiated twice.
+        variables: leaves; P numbers in all, each tensor by rows.
+
+    Raises:
+        RuntimeError: an operation has no second derivative.
+        InputError: one of ours has none.
+    """
+    with torch.enable_grad():
+        weight = torch.zeros_like(values, requires_grad=True)
+        swept = torch.autograd.grad(
+            values, list(variables), weight, create_graph=True, allow_unused=True
+        )
+        found = [
+            torch.zeros_like(variable) if part is None else part
+            for part, variable in zip(swept, variables, strict=True)
+        ]
+        flat = torch.cat([part.reshape(-1) for part in found])
+    if not flat.requires_grad:
+        return values.new_zeros(len(values), len(flat))
+    unit = torch.eye(len(flat), dtype=flat.dtype, device=flat.device)
+    (columns,) = torch.autograd.grad(
+        flat, weight, unit, is_grads_batched=True, retain_graph=True, allow_unused=True
+    )
+    if columns is None:
+        return values.new_zeros(len(values), len(flat))
+    return columns.T

@@ -1,13 +1,20 @@
 """What a least-squares optimizer asks of the thing that it makes small."""
 
+import logging
 from collections.abc import Sequence
+from functools import cache
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.row_jacobian import jacobian_of
+from dolens.optics.row_jacobian import jacobian_by_columns, jacobian_of
 from dolens.optimize.linear_model import LinearModel
+
+logger = logging.getLogger(__name__)
+
+# So many times as many residuals as variables are worth the second graph of forward sweeps.
+_MANY = 4
 
 
 @runtime_checkable
@@ -28,7 +35,11 @@ class Residuals(Protocol):
 
 
 class TensorResiduals:
-    """Residuals as a tensor with a graph; autograd sweeps back once for each of them.
+    """Residuals as a tensor with a graph; autograd sweeps it once for each of the fewer numbers.
+
+    Few residuals of many variables take a reverse sweep each, many of few variables a forward one
+    for each variable.  Forward sweeps need operations that can be differentiated twice: where one
+    cannot, as the fused kernels, the log says so, and reverse sweeps serve.
 
     Args:
         residuals: r, of any shape.
@@ -50,4 +61,18 @@ class TensorResiduals:
         """
         if not self._residuals.requires_grad:
             raise InputError("the closure's residuals have no gradient with respect to anything")
-        return LinearModel.of_rows(self._residuals, jacobian_of(self._residuals, self._variables))
+        return LinearModel.of_rows(self._residuals, self._jacobian())
+
+    def _jacobian(self) -> Tensor:
+        variables = sum(variable.numel() for variable in self._variables)
+        if len(self._residuals) > _MANY * variables:
+            try:
+                return jacobian_by_columns(self._residuals, self._variables)
+            except (RuntimeError, InputError) as reason:
+                _say_reverse(str(reason).splitlines()[0])
+        return jacobian_of(self._residuals, self._variables)
+
+
+@cache
+def _say_reverse(reason: str) -> None:
+    logger.info("Jacobian by one reverse sweep for each residual: %s", reason)

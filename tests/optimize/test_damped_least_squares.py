@@ -3,8 +3,11 @@
 import pytest
 import torch
 
+from dolens import Rays, load_lens
 from dolens.errors import InputError
+from dolens.optics.backend import trace_rays
 from dolens.optimize import DampedLeastSquares
+from dolens.optimize.residuals import TensorResiduals
 from tests.optimize.standard_problems import CERTIFIED, MORE
 
 # From these two of NIST's harder starts it does not get there.  BoxBOD: the first step leads to
@@ -224,3 +227,47 @@ def test_a_jacobian_that_is_not_finite_is_refused():
 def test_residuals_without_a_gradient_are_refused():
     with pytest.raises(InputError, match="no gradient"):
         minimise(lambda u: u.detach(), (1.0,))
+
+
+@pytest.mark.parametrize("count", [3, 200])
+def test_the_jacobian_of_few_and_of_many_residuals(count):
+    """By reverse sweeps, and by forward ones where residuals are many: jacfwd's numbers."""
+    u = torch.tensor([0.3, -0.7], dtype=torch.float64, requires_grad=True)
+    w = torch.tensor([1.1], dtype=torch.float64, requires_grad=True)
+    t = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
+
+    def residuals(u, w):
+        return torch.exp(u[0] * t) * torch.sin(w * t) + u[1] ** 2
+
+    model = TensorResiduals(residuals(u, w), [u, w]).linear_model()
+    jacobian = torch.cat(torch.func.jacfwd(residuals, (0, 1))(u.detach(), w.detach()), 1)
+    assert torch.allclose(model.root.T @ model.root, jacobian.T @ jacobian, rtol=1e-12)
+    assert torch.allclose(model.gradient, jacobian.T @ residuals(u, w).detach(), rtol=1e-12)
+
+
+def test_residuals_without_a_second_derivative_take_reverse_sweeps(triplet_residuals, caplog):
+    """A trace by the fused kernels: the log says so, and the Jacobian is right."""
+    residuals, curvature, step = triplet_residuals
+    with caplog.at_level("INFO"):
+        model = TensorResiduals(residuals(curvature), [curvature]).linear_model()
+    assert "one reverse sweep for each residual" in caplog.text
+    with torch.no_grad():
+        slope = (residuals(curvature + step) - residuals(curvature - step)) / (2.0 * step)
+    assert model.column_norms[0].item() == pytest.approx(slope.norm().item(), rel=1e-7)
+
+
+@pytest.fixture
+def triplet_residuals(root):
+    lens = load_lens(root / "conf/lens/cooke_triplet.yaml", dtype=torch.float64)
+    lens.requires_grad_(False)
+    lens.backend = "cpu"
+    y = torch.linspace(-3.0, 3.0, 12, dtype=torch.float64)
+    position = torch.stack((0.1 * y, y, torch.full_like(y, -5.0)), -1)
+    direction = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(12, 3)
+    rays = Rays(position, direction, 587.5618)
+
+    def residuals(curvature):
+        system = lens.system({"surfaces.1.curvature": curvature})
+        return trace_rays(system, rays, "cpu", 1.0, False, 1, None).position[:, :2].reshape(-1)
+
+    return residuals, lens.surfaces["1"].curvature.detach().clone().requires_grad_(), 1e-6
