@@ -32,6 +32,8 @@ from dolens.optics.trace import Trace, stop_gradient_where_invalid, trace_surfac
 MAX_TURN = 0.4
 MIN_STEP = 1e-3
 MAX_EVALUATIONS = 150
+# Newton's corrections of a guess.
+MAX_CORRECTIONS = 8
 # How near to its point on the stop, in semi-diameters, a ray on the way must come.
 NEAR = 1e-2
 # Residual of an aimed ray, in units of rounding at the stop or, seen from there, at the front.
@@ -51,9 +53,11 @@ class AimedRays(Rays):
             it at the point asked for.  Apertures are not tested.  A ray that is not converged
             starts at the first vertex towards -z, so that a trace finds it MISSED at surface 1, and
             carries no gradient.
+        crossing: (..., 2), mm: q, where the ray crosses that plane; a guess for another `aim`.
     """
 
     converged: Tensor
+    crossing: Tensor
 
 
 def field_tangents(
@@ -103,6 +107,7 @@ def aim(
     pupil: Tensor,
     wavelength: float | Tensor,
     object_distance: float | Tensor | None = None,
+    guess: Tensor | None = None,
 ) -> AimedRays:
     """Rays of a field that cross the stop surface at given points.
 
@@ -114,6 +119,9 @@ def aim(
             semi-diameter; in the unit disc.
         wavelength: nm, a number or (...).
         object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
+        guess: `crossing` of the same rays through a lens that is nearly this one, from where a few
+            of Newton's corrections lead to the solution; where one does not, all rays are searched
+            from the axis as without a guess.
 
     Returns:
         Rays of the common leading shape.  They have the gradient of the solution with respect to
@@ -128,7 +136,8 @@ def aim(
     tangents, target = tangents.expand(shape), target.expand(shape)
     problem = _Problem(system, wavelength, near, tangents.detach(), target.detach())
     with torch.no_grad():
-        q, slopes, found = _follow(problem)
+        found_near = None if guess is None else _corrected(problem, guess.expand(shape))
+        q, slopes, found = found_near or _follow(problem)
     residual, reached = _miss(system, wavelength, near, tangents, target, q)
     with torch.no_grad():
         front = slopes.abs().amax((-2, -1)) * system.surfaces[0].semi_diameter
@@ -144,6 +153,7 @@ def aim(
         torch.where(kept, direction, backwards),
         wavelength,
         converged=converged,
+        crossing=q.detach(),
     )
 
 
@@ -168,6 +178,23 @@ class _Evaluation(NamedTuple):
     slopes: Tensor
     rate: Tensor
     reached: Tensor
+
+
+def _corrected(problem: _Problem, q: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+    """As `_follow`, from a point near the solution; None where a ray is not that near."""
+    t = torch.ones_like(q[..., 0])
+    settled = math.sqrt(torch.finfo(t.dtype).eps)
+    allowed = torch.full_like(t, NEAR)
+    for _ in range(MAX_CORRECTIONS):
+        here = _evaluate(problem, q, t)
+        size = here.residual.norm(dim=-1) / problem.scale
+        q = q - _solve(here.slopes, here.residual)
+        if not bool((here.reached & (size <= allowed) & torch.isfinite(q).all(-1)).all()):
+            return None
+        if bool((size <= settled).all()):
+            return q, here.slopes, torch.ones_like(t, dtype=torch.bool)
+        allowed = torch.maximum(0.5 * size, torch.full_like(size, settled))
+    return None
 
 
 def _follow(problem: _Problem) -> tuple[Tensor, Tensor, Tensor]:

@@ -64,6 +64,7 @@ class MeritFunction:
                 "variable 'sensor_distance': solve 'best_focus' goes with the merit's spots or "
                 "wavefronts; vary sensor_distance instead"
             )
+        self.crossings: dict[tuple[float, float], Tensor] = {}
         self._last: tuple[Tensor, MeritValue] | None = None
 
     def __call__(self) -> "MeritValue":
@@ -203,7 +204,9 @@ def _operands(
     lens, parameters = merit.lens, merit.variables()
     if sensor_distance is not None:
         parameters["sensor_distance"] = sensor_distance
-    view = View(lens.system(parameters), lens.primary_wavelength, lens.object_distance)
+    view = View(
+        lens.system(parameters), lens.primary_wavelength, lens.object_distance, merit.crossings
+    )
     try:
         return [
             (operand, label, value)

@@ -37,11 +37,14 @@ class View:
         system: with a graph to the variables.
         wavelength: nm, the reference wavelength.
         object_distance: mm in front of the first vertex; None for an object at infinity.
+        crossings: where the chief rays of the last view crossed the front; this one leaves its own
+            there for the next.
     """
 
     system: OpticalSystem
     wavelength: float
     object_distance: float | None
+    crossings: dict[tuple[float, float], Tensor] = dataclass_field(default_factory=dict)
     _chief_rays: dict[tuple[float, float], Components] = dataclass_field(default_factory=dict)
 
     @cached_property
@@ -66,9 +69,11 @@ class View:
         if self.object_distance is None:
             angles = torch.deg2rad(angles)
         pupil = torch.zeros(2, **options)
-        aimed = aim(system, angles, pupil, self.wavelength, self.object_distance)
+        guess = self.crossings.get(field)
+        aimed = aim(system, angles, pupil, self.wavelength, self.object_distance, guess)
         if not bool(aimed.converged):
             raise UnreachableField(field)
+        self.crossings[field] = aimed.crossing
         ray, _ = enter_lens(system, aimed, 1, 1.0)
         traced = trace_surfaces(system, ray, self.wavelength, 1.0)
         return trace_to_plane(system, traced, system.vertices[-1], self.wavelength, 1.0).ray

@@ -366,3 +366,36 @@ def test_rays_are_aimed_at_the_stop_where_its_element_has_put_it(root):
             start.append(float(lens.aim([2.0, 7.0], pupil).position[0, 1]))
             shift -= h
     assert float(gradient) == pytest.approx((start[1] - start[0]) / 2e-4, rel=1e-6)
+
+
+def test_a_guess_saves_the_search_and_changes_nothing(root):
+    """From the solution of a lens that is nearly this one; a useless guess is not followed."""
+    lens = load_lens(root / "conf/lens/double_gauss.yaml", dtype=torch.float64)
+    field = torch.deg2rad(torch.tensor([[0.0, 22.0], [5.0, -15.0]], dtype=torch.float64))
+    pupil = torch.tensor([[0.0, 0.0], [0.3, -0.6]], dtype=torch.float64)
+    before = aim(lens.system(), field, pupil, 587.5618)
+    with torch.no_grad():
+        lens.surfaces["2"].curvature += 1e-4
+    names = ["surfaces.2.curvature", "thicknesses.5"]
+
+    def aimed(guess):
+        leaves = {n: p.detach().clone().requires_grad_() for n, p in lens.variables(names).items()}
+        found = aim(lens.system(leaves), field, pupil, 587.5618, guess=guess)
+        assert bool(found.converged.all())
+        rows = [
+            torch.cat(
+                [
+                    g.reshape(-1)
+                    for g in torch.autograd.grad(x, list(leaves.values()), retain_graph=True)
+                ]
+            )
+            for x in found.position[..., :2].reshape(-1)
+        ]
+        return found.position.detach(), torch.stack(rows)
+
+    position, slopes = aimed(None)
+    far = torch.full((2, 2), 11.0, dtype=torch.float64)
+    for guess in (before.crossing, far):
+        again, same = aimed(guess)
+        assert torch.allclose(again, position, rtol=0.0, atol=1e-12)
+        assert torch.allclose(same, slopes, rtol=1e-6, atol=1e-9 * float(slopes.abs().max()))
