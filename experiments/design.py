@@ -201,6 +201,8 @@ class DesignModule(lightning.LightningModule):
         else:
             progress = gradient_iteration(bare, optimizer.step, self.merit, self.variables)
         self._stopped = progress.stopped
+        if progress.value.operands:
+            progress.value.operand_derivatives()  # the next Jacobian's, and logged
         done = time.perf_counter()
         self._record(progress, done - started)
         # What lies between two iterations is the training loop's, and the loggers'.

@@ -15,13 +15,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.beam_edges import Beams
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-
-# Stop coordinates are searched for the edge of the light on so many radii, twice.
-_RADII = 48
-# Points along each side of the stop in the search for where light passes at all.
-_SIDE = 32
 
 
 @dataclass(frozen=True)
@@ -144,76 +140,37 @@ def gaussian_quadrature(
     shares = torch.from_numpy(0.5 * shares)
     symmetric = symmetry and is_rotationally_symmetric(lens)
 
-    def launch(field: tuple[float, float]) -> Launched:
-        x, y = field
-        if symmetric and x == 0.0 and y == 0.0:
-            azimuths = torch.tensor([0.25 * math.pi], dtype=torch.float64)
-        elif symmetric and x == 0.0:
-            half = arms // 2
-            azimuths = (torch.arange(half).double() + 0.5) * (math.pi / half) - 0.5 * math.pi
-        else:
-            azimuths = (torch.arange(arms).double() + 0.5) * (2.0 * math.pi / arms)
-        light = _Light(lens, field, object_distance)
-        centre = light.centre(symmetric and x == 0.0)
-        arm = torch.stack((azimuths.cos(), azimuths.sin()), -1)
-        reach = light.reach(centre, arm)
-        points = centre + (radii[:, None] * reach)[..., None] * arm
-        weight = shares[:, None] * reach.square()
-        aimed = light.aim(points.reshape(-1, 2))
-        return Launched(aimed.position, aimed.direction, weight.reshape(-1), len(azimuths))
+    distinct = list(dict.fromkeys(map(tuple, fields)))
+    points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)
+    azimuths = [_azimuths(field, arms, symmetric) for field in distinct]
+    most = max(map(len, azimuths), default=0)
+    # Fields with fewer arms repeat theirs, to be traced with the others.
+    angles = torch.stack([angle.repeat(-(-most // len(angle)))[:most] for angle in azimuths])
+    arm = torch.stack((angles.cos(), angles.sin()), -1)
+    beams = Beams(lens, points, object_distance)
+    centres = beams.centres((points[:, 0] == 0.0) & symmetric)
+    reach = beams.reach(centres, arm)
+    along = (radii[:, None] * reach[:, None])[..., None] * arm[:, None]
+    aimed = beams.aim((centres[:, None, None] + along).flatten(1, 2))
+    launched = {}
+    for at, (field, angle) in enumerate(zip(distinct, azimuths, strict=True)):
+        own = torch.arange(rings * most).reshape(rings, most)[:, : len(angle)].flatten()
+        weight = shares[:, None] * reach[at, : len(angle)].square()
+        launched[field] = Launched(
+            aimed.position[at, own], aimed.direction[at, own], weight.reshape(-1), len(angle)
+        )
+    return _passing(lens, fields, wavelengths, launched.__getitem__, symmetric)
 
-    return _passing(lens, fields, wavelengths, launch, symmetric)
 
-
-class _Light:
-    """Where on the stop the light of one field passes."""
-
-    def __init__(self, lens: Lens, field: Sequence[float], object_distance: float | None) -> None:
-        self.lens, self.field, self.object_distance = lens, field, object_distance
-        self.wavelength = lens.primary_wavelength
-
-    def aim(self, pupil: Tensor) -> Rays:
-        return self.lens.aim(self.field, pupil, self.wavelength, self.object_distance)
-
-    def passes(self, pupil: Tensor) -> Tensor:
-        """(...), bool, of stop coordinates (..., 2) over its semi-diameter."""
-        return self.lens.trace(self.aim(pupil)).valid.cpu()
-
-    def centre(self, symmetric: bool) -> Tensor:
-        """(2,): the middle of the light, from where every arm can be followed to its edge."""
-        axis = (torch.arange(_SIDE).double() + 0.5) * (2.0 / _SIDE) - 1.0
-        points = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
-        points = points[points.norm(dim=-1) < 1.0]
-        passing = self.passes(points)
-        if not bool(passing.any()):
-            raise InputError(f"no light of field {tuple(self.field)} passes the lens")
-        if bool(passing.all()):
-            return torch.zeros(2, dtype=torch.float64)
-        centre = points[passing].mean(0)
-        return centre * torch.tensor([0.0, 1.0]).double() if symmetric else centre
-
-    def reach(self, centre: Tensor, arm: Tensor) -> Tensor:
-        """(A,): how far along each arm (A, 2) from the centre light passes, in semi-diameters."""
-        # |c + ρa| = 1: the stop's own edge.
-        along = (arm * centre).sum(-1)
-        far = -along + (along.square() + 1.0 - centre.square().sum()).sqrt()
-        low, high = torch.zeros_like(far), far
-        steps = (torch.arange(_RADII).double() + 1.0) / _RADII
-        for turn in range(2):
-            radii = low + steps[:, None] * (high - low)
-            # The last of the first turn lies on the stop's edge, where a ray is outside.
-            tried = radii * (1.0 - 1e-9)
-            passing = self.passes(centre + tried[..., None] * arm)
-            # Number of radii that pass before the first that does not.
-            good = passing.long().cumprod(0).sum(0)
-            edges = torch.cat([low[None], radii])
-            low, high = (
-                edges.gather(0, good[None])[0],
-                edges.gather(0, (good + 1).clamp(max=_RADII)[None])[0],
-            )
-            if turn == 0 and bool((good == _RADII).all()):
-                break
-        return low
+def _azimuths(field: tuple[float, float], arms: int, symmetric: bool) -> Tensor:
+    """Of the arms that stand for the whole pupil, radians."""
+    x, y = field
+    if symmetric and x == 0.0 and y == 0.0:
+        return torch.tensor([0.25 * math.pi], dtype=torch.float64)
+    if symmetric and x == 0.0:
+        half = arms // 2
+        return (torch.arange(half).double() + 0.5) * (math.pi / half) - 0.5 * math.pi
+    return (torch.arange(arms).double() + 0.5) * (2.0 * math.pi / arms)
 
 
 def is_rotationally_symmetric(lens: Lens) -> bool:

@@ -88,6 +88,7 @@ class MeritValue:
     def __init__(self, merit: MeritFunction) -> None:
         self._merit = merit
         self._derivatives: Tensor | None = None
+        self._rows: tuple[list[tuple[Operand, str, Tensor]], Tensor] | None = None
         with torch.no_grad():
             merit.variables.write_to(merit.lens)
             self.quality: QualityValues | None = None
@@ -179,20 +180,26 @@ class MeritValue:
         self, focus: Tensor | None
     ) -> tuple[list[tuple[Operand, str, Tensor]], Tensor]:
         """Operands, and the derivatives of their values; `focus` (P,) is that of a best focus."""
-        merit = self._merit
-        with torch.enable_grad():
-            sensor = merit.lens.sensor_distance.detach().clone().requires_grad_()
-            found = _operands(merit, sensor if focus is not None else None) or []
-            scaled = merit.variables.scaled
-            if not found:
-                self._derivatives = scaled.new_zeros(0, scaled.numel())
-                return found, self._derivatives
-            values = torch.stack([value.reshape(()) for _, _, value in found])
-            rows = jacobian_of(values, [scaled, sensor]).double().cpu()
+        if self._rows is None:
+            self._rows = self._differentiated()
+        found, rows = self._rows
         self._derivatives = rows[:, :-1]
         if focus is not None:
             self._derivatives = self._derivatives + torch.outer(rows[:, -1], focus)
         return found, self._derivatives
+
+    def _differentiated(self) -> tuple[list[tuple[Operand, str, Tensor]], Tensor]:
+        """Operands, and their derivatives by the variables and, last, by the sensor's distance."""
+        merit = self._merit
+        scaled = merit.variables.scaled
+        with torch.enable_grad():
+            sensor = merit.lens.sensor_distance.detach().clone().requires_grad_()
+            found = _operands(merit, sensor if merit.variables.best_focus else None) or []
+            if not found:
+                return found, scaled.new_zeros(0, scaled.numel() + 1).double().cpu()
+            values = torch.stack([value.reshape(()) for _, _, value in found])
+            rows = jacobian_of(values, [scaled, sensor]).double().cpu()
+        return [(operand, label, value.detach()) for operand, label, value in found], rows
 
 
 def _operands(
