@@ -128,7 +128,7 @@ class TolerancesModule(lightning.LightningModule):
         numbers["tolerance/linear/expected_rms_um"] = 1e3 * found.contributions.expected_rms
         numbers["tolerance/failed_lenses"] = float((found.perturbed.failed > 0.0).double().mean())
         numbers["tolerance/vignetted_share"] = float(found.perturbed.vignetted.mean())
-        numbers["tolerance/lenses_per_s"] = self.lenses / found.seconds
+        numbers["cost/lenses_per_s"] = self.lenses / found.seconds
         for stage in ("", "_before_refocus"):
             traced = numbers[f"tolerance{stage.replace('_', '/', 1)}/rms_um/p90"]
             linear = numbers[f"tolerance/linear{stage}/rms_um/p90"]
@@ -191,7 +191,7 @@ class TolerancesModule(lightning.LightningModule):
         ]
         return (
             f"RMS radius, µm, of {self.lenses} lenses: {'; '.join(parts)} "
-            f"({n['tolerance/lenses_per_s']:.0f} lenses/s)"
+            f"({n['cost/lenses_per_s']:.0f} lenses/s)"
         )
 
     def _weights(self, weights: Sequence[float] | None) -> Tensor:
