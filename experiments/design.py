@@ -210,13 +210,6 @@ class DesignModule(lightning.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Look at the lens with the rays that pass it now, and decide whether to go on."""
-        if self._stopped:
-            logger.info(
-                "Round %d: %s after %d iterations in all",
-                self.current_epoch,
-                self._stopped,
-                len(self.history),
-            )
         before = float(self.best_merit)
         self.merit().write_to(self.lens)
         try:
@@ -230,6 +223,13 @@ class DesignModule(lightning.LightningModule):
             logger.warning("Round %d ends with a lens that fails: %s", self.current_epoch, problem)
             reached = math.inf
         self.log("val/merit", reached)
+        logger.info(
+            "Round %d, %d iterations in all: %s; merit over the rays that pass now %.6g",
+            self.current_epoch,
+            len(self.history),
+            self._stopped or "no end within the round",
+            reached,
+        )
         with torch.no_grad():
             self.round_start.copy_(self.variables.scaled)
             self.round_start_focus.copy_(self.lens.sensor_distance)
