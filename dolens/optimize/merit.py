@@ -101,7 +101,11 @@ class MeritValue:
                     self.quality = merit.quality.refocused(self.quality, self._slopes, shift)
                     merit.lens.sensor_distance += shift
             self.sensor_distance = float(merit.lens.sensor_distance)
-            found = _operands(merit)
+        # With their graph at once: nearly every point that is tried is where the next step begins.
+        self._sensor = merit.lens.sensor_distance.detach().clone().requires_grad_()
+        with torch.enable_grad():
+            found = _operands(merit, self._sensor if merit.variables.best_focus else None)
+        self._found = found
         self.operands: list[OperandValue] | None = None
         if found is not None:
             self.operands = [
@@ -190,15 +194,12 @@ class MeritValue:
 
     def _differentiated(self) -> tuple[list[tuple[Operand, str, Tensor]], Tensor]:
         """Operands, and their derivatives by the variables and, last, by the sensor's distance."""
-        merit = self._merit
-        scaled = merit.variables.scaled
+        scaled, found = self._merit.variables.scaled, self._found or []
+        if not found:
+            return found, scaled.new_zeros(0, scaled.numel() + 1).double().cpu()
         with torch.enable_grad():
-            sensor = merit.lens.sensor_distance.detach().clone().requires_grad_()
-            found = _operands(merit, sensor if merit.variables.best_focus else None) or []
-            if not found:
-                return found, scaled.new_zeros(0, scaled.numel() + 1).double().cpu()
             values = torch.stack([value.reshape(()) for _, _, value in found])
-            rows = jacobian_of(values, [scaled, sensor]).double().cpu()
+            rows = jacobian_of(values, [scaled, self._sensor]).double().cpu()
         return [(operand, label, value.detach()) for operand, label, value in found], rows
 
 

@@ -52,6 +52,12 @@ class View:
         """Computed once for all operands."""
         return first_order(self.system, self.wavelength, self.object_distance)
 
+    @cached_property
+    def rim_sags(self) -> list[Tensor]:
+        """Sag (mm) of every surface at the edge of its own aperture."""
+        like = self.system.vertices[-1]
+        return [surface.rim_sag(like) for surface in self.system.surfaces]
+
     def chief_ray(self, field: tuple[float, float]) -> Components:
         """The real chief ray of a field on the sensor plane, aimed once for all operands.
 
@@ -210,9 +216,7 @@ def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
         found = {}
         for gap in _gaps(operand, view, glass):
             at_centre = view.system.thicknesses[gap - 1]
-            front, back = (
-                view.system.surfaces[number].rim_sag(at_centre) for number in (gap - 1, gap)
-            )
+            front, back = view.rim_sags[gap - 1], view.rim_sags[gap]
             found[f"{operand.kind}/{gap}"] = at_centre + back - front
         return found
 
