@@ -42,7 +42,7 @@ def test_the_nikon_lens(composed, tmp_path):
     """Table II with its own variables: 28.06 µm to 0.18 µm, with the focal length and the edges
     held, and no more light lost than is allowed.
     """
-    rms = run(composed("experiment=nikon", *QUIET))
+    rms = run(composed("experiment=nikon", "trainer.max_epochs=2", *QUIET))
     metrics = metrics_of(tmp_path / "run")
     assert metrics["rms_spot_um/initial"] == pytest.approx(28.06, abs=0.01)
     assert metrics["rms_spot_um/published"] == pytest.approx(0.777, abs=0.001)
