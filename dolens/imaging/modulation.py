@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.spots import spectral_shares, working_f_numbers
-from dolens.imaging.stop_rays import even_points, field_unit, in_double_precision, land
+from dolens.imaging.stop_rays import even_points, in_double_precision, land
 from dolens.optics.aiming import field_tangents
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
@@ -139,12 +139,11 @@ def modulation(
     # The rim weighs nothing.
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
     landings = land(lens, fields, wavelengths, pupil, object_distance)
-    waves = torch.as_tensor(wavelengths, dtype=torch.float64).cpu()
+    field, waves = landings.fields, landings.wavelengths
     spectrum = spectral_shares(wavelength_weights, len(waves))
     light = (weight * landings.valid * spectrum[:, None]).flatten(1, 2)
     points = landings.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
-    field = torch.as_tensor(fields, dtype=torch.float64).cpu()
     along = _radial(field, object_distance)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
     curves = []
@@ -161,7 +160,7 @@ def modulation(
     limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
     return Modulation(
         field,
-        field_unit(object_distance),
+        landings.field_unit,
         waves,
         frequency,
         tangential,

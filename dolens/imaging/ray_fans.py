@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.stop_rays import field_unit, land
+from dolens.imaging.stop_rays import land
 from dolens.optics.lens import Lens
 
 # A ray that crosses the very rim is outside the stop's aperture.
@@ -68,9 +68,9 @@ def ray_fans(
     landings = land(lens, fields, wavelengths, pupil, object_distance, exact=True)
     deviation = 1e3 * (landings.points - landings.chief[:, None, None])
     return RayFans(
-        fields=torch.as_tensor(fields, dtype=torch.float64).cpu(),
-        field_unit=field_unit(object_distance),
-        wavelengths=torch.as_tensor(wavelengths, dtype=torch.float64).cpu(),
+        fields=landings.fields,
+        field_unit=landings.field_unit,
+        wavelengths=landings.wavelengths,
         reference_wavelength=lens.primary_wavelength,
         coordinate=coordinate,
         tangential_um=deviation[..., :count, 1],

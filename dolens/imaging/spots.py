@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.stop_rays import even_points, field_unit, in_double_precision, land
+from dolens.imaging.stop_rays import even_points, in_double_precision, land
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 
@@ -103,10 +103,10 @@ def spot_diagram(
     extent = (points - centroid[:, :, None]).norm(dim=-1).nan_to_num(-math.inf).amax(-1)
     every = (light * spectrum[:, None]).flatten(1, 2)
     common, common_square = moments(points.flatten(1, 2), every)
-    waves = torch.as_tensor(wavelengths, dtype=torch.float64).cpu()
+    waves = landings.wavelengths
     return SpotDiagram(
-        fields=torch.as_tensor(fields, dtype=torch.float64).cpu(),
-        field_unit=field_unit(object_distance),
+        fields=landings.fields,
+        field_unit=landings.field_unit,
         wavelengths=waves,
         reference_wavelength=lens.primary_wavelength,
         landing=points,

@@ -34,12 +34,18 @@ class Landings:
     """Rays of F fields and W wavelengths through N points of the stop, on the sensor.
 
     Attributes:
+        fields: (F, 2), degrees or mm, double precision, on the CPU like all of these.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
         points: (F, W, N, 2), mm, double precision; NaN where a ray does not pass.
         valid: (F, W, N), bool.
         chief: (F, 2), mm, where the chief rays of the reference wavelength land, whether apertures
             clip them or not; NaN where one does not reach the sensor.
     """
 
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
     points: Tensor
     valid: Tensor
     chief: Tensor
@@ -133,6 +139,9 @@ def land(
     reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
     reached = reached & aimed.converged[:, at, 0]
     return Landings(
+        field.cpu(),
+        field_unit(object_distance),
+        waves[:count].cpu(),
         hit.position[..., :2].where(valid[..., None], math.nan).cpu(),
         valid.cpu(),
         chief.position[..., :2].where(reached[..., None], math.nan).cpu(),

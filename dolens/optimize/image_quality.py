@@ -227,11 +227,16 @@ class ImageQuality(ABC):
         return field.to(spots.spot.device)[spots.spot]
 
     @cached_property
+    def group_weights(self) -> Tensor:
+        """(S,): W of every group, of which there are S at most; they sum to one."""
+        weight = self.ray_weights
+        return weight.new_zeros(self.spots.count).index_add(0, self.group, weight)
+
+    @cached_property
     def group_shares(self) -> Tensor:
         """(N,): w of every ray in its group; they sum to one over each."""
-        weight, group = self.ray_weights, self.group
-        total = weight.new_zeros(self.spots.count).index_add(0, group, weight)
-        return weight / total.clamp(min=torch.finfo(weight.dtype).tiny)[group]
+        weight, total = self.ray_weights, self.group_weights
+        return weight / total.clamp(min=torch.finfo(weight.dtype).tiny)[self.group]
 
     def _referenced(self, points: Tensor) -> Tensor:
         """Points (..., 2, N) on the sensor, or derivatives of points, from their references."""

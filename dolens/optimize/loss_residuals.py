@@ -24,10 +24,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
-from dolens.optics.rays import TracedRays
-from dolens.optimize.image_quality import ImageQuality
+from dolens.optimize.landing_points import LandingPoints
 from dolens.optimize.linear_model import LinearModel
 
 CURVATURES = ("directions", "step")
@@ -59,7 +57,7 @@ class LandingPointLoss(Protocol):
 
 
 @dataclass(frozen=True)
-class LossResiduals(ImageQuality):
+class LossResiduals(LandingPoints):
     """A loss of the landing points as the rays' residuals.
 
     Args:
@@ -82,19 +80,6 @@ class LossResiduals(ImageQuality):
             raise InputError(
                 f"curvature must be one of {', '.join(CURVATURES)}, not '{self.curvature}'"
             )
-
-    def _traced(self, lens: Lens, hit: TracedRays) -> tuple[Tensor, Tensor]:
-        direction = hit.direction.double()
-        points = self._referenced(hit.position[:, :2].double().T)
-        return points, (direction[:, :2] / direction[:, 2:]).T
-
-    def _slopes(self, growth: Tensor) -> Tensor:
-        return self._referenced(growth)
-
-    def _rows(self, lens: Lens, names: Sequence[str]) -> Tensor:
-        found = ray_jacobian(lens, self.spots.rays, names)
-        rows = torch.cat([found.values.T[None], found.derivatives.permute(2, 1, 0)])
-        return self._referenced(rows.double())
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
@@ -149,6 +134,5 @@ class LossResiduals(ImageQuality):
         return gradient.detach(), product
 
     def _loss(self, deviations: Tensor) -> Tensor:
-        weight, group = self.group_shares, self.group
-        total = weight.new_zeros(self.spots.count).index_add(0, group, self.ray_weights)
-        return self.landing_loss(deviations, Spots(weight, group, total))
+        spots = Spots(self.group_shares, self.group, self.group_weights)
+        return self.landing_loss(deviations, spots)

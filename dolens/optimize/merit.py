@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -87,8 +88,7 @@ class MeritValue:
 
     def __init__(self, merit: MeritFunction) -> None:
         self._merit = merit
-        self._derivatives: Tensor | None = None
-        self._rows: tuple[list[tuple[Operand, str, Tensor]], Tensor] | None = None
+        self._focus: Tensor | None = None
         with torch.no_grad():
             merit.variables.write_to(merit.lens)
             self.quality: QualityValues | None = None
@@ -104,13 +104,12 @@ class MeritValue:
         # With their graph at once: nearly every point that is tried is where the next step begins.
         self._sensor = merit.lens.sensor_distance.detach().clone().requires_grad_()
         with torch.enable_grad():
-            found = _operands(merit, self._sensor if merit.variables.best_focus else None)
-        self._found = found
+            self._found = _operands(merit, self._sensor if merit.variables.best_focus else None)
         self.operands: list[OperandValue] | None = None
-        if found is not None:
+        if self._found is not None:
             self.operands = [
                 OperandValue(label, value.item(), operand.deviation(value).item(), operand.weight)
-                for operand, label, value in found
+                for operand, label, value in self._found
             ]
 
     @torch.no_grad()
@@ -150,57 +149,42 @@ class MeritValue:
 
     def linear_model(self) -> LinearModel:
         """R and b in the variables u."""
-        merit, models, focus = self._merit, [], None
+        merit, models = self._merit, []
         if merit.quality is not None:
             names, matrix = merit.variables.derivatives()
             model, of_lens = merit.quality.linear_model(merit.opened, names, self._slopes)
             models.append(model.of_variables(matrix))
-            focus = None if of_lens is None else of_lens @ matrix
-        if merit.operands:
-            values, jacobian = self._operand_rows(focus)
-            operands = [operand for operand, _, _ in values]
-            deviations = torch.stack(
-                [operand.deviation(value).reshape(()) for operand, _, value in values]
-            ).detach()
-            weight = torch.tensor([operand.weight for operand in operands], dtype=torch.float64)
+            self._focus = None if of_lens is None else of_lens @ matrix
+        if self.operands:
+            jacobian = self.operand_derivatives()
+            deviations, weight = torch.tensor(
+                [(item.deviation, item.weight) for item in self.operands], dtype=torch.float64
+            ).unbind(1)
             # A limit that is kept has no slope.
-            targets = torch.tensor([operand.target is not None for operand in operands])
+            targets = torch.tensor([operand.target is not None for operand, _, _ in self._found])
             matters = weight * ((deviations != 0.0) | targets)
-            models.append(
-                LinearModel.of_rows(weight * deviations, matters[:, None] * jacobian.double())
-            )
+            models.append(LinearModel.of_rows(weight * deviations, matters[:, None] * jacobian))
         return LinearModel.join(models)
 
     def operand_derivatives(self) -> Tensor:
         """(n, P): of every operand's value by the variables u, in the order of `operands`.
 
-        Known once the linear model is; before that, the focus counts as fixed.
+        Once the linear model is known the sensor moves with a best focus; before, it stands still.
         """
-        if self._derivatives is None:
-            self._operand_rows(None)
-        return self._derivatives
+        rows = self._operand_rows
+        if self._focus is None:
+            return rows[:, :-1]
+        return rows[:, :-1] + torch.outer(rows[:, -1], self._focus)
 
-    def _operand_rows(
-        self, focus: Tensor | None
-    ) -> tuple[list[tuple[Operand, str, Tensor]], Tensor]:
-        """Operands, and the derivatives of their values; `focus` (P,) is that of a best focus."""
-        if self._rows is None:
-            self._rows = self._differentiated()
-        found, rows = self._rows
-        self._derivatives = rows[:, :-1]
-        if focus is not None:
-            self._derivatives = self._derivatives + torch.outer(rows[:, -1], focus)
-        return found, self._derivatives
-
-    def _differentiated(self) -> tuple[list[tuple[Operand, str, Tensor]], Tensor]:
-        """Operands, and their derivatives by the variables and, last, by the sensor's distance."""
-        scaled, found = self._merit.variables.scaled, self._found or []
-        if not found:
-            return found, scaled.new_zeros(0, scaled.numel() + 1).double().cpu()
+    @cached_property
+    def _operand_rows(self) -> Tensor:
+        """(n, P + 1): of every operand by the variables and, last, by the sensor's distance."""
+        scaled = self._merit.variables.scaled
+        if not self._found:
+            return scaled.new_zeros(0, scaled.numel() + 1).double().cpu()
         with torch.enable_grad():
-            values = torch.stack([value.reshape(()) for _, _, value in found])
-            rows = jacobian_of(values, [scaled, self._sensor]).double().cpu()
-        return [(operand, label, value.detach()) for operand, label, value in found], rows
+            values = torch.stack([value.reshape(()) for _, _, value in self._found])
+            return jacobian_of(values, [scaled, self._sensor]).double().cpu()
 
 
 def _operands(

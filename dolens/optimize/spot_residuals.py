@@ -3,20 +3,18 @@
 from collections.abc import Sequence
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
-from dolens.optics.jacobian import normal_equations, ray_jacobian
+from dolens.optics.jacobian import normal_equations
 from dolens.optics.lens import Lens
-from dolens.optics.rays import TracedRays
-from dolens.optimize.image_quality import ImageQuality
+from dolens.optimize.landing_points import LandingPoints
 from dolens.optimize.linear_model import LinearModel
 
 # More derivatives than this are summed on the way and never stored (400 MB).
 MOST_STORED = 50_000_000
 
 
-class SpotResiduals(ImageQuality):
+class SpotResiduals(LandingPoints):
     """Residuals √(W_s·w_i)·(p_i - p̄_s) of every ray i of every spot s, in µm, x and y apart.
 
     Their sum of squares is Σ W_s·(RMS radius)².  p̄ is the spot's centroid, or where its chief ray
@@ -25,20 +23,6 @@ class SpotResiduals(ImageQuality):
 
     scale: ClassVar[float] = 1e3
     unit: ClassVar[str] = "um"
-
-    def _traced(self, lens: Lens, hit: TracedRays) -> tuple[Tensor, Tensor]:
-        direction = hit.direction.double()
-        points = self._referenced(hit.position[:, :2].double().T)
-        return points, (direction[:, :2] / direction[:, 2:]).T
-
-    def _slopes(self, growth: Tensor) -> Tensor:
-        return self._referenced(growth)
-
-    def _rows(self, lens: Lens, names: Sequence[str]) -> Tensor:
-        found = ray_jacobian(lens, self.spots.rays, names)
-        # (1 + P, 2, N): neighbouring numbers are those of neighbouring rays.
-        rows = torch.cat([found.values.T[None], found.derivatives.permute(2, 1, 0)])
-        return self._referenced(rows.double())
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
