@@ -1,14 +1,12 @@
 """Tables of a tolerance analysis, in the units of files: degrees, mm, per cent, and µm."""
 
-import csv
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 
 import torch
 
 from dolens.tolerancing import ToleranceAnalysis, Tolerances
+from experiments.tables import Row
 
-Row = Mapping[str, float | str]
 # Parameters that a log is worth.
 _MOST = 12
 
@@ -104,17 +102,6 @@ def offender_text(found: ToleranceAnalysis) -> str:
     ]
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     return "\n".join(_line(row, widths) for row in (heads, *rows))
-
-
-def write_csv(path: Path, rows: Iterator[Row]) -> None:
-    """Write rows of the same keys under a line of these; numbers have nine digits."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        first = next(rows)
-        writer = csv.DictWriter(file, list(first), lineterminator="\n")
-        writer.writeheader()
-        for row in (first, *rows):
-            writer.writerow({k: f"{v:.9g}" if isinstance(v, float) else v for k, v in row.items()})
 
 
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:

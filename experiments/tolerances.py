@@ -22,16 +22,18 @@ from dolens.tolerancing import (
     spot_weights,
     tolerances_from,
 )
+from experiments.tables import write_table
 from experiments.tolerance_tables import (
     monte_carlo_rows,
     offender_rows,
     offender_text,
     sensitivity_rows,
-    write_csv,
 )
 
 logger = logging.getLogger(__name__)
 
+# Of numbers in tables.
+_DIGITS = 9
 QUANTILES = (0.5, 0.8, 0.9, 0.95, 0.98)
 
 
@@ -105,9 +107,9 @@ class TolerancesModule(lightning.LightningModule):
             self.analysis = self._analyse()
         self.log_dict(self.summary(), batch_size=1)
         found = self.analysis
-        write_csv(self.folder / "sensitivities.csv", sensitivity_rows(found))
-        write_csv(self.folder / "worst_offenders.csv", offender_rows(found))
-        write_csv(self.folder / "monte_carlo.csv", monte_carlo_rows(found))
+        write_table(self.folder / "sensitivities.csv", sensitivity_rows(found), _DIGITS)
+        write_table(self.folder / "worst_offenders.csv", offender_rows(found), _DIGITS)
+        write_table(self.folder / "monte_carlo.csv", monte_carlo_rows(found), _DIGITS)
         logger.info("Worst offenders, each alone and refocused:\n%s", offender_text(found))
         logger.info("%s", self._verdict())
 

@@ -1,10 +1,7 @@
 """What a design leaves as tables and files besides its pictures."""
 
-import csv
 import logging
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import lightning
 
@@ -12,6 +9,7 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, prescription_of, save_lens
 from experiments.design import DesignModule
+from experiments.tables import write_table
 
 logger = logging.getLogger(__name__)
 
@@ -58,14 +56,3 @@ def _with_catalogue_lines(lens: Lens) -> Lens:
     )
     prescription = {**prescription_of(lens), "index_model": _ZEMAX_MODEL}
     return lens_from_prescription(prescription, lens.dtype, where="lens/final.zmx")
-
-
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows as CSV with all their keys for columns; nothing where there are no rows."""
-    if not rows:
-        return
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)

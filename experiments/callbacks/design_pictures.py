@@ -6,7 +6,6 @@ from pathlib import Path
 
 import lightning
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 
 from dolens.errors import InputError
@@ -17,7 +16,6 @@ from dolens.imaging.spots import spot_diagram, working_f_numbers
 from dolens.optics.lens import Lens
 from dolens.plotting import (
     before_after_figure,
-    figure_to_image,
     history_figure,
     modulation_figure,
     ray_fans_figure,
@@ -25,6 +23,7 @@ from dolens.plotting import (
     save_figure,
     spots_figure,
 )
+from experiments.callbacks.figures import log_figure
 from experiments.design import DesignModule
 
 logger = logging.getLogger(__name__)
@@ -59,10 +58,7 @@ class DesignPictures(lightning.Callback):
                 logger.warning("No figure '%s': %s", name, problem)
                 continue
             save_figure(figure, self.folder / f"{name}.png")
-            for entry in trainer.loggers:
-                if isinstance(entry, TensorBoardLogger):
-                    image = figure_to_image(figure)
-                    entry.experiment.add_image(name, image, global_step=trainer.global_step)
+            log_figure(trainer, name, figure)
 
 
 def design_drawings(

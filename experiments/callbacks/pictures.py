@@ -5,19 +5,18 @@ from pathlib import Path
 
 import lightning
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.plotting import (
     comparison_figure,
-    figure_to_image,
     layout_figure,
     psf_figure,
     save_figure,
 )
 from dolens.reconstruction import psnr_db
+from experiments.callbacks.figures import log_figure
 from experiments.camera import CameraModule
 
 
@@ -71,14 +70,14 @@ class CameraPictures(lightning.Callback):
         ):
             return
         for name, figure in camera_figures(pl_module, self._batches["val"], "val").items():
-            _log(trainer, name, figure)
+            log_figure(trainer, name, figure)
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the PNG files."""
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, figure in camera_figures(pl_module, self._batches["test"], "test").items():
             save_figure(figure, self.folder / f"{name}.png")
-            _log(trainer, f"test_{name}", figure)
+            log_figure(trainer, f"test_{name}", figure)
 
 
 @torch.no_grad()
@@ -108,10 +107,3 @@ def camera_figures(module: CameraModule, textures: Tensor, stage: str) -> dict[s
             title=module.lens.name,
         ),
     }
-
-
-def _log(trainer: lightning.Trainer, name: str, figure: Figure) -> None:
-    for logger in trainer.loggers:
-        if isinstance(logger, TensorBoardLogger):
-            image = figure_to_image(figure)
-            logger.experiment.add_image(name, image, global_step=trainer.global_step)

@@ -4,17 +4,17 @@ from pathlib import Path
 
 import lightning
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.plotting import figure_to_image, save_figure
+from dolens.plotting import save_figure
 from dolens.plotting.tolerances import (
     matrix_figure,
     offenders_figure,
     parameter_label,
     yield_figure,
 )
+from experiments.callbacks.figures import log_figure
 from experiments.tolerance_tables import per_unit
 from experiments.tolerances import TolerancesModule
 
@@ -36,9 +36,7 @@ class TolerancePictures(lightning.Callback):
         """Write the files, and log them to TensorBoard."""
         for name, figure in tolerance_figures(pl_module).items():
             save_figure(figure, self.folder / f"{name}.png")
-            for logger in trainer.loggers:
-                if isinstance(logger, TensorBoardLogger):
-                    logger.experiment.add_image(name, figure_to_image(figure), global_step=0)
+            log_figure(trainer, name, figure)
 
 
 def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:
