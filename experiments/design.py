@@ -6,7 +6,7 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import lightning
@@ -21,6 +21,7 @@ from dolens.optimize.merit import MeritValue
 from dolens.optimize.rims import fitted_semi_diameters
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
+from experiments.design_tables import iteration_row, spot_labels, spot_table
 from experiments.search import Progress, gradient_iteration, least_squares_iteration
 
 logger = logging.getLogger(__name__)
@@ -30,21 +31,6 @@ SEMI_DIAMETERS = ("fixed", "follow")
 _LOGGED_FIRST = 20
 # Rings of the quadrature that tells where the edges of the beams are.
 _EDGE_RINGS = 40
-
-
-@dataclass(frozen=True)
-class SpotTable:
-    """RMS spot radii of a lens.
-
-    Attributes:
-        radii: label of the spot, as `0,14/588nm`, → µm, about its reference.
-        mean: of all, with the merit's weights.
-        light: share of the beams that passes, mean of all; see `SpotRays.light`.
-    """
-
-    radii: dict[str, float]
-    mean: float
-    light: float
 
 
 class DesignModule(lightning.LightningModule):
@@ -168,9 +154,10 @@ class DesignModule(lightning.LightningModule):
             lens.sensor_distance.copy_(self.round_start_focus)
             self.variables.scaled.copy_(now)
         self.merit = self._build(lens)
-        quality = self.merit_settings.image_quality(self.initial)
+        fresh = math.isinf(float(self.best_merit))
+        quality = self.merit.quality if fresh else self.merit_settings.image_quality(self.initial)
         self.initial_light = None if quality is None else quality.spots.light
-        if math.isinf(float(self.best_merit)):
+        if fresh:
             self._keep_if_better(self.merit())
             if not math.isfinite(float(self.best_merit)):
                 raise InputError(
@@ -251,7 +238,10 @@ class DesignModule(lightning.LightningModule):
             self._fit_edges()
 
     def _build(self, lens: Lens) -> MeritFunction:
-        return self.merit_settings.build(self.initial if self.follow else lens, self.variables)
+        if not self.follow:
+            return self.merit_settings.build(lens, self.variables)
+        # The rays of the start serve every round.
+        return self.merit or self.merit_settings.build(self.initial, self.variables)
 
     def _fit_edges(self) -> None:
         settings = replace(
@@ -304,27 +294,7 @@ class DesignModule(lightning.LightningModule):
         return 0 if quality is None else quality.spots.launched
 
     def _record(self, progress: Progress, seconds: float) -> None:
-        value = progress.value
-        row = {
-            "train/merit": value.sum_of_squares(),
-            **{f"train/{name}": number for name, number in progress.numbers.items()},
-            "cost/iteration_s": seconds,
-            "cost/jacobian_s": progress.cost.jacobian_s,
-            "cost/iteration_rays": float(progress.cost.rays),
-            "cost/evaluations": float(progress.cost.evaluations),
-        }
-        if value.quality is not None:
-            row["train/quality"] = value.quality.merit
-            scale, unit = self.merit.quality.scale, self.merit.quality.unit
-            if unit:
-                for label, rms in zip(self._labels(), value.quality.rms.tolist(), strict=True):
-                    row[f"spot_{unit}/{label}"] = scale * rms
-        if value.operands:
-            slopes = value.operand_derivatives().norm(dim=1).tolist()
-            for item, slope in zip(value.operands, slopes, strict=True):
-                row[f"operand/{item.label}"] = item.value
-                row[f"operand_slope/{item.label}"] = slope
-                row[f"merit/{item.label}"] = (item.weight * item.deviation) ** 2
+        row = iteration_row(progress, self.merit, seconds)
         self.history.append(row)
         self.log("train/merit", row["train/merit"], prog_bar=True, logger=False)
         # Straight to the loggers: Lightning's own bookkeeping costs more than many an iteration.
@@ -333,62 +303,23 @@ class DesignModule(lightning.LightningModule):
             for entry in self.loggers:
                 entry.log_metrics(row, step=self.global_step)
 
-    def operand_table(self) -> list[dict[str, Any]]:
-        """A row for every operand at the end: value, deviation, and derivatives by the variables.
-
-        Derivatives are those of the value by each variable in its own unit.
-        """
-        if self.merit is None:
-            return []
-        value = self.merit()
-        if not value.operands:
-            return []
-        slopes = (value.operand_derivatives() / self.variables.scale.cpu()).tolist()
-        labels = self.variables.labels()
-        return [
-            {
-                "operand": item.label,
-                "value": item.value,
-                "deviation": item.deviation,
-                "weight": item.weight,
-                **dict(zip(labels, row, strict=True)),
-            }
-            for item, row in zip(value.operands, slopes, strict=True)
-        ]
-
-    def _labels(self) -> list[str]:
-        return spot_labels(self.merit.quality.spots)
-
     # ---------------------------------------------------------------- evaluation
-
-    def spot_table(self, lens: Lens, finer: bool = False) -> SpotTable:
-        """RMS spot radii of a lens, over the rays that pass it.
-
-        Args:
-            lens: initial, published or final.
-            finer: twice the rays in each direction, to see what the sampling costs.
-        """
-        settings = self.evaluation
-        if finer:
-            settings = replace(settings, sampling_options=_doubled(settings))
-        quality = settings.image_quality(lens)
-        rms = 1e3 * quality.values(lens).rms
-        mean = float((quality.weights.to(rms) * rms).sum())
-        radii = dict(zip(spot_labels(quality.spots), rms.tolist(), strict=True))
-        return SpotTable(radii, mean, float(quality.spots.light.mean()))
 
     def test_step(self, batch: Any, batch_idx: int) -> None:
         """RMS spot radii before and after, and of the published design."""
-        final = self.spot_table(self.lens)
-        tables = {"initial": self.spot_table(self.initial), "final": final}
+        final = spot_table(self.lens, self.evaluation)
+        tables = {"initial": spot_table(self.initial, self.evaluation), "final": final}
         if self.published is not None:
-            tables["published"] = self.spot_table(self.published)
+            tables["published"] = spot_table(self.published, self.evaluation)
         for name, table in tables.items():
             self.log(f"rms_spot_um/{name}", table.mean)
             self.log(f"light/{name}", table.light)
         for label, radius in final.radii.items():
             self.log(f"rms_spot_um/final/{label}", radius)
-        self.log("error/sampling_um", abs(self.spot_table(self.lens, finer=True).mean - final.mean))
+        self.log(
+            "error/sampling_um",
+            abs(spot_table(self.lens, self.evaluation, finer=True).mean - final.mean),
+        )
         logger.info(
             "RMS spot radius, mean of %d: %s µm",
             len(final.radii),
@@ -439,18 +370,3 @@ class DesignModule(lightning.LightningModule):
             "lens": self.lens.name,
             "variables": list(self.variables.names),
         }
-
-
-def spot_labels(spots: Any) -> list[str]:
-    """`x,y/588nm` of every spot."""
-    fields, waves = spots.fields.tolist(), spots.wavelengths.tolist()
-    return [f"{x:g},{y:g}/{w:.0f}nm" for (x, y), w in zip(fields, waves, strict=True)]
-
-
-def _doubled(settings: MeritSettings) -> dict[str, Any]:
-    """Sampling options with twice the rays along each direction."""
-    default = {"gaussian_quadrature": {"rings": 6, "arms": 12}, "square_grid": {"count": 31}}
-    given = {key: value for key, value in settings.sampling_options.items() if value is not None}
-    options = {**default[settings.sampling], **given}
-    counts = ("rings", "arms", "count")
-    return {key: 2 * value if key in counts else value for key, value in options.items()}

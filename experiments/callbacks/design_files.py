@@ -9,6 +9,7 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, prescription_of, save_lens
 from experiments.design import DesignModule
+from experiments.design_tables import operand_table
 from experiments.tables import write_table
 
 logger = logging.getLogger(__name__)
@@ -35,7 +36,8 @@ class DesignFiles(lightning.Callback):
         """Write them."""
         module: DesignModule = pl_module
         write_table(self.folder / "history.csv", module.history)
-        write_table(self.folder / "operands.csv", module.operand_table())
+        if module.merit is not None:
+            write_table(self.folder / "operands.csv", operand_table(module.merit))
         try:
             (self.folder / "lens").mkdir(parents=True, exist_ok=True)
             save_lens(_with_catalogue_lines(module.lens), self.folder / "lens" / "final.zmx")

@@ -25,6 +25,7 @@ from dolens.plotting import (
 )
 from experiments.callbacks.figures import log_figure
 from experiments.design import DesignModule
+from experiments.design_tables import spot_table
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +90,7 @@ def design_drawings(
             wave = torch.tensor([lens.primary_wavelength], dtype=torch.float64)
             number = float(working_f_numbers(lens, wave, distance)[0])
             most = 0.5 / (1e-6 * lens.primary_wavelength * number)
-            blur = 1e-3 * module.spot_table(lens).mean
+            blur = 1e-3 * spot_table(lens, module.evaluation).mean
             most = min(most, _BLURRED / max(blur, 1e-12))
         frequencies = torch.linspace(0.0, most, _FREQUENCIES, dtype=torch.float64)
         found = modulation(of, fields, waves, frequencies, object_distance=distance)
