@@ -1,5 +1,6 @@
 """Geometric point spread functions, differentiable in the lens."""
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -97,30 +98,34 @@ def splat(
     """Sum weighted quadratic B-splines, centred on points, onto a grid of pixels.
 
     Args:
-        rows: (N,), fractional pixels.
-        columns: (N,).
-        weight: (N,); zero leaves a point out, wherever it lies.
+        rows: (..., N), fractional pixels; leading dimensions have a grid each.
+        columns: (..., N).
+        weight: (..., N); zero leaves a point out, wherever it lies.
         size: pixels along each side of the grid.
         backend: `cpu` takes the fused kernel, whose result is always the same to the bit.  The
             others take PyTorch's operations; on a GPU these are so on request only, by
             `torch.use_deterministic_algorithms`.
 
     Returns:
-        (size, size).  Once continuously differentiable in rows and columns.  Points within a
+        (..., size, size).  Once continuously differentiable in rows and columns.  Points within a
         pixel and a half of the edge lose what falls outside.
     """
+    shape, points = rows.shape[:-1], rows.shape[-1]
+    count = math.prod(shape)
+    rows, columns, weight = (t.reshape(count, points) for t in (rows, columns, weight))
     if backend == "cpu":
-        return splatting.splat(rows, columns, weight, size)
+        return splatting.splat(rows, columns, weight, size).reshape(*shape, size, size)
     row_taps, row_weights = _spline_taps(rows)
     column_taps, column_weights = _spline_taps(columns)
-    flat = torch.zeros(size * size, dtype=weight.dtype, device=weight.device)
+    first = torch.arange(count, device=weight.device)[:, None] * (size * size)
+    flat = torch.zeros(count * size * size, dtype=weight.dtype, device=weight.device)
     for row, row_weight in zip(row_taps, row_weights, strict=True):
         for column, column_weight in zip(column_taps, column_weights, strict=True):
             inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
-            index = torch.where(inside, row * size + column, 0)
+            index = first + torch.where(inside, row * size + column, 0)
             amount = torch.where(inside, weight * row_weight * column_weight, 0.0)
-            flat = flat.index_add(0, index, amount)
-    return flat.reshape(size, size)
+            flat = flat.index_add(0, index.flatten(), amount.flatten())
+    return flat.reshape(*shape, size, size)
 
 
 def _spline_taps(position: Tensor) -> tuple[list[Tensor], list[Tensor]]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import trace_rays
 from dolens.optics.paraxial import exit_pupil
 from dolens.optics.rays import Components, Rays
@@ -18,11 +19,23 @@ _AZIMUTHS = 16
 _RADII = 64
 
 
+# A larger disc is sampled only for more light than this share of what a corner gets.
+_NEGLIGIBLE = 2e-3
+_LARGEST = 2.0
+
+
 class ExitPupil(NamedTuple):
-    """A disc that every axial pixel sees filled with light: z from the first vertex, radius, mm."""
+    """A disc through which light reaches the sensor: z from the first vertex and radii, mm.
+
+    Attributes:
+        z: of the paraxial exit pupil.
+        radius: of the disc that holds the light of every pixel.
+        axial_radius: of the disc that pixels on the axis see filled.
+    """
 
     z: float
     radius: float
+    axial_radius: float
 
 
 def aim(
@@ -44,6 +57,48 @@ def aim(
         dy * inverse,
         dz * inverse,
     )
+
+
+@torch.no_grad()
+def sampled_exit_pupil(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    sensor: Sensor,
+    backend: str = "reference",
+) -> ExitPupil:
+    """The disc to be sampled from all pixels of a sensor.
+
+    It is the axial pixels' own, unless the pupil's aberrations let light reach the corners from
+    outside of it: then a larger one, of which axial pixels use a part.
+
+    Args:
+        system: the lens.
+        wavelengths: nm.
+        sensor: whose corners are asked.
+        backend: what traces.
+
+    Raises:
+        InputError: no ray from the sensor's centre gets through.
+    """
+    axial = axial_exit_pupil(system, wavelengths, backend)
+    options = {"dtype": system.dtype, "device": system.device}
+    rows = torch.tensor([0.0, 0.0, 1.0, 1.0], **options) * (sensor.height - 1)
+    columns = torch.tensor([0.0, 1.0, 0.0, 1.0], **options) * (sensor.width - 1)
+    x, y = (p[:, None, None] for p in sensor.positions(rows, columns))
+    angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
+    share = (torch.arange(_RADII, **options)[:, None] + 0.5) * (_LARGEST / _RADII)
+    radii = share * axial.radius
+    ray = aim(
+        x, y, system.vertices[-1], radii * torch.cos(angle), radii * torch.sin(angle), axial.z
+    )
+    passes = _get_through(system, ray, wavelengths[len(wavelengths) // 2 :][:1], backend)
+    light = torch.where(passes, share, 0.0)
+    outside = torch.where(share > 1.0, light, 0.0)
+    lost = outside.sum((-2, -1)) / light.sum((-2, -1)).clamp(min=torch.finfo(light.dtype).tiny)
+    if float(lost.max()) <= _NEGLIGIBLE:
+        return axial
+    farthest = float(torch.where(passes, share, 0.0).max()) + 0.5 * _LARGEST / _RADII
+    return axial._replace(radius=farthest * axial.radius)
 
 
 @torch.no_grad()
@@ -79,14 +134,14 @@ def axial_exit_pupil(
         passes = _get_through(system, ray, wavelengths, backend)
         failing = torch.nonzero(~passes.all(dim=1)).flatten()
         if len(failing) == 0:
-            return ExitPupil(z, high)
+            return ExitPupil(z, high, high)
         first = int(failing[0])
         if first == 0:
             raise InputError(
                 "no light reaches the centre of the sensor: every axial ray is stopped"
             )
         low, high = float(radii[first - 1]), float(radii[first])
-    return ExitPupil(z, low)
+    return ExitPupil(z, low, low)
 
 
 def _get_through(
@@ -96,7 +151,7 @@ def _get_through(
     if backend == "reference":
         passes = [trace_surfaces(system, ray, w, sense=-1.0).valid for w in wavelengths]
         return torch.stack(passes).all(dim=0)
-    every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)[:, None, None]
-    rays = Rays.from_components(ray, every)
+    every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
+    rays = Rays.from_components(ray, every.reshape(-1, *(1,) * ray.x.ndim))
     hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
     return hit.valid.all(dim=0)

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.pupil import aim, axial_exit_pupil
+from dolens.imaging.pupil import aim, sampled_exit_pupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.replay import replay
 from dolens.imaging.sampling import square_to_disc, stratified_square
-from dolens.imaging.scene import PlanarScene, texture_coordinates
+from dolens.imaging.scene import PlanarScene, texture_coordinates, texture_origin
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.texture import bilinear
 from dolens.kernels import rendering
@@ -106,7 +106,7 @@ class RayRenderer:
         backend = choose_backend(system, lens.backend, others=[textures])
         now = lens.system({n: p.detach() for n, p in parameters.items()})
         scene.check(now)
-        view = self._view(now, scene, seed, backend)
+        view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, backend)
         if backend == "cpu":
             return self._fused(system, scene, textures, view)
         if backend == "cuda":
@@ -127,18 +127,30 @@ class RayRenderer:
             flat = torch.cat([piece(i, *tensors) for i in range(len(sizes))], dim=-1)
         return flat.unflatten(-1, (self.sensor.height, self.sensor.width))
 
-    def _view(self, system: OpticalSystem, scene: PlanarScene, seed: int, backend: str) -> View:
+    def _view(
+        self,
+        system: OpticalSystem,
+        scene: PlanarScene,
+        texture_size: tuple[int, int],
+        seed: int,
+        backend: str,
+    ) -> View:
         """What does not depend on the lens's gradient: pixels, samples, pupil and planes."""
-        pupil = axial_exit_pupil(system, scene.wavelengths, backend)
+        sensor = self.sensor
+        pupil = sampled_exit_pupil(system, scene.wavelengths, sensor, backend)
         return View(
-            self.sensor.height,
-            self.sensor.width,
-            self.sensor.pixel_pitch,
+            sensor.height,
+            sensor.width,
+            sensor.pixel_pitch,
             self.pupil_samples,
             self.pixel_area,
             seed,
+            0.5 * (sensor.height - 1) - sensor.centre_row,
+            0.5 * (sensor.width - 1) - sensor.centre_column,
+            *texture_origin(texture_size, scene.texture_centre),
             pupil.z,
             pupil.radius,
+            pupil.axial_radius,
             scene.depths,
             tuple(scene.magnifications(system)),
         )
@@ -215,7 +227,7 @@ class RayRenderer:
         backend: str,
     ) -> Tensor:
         """(B, depths, C, count): trace, meet each plane, look the texture up, sum the samples."""
-        size = (textures.shape[-2], textures.shape[-1])
+        origin, pitch = (view.texture_row, view.texture_column), view.pixel_pitch
         channels = []
         for channel, wavelength in enumerate(scene.wavelengths):
             there, valid = _trace(system, ray, wavelength, backend)
@@ -225,7 +237,7 @@ class RayRenderer:
                 t, _ = distance_to_plane(there, -depth, -1.0)
                 x = torch.addcmul(there.x, t, there.l)
                 y = torch.addcmul(there.y, t, there.m)
-                rows, columns = texture_coordinates(x, y, magnification, self.sensor, size)
+                rows, columns = texture_coordinates(x, y, magnification, pitch, origin)
                 radiance = bilinear(textures[:, channel], rows, columns)
                 by_depth.append((radiance * arriving).sum(dim=-1))
             channels.append(torch.stack(by_depth, dim=1))

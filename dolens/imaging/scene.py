@@ -26,14 +26,23 @@ class PlanarScene:
     Attributes:
         depths: mm in front of the first vertex.
         wavelengths: nm, one for each of the texture's channels.
+        texture_centre: rows below and columns right of the axis, in the pinhole's image, where the
+            texture's centre lies; (0, 0) but for windows of a larger sensor.
     """
 
     depths: tuple[float, ...]
     wavelengths: tuple[float, ...]
+    texture_centre: tuple[float, float]
 
-    def __init__(self, depths: Sequence[float], wavelengths: Sequence[float]) -> None:
+    def __init__(
+        self,
+        depths: Sequence[float],
+        wavelengths: Sequence[float],
+        texture_centre: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         object.__setattr__(self, "depths", tuple(float(d) for d in depths))
         object.__setattr__(self, "wavelengths", tuple(float(w) for w in wavelengths))
+        object.__setattr__(self, "texture_centre", tuple(float(c) for c in texture_centre))
         if not self.depths or not self.wavelengths:
             raise InputError("scene: depths (mm) and wavelengths (nm) must not be empty")
         for wavelength in self.wavelengths:
@@ -68,31 +77,49 @@ class PlanarScene:
         ]
 
 
+def texture_origin(size: tuple[int, int], centre: tuple[float, float]) -> tuple[float, float]:
+    """Row and column of the axis in a texture of `size` texels; see `PlanarScene`."""
+    (height, width), (row, column) = size, centre
+    return 0.5 * (height - 1) - row, 0.5 * (width - 1) - column
+
+
 def texture_coordinates(
-    x: Tensor, y: Tensor, magnification: float, sensor: Sensor, texture_size: tuple[int, int]
+    x: Tensor, y: Tensor, magnification: float, pitch: float, origin: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
     """Rows and columns of the texture at points (x, y) mm of the plane.
 
     The plane is seen from the lens: columns grow with x, rows grow against y.
+
+    Args:
+        x: mm.
+        y: mm.
+        magnification: |image height / object height| of the plane.
+        pitch: of the pixels, mm.
+        origin: row and column of the axis in the texture, as `texture_origin` has it.
     """
-    height, width = texture_size
-    scale = magnification / sensor.pixel_pitch
-    return 0.5 * (height - 1) - y * scale, 0.5 * (width - 1) + x * scale
+    scale = magnification / pitch
+    row, column = origin
+    return row - y * scale, column + x * scale
 
 
-def pinhole_image(textures: Tensor, sensor: Sensor) -> Tensor:
+def pinhole_image(
+    textures: Tensor, sensor: Sensor, texture_centre: tuple[float, float] = (0.0, 0.0)
+) -> Tensor:
     """What a distortion-free pinhole of the lens's magnification sees: the ground truth.
 
     Args:
         textures: (..., H, W), as `PlanarScene` maps them.
         sensor: its pixels; where H - height is odd, pixel centres fall between texels.
+        texture_centre: of `PlanarScene`.
 
     Returns:
         (..., height, width): the textures' values at the pixel centres.
     """
     height, width = textures.shape[-2:]
-    top, left = (height - sensor.height) / 2.0, (width - sensor.width) / 2.0
-    if top >= 0 and left >= 0 and top.is_integer() and left.is_integer():
+    top = (height - sensor.height) / 2.0 + (sensor.centre_row - texture_centre[0])
+    left = (width - sensor.width) / 2.0 + (sensor.centre_column - texture_centre[1])
+    inside = 0 <= top <= height - sensor.height and 0 <= left <= width - sensor.width
+    if inside and top.is_integer() and left.is_integer():
         top, left = int(top), int(left)
         return textures[..., top : top + sensor.height, left : left + sensor.width]
     options = {"dtype": textures.dtype, "device": textures.device}

@@ -28,27 +28,27 @@ def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
     """Sum weighted quadratic B-splines, centred on points, onto a grid of pixels.
 
     Args:
-        rows: (N,), fractional pixels.
-        columns: (N,).
-        weight: (N,).
+        rows: (G, N), fractional pixels, for each of G grids.
+        columns: (G, N).
+        weight: (G, N).
         size: pixels along each side.
 
     Returns:
-        (size, size), bitwise the same for the same points.
+        (G, size, size), bitwise the same for the same points.
     """
     points = (t.contiguous() for t in (rows, columns, weight))
     return _backend(rows).splat(*points, size)
 
 
 def _splat_shapes(rows, columns, weight, size):  # noqa: ANN001, ANN202
-    return rows.new_empty((size, size))
+    return rows.new_empty((rows.shape[0], size, size))
 
 
 @operator
 def splat_adjoint(
     rows: Tensor, columns: Tensor, weight: Tensor, of_grid: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cotangents of rows, columns and weight, (N,), from that of the grid."""
+    """Cotangents of rows, columns and weight, (G, N), from that of the grids."""
     tensors = (t.contiguous() for t in (rows, columns, weight, of_grid))
     return _backend(rows).splat_adjoint(*tensors)
 

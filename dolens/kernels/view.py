@@ -14,8 +14,13 @@ class View:
         pupil_samples: strata along each side of the pupil.
         pixel_area: whether samples fill the pixel's area, or start from its centre.
         seed: of the samples; its 64 lowest bits count.
+        middle_row: row of the image where the axis is; the middle one but for windows.
+        middle_column: its column.
+        texture_row: row of the texture where the axis is.
+        texture_column: its column.
         pupil_z: of the exit pupil's disc, mm from the first vertex.
-        pupil_radius: mm.
+        pupil_radius: of the disc that is sampled, mm.
+        axial_radius: of the disc that axial pixels see filled with light, mm.
         depths: of the planes, mm in front of the first vertex.
         magnifications: of the planes; a texel covers pixel_pitch / magnification.
     """
@@ -26,8 +31,13 @@ class View:
     pupil_samples: int
     pixel_area: bool
     seed: int
+    middle_row: float
+    middle_column: float
+    texture_row: float
+    texture_column: float
     pupil_z: float
     pupil_radius: float
+    axial_radius: float
     depths: tuple[float, ...]
     magnifications: tuple[float, ...]
 
@@ -37,8 +47,9 @@ class View:
         The mean of cos⁴ over a disc of radius a at distance L, seen from the axis, is L²/(L² + a²).
         """
         squared = (sensor_z - self.pupil_z) ** 2
-        axial = squared / (squared + self.pupil_radius**2)
-        return 1.0 / (axial * self.pupil_samples**2)
+        axial = squared / (squared + self.axial_radius**2)
+        larger = (self.pupil_radius / self.axial_radius) ** 2
+        return larger / (axial * self.pupil_samples**2)
 
     def integers(self) -> list[int]:
         """The integers, as an operator takes them; `from_lists` is the inverse."""
@@ -53,14 +64,24 @@ class View:
 
     def numbers(self) -> list[float]:
         """The lengths and magnifications, as an operator takes them."""
-        own = (self.pixel_pitch, self.pupil_z, self.pupil_radius)
+        own = (
+            self.pixel_pitch,
+            self.middle_row,
+            self.middle_column,
+            self.texture_row,
+            self.texture_column,
+            self.pupil_z,
+            self.pupil_radius,
+            self.axial_radius,
+        )
         return [*own, *self.depths, *self.magnifications]
 
     @staticmethod
     def from_lists(integers: list[int], numbers: list[float]) -> "View":
         """The view of `integers` and `numbers`."""
         height, width, pupil_samples, pixel_area, low, high = integers
-        pixel_pitch, pupil_z, pupil_radius, *planes = numbers
+        pixel_pitch, *places, pupil_z, pupil_radius, axial_radius = numbers[:8]
+        planes = numbers[8:]
         depths = len(planes) // 2
         return View(
             height,
@@ -69,8 +90,10 @@ class View:
             pupil_samples,
             bool(pixel_area),
             low + (high << 32),
+            *places,
             pupil_z,
             pupil_radius,
+            axial_radius,
             tuple(planes[:depths]),
             tuple(planes[depths:]),
         )

@@ -95,7 +95,7 @@ def test_wavelengths_part_at_the_first_surface_they_meet(last):
     if last == "total reflection":
         ended = []
         system, renderer = lens.system(), RayRenderer(Sensor(9, 20, 0.6), 5)
-        view = renderer._view(system, scene, 5, "reference")
+        view = renderer._view(system, scene, (40, 43), 5, "reference")
         ray, _ = renderer._samples(system, view, 0, 180)
         for wavelength in LINES:
             hit = lens.sensor_to_scene(Rays.from_components(ray, wavelength), first=3)
@@ -215,7 +215,7 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     # What a GPU does: the reference's samples and lookup about a fused trace.
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
-    view = renderer._view(system, scene, 0, "reference")
+    view = renderer._view(system, scene, (40, 43), 0, "reference")
     ray, weight = renderer._samples(system, view, 0, 180)
     images = [renderer._shade(system, scene, view, texture(40), ray, weight, backend)
               for backend in ("reference", "cpu")]  # fmt: skip

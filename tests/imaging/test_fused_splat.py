@@ -38,6 +38,24 @@ def test_sums_and_gradients_are_the_reference_s(count):
         assert torch.allclose(one, two, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("count", [0, 7, 9000])
+def test_many_grids_are_each_their_own(count):
+    size, grids = 11, 3
+    given = [torch.stack([t + 0.3 * g for g in range(grids)]) for t in points(count, size)]
+    for backend in ("reference", "cpu"):
+        together = splat(*given, size, backend)
+        apart = torch.stack([splat(*(t[g] for t in given), size, backend) for g in range(grids)])
+        assert torch.equal(together, apart)
+    inputs = [t.requires_grad_() for t in given]
+    weight = torch.arange(grids * size * size, dtype=torch.float64).reshape(grids, size, size)
+    gradients = [
+        torch.autograd.grad((splat(*inputs, size, backend) * weight).sum(), inputs)
+        for backend in ("reference", "cpu")
+    ]
+    for one, two in zip(*gradients, strict=True):
+        assert torch.allclose(one, two, rtol=1e-10, atol=1e-9)
+
+
 def test_single_precision_sums_err_by_its_rounding():
     given = points(50_000, 15)
     expected = splat(*given, 15)
@@ -88,6 +106,6 @@ def test_second_derivatives_are_an_error():
 
 
 def test_the_operator_is_what_pytorch_asks_of_one():
-    given = [t.requires_grad_() for t in points(20, 9)]
+    given = [t.reshape(2, 10).requires_grad_() for t in points(20, 9)]
     tests = ("test_schema", "test_faketensor", "test_autograd_registration")
     torch.library.opcheck(splatting.splat, (*given, 9), test_utils=tests)

@@ -137,14 +137,14 @@ class _RenderJob:
         self.lengths = np.zeros(Length.PLANES + 2 * len(view.depths), dtype=self.program.real)
         self.lengths[: Length.LAST_COLUMN + 1] = (
             view.pixel_pitch,
-            0.5 * (view.height - 1),
-            0.5 * (view.width - 1),
+            view.middle_row,
+            view.middle_column,
             view.pupil_z,
             view.pupil_radius,
             z,
             view.weight(z),
-            0.5 * (height - 1),
-            0.5 * (width - 1),
+            view.texture_row,
+            view.texture_column,
             height - 1,
             width - 1,
         )

@@ -24,9 +24,9 @@ class Place:
 class Length:
     """Places in the array of numbers at `Job.LENGTHS`."""
 
-    # Pixel pitch, mm; the sensor's central row and column; z and radius of the pupil; z of the
+    # Pixel pitch, mm; the axis's row and column in the image; z and radius of the pupil; z of the
     # sensor; the weight of a ray along the axis.
     PITCH, MIDDLE_ROW, MIDDLE_COLUMN, PUPIL_Z, RADIUS, SENSOR_Z, WEIGHT = range(7)
-    # The texture's central row and column and its last ones; what image cotangents are scaled by.
+    # The axis's row and column in the texture; its last ones; what image cotangents are scaled by.
     TEXTURE_ROW, TEXTURE_COLUMN, LAST_ROW, LAST_COLUMN, SCALE = range(7, 12)
     PLANES = 16  # then for every plane: its depth, mm, and texels a mm

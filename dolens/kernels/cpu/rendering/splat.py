@@ -1,7 +1,7 @@
 """Splatting points onto pixels as quadratic B-splines, and its adjoint; see `dolens.imaging.psf`.
 
-Chunks of points have a grid each, which are then added in their order: the result depends neither
-on the number of threads nor on their timing.
+Chunks of a grid's points have a grid each, which are then added in their order: the result depends
+neither on the number of threads nor on their timing.
 """
 
 import math
@@ -19,7 +19,8 @@ class SplatJob:
     """Places in the splat's array of integers: addresses of arrays, and counts."""
 
     ROWS, COLUMNS, WEIGHT, GRIDS, OF_ROWS, OF_COLUMNS, OF_WEIGHT = range(7)
-    POINTS, SIZE, CHUNK = range(7, 10)
+    # Points of a grid, pixels along its side, points of a chunk, chunks of a grid.
+    POINTS, SIZE, CHUNK, CHUNKS = range(7, 11)
     LENGTH = 64
 
 
@@ -46,7 +47,7 @@ def _taps(real: types.Type) -> tuple[Any, Any]:
 
 
 def splat_driver(real: types.Type) -> Callable[..., None]:
-    """Add the points of chunks `first` to `last` to the chunks' grids."""
+    """Add the points of chunks `first` to `last`, of all grids, to the chunks' grids."""
     at = real_at(real)
     centre, spline = _taps(real)
 
@@ -56,7 +57,9 @@ def splat_driver(real: types.Type) -> Callable[..., None]:
         weights, points, size = carray(at(job[2]), 1 << 40), job[7], job[8]
         for chunk in range(first, last):
             grid = carray(shifted(at(job[3]), chunk * size * size), 1 << 40)
-            for p in range(chunk * job[9], min((chunk + 1) * job[9], points)):
+            start = (chunk // job[10]) * points
+            place = chunk % job[10]
+            for p in range(start + place * job[9], start + min((place + 1) * job[9], points)):
                 row, down = centre(rows[p], size)
                 column, across = centre(columns[p], size)
                 if row < -1 or column < -1:
@@ -82,25 +85,28 @@ def splat_adjoint_driver(real: types.Type) -> Callable[..., None]:
         job = carray(job_, 64)
         rows, columns = carray(at(job[0]), 1 << 40), carray(at(job[1]), 1 << 40)
         weights, points, size = carray(at(job[2]), 1 << 40), job[7], job[8]
-        grid = carray(at(job[3]), 1 << 40)
         of_rows, of_columns = carray(at(job[4]), 1 << 40), carray(at(job[5]), 1 << 40)
         of_weights = carray(at(job[6]), 1 << 40)
-        for p in range(first * job[9], min(last * job[9], points)):
-            row, down = centre(rows[p], size)
-            column, across = centre(columns[p], size)
-            of_row, of_column, of_weight = zero, zero, zero
-            if row >= -1 and column >= -1:
-                a = spline(down)
-                b = spline(across)
-                for i in range(3):
-                    for j in range(3):
-                        r, c = row - 1 + i, column - 1 + j
-                        if r >= 0 and r < size and c >= 0 and c < size:
-                            cotangent = grid[r * size + c]
-                            of_weight += cotangent * (a[i] * b[j])
-                            of_row += cotangent * (a[3 + i] * b[j])
-                            of_column += cotangent * (a[i] * b[3 + j])
-            of_rows[p], of_columns[p] = weights[p] * of_row, weights[p] * of_column
-            of_weights[p] = of_weight
+        for chunk in range(first, last):
+            own = chunk // job[10]
+            grid = carray(shifted(at(job[3]), own * size * size), 1 << 40)
+            start, place = own * points, chunk % job[10]
+            for p in range(start + place * job[9], start + min((place + 1) * job[9], points)):
+                row, down = centre(rows[p], size)
+                column, across = centre(columns[p], size)
+                of_row, of_column, of_weight = zero, zero, zero
+                if row >= -1 and column >= -1:
+                    a = spline(down)
+                    b = spline(across)
+                    for i in range(3):
+                        for j in range(3):
+                            r, c = row - 1 + i, column - 1 + j
+                            if r >= 0 and r < size and c >= 0 and c < size:
+                                cotangent = grid[r * size + c]
+                                of_weight += cotangent * (a[i] * b[j])
+                                of_row += cotangent * (a[3 + i] * b[j])
+                                of_column += cotangent * (a[i] * b[3 + j])
+                of_rows[p], of_columns[p] = weights[p] * of_row, weights[p] * of_column
+                of_weights[p] = of_weight
 
     return kernel

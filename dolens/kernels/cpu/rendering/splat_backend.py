@@ -9,38 +9,41 @@ from dolens.kernels.cpu.program import REAL
 from dolens.kernels.cpu.rendering.splat import SplatJob, splat_adjoint_driver, splat_driver
 from dolens.kernels.cpu.threads import spread, thread_count
 
-# Chunks of points that have a grid of their own.
+# Chunks of points of a grid that have a grid of their own.
 _CHUNKS, _SMALLEST = 16, 4096
 
 
 def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
-    """Sum weighted quadratic B-splines at points (N,) onto a grid (size, size)."""
+    """Sum weighted quadratic B-splines at points (G, N) onto grids (G, size, size)."""
     job, chunks = _job(rows, columns, weight, size)
-    grids = rows.new_zeros((max(chunks, 1), size, size))
+    count = rows.shape[0]
+    grids = rows.new_zeros((count, chunks, size, size))
     job[SplatJob.GRIDS] = grids.data_ptr()
-    _run(splat_driver, job, chunks, rows)
-    return grids.sum(0)
+    _run(splat_driver, job, count * chunks, rows)
+    return grids[:, 0].clone() if chunks == 1 else grids.sum(1)
 
 
 def splat_adjoint(
     rows: Tensor, columns: Tensor, weight: Tensor, of_grid: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cotangents (N,) of rows, columns and weight from that of the grid (size, size)."""
-    job, chunks = _job(rows, columns, weight, of_grid.shape[0])
+    """Cotangents (G, N) of rows, columns and weight from that of the grids (G, size, size)."""
+    job, chunks = _job(rows, columns, weight, of_grid.shape[-1])
     job[SplatJob.GRIDS] = of_grid.data_ptr()
     gradients = torch.empty_like(rows), torch.empty_like(rows), torch.empty_like(rows)
     job[SplatJob.OF_ROWS : SplatJob.OF_WEIGHT + 1] = [g.data_ptr() for g in gradients]
-    _run(splat_adjoint_driver, job, chunks, rows)
+    _run(splat_adjoint_driver, job, rows.shape[0] * chunks, rows)
     return gradients
 
 
 def _job(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> tuple[np.ndarray, int]:
-    points = rows.numel()
+    """The job, and the chunks of a grid, at least one."""
+    points = rows.shape[1]
     chunk = max(_SMALLEST, -(-points // _CHUNKS))
+    chunks = max(1, -(-points // chunk))
     job = np.zeros(SplatJob.LENGTH, dtype=np.int64)
     job[: SplatJob.WEIGHT + 1] = (rows.data_ptr(), columns.data_ptr(), weight.data_ptr())
-    job[SplatJob.POINTS : SplatJob.CHUNK + 1] = (points, size, chunk)
-    return job, -(-points // chunk)
+    job[SplatJob.POINTS : SplatJob.CHUNKS + 1] = (points, size, chunk, chunks)
+    return job, chunks
 
 
 def _run(driver: compiler.Factory, job: np.ndarray, chunks: int, like: Tensor) -> None:
