@@ -115,8 +115,8 @@ def splat(
     rows, columns, weight = (t.reshape(count, points) for t in (rows, columns, weight))
     if backend == "cpu":
         return splatting.splat(rows, columns, weight, size).reshape(*shape, size, size)
-    row_taps, row_weights = _spline_taps(rows)
-    column_taps, column_weights = _spline_taps(columns)
+    row_taps, row_weights = spline_taps(rows)
+    column_taps, column_weights = spline_taps(columns)
     first = torch.arange(count, device=weight.device)[:, None] * (size * size)
     flat = torch.zeros(count * size * size, dtype=weight.dtype, device=weight.device)
     for row, row_weight in zip(row_taps, row_weights, strict=True):
@@ -128,7 +128,7 @@ def splat(
     return flat.reshape(*shape, size, size)
 
 
-def _spline_taps(position: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+def spline_taps(position: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     """The three pixels under a quadratic B-spline at each position, and its values there."""
     centre = torch.round(position.detach())
     d = position - centre

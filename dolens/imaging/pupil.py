@@ -21,7 +21,8 @@ _RADII = 64
 
 # A larger disc is sampled only for more light than this share of what a corner gets.
 _NEGLIGIBLE = 2e-3
-_LARGEST = 2.0
+# Radii, over the axial one, at which that light is looked for: the crescent may be a thin one.
+_LARGEST, _FINE_RADII = 2.0, 256
 
 
 class ExitPupil(NamedTuple):
@@ -68,13 +69,14 @@ def sampled_exit_pupil(
 ) -> ExitPupil:
     """The disc to be sampled from all pixels of a sensor.
 
-    It is the axial pixels' own, unless the pupil's aberrations let light reach the corners from
-    outside of it: then a larger one, of which axial pixels use a part.
+    It is the axial pixels' own, unless the pupil's aberrations let light reach other pixels from
+    outside of it: then a larger one, of which axial pixels use a part.  The corners are asked, and
+    points halfway to them.
 
     Args:
         system: the lens.
         wavelengths: nm.
-        sensor: whose corners are asked.
+        sensor: the pixels.
         backend: what traces.
 
     Raises:
@@ -82,11 +84,12 @@ def sampled_exit_pupil(
     """
     axial = axial_exit_pupil(system, wavelengths, backend)
     options = {"dtype": system.dtype, "device": system.device}
-    rows = torch.tensor([0.0, 0.0, 1.0, 1.0], **options) * (sensor.height - 1)
-    columns = torch.tensor([0.0, 1.0, 0.0, 1.0], **options) * (sensor.width - 1)
+    places = torch.tensor([0.0, 0.25, 0.75, 1.0], **options)
+    rows = torch.stack((places, places)).flatten() * (sensor.height - 1)
+    columns = torch.stack((places, 1.0 - places)).flatten() * (sensor.width - 1)
     x, y = (p[:, None, None] for p in sensor.positions(rows, columns))
     angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
-    share = (torch.arange(_RADII, **options)[:, None] + 0.5) * (_LARGEST / _RADII)
+    share = (torch.arange(_FINE_RADII, **options)[:, None] + 0.5) * (_LARGEST / _FINE_RADII)
     radii = share * axial.radius
     ray = aim(
         x, y, system.vertices[-1], radii * torch.cos(angle), radii * torch.sin(angle), axial.z
@@ -97,7 +100,7 @@ def sampled_exit_pupil(
     lost = outside.sum((-2, -1)) / light.sum((-2, -1)).clamp(min=torch.finfo(light.dtype).tiny)
     if float(lost.max()) <= _NEGLIGIBLE:
         return axial
-    farthest = float(torch.where(passes, share, 0.0).max()) + 0.5 * _LARGEST / _RADII
+    farthest = float(torch.where(passes, share, 0.0).max()) + 0.5 * _LARGEST / _FINE_RADII
     return axial._replace(radius=farthest * axial.radius)
 
 

@@ -18,6 +18,7 @@ from dolens.errors import InputError
 from dolens.imaging.beam_edges import Beams
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
+from dolens.optics.system import is_rotationally_symmetric
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def gaussian_quadrature(
     # Gauss and Legendre's nodes in ρ², on which an area's element is even.
     radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))
     shares = torch.from_numpy(0.5 * shares)
-    symmetric = symmetry and is_rotationally_symmetric(lens)
+    symmetric = symmetry and is_rotationally_symmetric(lens.system())
 
     distinct = list(dict.fromkeys(map(tuple, fields)))
     points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)
@@ -171,15 +172,6 @@ def _azimuths(field: tuple[float, float], arms: int, symmetric: bool) -> Tensor:
         half = arms // 2
         return (torch.arange(half).double() + 0.5) * (math.pi / half) - 0.5 * math.pi
     return (torch.arange(arms).double() + 0.5) * (2.0 * math.pi / arms)
-
-
-def is_rotationally_symmetric(lens: Lens) -> bool:
-    """Whether nothing in a lens singles out a direction across the axis."""
-    system = lens.system()
-    surfaces = all(
-        surface.shape.rotational and surface.aperture.rotational for surface in system.surfaces
-    )
-    return surfaces and not system.elements
 
 
 class Launched(NamedTuple):

@@ -67,3 +67,11 @@ class OpticalSystem:
     def device(self) -> torch.device:
         """Where the lens lives."""
         return self.sensor_distance.device
+
+
+def is_rotationally_symmetric(system: OpticalSystem) -> bool:
+    """Whether nothing in a lens singles out a direction across the axis."""
+    surfaces = all(
+        surface.shape.rotational and surface.aperture.rotational for surface in system.surfaces
+    )
+    return surfaces and not system.elements

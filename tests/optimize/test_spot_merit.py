@@ -10,10 +10,10 @@ from dolens import Rays, load_lens
 from dolens.errors import InputError
 from dolens.imaging.spot_rays import (
     gaussian_quadrature,
-    is_rotationally_symmetric,
     square_grid,
     with_chief_rays,
 )
+from dolens.optics.system import is_rotationally_symmetric
 from dolens.optimize import DesignVariables, MeritSettings
 from dolens.optimize.bounded_step import damped_step
 from dolens.optimize.image_quality import without_edges
@@ -81,7 +81,7 @@ def test_quadrature_agrees_with_a_fine_sampling(triplet, field):
 
 def test_symmetry_saves_rays_and_nothing_else(triplet):
     """Half of the arms for a field along y, one for the axis: the radii stay."""
-    assert is_rotationally_symmetric(triplet)
+    assert is_rotationally_symmetric(triplet.system())
     fields = [(0.0, 0.0), (0.0, 12.0)]
     spots = gaussian_quadrature(triplet, fields, LINES, 5, 16)
     assert len(spots.weight) == 3 * (5 + 5 * 8)

@@ -1,0 +1,114 @@
+"""Point spread functions all over a sensor, as its pixels see the scene."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.imaging.plane_points import (
+    PlanePoints,
+    chief_ray_points,
+    distinct_radii,
+    pinhole_points,
+    plane_points,
+)
+from dolens.imaging.psf import splat
+from dolens.imaging.pupil import ExitPupil
+from dolens.imaging.random_numbers import random_words, uniform
+from dolens.imaging.sampling import square_to_disc, stratified_square
+from dolens.imaging.scene import PlanarScene
+from dolens.optics.system import OpticalSystem
+
+
+class FieldFunctions(NamedTuple):
+    """Point spread functions at N points of the sensor.
+
+    Attributes:
+        functions: (N, D, C, K, K), upright, of the points' light about the central pixel; their
+            sums are relative illuminations, less what falls beyond the window.
+        light: (N, C), relative illumination by the same rays, no gradient.
+        lost: (), the largest share of a function's light that falls beyond its window.
+    """
+
+    functions: Tensor
+    light: Tensor
+    lost: Tensor
+
+
+def field_point_spread_functions(
+    system: OpticalSystem,
+    scene: PlanarScene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    size: int,
+    pupil_samples: int,
+    seed: int | None,
+    distortion: bool,
+    symmetric: bool,
+    backend: str,
+) -> FieldFunctions:
+    """Geometric point spread functions at points of the sensor.
+
+    A function says how much of the light of the scene's point (row, column), counted from the
+    function's own centre, a pixel gets: I(p) = Σ PSF(e) · T(c(p) - e), with c(p) the centre.  Each
+    ray lands as a quadratic B-spline, the pixel's box convolved with the texel's tent.
+
+    Args:
+        system: the lens.
+        scene: D depths and C wavelengths.
+        points: x and y, mm, each (N,), double precision.
+        pupil: what is sampled.
+        pitch: of the pixels, mm.
+        size: K, odd.
+        pupil_samples: strata along each side of the pupil.
+        seed: of the points in the strata; None: their centres.
+        distortion: whether a function's centre is where the chief ray meets the plane, else where
+            a pinhole sees it.
+        symmetric: whether the lens has rotational symmetry.
+        backend: what traces and splats.
+    """
+    count = distinct_radii(points) if symmetric else len(points[0])
+    disc = sampled_disc(count, pupil_samples, seed, system)
+    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    planes, channels = len(scene.depths), len(scene.wavelengths)
+    if distortion:
+        centre = chief_ray_points(system, scene, points, pupil, pitch, backend)
+    else:
+        centre = pinhole_points(points, pitch, planes, channels)
+    rows, columns = (c[..., None].to(system.dtype) for c in centre)
+    return splatted(
+        PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight), size, backend
+    )
+
+
+def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
+    """Functions (N, D, C, size, size) of rays by where they meet the planes, from their centre."""
+    middle = size // 2
+    # A pixel sees the point at +e: seen from there, the pixel is at -e.
+    rows, columns = middle - seen.rows, middle - seen.columns
+    weight = seen.weight.expand(rows.shape)
+    functions = splat(rows, columns, weight, size, backend)
+    with torch.no_grad():
+        total = weight.sum(-1)
+        kept = functions.sum((-2, -1)) / total.clamp(min=torch.finfo(total.dtype).tiny)
+        lost = torch.where(total > 0.0, 1.0 - kept, 0.0).max()
+    return FieldFunctions(functions, total[:, 0], lost)
+
+
+def sampled_disc(
+    count: int, side: int, seed: int | None, system: OpticalSystem
+) -> tuple[Tensor, Tensor]:
+    """Points of the unit disc, one in each of side² strata: x and y, each (count, side²).
+
+    Every one of the `count` has samples of its own; `seed` None takes the strata's centres.
+    """
+    shape = (count, side * side)
+    if seed is None:
+        u = v = torch.full(shape, 0.5, dtype=system.dtype, device=system.device)
+    else:
+        place = torch.arange(count, device=system.device)[:, None]
+        sample = torch.arange(side * side, device=system.device)
+        words = random_words(seed, place, sample)
+        u, v = (uniform(word, system.dtype).expand(shape) for word in words[:2])
+    return square_to_disc(*stratified_square(side, u, v))

@@ -1,0 +1,75 @@
+"""Relative illumination: how bright a white scene is over the sensor."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from dolens.imaging.plane_points import pupil_rays
+from dolens.imaging.pupil import ExitPupil
+from dolens.imaging.sensor import Sensor
+from dolens.imaging.stop_rays import even_points
+from dolens.optics.system import OpticalSystem
+
+# Points along the radius of a symmetric lens, or along each side of the sensor.
+_RADII, _SIDE = 33, 13
+
+
+@torch.no_grad()
+def relative_illumination(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    sensor: Sensor,
+    pupil: ExitPupil,
+    symmetric: bool,
+    backend: str,
+    rays: int = 1024,
+) -> Tensor:
+    """Irradiance of every pixel under a uniform scene, over that on the axis.
+
+    The mean of cos⁴ over the exit pupil as each pixel sees it, vignetting included.  It is found at
+    some points, and interpolated: linearly in the squared radius for a lens of rotational symmetry,
+    else bicubically.
+
+    Args:
+        system: the lens.
+        wavelengths: nm.
+        sensor: the pixels.
+        pupil: the disc that is sampled.
+        symmetric: whether the lens has rotational symmetry.
+        backend: what traces.
+        rays: through the pupil, for each point and wavelength; a multiple of four.
+
+    Returns:
+        (wavelengths, height, width), no gradient.
+    """
+    options = {"dtype": torch.float64, "device": system.device}
+    height, width = sensor.height, sensor.width
+    grid = torch.meshgrid(
+        torch.arange(height, **options), torch.arange(width, **options), indexing="ij"
+    )
+    # No two of them on one circle: strata lie on rings, which an aperture's edge takes as wholes.
+    spiral = even_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
+    disc = tuple(d.expand(max(_RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
+    if symmetric:
+        x, y = sensor.positions(*grid)
+        squared = x * x + y * y
+        low, high = float(squared.min()), float(squared.max())
+        radius = torch.linspace(low, high, _RADII, **options).sqrt()
+        points = (radius, torch.zeros_like(radius))
+        _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
+        light = weight.sum(-1)
+        place = (squared - low) * ((_RADII - 1) / max(high - low, 1e-300))
+        first = place.long().clamp(max=_RADII - 2)
+        between = (place - first).to(light)
+        return torch.lerp(light[:, first], light[:, first + 1], between)
+    rows = torch.linspace(0.0, height - 1.0, _SIDE, **options)
+    columns = torch.linspace(0.0, width - 1.0, _SIDE, **options)
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    points = sensor.positions(row.reshape(-1), column.reshape(-1))
+    _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
+    light = weight.sum(-1).unflatten(-1, (_SIDE, _SIDE))
+    return functional.interpolate(
+        light[None], size=(height, width), mode="bicubic", align_corners=True
+    )[0]

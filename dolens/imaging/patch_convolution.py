@@ -1,0 +1,272 @@
+"""Convolution with a kernel that changes over the image: overlapping patches, by FFT."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.imaging.psf import splat
+from dolens.imaging.spline_lookup import spline_lookup
+
+# Pixels after which the inverse of the quadratic spline's filter has faded: (3 - √8)^10 = 2e-8.
+_FADED = 10
+
+
+class Patch(NamedTuple):
+    """A rectangle of the image around a node.
+
+    Attributes:
+        top, bottom, left, right: rows and columns of the image, half open.
+        weight: (bottom - top, right - left), or one for each channel in front of these: how much of
+            each pixel the node's kernel makes.
+    """
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+    weight: Tensor
+
+
+class Coordinates(NamedTuple):
+    """Where in the texture each pixel of the image looks, fractional rows and columns.
+
+    Attributes:
+        rows: (D, C, height, width), no gradient.
+        columns: (D, C, height, width).
+    """
+
+    rows: Tensor
+    columns: Tensor
+
+
+def node_positions(length: int, count: int) -> list[float]:
+    """Coordinates of `count` nodes along `length` pixels: the ends included, or the middle."""
+    if count == 1:
+        return [0.5 * (length - 1)]
+    return [i * (length - 1) / (count - 1) for i in range(count)]
+
+
+def patches(height: int, width: int, rows: int, columns: int, like: Tensor) -> list[Patch]:
+    """The patches of a grid of nodes, row after row; at each pixel their weights sum to one.
+
+    Weights are bilinear between the nodes.
+
+    Raises:
+        InputError: more nodes than pixels.
+    """
+    if rows < 1 or columns < 1 or rows > height or columns > width:
+        raise InputError(
+            f"renderer: fields must be from 1 to {height} rows and 1 to {width} columns, "
+            f"not {rows}, {columns}"
+        )
+    vertical, horizontal = (
+        [_hat(length, count, i, like) for i in range(count)]
+        for length, count in ((height, rows), (width, columns))
+    )
+    return [
+        Patch(top, bottom, left, right, down[:, None] * across)
+        for top, bottom, down in vertical
+        for left, right, across in horizontal
+    ]
+
+
+def _hat(length: int, count: int, node: int, like: Tensor) -> tuple[int, int, Tensor]:
+    """First pixel, end and weights of a node along one side."""
+    place = torch.arange(length, dtype=torch.float64)
+    if count == 1:
+        return 0, length, torch.ones_like(place).to(like)
+    spacing = (length - 1) / (count - 1)
+    weight = (1.0 - (place - node * spacing).abs() / spacing).clamp(min=0.0)
+    inside = torch.nonzero(weight > 0.0).flatten()
+    first, end = int(inside[0]), int(inside[-1]) + 1
+    return first, end, weight[first:end].to(like)
+
+
+def convolve_patches(
+    textures: Tensor,
+    kernels: Tensor,
+    layout: Sequence[Patch],
+    origin: tuple[int, int],
+    image_size: tuple[int, int],
+    coordinates: Coordinates | None,
+    backend: str,
+) -> Tensor:
+    """Σ over nodes of weight · (texture ∗ kernel), at the image's pixels.
+
+    A texture's edge goes on beyond it.  Memory is that of one patch at a time: the backward pass
+    transforms again.
+
+    Args:
+        textures: (B, C, H, W).
+        kernels: (N, D or 1, C or 1, K, K), K odd, sums of quadratic B-splines.
+        layout: N patches.
+        origin: row and column of the texture that pixel (0, 0) looks at, where there are no
+            `coordinates`.
+        image_size: height and width.
+        coordinates: where the pixels look, if that is not simply every pixel a texel further.
+        backend: `cpu`, `cuda` or `reference`, for lookups.
+
+    Returns:
+        (B, D, C, height, width).
+    """
+    planes = kernels.shape[1] if coordinates is None else coordinates.rows.shape[0]
+    settings = (tuple(layout), origin, (planes, *image_size), coordinates, backend)
+    return _Convolution.apply(textures, kernels, settings)
+
+
+class _Convolution(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, textures: Tensor, kernels: Tensor, settings: tuple[Any, ...]):  # noqa: ANN205
+        ctx.save_for_backward(textures, kernels)
+        ctx.settings = settings
+        layout, _, (planes, height, width), _, _ = settings
+        image = textures.new_zeros((textures.shape[0], planes, textures.shape[1], height, width))
+        for node, patch in enumerate(layout):
+            tile = _Tile(textures, kernels.shape[-1], patch, settings)
+            seen = tile.see(tile.texture_spectrum()[:, None] * tile.kernel_spectrum(kernels[node]))
+            image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
+        return image
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        textures, kernels = ctx.saved_tensors
+        of_textures = torch.zeros_like(textures) if ctx.needs_input_grad[0] else None
+        of_kernels = torch.zeros_like(kernels) if ctx.needs_input_grad[1] else None
+        for node, patch in enumerate(ctx.settings[0]):
+            tile = _Tile(textures, kernels.shape[-1], patch, ctx.settings)
+            part = gradient[..., patch.top : patch.bottom, patch.left : patch.right]
+            spectrum = tile.of_seen(patch.weight * part)
+            if of_kernels is not None:
+                product = (tile.texture_spectrum()[:, None].conj() * spectrum).sum(0)
+                of_kernels[node] = tile.of_kernel(product, kernels[node].shape)
+            if of_textures is not None:
+                product = (tile.kernel_spectrum(kernels[node]).conj() * spectrum).sum(1)
+                tile.add_to_texture(product, of_textures)
+        return of_textures, of_kernels, None
+
+
+class _Tile:
+    """The part of the texture that a patch sees, and the transforms between the two."""
+
+    def __init__(
+        self, textures: Tensor, size: int, patch: Patch, settings: tuple[Any, ...]
+    ) -> None:
+        _, origin, (planes, _, _), coordinates, self.backend = settings
+        self.textures, self.size, self.planes = textures, size, planes
+        self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
+        self.coordinates = None
+        if coordinates is None:
+            top, left = origin[0] + patch.top, origin[1] + patch.left
+            height, width = self.height, self.width
+        else:
+            area = (..., slice(patch.top, patch.bottom), slice(patch.left, patch.right))
+            rows, columns = coordinates.rows[area], coordinates.columns[area]
+            top, bottom = _bounds(rows)
+            left, right = _bounds(columns)
+            # Lookups read square images.
+            height = width = max(bottom - top, right - left)
+            self.coordinates = Coordinates(rows - top, columns - left)
+        self.seen_size = (height, width)
+        reach = size // 2
+        self.rows = _clamped(top - reach, height + size - 1, textures.shape[-2], textures)
+        self.columns = _clamped(left - reach, width + size - 1, textures.shape[-1], textures)
+        self.transform = (fast_length(height + size - 1), fast_length(width + size - 1))
+
+    def texture_spectrum(self) -> Tensor:
+        """(B, C, ...)."""
+        part = self.textures.index_select(-2, self.rows).index_select(-1, self.columns)
+        return torch.fft.rfft2(part, s=self.transform)
+
+    def kernel_spectrum(self, kernel: Tensor) -> Tensor:
+        """(D or 1, C or 1, ...), with what a lookup's splines do undone."""
+        return self._sharpened(torch.fft.rfft2(kernel, s=self.transform))
+
+    def _sharpened(self, spectrum: Tensor) -> Tensor:
+        if self.coordinates is None:
+            return spectrum
+        height, width = self.transform
+        # β²'s values at the pixels, 1/8, 6/8 and 1/8, have this spectrum.
+        down, across = (
+            0.75 + 0.25 * torch.cos(2.0 * torch.pi * frequency.to(self.textures))
+            for frequency in (torch.fft.fftfreq(height), torch.fft.rfftfreq(width))
+        )
+        return spectrum / (down[:, None] * across)
+
+    def see(self, spectrum: Tensor) -> Tensor:
+        """(B, D, C, height, width) of the patch from the product of the spectra."""
+        image = torch.fft.irfft2(spectrum, s=self.transform)
+        first, (height, width) = self.size - 1, self.seen_size
+        image = image[..., first : first + height, first : first + width]
+        if self.coordinates is None:
+            return image
+        image = image.expand(-1, self.planes, -1, -1, -1)
+        flat, rows, columns = self._lookup_arguments(image)
+        seen = spline_lookup(flat, rows, columns, self.backend)
+        return seen.reshape(*image.shape[:3], self.height, self.width)
+
+    def of_seen(self, of_seen: Tensor) -> Tensor:
+        """The adjoint of `see`: a spectrum (B, D, C, ...)."""
+        first, (height, width) = self.size - 1, self.seen_size
+        if self.coordinates is not None:
+            images = self._batched(self.coordinates.rows, of_seen)
+            columns = self._batched(self.coordinates.columns, of_seen)
+            flat = of_seen.reshape(-1, self.height * self.width)
+            grids = splat(images, columns, flat, height, self.backend)
+            of_seen = grids.reshape(*of_seen.shape[:3], height, width)
+        image = of_seen.new_zeros((*of_seen.shape[:3], *self.transform))
+        image[..., first : first + height, first : first + width] = of_seen
+        return torch.fft.rfft2(image)
+
+    def of_kernel(self, spectrum: Tensor, shape: torch.Size) -> Tensor:
+        """(D or 1, C or 1, K, K) of the sum over the batch."""
+        spectrum = self._sharpened(spectrum)
+        for dim in (0, 1):
+            if shape[dim] == 1:
+                spectrum = spectrum.sum(dim, keepdim=True)
+        kernel = torch.fft.irfft2(spectrum, s=self.transform)
+        return kernel[..., : self.size, : self.size]
+
+    def add_to_texture(self, spectrum: Tensor, of_textures: Tensor) -> None:
+        """Add the gradient (B, C, ...) to the texture's; its edge takes what lies beyond."""
+        part = torch.fft.irfft2(spectrum, s=self.transform)
+        part = part[..., : len(self.rows), : len(self.columns)]
+        gathered = part.new_zeros((*part.shape[:-1], of_textures.shape[-1]))
+        gathered.index_add_(-1, self.columns, part)
+        of_textures.index_add_(-2, self.rows, gathered)
+
+    def _lookup_arguments(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rows, columns = (self._batched(c, image) for c in self.coordinates)
+        return image.reshape(-1, *image.shape[-2:]), rows, columns
+
+    def _batched(self, coordinate: Tensor, image: Tensor) -> Tensor:
+        """(B · D · C, pixels) of coordinates (D, C, height, width)."""
+        flat = coordinate.flatten(-2).to(image.dtype)
+        return flat.expand(image.shape[0], *flat.shape).reshape(-1, flat.shape[-1])
+
+
+def _bounds(coordinate: Tensor) -> tuple[int, int]:
+    """First texel and end of what lookups at coordinates read, and where filters fade."""
+    low, high = int(coordinate.min().floor()), int(coordinate.max().ceil())
+    return low - 1 - _FADED, high + 2 + _FADED
+
+
+def _clamped(start: int, count: int, size: int, like: Tensor) -> Tensor:
+    """Indices of `count` texels from `start` on, those of the edge beyond it."""
+    return (torch.arange(count, device=like.device) + start).clamp(0, size - 1)
+
+
+def fast_length(length: int) -> int:
+    """The least even number of 2, 3 and 5 that is not below: FFTs of such lengths are fast."""
+    candidate = length + length % 2
+    while True:
+        rest = candidate
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return candidate
+        candidate += 2

@@ -1,0 +1,250 @@
+"""Rendering by point spread functions on a grid of fields, convolved in overlapping patches."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.imaging.field_psf import FieldFunctions, field_point_spread_functions
+from dolens.imaging.illumination import relative_illumination
+from dolens.imaging.patch_convolution import (
+    Coordinates,
+    Patch,
+    convolve_patches,
+    node_positions,
+    patches,
+)
+from dolens.imaging.plane_points import chief_ray_points
+from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
+from dolens.imaging.scene import PlanarScene, texture_origin
+from dolens.imaging.sensor import Sensor
+from dolens.optics.backend import choose_backend, say_once
+from dolens.optics.lens import Lens
+from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+
+logger = logging.getLogger(__name__)
+
+# A window that loses more of a function's light than this is worth a warning.
+_NOTABLE_LOSS = 0.01
+
+
+@dataclass(frozen=True)
+class PsfRenderer:
+    """Point spread functions at a grid of sensor points, linear in between, convolved by FFT.
+
+    It renders what `RayRenderer` does, with distortion, lateral colour and relative illumination,
+    with two approximations: between the grid's points functions are interpolated, and the pupil is
+    sampled once for all pixels that share one.
+
+    Attributes:
+        sensor: the pixels.
+        fields: rows and columns of the grid; (1, 1) is one function for all pixels.
+        pupil_samples: strata along each side of the pupil, for each function.
+        size: pixels along each side of a function, odd; light beyond is lost, and warned of.
+        registration: `chief_rays`: functions are centred on the lens's own, distorted image points,
+            and pixels look there; `pinhole`: on the undistorted ones, and shifts are part of the
+            functions, which is cheaper, and exact where shifts change little between fields.
+        illumination: `map`: relative illumination is found on a finer grid than the functions, so
+            that only their shape is interpolated; `functions`: it is as they have it.
+        depths: `each` has functions of its own, or `one`, the middle in vergence, serves all.
+        colours: `each` wavelength has functions of its own, or `one`, the middle, serves all.
+        jitter: draw points in the pupil's strata anew for each seed, or take their centres.
+    """
+
+    sensor: Sensor
+    fields: tuple[int, int] = (3, 3)
+    pupil_samples: int = 32
+    size: int = 65
+    registration: Literal["chief_rays", "pinhole"] = "chief_rays"
+    illumination: Literal["map", "functions"] = "map"
+    depths: Literal["each", "one"] = "each"
+    colours: Literal["each", "one"] = "each"
+    jitter: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "fields", tuple(int(n) for n in self.fields))
+        if len(self.fields) != 2 or min(self.fields) < 1:
+            raise InputError(f"renderer: fields must be rows and columns, not {self.fields}")
+        if self.size < 3 or self.size % 2 == 0:
+            raise InputError(f"renderer: size must be odd and at least 3, not {self.size}")
+        if self.pupil_samples < 1:
+            raise InputError("renderer: pupil_samples must be at least 1")
+        for key, allowed in (
+            ("registration", ("chief_rays", "pinhole")),
+            ("illumination", ("map", "functions")),
+            ("depths", ("each", "one")),
+            ("colours", ("each", "one")),
+        ):
+            if getattr(self, key) not in allowed:
+                raise InputError(
+                    f"renderer: {key} '{getattr(self, key)}' is unknown; "
+                    f"allowed: {', '.join(allowed)}"
+                )
+
+    def rays_per_image(self, scene: PlanarScene) -> int:
+        """Rays traced for the functions of one render, where the lens has no symmetry."""
+        channels = len(scene.wavelengths) if self.colours == "each" else 1
+        return self.fields[0] * self.fields[1] * self.pupil_samples**2 * channels
+
+    def render(
+        self,
+        lens: Lens,
+        scene: PlanarScene,
+        textures: Tensor,
+        seed: int,
+        values: Mapping[str, Tensor] | None = None,
+    ) -> Tensor:
+        """Image textures at every depth of a scene; as `RayRenderer.render`.
+
+        Args:
+            lens: the lens; its precision is that of rays and image.
+            scene: depths and wavelengths.
+            textures: (B, C, H, W), linear light, a channel for each wavelength.
+            seed: of the points in the pupil's strata.
+            values: lens parameters to use instead of the stored ones.
+
+        Returns:
+            (B, depths, C, height, width), linear light.  Differentiable in the lens's parameters,
+            `values` and the textures.
+
+        Raises:
+            InputError: a depth inside the lens, or channels that do not match the wavelengths.
+        """
+        if textures.dim() != 4 or textures.shape[1] != len(scene.wavelengths):
+            raise InputError(
+                f"textures must be (B, {len(scene.wavelengths)}, H, W), one channel a wavelength, "
+                f"not {tuple(textures.shape)}"
+            )
+        textures = textures.to(device=lens.device, dtype=lens.dtype)
+        system = lens.system(values)
+        backend = choose_backend(system, lens.backend, others=[textures])
+        with torch.no_grad():
+            scene.check(system)
+            pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        found = self.point_spread_functions(system, scene, pupil, seed, backend)
+        if float(found.lost) > _NOTABLE_LOSS:
+            say_once(
+                f"renderer psf: {100 * float(found.lost):.0f} % of a function's light falls beyond "
+                f"its {self.size} pixels; a larger renderer.size keeps it"
+            )
+        sensor, size = self.sensor, (textures.shape[-2], textures.shape[-1])
+        coordinates, origin = self._coordinates(system, scene, size, pupil, backend)
+        layout = patches(sensor.height, sensor.width, *self.fields, textures)
+        if self.illumination == "map":
+            layout = self._illuminated(layout, system, scene, pupil, found.light, backend)
+        image = convolve_patches(
+            textures,
+            found.functions,
+            layout,
+            origin,
+            (sensor.height, sensor.width),
+            coordinates,
+            backend,
+        )
+        return image.expand(-1, len(scene.depths), -1, -1, -1)
+
+    def point_spread_functions(
+        self,
+        system: OpticalSystem,
+        scene: PlanarScene,
+        pupil: ExitPupil,
+        seed: int,
+        backend: str,
+    ) -> FieldFunctions:
+        """The functions at the grid's points, row after row; differentiable in the system."""
+        return field_point_spread_functions(
+            system,
+            self.shared(scene),
+            self.points(),
+            pupil,
+            self.sensor.pixel_pitch,
+            self.size,
+            self.pupil_samples,
+            seed if self.jitter else None,
+            self.registration == "chief_rays",
+            is_rotationally_symmetric(system),
+            backend,
+        )
+
+    def points(self) -> tuple[Tensor, Tensor]:
+        """x and y of the grid on the sensor, mm, each (fields,), double precision."""
+        rows = node_positions(self.sensor.height, self.fields[0])
+        columns = node_positions(self.sensor.width, self.fields[1])
+        row, column = torch.meshgrid(
+            torch.tensor(rows, dtype=torch.float64),
+            torch.tensor(columns, dtype=torch.float64),
+            indexing="ij",
+        )
+        return self.sensor.positions(row.reshape(-1), column.reshape(-1))
+
+    def shared(self, scene: PlanarScene) -> PlanarScene:
+        """The scene of the depths and wavelengths that have functions of their own."""
+        depths, wavelengths = scene.depths, scene.wavelengths
+        if self.depths == "one":
+            middle = 0.5 * (1.0 / min(depths) + 1.0 / max(depths))
+            depths = (min(depths, key=lambda depth: abs(1.0 / depth - middle)),)
+        if self.colours == "one":
+            wavelengths = (sorted(wavelengths)[len(wavelengths) // 2],)
+        return PlanarScene(depths, wavelengths, scene.texture_centre)
+
+    def _illuminated(
+        self,
+        layout: list[Patch],
+        system: OpticalSystem,
+        scene: PlanarScene,
+        pupil: ExitPupil,
+        light: Tensor,
+        backend: str,
+    ) -> list[Patch]:
+        """Weights that give every pixel its own illumination, whatever the functions' own is."""
+        wavelengths, symmetric = self.shared(scene).wavelengths, is_rotationally_symmetric(system)
+        wanted = relative_illumination(system, wavelengths, self.sensor, pupil, symmetric, backend)
+        lit, shares = torch.zeros_like(wanted), []
+        for patch, own in zip(layout, light[..., None, None], strict=True):
+            share = torch.where(own > 0.0, patch.weight, 0.0)
+            lit[:, patch.top : patch.bottom, patch.left : patch.right] += share
+            shares.append(share / torch.where(own > 0.0, own, 1.0))
+        scale = wanted / torch.where(lit > 0.0, lit, 1.0)
+        return [
+            patch._replace(
+                weight=share * scale[:, patch.top : patch.bottom, patch.left : patch.right]
+            )
+            for patch, share in zip(layout, shares, strict=True)
+        ]
+
+    def _coordinates(
+        self,
+        system: OpticalSystem,
+        scene: PlanarScene,
+        texture_size: tuple[int, int],
+        pupil: ExitPupil,
+        backend: str,
+    ) -> tuple[Coordinates | None, tuple[int, int]]:
+        """Where pixels look in the texture, or where the first does if the others follow on."""
+        sensor = self.sensor
+        row, column = texture_origin(texture_size, scene.texture_centre)
+        if self.registration == "pinhole":
+            top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
+            left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
+            if top.is_integer() and left.is_integer():
+                return None, (int(top), int(left))
+        options = {"dtype": torch.float64, "device": system.device}
+        rows, columns = torch.meshgrid(
+            torch.arange(sensor.height, **options),
+            torch.arange(sensor.width, **options),
+            indexing="ij",
+        )
+        if self.registration == "pinhole":
+            shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
+            return Coordinates((rows + top).expand(shape), (columns + left).expand(shape)), (0, 0)
+        points = sensor.positions(rows.reshape(-1), columns.reshape(-1))
+        seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch, backend)
+        down, across = (
+            (c.double().permute(1, 2, 0) + start).unflatten(-1, (sensor.height, sensor.width))
+            for c, start in zip(seen, (row, column), strict=True)
+        )
+        return Coordinates(down, across), (0, 0)
