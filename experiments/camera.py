@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
+from dolens.imaging.noise import add_read_noise
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene, pinhole_image
-from dolens.imaging.sensor import add_read_noise
 from dolens.optics.lens import Lens
 from dolens.optimize.variables import DesignVariables
 from dolens.reconstruction import (

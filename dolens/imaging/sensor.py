@@ -1,8 +1,7 @@
-"""The pixel grid and its noise."""
+"""The pixel grid."""
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -38,20 +37,3 @@ class Sensor:
         x = (0.5 * (self.width - 1) - columns) * self.pixel_pitch
         y = (rows - 0.5 * (self.height - 1)) * self.pixel_pitch
         return x, y
-
-
-def add_read_noise(image: Tensor, sigma: float, generator: torch.Generator) -> Tensor:
-    """Add Gaussian read noise.
-
-    Args:
-        image: linear light, 1 is full scale.
-        sigma: standard deviation in units of full scale; 0 returns the image itself.
-        generator: the source of randomness, on the image's device.
-
-    Returns:
-        The noisy image, not clipped: a real sensor's black level keeps negative noise too.
-    """
-    if sigma == 0.0:
-        return image
-    noise = torch.randn(image.shape, generator=generator, device=image.device, dtype=image.dtype)
-    return image + sigma * noise
