@@ -1,4 +1,4 @@
-"""A camera as one Lightning module: lens, scene, renderer, noise, reconstruction and loss."""
+"""A camera as one Lightning module: lens, scene, renderer, readout, reconstruction and loss."""
 
 import statistics
 import time
@@ -14,8 +14,8 @@ from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.imaging.ray_renderer import RayRenderer
+from dolens.imaging.readout import Readout
 from dolens.imaging.scene import PlanarScene, pinhole_image
-from dolens.imaging.sensor import add_read_noise
 from dolens.optics.lens import Lens
 from dolens.optimize.variables import DesignVariables
 from dolens.reconstruction import (
@@ -33,7 +33,7 @@ _STREAM_STRIDE, _NOISE_OFFSET = 1 << 40, 1 << 39
 class CameraModule(lightning.LightningModule):
     """End-to-end training of a camera on planar scenes at several depths.
 
-    A batch of textures is imaged at every depth, noise is added, and one network restores all the
+    A batch of textures is imaged at every depth and read out, and one network restores all the
     images without being told the depth.  The loss reaches the network and the lens's variables.
 
     All random numbers are functions of the seed and the step, so that a resumed run repeats an
@@ -44,6 +44,7 @@ class CameraModule(lightning.LightningModule):
         experiment: name of the experiment; a checkpoint of another one is refused.
         scene: depths and wavelengths.
         renderer: makes the training images.
+        readout: what the sensor makes of them.
         network: restores them.
         loss: compares display-encoded images.
         optimizer: parameter groups → optimizer.
@@ -52,7 +53,6 @@ class CameraModule(lightning.LightningModule):
         variables: settings of `DesignVariables`; empty or None trains the network alone.
         evaluation_pupil_samples: `pupil_samples` of the renderer that makes the validation and test
             images; by default the training renderer's own.
-        read_noise: standard deviation, of full scale in linear light.
         depth_norm: p of the power mean that joins the depths' losses; see `loss_over_depths`.
         psf_size: pixels along each side of the point spread functions.
         psf_pupil_samples: their strata along each side of the pupil.
@@ -65,6 +65,7 @@ class CameraModule(lightning.LightningModule):
         experiment: str,
         scene: PlanarScene,
         renderer: RayRenderer,
+        readout: Readout,
         network: Restoration,
         loss: RestorationLoss,
         optimizer: Callable[..., torch.optim.Optimizer],
@@ -72,7 +73,6 @@ class CameraModule(lightning.LightningModule):
         scheduler: Callable[..., Any] | None = None,
         variables: Mapping[str, Mapping[str, Any] | None] | None = None,
         evaluation_pupil_samples: int | None = None,
-        read_noise: float = 0.0,
         depth_norm: float = 1.0,
         psf_size: int = 65,
         psf_pupil_samples: int = 48,
@@ -93,7 +93,7 @@ class CameraModule(lightning.LightningModule):
         self.optimizer = optimizer
         self.scheduler = scheduler
         self.learning_rates = dict(learning_rates)
-        self.read_noise = read_noise
+        self.readout = readout
         if not depth_norm >= 1.0:
             raise InputError(f"depth_norm must be at least 1, not {depth_norm}")
         self.depth_norm = depth_norm
@@ -118,10 +118,10 @@ class CameraModule(lightning.LightningModule):
     def raw_images(
         self, textures: Tensor, renderer: RayRenderer, seed: int, values: Mapping[str, Tensor]
     ) -> Tensor:
-        """(B, depths, 3, H, W), linear light, with noise."""
+        """(B, depths, 3, H, W), linear light, read out and developed."""
         image = renderer.render(self.lens, self.scene, textures, seed, values)
         generator = torch.Generator(image.device).manual_seed(seed + _NOISE_OFFSET)
-        return add_read_noise(image, self.read_noise, generator)
+        return self.readout.develop(self.readout(image, generator))
 
     def point_spread_functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
         """(depths, 3, K, K) of the lens as it is, or None where the network asks for none."""

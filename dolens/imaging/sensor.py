@@ -1,8 +1,7 @@
-"""The pixel grid and its noise."""
+"""The pixel grid."""
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -62,20 +61,3 @@ class Sensor:
             self.centre_row + top + 0.5 * (height - self.height),
             self.centre_column + left + 0.5 * (width - self.width),
         )
-
-
-def add_read_noise(image: Tensor, sigma: float, generator: torch.Generator) -> Tensor:
-    """Add Gaussian read noise.
-
-    Args:
-        image: linear light, 1 is full scale.
-        sigma: standard deviation in units of full scale; 0 returns the image itself.
-        generator: the source of randomness, on the image's device.
-
-    Returns:
-        The noisy image, not clipped: a real sensor's black level keeps negative noise too.
-    """
-    if sigma == 0.0:
-        return image
-    noise = torch.randn(image.shape, generator=generator, device=image.device, dtype=image.dtype)
-    return image + sigma * noise

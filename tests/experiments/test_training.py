@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
 from PIL import Image
 from tiny_experiment import TINY, TINY_NETWORK
 
 from dolens import load_lens
 from dolens.errors import InputError
+from dolens.imaging.readout import Readout
 from experiments.training import run
 
 EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experiment").glob("*.yaml"))
@@ -166,6 +168,30 @@ def test_the_plain_unet_trains_too(composed, tmp_path):
     assert metrics["variables/surfaces.5.x3"] != 1e-5
 
 
+READOUTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/readout").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", READOUTS)
+def test_read_noise_is_one_key_for_every_readout(composed, name):
+    cfg = composed("experiment=wavefront_coding", f"readout={name}", "read_noise=0.005")
+    assert instantiate(cfg.module).keywords["readout"].read_noise == 0.005
+
+
+def test_the_default_readout_is_its_read_noise_alone(composed):
+    cfg = composed("experiment=wavefront_coding")
+    assert instantiate(cfg.module).keywords["readout"] == Readout(read_noise=0.003)
+
+
+def test_a_camera_behind_colour_filters_trains_too(composed, tmp_path):
+    run(composed(*WAVEFRONT_CODING, "readout=bayer_12bit", "trainer.max_epochs=1"))
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert all(math.isfinite(value) for value in metrics.values())
+    initial = load_lens(tmp_path / "run" / "lens" / "initial.yaml", dtype=torch.float32)
+    for name in ("x3", "x2y", "xy2", "y3"):
+        start = float(getattr(initial.surfaces["5"], name).detach())
+        assert metrics[f"variables/surfaces.5.{name}"] != start
+
+
 def test_the_paper_scale_composes_and_runs_two_steps(composed, tmp_path):
     images, generator = tmp_path / "images", np.random.default_rng(0)
     images.mkdir()
@@ -282,6 +308,8 @@ BAD_INPUT = {
         ["loss.perceptual=vgg16", "loss.vgg16_weights=nowhere.pth"],
         "nowhere.pth",
     ),
+    "unknown colour filters": (["readout.pattern=RGBG"], "'RGBG' is unknown; allowed: RGGB"),
+    "a converter of no bits": (["readout.bits=0"], "bits is 0; allowed: null, or a whole number"),
     "unknown variable": (
         ["+variables={surfaces.5.x4: {scale: 1.0}}"],
         "has no parameter 'surfaces.5.x4'",

@@ -5,7 +5,7 @@ import torch
 
 from dolens.errors import InputError
 from dolens.imaging.scene import PlanarScene, pinhole_image
-from dolens.imaging.sensor import Sensor, add_read_noise
+from dolens.imaging.sensor import Sensor
 from dolens.imaging.texture import bilinear
 
 
@@ -58,12 +58,3 @@ def test_magnification_is_that_of_the_gaussian_image_in_focus(wavefront_coding):
     depth = f * f / behind_focus - front_focus
     scene = PlanarScene([depth], [587.5618])
     assert scene.magnifications(lens.system())[0] == pytest.approx(behind_focus / f, rel=1e-9)
-
-
-def test_read_noise_has_its_standard_deviation_and_its_seed():
-    image = torch.full((200, 200), 0.5, dtype=torch.float64)
-    one = add_read_noise(image, 0.01, torch.Generator().manual_seed(1))
-    two = add_read_noise(image, 0.01, torch.Generator().manual_seed(1))
-    assert torch.equal(one, two)
-    assert float((one - image).std()) == pytest.approx(0.01, rel=0.02)
-    assert add_read_noise(image, 0.0, torch.Generator()) is image
