@@ -15,7 +15,7 @@ from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.readout import Readout
-from dolens.imaging.scene import PlanarScene, pinhole_image
+from dolens.imaging.scene import Scene, pinhole_image
 from dolens.optics.lens import Lens
 from dolens.optimize.variables import DesignVariables
 from dolens.reconstruction import (
@@ -31,10 +31,11 @@ _STREAM_STRIDE, _NOISE_OFFSET = 1 << 40, 1 << 39
 
 
 class CameraModule(lightning.LightningModule):
-    """End-to-end training of a camera on planar scenes at several depths.
+    """End-to-end training of a camera on planes at several depths, or on scenes with depth.
 
-    A batch of textures is imaged at every depth and read out, and one network restores all the
-    images without being told the depth.  The loss reaches the network and the lens's variables.
+    A batch of textures is imaged at every depth, or once with a depth for each texel, and read out,
+    and one network restores all the images without being told the depth.  The loss reaches the
+    network and the lens's variables.
 
     All random numbers are functions of the seed and the step, so that a resumed run repeats an
     uninterrupted one.
@@ -63,7 +64,7 @@ class CameraModule(lightning.LightningModule):
         self,
         lens: Lens,
         experiment: str,
-        scene: PlanarScene,
+        scene: Scene,
         renderer: RayRenderer,
         readout: Readout,
         network: Restoration,
@@ -113,7 +114,8 @@ class CameraModule(lightning.LightningModule):
 
     def truth(self, textures: Tensor) -> Tensor:
         """(B, 3, H, W), display-encoded: what a distortion-free pinhole sees."""
-        return linear_to_srgb(pinhole_image(textures, self.renderer.sensor))
+        colours = self.scene.colours(textures)
+        return linear_to_srgb(pinhole_image(colours, self.renderer.sensor))
 
     def raw_images(
         self, textures: Tensor, renderer: RayRenderer, seed: int, values: Mapping[str, Tensor]
@@ -269,7 +271,7 @@ class CameraModule(lightning.LightningModule):
         loss = self.loss_over_depths(
             restored, truth[:, None].expand_as(restored).to(restored.dtype)
         )
-        row = {"loss": loss["total"].expand(len(batch), len(self.scene.depths))}
+        row = {"loss": loss["total"].expand(len(batch), restored.shape[1])}
         for name, image in (("", restored), ("raw_", raw)):
             row[f"{name}psnr_db"] = torch.stack(
                 [psnr_db(image[:, d], truth) for d in range(image.shape[1])], 1

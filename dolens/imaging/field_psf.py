@@ -16,7 +16,7 @@ from dolens.imaging.psf import splat
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.sampling import square_to_disc, stratified_square
-from dolens.imaging.scene import PlanarScene
+from dolens.imaging.scene import Scene
 from dolens.optics.system import OpticalSystem
 
 
@@ -37,7 +37,7 @@ class FieldFunctions(NamedTuple):
 
 def field_point_spread_functions(
     system: OpticalSystem,
-    scene: PlanarScene,
+    scene: Scene,
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     pitch: float,

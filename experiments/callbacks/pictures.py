@@ -99,7 +99,10 @@ def camera_figures(module: CameraModule, textures: Tensor, stage: str) -> dict[s
     return {
         "images": comparison_figure(truth[0], raw[0], restored[0], labels, quality),
         "point_spread_functions": psf_figure(
-            psfs.cpu(), labels, module.renderer.sensor.pixel_pitch, "Point spread functions"
+            psfs.cpu(),
+            module.scene.plane_labels(),
+            module.renderer.sensor.pixel_pitch,
+            "Point spread functions",
         ),
         "layout": layout_figure(
             copy.deepcopy(module.lens).cpu(),
