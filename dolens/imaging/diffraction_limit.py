@@ -49,12 +49,17 @@ def with_diffraction_limit(
 ) -> Tensor:
     """Functions (..., C, K, K) blurred by the perfect pupil's diffraction at C wavelengths.
 
-    Light that this spreads beyond the window is lost.
+    What this spreads beyond the window, 2λN/(π²r) of the light beyond radius r, is given back in
+    proportion, so that each function keeps its sum.
     """
     size = functions.shape[-1]
-    side = 2 * size
+    # As wide as the Airy disc's share beyond it is small, lest its other side come back in.
+    side = max(2 * size, 128)
     transfer = torch.stack(
         [diffraction_transfer(side, side, pitch, w, f_number) for w in wavelengths]
     ).to(functions)
     spectrum = torch.fft.rfft2(functions, s=(side, side)) * transfer
-    return torch.fft.irfft2(spectrum, s=(side, side))[..., :size, :size]
+    blurred = torch.fft.irfft2(spectrum, s=(side, side))[..., :size, :size]
+    kept = blurred.sum((-2, -1), keepdim=True)
+    total = functions.sum((-2, -1), keepdim=True)
+    return blurred * torch.where(kept > 0.0, total / torch.where(kept > 0.0, kept, 1.0), 0.0)

@@ -15,7 +15,7 @@ from dolens.imaging.choice.probe import (
     grey_levels,
 )
 from dolens.imaging.choice.survey import Survey, spread_pixels, survey
-from dolens.imaging.diffraction_limit import diffraction_transfer
+from dolens.imaging.diffraction_limit import diffraction_transfer, with_diffraction_limit
 from dolens.imaging.patch_convolution import node_positions
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.scene import PlanarScene
@@ -28,6 +28,8 @@ _GRIDS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25)
 _PUPIL_SAMPLES = (6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64)
 # The share of the tolerance that each simplification may take; their squares add up to less than 1.
 _FIELDS, _SAMPLING, _WINDOW, _SHARING, _DIFFRACTION, _PRECISION = 0.6, 0.5, 0.25, 0.25, 0.3, 0.1
+# Pixels by which windows grow, for diffraction; the last is for comparison.
+_MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 # Light that a window leaves out lies far from the centre; the largest window, pixels.
 _LARGEST = 511
 
@@ -111,6 +113,11 @@ def plan(
     finding, without = _diffraction(functions, truth, scene, sensor, tolerance)
     renderer = replace(renderer, diffraction=finding.chosen)
     findings.append(finding)
+    if finding.chosen == "limit":
+        finding = _wider_window(truth, scene, renderer, tolerance)
+        renderer = replace(renderer, size=int(finding.chosen))
+        findings.append(finding)
+        functions = truth.functions(renderer.size, distortion)
     few = slice(0, 8)
     part = rows[few], columns[few]
     finding = _sampling(precise, scene, sensor, part, functions[few], renderer, tolerance, backend)
@@ -309,6 +316,28 @@ def _diffraction(
     if error <= _DIFFRACTION * tolerance:
         return Finding("diffraction", "none", error, seen), error
     return Finding("diffraction", "limit", 0.0, f"{seen}; without it {error:.2g}"), error
+
+
+def _wider_window(
+    truth: Survey, scene: PlanarScene, renderer: PsfRenderer, tolerance: float
+) -> Finding:
+    """A window that holds what diffraction spreads."""
+    pitch, distortion = renderer.sensor.pixel_pitch, renderer.registration == "chief_rays"
+
+    def blurred(size: int) -> Tensor:
+        functions = truth.functions(size, distortion)[:4].double()
+        return with_diffraction_limit(functions, pitch, scene.wavelengths, truth.f_number)
+
+    widest = renderer.size + 2 * _MARGINS[-1]
+    whole, error, size = blurred(widest), math.inf, renderer.size
+    for margin in _MARGINS[:-1]:
+        size = renderer.size + 2 * margin
+        edge = (widest - size) // 2
+        difference = torch.nn.functional.pad(blurred(size), (edge,) * 4) - whole
+        error = float(grey_levels(difference).square().mean().sqrt())
+        if error <= _WINDOW * tolerance:
+            break
+    return Finding("window with diffraction", str(size), error, "the Airy disc is wide")
 
 
 def _sampling(
