@@ -3,7 +3,6 @@
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 import lightning
@@ -13,8 +12,8 @@ from torch import Tensor, nn
 from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.psf import axial_point_spread_functions
-from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.readout import Readout
+from dolens.imaging.renderer import Renderer
 from dolens.imaging.scene import PlanarScene, pinhole_image
 from dolens.optics.lens import Lens
 from dolens.optimize.variables import DesignVariables
@@ -51,8 +50,8 @@ class CameraModule(lightning.LightningModule):
         learning_rates: `optics` and `network`.
         scheduler: optimizer → scheduler, stepped once a training step; or None.
         variables: settings of `DesignVariables`; empty or None trains the network alone.
-        evaluation_pupil_samples: `pupil_samples` of the renderer that makes the validation and test
-            images; by default the training renderer's own.
+        evaluation_renderer: makes the validation and test images, of the same sensor; by default
+            the training renderer, which then judges its own approximations.
         depth_norm: p of the power mean that joins the depths' losses; see `loss_over_depths`.
         psf_size: pixels along each side of the point spread functions.
         psf_pupil_samples: their strata along each side of the pupil.
@@ -64,7 +63,7 @@ class CameraModule(lightning.LightningModule):
         lens: Lens,
         experiment: str,
         scene: PlanarScene,
-        renderer: RayRenderer,
+        renderer: Renderer,
         readout: Readout,
         network: Restoration,
         loss: RestorationLoss,
@@ -72,7 +71,7 @@ class CameraModule(lightning.LightningModule):
         learning_rates: Mapping[str, float],
         scheduler: Callable[..., Any] | None = None,
         variables: Mapping[str, Mapping[str, Any] | None] | None = None,
-        evaluation_pupil_samples: int | None = None,
+        evaluation_renderer: Renderer | None = None,
         depth_norm: float = 1.0,
         psf_size: int = 65,
         psf_pupil_samples: int = 48,
@@ -87,9 +86,12 @@ class CameraModule(lightning.LightningModule):
         self.experiment = experiment
         self.scene = scene
         self.renderer = renderer
-        self.evaluation_renderer = replace(
-            renderer, pupil_samples=evaluation_pupil_samples or renderer.pupil_samples
-        )
+        self.evaluation_renderer = evaluation_renderer or renderer
+        if self.evaluation_renderer.sensor != renderer.sensor:
+            raise InputError(
+                f"evaluation_renderer.sensor: {self.evaluation_renderer.sensor} is not that of "
+                f"the training renderer, {renderer.sensor}"
+            )
         self.optimizer = optimizer
         self.scheduler = scheduler
         self.learning_rates = dict(learning_rates)
@@ -116,7 +118,7 @@ class CameraModule(lightning.LightningModule):
         return linear_to_srgb(pinhole_image(textures, self.renderer.sensor))
 
     def raw_images(
-        self, textures: Tensor, renderer: RayRenderer, seed: int, values: Mapping[str, Tensor]
+        self, textures: Tensor, renderer: Renderer, seed: int, values: Mapping[str, Tensor]
     ) -> Tensor:
         """(B, depths, 3, H, W), linear light, read out and developed."""
         image = renderer.render(self.lens, self.scene, textures, seed, values)
@@ -181,6 +183,11 @@ class CameraModule(lightning.LightningModule):
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": self.scheduler(optimizer), "interval": "step"},
         }
+
+    def on_train_epoch_start(self) -> None:
+        """Let the renderer look at the lens as it is now; not when an epoch is resumed within."""
+        if self.trainer.fit_loop.epoch_loop.batch_progress.current.ready == 0:
+            self.renderer.prepare(self.lens, self.scene, self.variables())
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
         """Start the step's clock."""
@@ -297,6 +304,7 @@ class CameraModule(lightning.LightningModule):
         numbers = {f"variables/{n}": float(v) for n, v in self._variable_numbers().items()}
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.renderer.rays_per_image(self.scene))
+        numbers |= self.renderer.numbers()
         if self.step_seconds:
             numbers["cost/step_s"] = statistics.median(self.step_seconds)
             numbers["cost/optics_s"] = statistics.median(self.optics_seconds)
@@ -319,6 +327,7 @@ class CameraModule(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say whose checkpoint it is, in plain values."""
         checkpoint["dolens"] = self._identity()
+        checkpoint["dolens_renderer"] = self.renderer.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another experiment before any weight is loaded."""
@@ -331,6 +340,7 @@ class CameraModule(lightning.LightningModule):
                     f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
                     f"{value!r}; resume with the experiment and settings that wrote it"
                 )
+        self.renderer.load_state(self.lens, checkpoint.get("dolens_renderer", {}))
 
     def _identity(self) -> dict[str, Any]:
         return {

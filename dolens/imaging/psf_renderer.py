@@ -21,6 +21,7 @@ from dolens.imaging.patch_convolution import (
 )
 from dolens.imaging.plane_points import chief_ray_points
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
+from dolens.imaging.renderer import Unprepared
 from dolens.imaging.scene import PlanarScene, texture_origin
 from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import choose_backend, say_once
@@ -34,7 +35,7 @@ _NOTABLE_LOSS = 0.01
 
 
 @dataclass(frozen=True)
-class PsfRenderer:
+class PsfRenderer(Unprepared):
     """Point spread functions at a grid of sensor points, linear in between, convolved by FFT.
 
     It renders what `RayRenderer` does, with distortion, lateral colour and relative illumination.

@@ -3,8 +3,9 @@
 TINY = [
     "renderer.sensor.height=24",
     "renderer.sensor.width=24",
+    "renderer=rays",
     "renderer.pupil_samples=2",
-    "module.evaluation_pupil_samples=2",
+    "evaluation_renderer.pupil_samples=2",
     "module.psf_size=33",
     "module.psf_pupil_samples=8",
     "data.margin=16",

@@ -5,12 +5,14 @@ import logging
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.choice.chosen import Choice
 from dolens.imaging.choice.cost import psf_cost, rays_cost
 from dolens.imaging.choice.plan import Finding, plan
 from dolens.imaging.choice.probe import probe_image
@@ -29,62 +31,11 @@ _REFERENCE_SAMPLES, _ROUNDS = 24, 3
 _MARGIN = 32
 
 
-@dataclass(frozen=True)
-class Choice:
-    """A renderer, its precision, and how it was found.
-
-    Attributes:
-        renderer: what renders.
-        dtype: of rays and image.
-        findings: the decisions, with what each costs in grey levels.
-        error: RMS error on the probe image against rays, both without diffraction, grey levels;
-            0 is below what the reference can tell.
-        uncertainty: of that error, grey levels.
-        tolerance: grey levels that were asked for.
-        seconds: that choosing took.
-    """
-
-    renderer: PsfRenderer | RayRenderer
-    dtype: torch.dtype
-    findings: tuple[Finding, ...]
-    error: float
-    uncertainty: float
-    tolerance: float
-    seconds: float
-
-    def lines(self) -> list[str]:
-        """The plan, for people: a line a decision."""
-        model = "psf" if isinstance(self.renderer, PsfRenderer) else "rays"
-        return [
-            f"renderer auto: {model}, error {self.error:.2g} of {self.tolerance:g} grey levels "
-            f"(±{self.uncertainty:.2g}) on the probe image, planned in {self.seconds:.1f} s",
-            *(f"  {finding}" for finding in self.findings),
-        ]
-
-    def numbers(self) -> dict[str, float]:
-        """The plan as metrics."""
-        renderer = self.renderer
-        numbers = {
-            "auto/error_grey_levels": self.error,
-            "auto/uncertainty_grey_levels": self.uncertainty,
-            "auto/tolerance_grey_levels": self.tolerance,
-            "auto/plan_s": self.seconds,
-            "auto/pupil_samples": float(renderer.pupil_samples),
-            "auto/precision_bits": float(torch.finfo(self.dtype).bits),
-            "auto/by_rays": float(isinstance(renderer, RayRenderer)),
-        }
-        if isinstance(renderer, PsfRenderer):
-            numbers["auto/fields"] = float(renderer.fields[0] * renderer.fields[1])
-            numbers["auto/psf_pixels"] = float(renderer.size)
-            numbers["auto/diffraction"] = float(renderer.diffraction != "none")
-        return numbers
-
-
 class AutoRenderer:
     """Renders by the cheapest model whose error stays within a tolerance.
 
-    The first render makes a plan for the lens as it is, and later ones keep to it; a lens that
-    changes wants a new plan now and then (`make_plan`).
+    The first render makes a plan for the lens as it is, and later ones keep to it; `prepare` asks
+    whether it still serves a lens that has changed, and makes another if it does not.
 
     Args:
         sensor: the pixels.
@@ -100,6 +51,7 @@ class AutoRenderer:
         self.tolerance = tolerance
         self.seed = seed
         self.choice: Choice | None = None
+        self.plans = 0
         self._other: Lens | None = None
 
     def rays_per_image(self, scene: PlanarScene) -> int:
@@ -131,11 +83,72 @@ class AutoRenderer:
         return image.to(lens.dtype)
 
     @torch.no_grad()
+    def prepare(
+        self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
+    ) -> None:
+        """Measure what the plan errs by for the lens as it is now; plan anew where it is too much,
+        and where there is none.
+        """
+        if self.choice is None:
+            self.make_plan(lens, scene, values)
+            return
+        started = time.perf_counter()
+        current = _with_values(lens, values)
+        single, double = (copy.deepcopy(current).to(d) for d in (torch.float32, torch.float64))
+        texture, whole = self._probe(scene)
+        judge = reference(single, whole, self.sensor, texture, _REFERENCE_SAMPLES, self.seed)
+        choice = self.choice
+        error = self._measured(choice.renderer, choice.dtype, single, double, texture, whole, judge)
+        if error <= max(self.tolerance, choice.error):
+            seconds = choice.seconds + time.perf_counter() - started
+            self.choice = replace(choice, error=error, seconds=seconds)
+            logger.info("renderer auto: the plan still serves, error %.2g grey levels", error)
+            return
+        logger.info("renderer auto: the lens has changed, error %.2g grey levels", error)
+        self.make_plan(lens, scene, values)
+        self.choice = replace(self.choice, seconds=self.choice.seconds + choice.seconds)
+
+    def numbers(self) -> dict[str, float]:
+        """The plan as metrics, `auto/…`."""
+        if self.choice is None:
+            return {}
+        return self.choice.numbers() | {"auto/plans": float(self.plans)}
+
+    def state(self) -> dict[str, Any]:
+        """The plan, as plain values."""
+        if self.choice is None:
+            return {}
+        renderer = self.choice.renderer
+        settings = {f.name: getattr(renderer, f.name) for f in fields(renderer)}
+        del settings["sensor"]
+        return {
+            "model": "psf" if isinstance(renderer, PsfRenderer) else "rays",
+            "settings": {n: list(v) if isinstance(v, tuple) else v for n, v in settings.items()},
+            "bits": torch.finfo(self.choice.dtype).bits,
+            "error": self.choice.error,
+            "uncertainty": self.choice.uncertainty,
+        }
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
+        """Go on with a plan that was made before."""
+        if not state:
+            return
+        model = {"psf": PsfRenderer, "rays": RayRenderer}[state["model"]]
+        dtype = {32: torch.float32, 64: torch.float64}[state["bits"]]
+        renderer = model(sensor=self.sensor, **state["settings"])
+        self._other = copy.deepcopy(lens).requires_grad_(False).to(dtype)
+        self.choice = Choice(
+            renderer, dtype, (), state["error"], state["uncertainty"], self.tolerance, 0.0
+        )
+        logger.info("renderer auto: the plan of the checkpoint is taken up")
+
+    @torch.no_grad()
     def make_plan(
         self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
     ) -> Choice:
         """Choose, measure on the probe image, log; the choice is kept for `render`."""
         started = time.perf_counter()
+        self.plans += 1
         current = _with_values(lens, values)
         single, double = (copy.deepcopy(current).to(d) for d in (torch.float32, torch.float64))
         backend = choose_backend(double.system(), lens.backend)
@@ -181,7 +194,7 @@ class AutoRenderer:
             error = self._measured(renderer, dtype, single, double, texture, whole, judge)
         else:
             findings.insert(0, Finding("model", "psf", error, verdict))
-        self._other = single if dtype == torch.float32 else double
+        self._other = (single if dtype == torch.float32 else double).requires_grad_(False)
         self.choice = Choice(
             renderer,
             dtype,
