@@ -190,12 +190,12 @@ READOUTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/readout").g
 @pytest.mark.parametrize("name", READOUTS)
 def test_read_noise_is_one_key_for_every_readout(composed, name):
     cfg = composed("experiment=wavefront_coding", f"readout={name}", "read_noise=0.005")
-    assert instantiate(cfg.module).keywords["readout"].read_noise == 0.005
+    assert instantiate(cfg.views).readout.read_noise == 0.005
 
 
 def test_the_default_readout_is_its_read_noise_alone(composed):
     cfg = composed("experiment=wavefront_coding")
-    assert instantiate(cfg.module).keywords["readout"] == Readout(read_noise=0.003)
+    assert instantiate(cfg.views).readout == Readout(read_noise=0.003)
 
 
 def test_a_camera_behind_colour_filters_trains_too(composed, tmp_path):
