@@ -146,7 +146,7 @@ def test_a_scene_gets_no_more_than_it_needs(root):
         },
         torch.float32,
     )
-    choice = AutoRenderer(Sensor(64, 64, 0.1), 1.0).make_plan(
+    choice = AutoRenderer(Sensor(64, 64, 0.1), 1.0, gradients=False).make_plan(
         lens, PlanarScene((4000.0, 1000.0), LINES)
     )
     renderer = choice.renderer
@@ -154,6 +154,16 @@ def test_a_scene_gets_no_more_than_it_needs(root):
     assert renderer.fields == (1, 1)
     assert (renderer.depths, renderer.colours) == ("one", "one")
     assert renderer.registration == "pinhole"
+
+
+def test_colours_are_shared_for_images_but_not_for_gradients(root):
+    lens, sensor = coded(root), Sensor(48, 48, 0.0069)
+    scene = PlanarScene((8000.0,), LINES)
+    chosen = [
+        AutoRenderer(sensor, 4.0, gradients).make_plan(lens, scene).renderer.colours
+        for gradients in (True, False)
+    ]
+    assert chosen == ["each", "one"]
 
 
 def test_diffraction_is_modelled_where_it_shows(root):

@@ -14,7 +14,8 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.imaging.choice.chosen import Choice
 from dolens.imaging.choice.cost import psf_cost, rays_cost
-from dolens.imaging.choice.plan import Finding, plan
+from dolens.imaging.choice.finding import Finding
+from dolens.imaging.choice.plan import plan
 from dolens.imaging.choice.probe import probe_image
 from dolens.imaging.choice.reference import Reference, rays_samples, reference
 from dolens.imaging.psf_renderer import PsfRenderer
@@ -41,14 +42,18 @@ class AutoRenderer:
         sensor: the pixels.
         tolerance: RMS error on a photograph-like probe image, in grey levels: 1/255 of full scale
             in linear light, before the sensor's own noise.
+        gradients: whether the lens's gradients matter too, and not only the image.
         seed: of the probe and its reference.
     """
 
-    def __init__(self, sensor: Sensor, tolerance: float = 1.0, seed: int = 0) -> None:
+    def __init__(
+        self, sensor: Sensor, tolerance: float = 1.0, gradients: bool = True, seed: int = 0
+    ) -> None:
         if not tolerance > 0.0:
             raise InputError(f"renderer: tolerance must be positive (grey levels), not {tolerance}")
         self.sensor = sensor
         self.tolerance = tolerance
+        self.gradients = gradients
         self.seed = seed
         self.choice: Choice | None = None
         self.plans = 0
@@ -162,6 +167,7 @@ class AutoRenderer:
                 scene,
                 self.sensor,
                 tightened * self.tolerance,
+                self.gradients,
                 backend,
             )
             error = self._measured(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from dolens.imaging.choice.plan import Finding
+from dolens.imaging.choice.finding import Finding
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
 

@@ -1,57 +1,32 @@
 """What a scene needs of a renderer, found from a few probe rays, in grey levels."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
-from dolens.imaging.choice.cost import psf_cost
-from dolens.imaging.choice.probe import (
-    MEAN,
-    blurred_grey_levels,
-    grey_levels,
-)
+from dolens.imaging.choice.finding import Finding
+from dolens.imaging.choice.grid import SAMPLES, WINDOW_SHARE, choose_fields, window_finding
+from dolens.imaging.choice.probe import blurred_grey_levels, grey_levels
 from dolens.imaging.choice.survey import Survey, spread_pixels, survey
 from dolens.imaging.diffraction_limit import diffraction_transfer, with_diffraction_limit
-from dolens.imaging.patch_convolution import node_positions
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
 from dolens.optics.system import OpticalSystem
 
-# Points of the sensor where functions are compared, and strata of the pupil along each side there.
-_POINTS, _SAMPLES = 24, 48
-_GRIDS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25)
+# Points of the sensor where functions are compared.
+_POINTS = 24
 _PUPIL_SAMPLES = (6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64)
-# The share of the tolerance that each simplification may take; their squares add up to less than 1.
-_FIELDS, _SAMPLING, _WINDOW, _SHARING, _DIFFRACTION, _PRECISION = 0.6, 0.5, 0.25, 0.25, 0.3, 0.1
+# The share of the tolerance that each simplification may take; with those of
+# `grid` their squares add up to less than 1.
+_SAMPLING, _SHARING, _DIFFRACTION, _PRECISION = 0.5, 0.25, 0.3, 0.1
+# Near an optimum the gradients of colours, and of depths, cancel; one in place of all turns their
+# sum: a cosine of 0.3 with the rays' gradient was measured, in images a quarter grey level off.
+_SHARING_OF_GRADIENTS = 0.005
 # Pixels by which windows grow, for diffraction; the last is for comparison.
 _MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
-# Light that a window leaves out lies far from the centre; the largest window, pixels.
-_LARGEST = 511
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One decision of a plan.
-
-    Attributes:
-        what: what was decided.
-        chosen: what for.
-        error: what it costs in accuracy, grey levels on the probe.
-        because: why.
-    """
-
-    what: str
-    chosen: str
-    error: float
-    because: str
-
-    def __str__(self) -> str:
-        return f"{self.what}: {self.chosen} ({self.error:.2g} grey levels; {self.because})"
 
 
 @dataclass(frozen=True)
@@ -83,6 +58,7 @@ def plan(
     scene: PlanarScene,
     sensor: Sensor,
     tolerance: float,
+    gradients: bool,
     backend: str,
 ) -> Plan:
     """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
@@ -93,20 +69,22 @@ def plan(
         scene: depths and wavelengths.
         sensor: the pixels.
         tolerance: RMS grey levels (1/255 of full scale, linear light) on the probe.
+        gradients: whether the lens's gradients matter too.
         backend: what traces.
 
     Raises:
         InputError: functions are too wide for any window.
     """
     rows, columns = spread_pixels(sensor, _POINTS)
-    truth = survey(precise, scene, sensor, rows, columns, _SAMPLES, backend)
-    layout = _fields(precise, scene, sensor, rows, columns, truth, tolerance, backend)
+    truth = survey(precise, scene, sensor, rows, columns, SAMPLES, backend)
+    layout = choose_fields(precise, scene, sensor, rows, columns, truth, tolerance, backend)
     renderer, distortion = layout.renderer, layout.renderer.registration == "chief_rays"
     functions = truth.functions(renderer.size, distortion)
-    findings = [layout.finding, _window_finding(truth, renderer.size, distortion)]
+    findings = [layout.finding, window_finding(truth, renderer.size, distortion)]
+    shared = (_SHARING_OF_GRADIENTS if gradients else _SHARING) * tolerance
     for name, finding in (
-        ("depths", _shared_depths(functions, scene, tolerance)),
-        ("colours", _shared_colours(functions, scene, tolerance)),
+        ("depths", _shared_depths(functions, scene, shared)),
+        ("colours", _shared_colours(functions, scene, shared)),
     ):
         renderer = replace(renderer, **{name: finding.chosen})
         findings.append(finding)
@@ -129,156 +107,6 @@ def plan(
     return Plan(renderer, dtype, tuple(findings), without)
 
 
-@dataclass(frozen=True)
-class _Layout:
-    renderer: PsfRenderer
-    finding: Finding
-
-
-def _fields(
-    system: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    rows: Tensor,
-    columns: Tensor,
-    truth: Survey,
-    tolerance: float,
-    backend: str,
-) -> _Layout:
-    """The cheapest grid whose interpolated functions are those of the points in between."""
-    surfaces = len(system.surfaces)
-    candidates = sorted(
-        _candidates(truth, sensor, tolerance), key=lambda r: psf_cost(r, scene, surfaces)
-    )
-    if not candidates:
-        raise InputError(
-            f"renderer auto: point spread functions are wider than {_LARGEST} pixels; "
-            "use renderer=rays"
-        )
-    nodes: dict[tuple[int, int], Survey] = {}
-    best: tuple[float, PsfRenderer] | None = None
-    for renderer in candidates:
-        if renderer.fields not in nodes:
-            nodes[renderer.fields] = _node_survey(system, scene, sensor, renderer, backend)
-        error = _interpolation_error(renderer, sensor, rows, columns, truth, nodes[renderer.fields])
-        if best is None or error < best[0]:
-            best = error, renderer
-        if error <= _FIELDS * tolerance:
-            break
-    error, renderer = best
-    why = (
-        "the least that interpolates well" if error <= _FIELDS * tolerance else "the best there is"
-    )
-    chosen = (
-        f"{renderer.fields[0]}×{renderer.fields[1]}, registration {renderer.registration}, "
-        f"illumination in {'a map' if renderer.illumination == 'map' else 'the functions'}, "
-        f"{renderer.size} pixels"
-    )
-    return _Layout(renderer, Finding("fields", chosen, error, why))
-
-
-def _candidates(truth: Survey, sensor: Sensor, tolerance: float) -> Iterator[PsfRenderer]:
-    longer = max(sensor.height, sensor.width)
-    for registration in ("pinhole", "chief_rays"):
-        distortion = registration == "chief_rays"
-        if distortion and truth.chief is None:
-            continue
-        size = _window(truth, distortion, _WINDOW * tolerance)
-        if size is None:
-            continue
-        for count in _GRIDS:
-            fields = tuple(
-                1 if count == 1 else max(2, math.ceil(count * side / longer))
-                for side in (sensor.height, sensor.width)
-            )
-            if count > 1 and (fields[0] > sensor.height // 4 or fields[1] > sensor.width // 4):
-                continue
-            for illumination in ("functions", "map"):
-                yield PsfRenderer(
-                    sensor,
-                    fields,
-                    size=size,
-                    registration=registration,
-                    illumination=illumination,
-                )
-
-
-def _lost(truth: Survey, distortion: bool, size: int) -> float:
-    """The mean share of light beyond a window."""
-    seen = truth.offsets(distortion)
-    # A ray's spline reaches a pixel and a half.
-    far = torch.maximum(seen.rows.abs(), seen.columns.abs()) > size / 2 - 1.5
-    light = seen.weight.expand(far.shape)
-    return float((light * far).sum() / light.sum())
-
-
-def _window(truth: Survey, distortion: bool, tolerance: float) -> int | None:
-    """The smallest window that leaves out no more than `tolerance` grey levels of mean light."""
-    share = tolerance / (255.0 * MEAN)
-    low, high = 2, (_LARGEST - 1) // 2
-    if _lost(truth, distortion, 2 * high + 1) > share:
-        return None
-    while low < high:
-        middle = (low + high) // 2
-        if _lost(truth, distortion, 2 * middle + 1) <= share:
-            high = middle
-        else:
-            low = middle + 1
-    return 2 * high + 1
-
-
-def _window_finding(truth: Survey, size: int, distortion: bool) -> Finding:
-    error = 255.0 * MEAN * _lost(truth, distortion, size)
-    return Finding("window", f"{size} pixels", error, "light beyond it is lost")
-
-
-def _node_survey(
-    system: OpticalSystem, scene: PlanarScene, sensor: Sensor, renderer: PsfRenderer, backend: str
-) -> Survey:
-    down, across = (
-        torch.tensor(node_positions(side, count), dtype=torch.float64)
-        for side, count in zip((sensor.height, sensor.width), renderer.fields, strict=True)
-    )
-    rows, columns = torch.meshgrid(down, across, indexing="ij")
-    return survey(system, scene, sensor, rows.reshape(-1), columns.reshape(-1), _SAMPLES, backend)
-
-
-def _interpolation_error(
-    renderer: PsfRenderer,
-    sensor: Sensor,
-    rows: Tensor,
-    columns: Tensor,
-    truth: Survey,
-    nodes: Survey,
-) -> float:
-    """RMS over the points of the error of functions interpolated from the nodes, grey levels."""
-    distortion = renderer.registration == "chief_rays"
-    if distortion and nodes.chief is None:
-        return math.inf
-    functions, wanted = (s.functions(renderer.size, distortion) for s in (nodes, truth))
-    if renderer.illumination == "map":
-        light = nodes.light()[..., None, None]
-        functions = functions / light.clamp(min=torch.finfo(light.dtype).tiny)
-    weights = torch.einsum(
-        "nr,nc->nrc",
-        _hats(rows, sensor.height, renderer.fields[0]),
-        _hats(columns, sensor.width, renderer.fields[1]),
-    ).flatten(1)
-    found = torch.einsum("nm,mdcij->ndcij", weights.to(functions), functions)
-    if renderer.illumination == "map":
-        found = found * truth.light()[..., None, None]
-    return float(grey_levels(found - wanted).square().mean().sqrt())
-
-
-def _hats(places: Tensor, length: int, count: int) -> Tensor:
-    """(N, count): bilinear weights of nodes at places along a side."""
-    if count == 1:
-        return torch.ones(len(places), 1, dtype=places.dtype)
-    spacing = (length - 1) / (count - 1)
-    node = torch.arange(count, dtype=places.dtype) * spacing
-    return (1.0 - (places[:, None] - node).abs() / spacing).clamp(min=0.0)
-
-
 def _shared_depths(functions: Tensor, scene: PlanarScene, tolerance: float) -> Finding:
     middle = functions[:, scene.depths.index(scene.middle_depth)][:, None]
     return _sharing("depths", functions - middle, len(scene.depths), tolerance)
@@ -293,7 +121,7 @@ def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Fin
     error = float(grey_levels(difference).square().mean().sqrt())
     if count == 1:
         return Finding(what, "each", 0.0, "there is one")
-    if error <= _SHARING * tolerance:
+    if error <= tolerance:
         return Finding(what, "one", error, "they hardly differ")
     return Finding(what, "each", 0.0, f"one for all would cost {error:.2g}")
 
@@ -335,7 +163,7 @@ def _wider_window(
         edge = (widest - size) // 2
         difference = torch.nn.functional.pad(blurred(size), (edge,) * 4) - whole
         error = float(grey_levels(difference).square().mean().sqrt())
-        if error <= _WINDOW * tolerance:
+        if error <= WINDOW_SHARE * tolerance:
             break
     return Finding("window with diffraction", str(size), error, "the Airy disc is wide")
 
