@@ -5,7 +5,7 @@ cosines at the image, which a Fourier transform wants.  A few hundred of them de
 that give path difference, amplitude and crossings of apertures anywhere in the pupil.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -69,6 +69,10 @@ class RegularPupil:
     wavelength: Tensor
     index: Tensor
 
+    def __getitem__(self, which: Tensor) -> "RegularPupil":
+        """The pupils that an index chooses."""
+        return RegularPupil(*(getattr(self, field.name)[which] for field in fields(self)))
+
 
 def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
     """Fit a wavefront's rays by least squares.
@@ -95,7 +99,7 @@ def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
         passing = wavefront.coverage > 0.0
         used = (dilated(passing, _AROUND) & wavefront.valid).flatten(1)
         centre, half_width = _middle(*_bounds(alpha, used))
-        low, high = _bounds(*_cells(wavefront.direction, passing))
+        low, high = _bounds(*_cells(wavefront.direction, passing, wavefront.valid))
         unit = ((alpha - centre[:, None]) / half_width[:, None]).clamp(-1.0, 1.0)
         (x, dx), (y, dy) = (chebyshev(unit[..., axis], degree) for axis in (0, 1))
         rows, columns = _terms(degree, x.device)
@@ -211,14 +215,20 @@ def _middle(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     return 0.5 * (low + high), 0.5 * (high - low) * (1.0 + 1e-9)
 
 
-def _cells(direction: Tensor, passing: Tensor) -> tuple[Tensor, Tensor]:
-    """Points half-way to all neighbours of the rays that pass, and whether they count: a cell
-    that light passes in part has its centre up to half a cell outside.
+def _cells(direction: Tensor, passing: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Points half-way from rays that pass to their neighbours, and whether they count: the centre
+    of a cell that light passes in part lies up to half a cell outside.
     """
     points, counts = [], []
     for dim in (1, 2):
         size = passing.shape[dim] - 1
-        first, second = (direction.narrow(dim, at, size) for at in (0, 1))
-        points.append((0.5 * (first + second)).flatten(1, 2))
-        counts.append((passing.narrow(dim, 0, size) | passing.narrow(dim, 1, size)).flatten(1))
+        (a, b), (lit, beside), (there, known) = (
+            [values.narrow(dim, at, size) for at in (0, 1)]
+            for values in (direction, passing, valid)
+        )
+        middle = torch.where(
+            (there & known)[..., None], 0.5 * (a + b), torch.where(lit[..., None], a, b)
+        )
+        points.append(middle.flatten(1, 2))
+        counts.append((lit | beside).flatten(1))
     return torch.cat(points, 1), torch.cat(counts, 1)

@@ -14,6 +14,12 @@ GLASS = parse_material("1.5", _MODEL)
 N = 1.5
 
 
+def _fixed(surfaces, thicknesses, sensor_distance, materials, **options) -> Lens:
+    """A lens with its stop in front, whose parameters want no gradient."""
+    lens = Lens(surfaces, thicknesses, sensor_distance, materials, stop=1, **options)
+    return lens.requires_grad_(False)
+
+
 def hyperbola(
     focal_length: float = 50.0,
     aperture: float | ClearAperture = 2.5,
@@ -28,8 +34,8 @@ def hyperbola(
     distance = focal_length + defocus
     if gap:
         surfaces = [Plane(aperture, {}), Plane(40.0, {}), rear]
-        return Lens(surfaces, [gap, 4.0], distance, [AIR, AIR, GLASS, AIR], stop=1, **options)
-    return Lens([Plane(aperture, {}), rear], [4.0], distance, [AIR, GLASS, AIR], stop=1, **options)
+        return _fixed(surfaces, [gap, 4.0], distance, [AIR, AIR, GLASS, AIR], **options)
+    return _fixed([Plane(aperture, {}), rear], [4.0], distance, [AIR, GLASS, AIR], **options)
 
 
 def hyperbola_height(sine: float, focal_length: float) -> float:
@@ -46,7 +52,7 @@ def ellipse(radius: float = 20.0, aperture: float = 2.0) -> Lens:
     infinity meet at n·R/(n - 1).
     """
     front = Conic(aperture, {"curvature": 1.0 / radius, "conic": -1.0 / N**2})
-    return Lens([front], [], N * radius / (N - 1.0), [AIR, GLASS], stop=1)
+    return _fixed([front], [], N * radius / (N - 1.0), [AIR, GLASS])
 
 
 def relay(object_distance: float, focal_length: float = 60.0, aperture: float = 5.0) -> Lens:
@@ -55,7 +61,7 @@ def relay(object_distance: float, focal_length: float = 60.0, aperture: float = 
     """
     front = Conic(aperture, {"curvature": 1.0 / ((N - 1.0) * object_distance), "conic": -N * N})
     rear = Conic(3 * aperture, {"curvature": -1.0 / ((N - 1.0) * focal_length), "conic": -N * N})
-    return Lens([front, rear], [5.0], focal_length, [AIR, GLASS, AIR], stop=1)
+    return _fixed([front, rear], [5.0], focal_length, [AIR, GLASS, AIR])
 
 
 def pinhole(
@@ -63,6 +69,6 @@ def pinhole(
 ) -> Lens:
     """Nothing but a hole in front of the sensor, or two: `second` is (gap, semi-diameter), mm."""
     if not second:
-        return Lens([Plane(aperture, {})], [], distance, [AIR, AIR], stop=1)
+        return _fixed([Plane(aperture, {})], [], distance, [AIR, AIR])
     gap, other = second
-    return Lens([Plane(aperture, {}), Plane(other, {})], [gap], distance, [AIR] * 3, stop=1)
+    return _fixed([Plane(aperture, {}), Plane(other, {})], [gap], distance, [AIR] * 3)

@@ -249,7 +249,7 @@ def test_the_pupil_of_a_telecentric_lens_lies_at_infinity():
 
 
 def test_a_lens_in_single_precision_is_traced_in_double():
-    single = hyperbola(aperture=5.0, dtype=torch.float32)
+    single = hyperbola(aperture=5.0, dtype=torch.float32).requires_grad_(True)
     single.surfaces.to(torch.float32)
     found = pupil_wavefront(single.system(), AXIS, 500.0, CENTRE)
     double = copy.deepcopy(single).to(torch.float64)
