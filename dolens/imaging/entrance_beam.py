@@ -18,9 +18,8 @@ from dolens.optics.aiming import launch
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.paraxial import entrance_pupil
-from dolens.optics.rays import Components, Rays
+from dolens.optics.rays import Components, Rays, Status, TracedRays
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import trace_surfaces, trace_to_plane
 
 # Rays across the paraxial entrance pupil in the first search, and bounds of their number along each
 # side of the first surface.
@@ -155,26 +154,25 @@ class _Search:
         return edge
 
     def stops(self, edge: _Edge) -> tuple[tuple[int, ...], Tensor]:
-        """What stops the rays just outside: apertures, and (N,), bool, anything else."""
-        system, wavelength = self.system, self.wavelength[edge.owner]
-        traced = trace_surfaces(system, self._rays(edge.outside, edge.owner), wavelength)
-        margins = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0).margins
-        apertures, ended = [], torch.zeros_like(traced.valid)
-        for number, met, inside, transmitted in margins:
-            if inside is not None and not bool((inside > 0.0).all()):
-                apertures.append(number)
-            for margin in (met, transmitted):
-                if margin is not None:
-                    ended = ended | ~(margin > 0.0)
-        owners = torch.zeros(len(self.points), dtype=torch.bool, device=ended.device)
-        return tuple(apertures), owners.index_fill(0, edge.owner[ended], True)
+        """What stops the rays just outside: apertures, and (N,), bool, anything else.
+
+        They are so near the edge that only what makes it stops them.
+        """
+        hit = self._trace(self._rays(edge.outside, edge.owner), self.wavelength[edge.owner])
+        clipped = hit.status == Status.VIGNETTED
+        owners = torch.zeros(len(self.points), dtype=torch.bool, device=clipped.device)
+        ended = owners.index_fill(0, edge.owner[~clipped], True)
+        return tuple(hit.surface[clipped].unique().tolist()), ended
 
     def _rays(self, q: Tensor, owner: Tensor) -> Components:
         return launch(self.points.slopes[owner], self.points.vergence[owner], q)
 
     def _pass(self, ray: Components, wavelength: Tensor) -> Tensor:
+        return self._trace(ray, wavelength).valid
+
+    def _trace(self, ray: Components, wavelength: Tensor) -> TracedRays:
         rays = Rays.from_components(ray, wavelength)
-        return trace_rays(self.system, rays, self.backend, 1.0, False, 1, None).valid
+        return trace_rays(self.system, rays, self.backend, 1.0, False, 1, None)
 
 
 def _box(q: Tensor, valid: Tensor, centre: Tensor, half_width: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,6 +18,8 @@ _FEWEST, _MOST = 96, 2048
 _AIRY_RADII = 10.0
 # Largest difference of the flux through the fitted pupil and of that of the rays, relative.
 _FLUX = 0.01
+# Largest displacement of the image by the Fourier transform, of its distance from the middle.
+_DISTORTION = 0.01
 _SOME = 3
 
 
@@ -29,14 +31,14 @@ class DiffractionSettings:
         method: `fourier`, `direct`, or `auto`: Fourier transform where its phases hold.
         phase_error: waves, the largest error of a phase that the Fourier transform may make.
         rays: along each side of the box of rays that the wavefront is fitted to.
-        degree: of the fit; None: 10, or 16 where 10 leaves a tenth of `phase_error`.
+        degree: of the fit; None: 10, or 16 where 10 leaves a hundredth of `phase_error`.
         oversampling: samples of the pupil over those at which copies of the image meet the window.
         samples: across the pupil, G; None: by window, spot, F-number and `oversampling`.
         subsamples: of the irradiance along a pixel; None: by F-number and pitch.
     """
 
     method: str = "auto"
-    phase_error: float = 0.05
+    phase_error: float = 0.1
     rays: int = 24
     degree: int | None = None
     oversampling: float = 1.5
@@ -62,8 +64,9 @@ class Propagation:
         fourier: (N,), bool: the Fourier transform holds.
         reasons: why, or why not, of each.
         fit_residual: (N,), waves: the largest error of the fitted path difference at a ray.
-        sphere_term: (N,), waves: the largest error of taking the distance to a point of the sensor
-            as linear in the direction cosines, where light goes in the window.
+        sphere_term: (N,), waves: how far the distance from the pupil to a point of the sensor bends
+            away from a linear function of the direction cosines, where light goes in the window.
+        distortion: (N,), by which part of its distance from the window's middle light is displaced.
         flux_error: (N,), relative difference of fitted and traced flux.
     """
 
@@ -71,6 +74,7 @@ class Propagation:
     reasons: tuple[str, ...]
     fit_residual: Tensor
     sphere_term: Tensor
+    distortion: Tensor
     flux_error: Tensor
 
 
@@ -84,9 +88,10 @@ def choose_propagation(
     """Whether pupils may be propagated by a Fourier transform.
 
     They may where the fitted path difference, and the distance from the reference sphere taken as
-    linear in the direction cosines, are right to `settings.phase_error`; where no part of the
-    pupil's edge is made by rays that miss a surface or are totally reflected, which no aperture's
-    margin describes; and where rays and fit agree on the flux.
+    linear in the direction cosines, are right to `settings.phase_error`, and the image is displaced
+    by less than a hundredth of itself; where no part of the pupil's edge is made by rays that miss
+    a surface or are totally reflected, which no aperture's margin describes; and where rays and fit
+    agree on the flux.
 
     Args:
         fit: of N pupils.
@@ -97,11 +102,12 @@ def choose_propagation(
     limit = (settings or DiffractionSettings()).phase_error
     wavefront = fit.wavefront
     lit = wavefront.flux > 0.0
-    term = sphere_term(fit, half_window)
+    term, distortion = sphere_term(fit, half_window)
     error = torch.where(lit, pupil.flux / wavefront.flux - 1.0, 0.0)
-    columns = (lit, fit.residual, term, wavefront.ended, error)
+    columns = (lit, fit.residual, term, distortion, wavefront.ended, error)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
     reasons = []
-    for light, residual, bend, ended, excess in zip(*(c.tolist() for c in columns), strict=True):
+    for light, residual, bend, moved, ended, excess in rows:
         if not light:
             reasons.append("fourier: no light passes")
             continue
@@ -110,6 +116,8 @@ def choose_propagation(
             against.append(f"the path difference is fitted to {residual:.2g} waves only")
         if not bend <= limit:
             against.append(f"distances to the window bend by {bend:.2g} waves across the pupil")
+        if not moved <= _DISTORTION:
+            against.append(f"the window's edge is displaced by {moved:.2g} of its distance")
         if ended:
             against.append("rays at the pupil's edge miss a surface or are totally reflected")
         if not abs(excess) <= _FLUX:
@@ -121,6 +129,7 @@ def choose_propagation(
         reasons=tuple(reasons),
         fit_residual=fit.residual,
         sphere_term=term,
+        distortion=distortion,
         flux_error=error,
     )
 
@@ -175,27 +184,44 @@ def subsamples(fit: PupilFit, pitch: float) -> int:
 
 
 @torch.no_grad()
-def sphere_term(fit: PupilFit, half_window: float) -> Tensor:
-    """(N,), waves: half the range over the pupil of D - R - α·ρ, at worst where light goes.
+def sphere_term(fit: PupilFit, half_window: float) -> tuple[Tensor, Tensor]:
+    """What a Fourier transform leaves of the distance D from the pupil to a point ρ of the sensor.
 
-    Light goes, within the window, where rays land and ten Airy radii around.
+    About the middle ᾱ of the pupil, D - R = ρ·(α - ᾱ)/s̄ + ... besides what all of it shares, with
+    s̄ = D̄/R.  Taking ρ·(α - ᾱ) for it displaces the image by the part 1/s̄ - 1 of its distance from
+    the centre, and leaves out -(ρ·(α - ᾱ))²/2R and what follows.
+
+    Args:
+        fit: of N pupils.
+        half_window: mm; of the window, that part counts where rays land and ten Airy radii around.
+
+    Returns:
+        Half the range of what is left out over the pupil, (N,) in waves, and the largest
+        |1/s̄ - 1| (N,), at worst of eight points ρ at the sides and corners.
     """
     wavefront, wave = fit.wavefront, _wave(fit.wavefront)
     blur = 1.22 * wave[:, None] / (fit.high - fit.low)
     reach = (_farthest(wavefront) + _AIRY_RADII * blur).clamp(max=half_window)
-    # Bends are smooth: some of the rays tell.
+    # It is smooth: some of the rays tell.
     some = (slice(None), slice(None, None, _SOME), slice(None, None, _SOME))
-    lit, direction = (wavefront.coverage > 0.0)[some], wavefront.direction[some]
-    curvature = wavefront.curvature[:, None, None]
-    worst = torch.zeros_like(wave)
+    lit, curvature = (wavefront.coverage > 0.0)[some], wavefront.curvature
+    middle = 0.5 * (fit.low + fit.high)
+    from_middle = wavefront.direction[some] - middle[:, None, None]
+    worst, moved = torch.zeros_like(wave), torch.zeros_like(wave)
     for towards in ((1, 0), (0, 1), (1, 1), (1, -1), (-1, 0), (0, -1), (-1, -1), (-1, 1)):
         rho = reach * reach.new_tensor(towards)
-        along = (direction * rho[:, None, None]).sum(-1)
-        beyond, _ = path_beyond(along, rho.square().sum(-1)[:, None, None], curvature)
-        high = torch.where(lit, beyond - along, -torch.inf).amax((1, 2))
-        low = torch.where(lit, beyond - along, torch.inf).amin((1, 2))
+        squared, along = rho.square().sum(-1), (middle * rho).sum(-1)
+        _, s = path_beyond(along, squared, curvature)
+        step = (from_middle * rho[:, None, None]).sum(-1)
+        beyond, _ = path_beyond(
+            along[:, None, None] + step, squared[:, None, None], curvature[:, None, None]
+        )
+        bend = beyond - step / s[:, None, None]
+        high = torch.where(lit, bend, -torch.inf).amax((1, 2))
+        low = torch.where(lit, bend, torch.inf).amin((1, 2))
         worst = torch.maximum(worst, torch.where(high >= low, 0.5 * (high - low), 0.0))
-    return worst / wave
+        moved = torch.maximum(moved, (1.0 / s - 1.0).abs())
+    return worst / wave, moved
 
 
 def _wave(wavefront: Wavefront) -> Tensor:

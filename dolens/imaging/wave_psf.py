@@ -29,7 +29,7 @@ Centres = Tensor | Sequence[Sequence[float]] | None
 Wavelengths = float | Sequence[float] | Tensor
 
 # Degrees of the fit that are tried, and the share of the phase error that the first may leave.
-_DEGREES, _SHARE = (10, 16), 0.1
+_DEGREES, _SHARE = (10, 16), 0.01
 # Numbers of a piece of work; more pupils than fit are done in pieces, and again for the gradient.
 _PIECE = 1 << 24
 
