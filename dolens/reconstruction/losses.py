@@ -8,12 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.reconstruction.perceptual import (
-    PerceptualWeightsUnavailable,
-    VGG16Features,
-    load_vgg16_weights,
-    perceptual_loss,
-)
+from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
+from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +63,7 @@ class RestorationLoss(nn.Module):
 
     Raises:
         InputError: a negative weight, another word for `perceptual`, or a wrong weights file.
-        PerceptualWeightsUnavailable: `perceptual="vgg16"` and no weights were found.
+        PretrainedWeightsUnavailable: `perceptual="vgg16"` and no weights were found.
     """
 
     def __init__(
@@ -134,7 +130,7 @@ def _check_choice(perceptual: str) -> None:
 def _find_features(perceptual: str, vgg16_weights: str | None) -> tuple[VGG16Features, ...]:
     try:
         return (VGG16Features(load_vgg16_weights(vgg16_weights)),)
-    except PerceptualWeightsUnavailable as error:
+    except PretrainedWeightsUnavailable as error:
         if perceptual == "vgg16":
             raise
         logger.warning("TRAINING WITHOUT THE PERCEPTUAL TERM: %s", error)

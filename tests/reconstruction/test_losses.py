@@ -6,7 +6,7 @@ import torch
 
 from dolens.errors import InputError
 from dolens.reconstruction import (
-    PerceptualWeightsUnavailable,
+    PretrainedWeightsUnavailable,
     RestorationLoss,
     VGG16Features,
     mean_squared_error,
@@ -128,7 +128,7 @@ def test_auto_without_weights_warns_once_and_trains(caplog):
 
 
 def test_vgg16_without_weights_refuses():
-    with pytest.raises(PerceptualWeightsUnavailable, match="no VGG-16 weights"):
+    with pytest.raises(PretrainedWeightsUnavailable, match="no VGG-16 weights"):
         RestorationLoss(perceptual="vgg16")
 
 
