@@ -1,6 +1,11 @@
 """From the sensor image to the picture: networks, deconvolution, losses, image quality."""
 
-from dolens.reconstruction.losses import RestorationLoss, mean_squared_error, total_variation
+from dolens.reconstruction.losses import (
+    RestorationLoss,
+    mean_absolute_error,
+    mean_squared_error,
+    total_variation,
+)
 from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
 from dolens.reconstruction.quality import psnr_db, structural_similarity
 from dolens.reconstruction.restoration import (
@@ -21,6 +26,7 @@ __all__ = [
     "VGG16Features",
     "WienerUNetRestoration",
     "load_vgg16_weights",
+    "mean_absolute_error",
     "mean_squared_error",
     "perceptual_loss",
     "psnr_db",
