@@ -1,5 +1,8 @@
 """From the sensor image to the picture: networks, deconvolution, losses, image quality."""
 
+from dolens.reconstruction.backbones import Backbone, load_backbone
+from dolens.reconstruction.feature_pyramid import FeaturePyramid
+from dolens.reconstruction.field_coordinates import field_channels
 from dolens.reconstruction.losses import (
     RestorationLoss,
     mean_absolute_error,
@@ -9,6 +12,7 @@ from dolens.reconstruction.losses import (
 from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
 from dolens.reconstruction.quality import psnr_db, structural_similarity
 from dolens.reconstruction.restoration import (
+    FeaturePyramidRestoration,
     Restoration,
     UNetRestoration,
     WienerUNetRestoration,
@@ -18,6 +22,9 @@ from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.wiener import wiener_deconvolve
 
 __all__ = [
+    "Backbone",
+    "FeaturePyramid",
+    "FeaturePyramidRestoration",
     "PretrainedWeightsUnavailable",
     "Restoration",
     "RestorationLoss",
@@ -25,6 +32,8 @@ __all__ = [
     "UNetRestoration",
     "VGG16Features",
     "WienerUNetRestoration",
+    "field_channels",
+    "load_backbone",
     "load_vgg16_weights",
     "mean_absolute_error",
     "mean_squared_error",
