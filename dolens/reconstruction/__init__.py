@@ -1,6 +1,12 @@
 """From the sensor image to the picture: networks, deconvolution, losses, image quality."""
 
+from dolens.reconstruction.adversarial import (
+    RelativisticDiscriminators,
+    relativistic_discriminator_loss,
+    relativistic_generator_loss,
+)
 from dolens.reconstruction.backbones import Backbone, load_backbone
+from dolens.reconstruction.discriminators import GlobalDiscriminator, PatchDiscriminator
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
 from dolens.reconstruction.field_coordinates import field_channels
 from dolens.reconstruction.losses import (
@@ -25,7 +31,10 @@ __all__ = [
     "Backbone",
     "FeaturePyramid",
     "FeaturePyramidRestoration",
+    "GlobalDiscriminator",
+    "PatchDiscriminator",
     "PretrainedWeightsUnavailable",
+    "RelativisticDiscriminators",
     "Restoration",
     "RestorationLoss",
     "UNet",
@@ -39,6 +48,8 @@ __all__ = [
     "mean_squared_error",
     "perceptual_loss",
     "psnr_db",
+    "relativistic_discriminator_loss",
+    "relativistic_generator_loss",
     "structural_similarity",
     "total_variation",
     "wiener_deconvolve",
