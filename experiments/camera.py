@@ -15,11 +15,13 @@ from dolens.optics.lens import Lens
 from dolens.optimize.operands import View, operand
 from dolens.optimize.variables import DesignVariables
 from dolens.reconstruction import (
+    RelativisticDiscriminators,
     Restoration,
     RestorationLoss,
     psnr_db,
     structural_similarity,
 )
+from experiments.adversary import Adversary
 from experiments.views.base import Imaging, Views
 
 
@@ -43,6 +45,7 @@ class CameraModule(lightning.LightningModule):
         learning_rates: `optics` and `network`.
         scheduler: optimizer → scheduler, stepped once a training step; or None.
         variables: settings of `DesignVariables`; empty or None trains the network alone.
+        discriminator: judges the restored images besides; None for no adversarial term.
         operands: what the lens must be besides, as of a merit function: Σ (weight·deviation)² is
             added to the loss.
         view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
@@ -59,6 +62,7 @@ class CameraModule(lightning.LightningModule):
         learning_rates: Mapping[str, float],
         scheduler: Callable[..., Any] | None = None,
         variables: Mapping[str, Mapping[str, Any] | None] | None = None,
+        discriminator: RelativisticDiscriminators | None = None,
         operands: Sequence[Mapping[str, Any]] = (),
         view_norm: float = 1.0,
     ) -> None:
@@ -69,6 +73,7 @@ class CameraModule(lightning.LightningModule):
         self.operands = [operand(settings, lens) for settings in operands]
         self.network = network
         self.loss = loss
+        self.adversary = Adversary(discriminator, learning_rates) if discriminator else None
         self.experiment = experiment
         self.views = views
         self.optimizer = optimizer
@@ -95,7 +100,8 @@ class CameraModule(lightning.LightningModule):
             taken: what the sensor gave.
             functions: point spread functions, or None where the network asks for none.
         """
-        restored = self.network(taken.raw.flatten(0, 1), functions)
+        field = None if taken.field is None else taken.field.flatten(0, 1)
+        restored = self.network(taken.raw.flatten(0, 1), functions, field)
         return restored.unflatten(0, taken.raw.shape[:2])
 
     def loss_over_views(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:
@@ -189,7 +195,12 @@ class CameraModule(lightning.LightningModule):
                 self.log(f"train/{name}", value)
         for label, value in operands.items():
             self.log(f"operand/{label}", value.float())
-        return terms["total"] + penalty.to(restored.dtype)
+        total = terms["total"] + penalty.to(restored.dtype)
+        if self.adversary is not None:
+            term, numbers = self.adversary(truth.flatten(0, 1), restored.flatten(0, 1))
+            self.log_dict({f"train/{name}": value for name, value in numbers.items()})
+            total = total + term
+        return total
 
     def on_after_backward(self) -> None:
         """Close the optics' share of the backward pass."""
@@ -271,6 +282,8 @@ class CameraModule(lightning.LightningModule):
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
         numbers = {f"variables/{n}": float(v) for n, v in self._variable_numbers().items()}
+        if isinstance(getattr(self.network, "pretrained", None), bool):
+            numbers["network/pretrained"] = float(self.network.pretrained)
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.views.rays())
         numbers |= self.views.numbers()
@@ -297,6 +310,8 @@ class CameraModule(lightning.LightningModule):
         """Say whose checkpoint it is, in plain values."""
         checkpoint["dolens"] = self._identity()
         checkpoint["dolens_views"] = self.views.state()
+        if self.adversary is not None:
+            checkpoint["dolens_adversary"] = self.adversary.optimizer.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another experiment before any weight is loaded."""
@@ -310,6 +325,8 @@ class CameraModule(lightning.LightningModule):
                     f"{value!r}; resume with the experiment and settings that wrote it"
                 )
         self.views.load_state(self.lens, checkpoint.get("dolens_views", {}))
+        if self.adversary is not None:
+            self.adversary.optimizer.load_state_dict(checkpoint["dolens_adversary"])
 
     def _identity(self) -> dict[str, Any]:
         return {

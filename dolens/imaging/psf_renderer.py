@@ -10,7 +10,11 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.diffraction_limit import with_diffraction_limit, working_f_number
-from dolens.imaging.field_psf import FieldFunctions, field_point_spread_functions
+from dolens.imaging.field_psf import (
+    FieldFunctions,
+    field_point_spread_functions,
+    wave_point_spread_functions,
+)
 from dolens.imaging.illumination import relative_illumination
 from dolens.imaging.patch_convolution import (
     Coordinates,
@@ -165,6 +169,19 @@ class PsfRenderer(Unprepared):
     ) -> FieldFunctions:
         """The functions at the grid's points, row after row; differentiable in the system."""
         shared, pitch = self.shared(scene), self.sensor.pixel_pitch
+        distortion, symmetric = self.registration == "chief_rays", is_rotationally_symmetric(system)
+        if self.diffraction == "wave":
+            return wave_point_spread_functions(
+                system,
+                shared,
+                self.points(),
+                pupil,
+                pitch,
+                self.size,
+                distortion,
+                symmetric,
+                backend,
+            )
         found = field_point_spread_functions(
             system,
             shared,
@@ -174,8 +191,8 @@ class PsfRenderer(Unprepared):
             self.size,
             self.pupil_samples,
             seed if self.jitter else None,
-            self.registration == "chief_rays",
-            is_rotationally_symmetric(system),
+            distortion,
+            symmetric,
             backend,
         )
         if self.diffraction == "none":

@@ -126,7 +126,8 @@ def test_settings_out_of_range_are_errors(settings, message):
         field_views(**settings)
 
 
-def test_the_experiment_runs_whole(composed, tmp_path):
+@pytest.mark.parametrize("discriminator", ["none", "double_scale"])
+def test_the_experiment_runs_whole(composed, tmp_path, discriminator):
     run(
         composed(
             "experiment=large_fov_doublet",
@@ -142,7 +143,9 @@ def test_the_experiment_runs_whole(composed, tmp_path):
             "+trainer.limit_val_batches=1",
             "+trainer.limit_test_batches=1",
             "+trainer.enable_progress_bar=false",
-            "network.width=4",
+            "network.width_multiplier=0.25",
+            "network.weights=none",
+            f"discriminator={discriminator}",
             "loss.perceptual=none",
         )
     )
@@ -150,6 +153,7 @@ def test_the_experiment_runs_whole(composed, tmp_path):
     for zone in ("axis", "0.5", "0.7", "full", "field"):
         assert math.isfinite(metrics[f"test/psnr_db/{zone}"])
     assert metrics["operand/edge_thickness/1"] > 0.0
+    assert ("train/adversarial" in metrics) == (discriminator == "double_scale")
     # The focal length is held by the last curvature.
     lens = yaml.safe_load((tmp_path / "run/lens/final.yaml").read_text())
     assert float(lens_from_prescription(lens).first_order().efl) == pytest.approx(

@@ -172,9 +172,12 @@ def test_diffraction_is_modelled_where_it_shows(root):
     with torch.no_grad():
         lens.sensor_distance.fill_(float(lens.first_order().bfd))
     scene = PlanarScene((1e7,), LINES[1:2])
-    for pitch, diffraction in ((0.002, "limit"), (0.2, "none")):
+    for pitch, models in ((0.002, ("limit", "wave")), (0.2, ("none",))):
         choice = AutoRenderer(Sensor(32, 32, pitch), 1.0).make_plan(lens, scene)
-        assert choice.renderer.diffraction == diffraction
+        assert choice.renderer.diffraction in models
+    unasked = AutoRenderer(Sensor(32, 32, 0.002), 1.0, diffraction=False).make_plan(lens, scene)
+    assert unasked.renderer.diffraction == "none"
+    assert any("would change" in line for line in unasked.lines())
 
 
 def test_the_plan_is_kept_logged_and_counted(root, caplog):

@@ -43,17 +43,25 @@ class AutoRenderer:
         tolerance: RMS error on a photograph-like probe image, in grey levels: 1/255 of full scale
             in linear light, before the sensor's own noise.
         gradients: whether the lens's gradients matter too, and not only the image.
+        diffraction: whether to model it where it shows; where not, the log says what it would
+            change.
         seed: of the probe and its reference.
     """
 
     def __init__(
-        self, sensor: Sensor, tolerance: float = 1.0, gradients: bool = True, seed: int = 0
+        self,
+        sensor: Sensor,
+        tolerance: float = 1.0,
+        gradients: bool = True,
+        diffraction: bool = True,
+        seed: int = 0,
     ) -> None:
         if not tolerance > 0.0:
             raise InputError(f"renderer: tolerance must be positive (grey levels), not {tolerance}")
         self.sensor = sensor
         self.tolerance = tolerance
         self.gradients = gradients
+        self.diffraction = diffraction
         self.seed = seed
         self.choice: Choice | None = None
         self.plans = 0
@@ -168,6 +176,7 @@ class AutoRenderer:
                 self.sensor,
                 tightened * self.tolerance,
                 self.gradients,
+                self.diffraction,
                 backend,
             )
             error = self._measured(
@@ -186,7 +195,7 @@ class AutoRenderer:
             renderer, scene, surfaces
         )
         # Rays know no diffraction.
-        of_rays = math.hypot(noise, found.without_diffraction)
+        of_rays = math.hypot(noise, found.without_diffraction if self.diffraction else 0.0)
         verdict = (
             f"{samples**2} rays a pixel and colour would err by {of_rays:.2g} at {times:.2g} times "
             f"the cost"

@@ -25,6 +25,8 @@ _SAMPLING, _SHARING, _DIFFRACTION, _PRECISION = 0.5, 0.25, 0.3, 0.1
 # Near an optimum the gradients of colours, and of depths, cancel; one in place of all turns their
 # sum: a cosine of 0.3 with the rays' gradient was measured, in images a quarter grey level off.
 _SHARING_OF_GRADIENTS = 0.005
+# Points where wavefronts are asked.
+_WAVES = 4
 # Pixels by which windows grow, for diffraction; the last is for comparison.
 _MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
@@ -59,6 +61,7 @@ def plan(
     sensor: Sensor,
     tolerance: float,
     gradients: bool,
+    diffraction: bool,
     backend: str,
 ) -> Plan:
     """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
@@ -70,6 +73,7 @@ def plan(
         sensor: the pixels.
         tolerance: RMS grey levels (1/255 of full scale, linear light) on the probe.
         gradients: whether the lens's gradients matter too.
+        diffraction: whether it may be modelled.
         backend: what traces.
 
     Raises:
@@ -88,10 +92,17 @@ def plan(
     ):
         renderer = replace(renderer, **{name: finding.chosen})
         findings.append(finding)
-    finding, without = _diffraction(functions, truth, scene, sensor, tolerance)
+    places = rows, columns
+    finding, without = _diffraction(
+        functions, truth, precise, scene, places, renderer, tolerance, backend
+    )
+    if not diffraction:
+        finding = Finding(
+            "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
+        )
     renderer = replace(renderer, diffraction=finding.chosen)
     findings.append(finding)
-    if finding.chosen == "limit":
+    if finding.chosen != "none":
         finding = _wider_window(truth, scene, renderer, tolerance)
         renderer = replace(renderer, size=int(finding.chosen))
         findings.append(finding)
@@ -127,23 +138,51 @@ def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Fin
 
 
 def _diffraction(
-    functions: Tensor, truth: Survey, scene: PlanarScene, sensor: Sensor, tolerance: float
+    functions: Tensor,
+    truth: Survey,
+    system: OpticalSystem,
+    scene: PlanarScene,
+    places: tuple[Tensor, Tensor],
+    renderer: PsfRenderer,
+    tolerance: float,
+    backend: str,
 ) -> tuple[Finding, float]:
-    """Whether the blur of the pupil's edge shows behind that of the rays, and by how much."""
-    airy = 1.22 * max(scene.wavelengths) * 1e-6 * truth.f_number / sensor.pixel_pitch
+    """What model of diffraction is enough, and what leaving it out would cost.
+
+    A perfect pupil's says whether it can matter at all; where it can, wavefronts are asked.
+    """
+    pitch = renderer.sensor.pixel_pitch
+    airy = 1.22 * max(scene.wavelengths) * 1e-6 * truth.f_number / pitch
+    seen = f"the Airy disc's radius is {airy:.2g} pixels"
     side = max(128, functions.shape[-1] + 1)
     errors = [
         blurred_grey_levels(
             functions[:, :, channel],
-            diffraction_transfer(side, side, sensor.pixel_pitch, wavelength, truth.f_number),
+            diffraction_transfer(side, side, pitch, wavelength, truth.f_number),
         )
         for channel, wavelength in enumerate(scene.wavelengths)
     ]
     error = float(torch.stack(errors).square().mean().sqrt())
-    seen = f"the Airy disc's radius is {airy:.2g} pixels"
     if error <= _DIFFRACTION * tolerance:
         return Finding("diffraction", "none", error, seen), error
-    return Finding("diffraction", "limit", 0.0, f"{seen}; without it {error:.2g}"), error
+    few = slice(0, _WAVES)
+    sensor, distortion = renderer.sensor, renderer.registration == "chief_rays"
+    found = survey(system, scene, sensor, *(p[few] for p in places), SAMPLES, backend)
+    # As wide as diffraction spreads light, within reason.
+    size = renderer.size + 2 * min(math.ceil(8.0 * airy) + 2, _MARGINS[-1])
+    waves = found.waves(system, scene, sensor, places[0][few], places[1][few], size, distortion)
+    rays = found.functions(size, distortion).double()
+    limited = with_diffraction_limit(rays, pitch, scene.wavelengths, truth.f_number)
+    without, with_limit = (
+        float(grey_levels(f - waves).square().mean().sqrt()) for f in (rays, limited)
+    )
+    if without <= _DIFFRACTION * tolerance:
+        return Finding("diffraction", "none", without, f"{seen}; measured by waves"), without
+    if with_limit <= _DIFFRACTION * tolerance:
+        because = f"{seen}; measured by waves; without it {without:.2g}"
+        return Finding("diffraction", "limit", with_limit, because), without
+    because = f"{seen}; without it {without:.2g}, with a perfect pupil's {with_limit:.2g}"
+    return Finding("diffraction", "wave", 0.0, because), without
 
 
 def _wider_window(

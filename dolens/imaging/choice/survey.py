@@ -7,7 +7,11 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.diffraction_limit import working_f_number
-from dolens.imaging.field_psf import sampled_disc, splatted
+from dolens.imaging.field_psf import (
+    sampled_disc,
+    splatted,
+    wave_point_spread_functions,
+)
 from dolens.imaging.plane_points import (
     PlanePoints,
     chief_ray_points,
@@ -53,6 +57,30 @@ class Survey:
     def functions(self, size: int, distortion: bool) -> Tensor:
         """(N, D, C, size, size)."""
         return splatted(self.offsets(distortion), size, self.backend).functions
+
+    def waves(
+        self,
+        system: OpticalSystem,
+        scene: PlanarScene,
+        sensor: Sensor,
+        rows: Tensor,
+        columns: Tensor,
+        size: int,
+        distortion: bool,
+    ) -> Tensor:
+        """Functions (N, D, C, size, size) with diffraction, of the same points."""
+        pupil = sampled_exit_pupil(system, scene.wavelengths, sensor, self.backend)
+        return wave_point_spread_functions(
+            system,
+            scene,
+            sensor.positions(rows, columns),
+            pupil,
+            sensor.pixel_pitch,
+            size,
+            distortion,
+            is_rotationally_symmetric(system),
+            self.backend,
+        ).functions
 
     def light(self) -> Tensor:
         """(N, 1, C), relative illumination."""
