@@ -14,6 +14,7 @@ from dolens.errors import InputError
 from dolens.imaging.diffraction import direct_field, fourier_field
 from dolens.imaging.object_points import ObjectPoints
 from dolens.imaging.pupil_fit import fit_pupil, regular_pupil
+from dolens.imaging.reference_sphere import path_beyond
 from dolens.imaging.wavefront import pupil_wavefront
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
 from dolens.optics.surfaces.even_asphere import EvenAsphere
@@ -303,6 +304,24 @@ def test_light_beyond_a_hole_is_fresnel_s():
         expected = 4.0 * math.sin(0.5 * math.pi * number) ** 2
         for found in (fourier(lens, ZERO, samples=400), direct(lens, ZERO, samples=256)):
             assert float(found) * math.pi * a * a == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize("radius", [50.0, 3.0, -20.0, math.inf])
+def test_distances_are_those_of_points(radius):
+    """|Q + ρ - (Q - R·α)|, with the sign of R, less R; of an infinite sphere α·ρ."""
+    generator = torch.Generator().manual_seed(5)
+    alpha = 0.8 * torch.rand(200, 2, generator=generator).double() - 0.4
+    rho = torch.rand(200, 2, generator=generator).double() - 0.5
+    along, squared = (alpha * rho).sum(-1), rho.square().sum(-1)
+    beyond, ratio = path_beyond(along, squared, torch.tensor(1.0 / radius, dtype=torch.float64))
+    if math.isinf(radius):
+        assert torch.equal(beyond, along) and bool((ratio == 1.0).all())
+        return
+    height = (1.0 - alpha.square().sum(-1)).sqrt()
+    step = torch.cat([rho + radius * alpha, radius * height[:, None]], -1)
+    distance = math.copysign(1.0, radius) * step.norm(dim=-1)
+    assert torch.allclose(beyond, distance - radius, rtol=0.0, atol=1e-13)
+    assert torch.allclose(ratio, distance / radius, rtol=1e-14)
 
 
 def test_points_must_be_pairs():

@@ -1,6 +1,7 @@
 """Kernels of pixels with diffraction, and the choice of how light is propagated."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,13 +14,15 @@ from dolens.errors import InputError
 from dolens.imaging import wave_psf
 from dolens.imaging.object_points import ObjectPoints
 from dolens.imaging.pixel_integration import fine_grid, pixel_matrix, quadratic_b_spline
-from dolens.imaging.propagation import DiffractionSettings
+from dolens.imaging.propagation import DiffractionSettings, choose_propagation
 from dolens.imaging.psf import axial_point_spread_functions, splat
+from dolens.imaging.pupil_fit import fit_pupil, regular_pupil
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.wave_psf import propagation, wave_kernels
+from dolens.imaging.wavefront import pupil_wavefront
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
-from tests.imaging.perfect_lenses import ellipse, hyperbola
+from tests.imaging.perfect_lenses import ellipse, hyperbola, pinhole
 
 AXIS = ObjectPoints.at_infinity([[0.0, 0.0]])
 CENTRE = [[0.0, 0.0]]
@@ -249,6 +252,19 @@ def test_the_choice_is_explained(coding, triplet):
     strict = DiffractionSettings(phase_error=1e-6, degree=16)
     chosen = propagation(coding().system(), on_axis([8000.0]), 550.0, None, 0.0069, 65, strict)
     assert "distances to the window bend" in chosen.reasons[0]
+
+    # A hole's oblique light: αρ/R = 0.57·1.65/61 at the window's edge.
+    aside = ObjectPoints.at_infinity([[0.0, 35.0]])
+    chosen = propagation(pinhole(2.0).system(), aside, 500.0, None, 0.1, 31)
+    assert float(chosen.distortion) == pytest.approx(0.0154, rel=0.1)
+    assert chosen.reasons[0].startswith("direct: the window's edge is displaced by")
+
+    rays = pupil_wavefront(hyperbola().system(), AXIS, 500.0, CENTRE, 24)
+    pupil = regular_pupil(fit_pupil(rays), 96)
+    assert bool(choose_propagation(fit_pupil(rays), pupil, 0.05).fourier)
+    wrong = replace(pupil, flux=1.05 * pupil.flux)
+    chosen = choose_propagation(fit_pupil(rays), wrong, 0.05)
+    assert chosen.reasons[0].startswith("direct: the flux through the fitted pupil errs by 0.05")
 
     dark = ObjectPoints.at_infinity([[0.0, 60.0]])
     chosen = propagation(triplet.system(), dark, 550.0, [[0.0, 40.0]], 0.004, 9)
