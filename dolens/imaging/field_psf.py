@@ -12,6 +12,7 @@ from dolens.imaging.plane_points import (
     pinhole_points,
     plane_points,
 )
+from dolens.imaging.propagation import DiffractionSettings
 from dolens.imaging.psf import splat
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.random_numbers import random_words, uniform
@@ -110,11 +111,13 @@ def wave_point_spread_functions(
     distortion: bool,
     symmetric: bool,
     backend: str,
+    settings: DiffractionSettings | None = None,
 ) -> FieldFunctions:
     """The same with diffraction: of the wavefronts of the points that functions are centred on.
 
     Each function keeps the share of light that rays give it; what diffraction spreads beyond the
-    window is given back in proportion.  Arguments as of `field_point_spread_functions`.
+    window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
+    finely diffraction is computed.
     """
     planes, channels = len(scene.depths), len(scene.wavelengths)
     if distortion:
@@ -142,7 +145,8 @@ def wave_point_spread_functions(
         centres.reshape(-1, 2),
         pitch,
         size,
-        backend=backend,
+        settings,
+        backend,
     ).reshape(*shape, size, size)
     with torch.no_grad():
         disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)

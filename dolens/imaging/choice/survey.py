@@ -18,6 +18,7 @@ from dolens.imaging.plane_points import (
     pinhole_points,
     plane_points,
 )
+from dolens.imaging.propagation import DiffractionSettings
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
@@ -80,6 +81,8 @@ class Survey:
             distortion,
             is_rotationally_symmetric(system),
             self.backend,
+            # Near enough for a plan; direct integration would take minutes.
+            DiffractionSettings(method="fourier"),
         ).functions
 
     def light(self) -> Tensor:
