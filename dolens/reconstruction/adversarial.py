@@ -16,7 +16,7 @@ def relativistic_discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
         ½ mean((D(x) − E D(G) − 1)²) + ½ mean((D(G) − E D(x) + 1)²)
 
     D(x) being the scores of true images, D(G) those of restored ones and E the mean over all of
-    a kind (Jolicoeur-Martineau 2018; DeblurGAN-v2, section 3.2).  It is zero where every true
+    a kind (Jolicoeur-Martineau 2018; the RaGAN-LS of DeblurGAN-v2).  It is zero where every true
     image scores one more than the mean restored one, and conversely; 1 where all score alike.
 
     Args:

@@ -16,7 +16,7 @@ _SLOPE = 0.2
 class FeaturePyramid(nn.Module):
     """Image to image, through a backbone down and a pyramid of features up again.
 
-    After Kupyn et al., DeblurGAN-v2, ICCV 2019, Figure 2, with P = `pyramid_channels` and the
+    After Kupyn et al., DeblurGAN-v2, ICCV 2019, with P = `pyramid_channels` and the
     backbone's features Cₖ at stride 2ᵏ, k = 0 … n, C₀ being the image:
 
         Pₙ = lateral(Cₙ),   Pₖ = smooth(lateral(Cₖ) + ×2 Pₖ₊₁),   k = n − 1 … 2,
