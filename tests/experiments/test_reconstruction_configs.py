@@ -35,11 +35,11 @@ def test_losses_weigh_their_terms_as_written(composed, name):
 
 
 def test_no_discriminator_is_none(composed):
-    assert instantiate(composed(EXPERIMENT, "+discriminator=none").discriminator) is None
+    assert instantiate(composed(EXPERIMENT, "discriminator=none").discriminator) is None
 
 
 def test_the_double_scale_discriminators_train_and_judge(composed):
-    cfg = composed(EXPERIMENT, "+discriminator=double_scale", "discriminator.weight=0.02")
+    cfg = composed(EXPERIMENT, "discriminator=double_scale", "discriminator.weight=0.02")
     discriminators = instantiate(cfg.discriminator)
     assert isinstance(discriminators, RelativisticDiscriminators)
     assert discriminators.weight == 0.02
