@@ -20,6 +20,7 @@ _AIRY_RADII = 10.0
 _FLUX = 0.01
 # Largest displacement of the image by the Fourier transform, of its distance from the middle.
 _DISTORTION = 0.01
+# Every third ray tells how distances bend.
 _SOME = 3
 
 
@@ -202,7 +203,6 @@ def sphere_term(fit: PupilFit, half_window: float) -> tuple[Tensor, Tensor]:
     wavefront, wave = fit.wavefront, _wave(fit.wavefront)
     blur = 1.22 * wave[:, None] / (fit.high - fit.low)
     reach = (_farthest(wavefront) + _AIRY_RADII * blur).clamp(max=half_window)
-    # It is smooth: some of the rays tell.
     some = (slice(None), slice(None, None, _SOME), slice(None, None, _SOME))
     lit, curvature = (wavefront.coverage > 0.0)[some], wavefront.curvature
     middle = 0.5 * (fit.low + fit.high)
