@@ -230,9 +230,13 @@ def _wave(wavefront: Wavefront) -> Tensor:
 
 
 def _farthest(wavefront: Wavefront) -> Tensor:
-    """(N, 2), mm, of the rays that pass: largest |x| and |y| on the sensor from the centre."""
-    lit = (wavefront.coverage > 0.0)[..., None]
-    return torch.where(lit, wavefront.landing.abs(), 0.0).amax((1, 2))
+    """(N, 2), mm, of the rays that pass: largest |x| and |y| on the sensor from the centre.
+
+    Rays whose cells pass less than half of their light lie outside the beam.
+    """
+    share = wavefront.coverage
+    lit = (share > 0.0) & (share >= 0.5 * share.amax((1, 2), keepdim=True))
+    return torch.where(lit[..., None], wavefront.landing.abs(), 0.0).amax((1, 2))
 
 
 def _enough(needed: float) -> int:
