@@ -23,10 +23,10 @@ from dolens.optics.system import OpticalSystem
 
 # Rays across the paraxial entrance pupil in the first search, and bounds of their number along each
 # side of the first surface.
-_ACROSS, _FEWEST, _MOST = 8, 32, 256
+_ACROSS, _FEWEST, _MOST = 8, 16, 256
 # Rays along each side of the beam; the parts that the last spacing before its edge is cut into, and
 # how often.
-_SIDE, _PARTS, _CUTS = 48, 6, 2
+_SIDE, _PARTS, _CUTS = 32, 4, 2
 _AZIMUTHS, _RADII = 32, 8
 
 

@@ -27,15 +27,20 @@ def fine_grid(size: int, subsamples: int, like: Tensor) -> Tensor:
 
 
 def pixel_matrix(size: int, subsamples: int, like: Tensor) -> Tensor:
-    """B of the pixel-integrated window B·I·Bᵀ, for irradiance I on `fine_grid`.
+    """β(x/p - i) of every pixel i at the samples x of `fine_grid`.
 
-    A pixel collects ∫I·β(x/p - i), with β the quadratic B-spline: the pixel's box convolved with a
-    texel's tent, as in `dolens.imaging.psf`.  Light whose spectrum ends below subsamples/pitch - f
-    is integrated with its true weight at the frequency f.
+    β is a pixel's box convolved with a texel's tent, as in `dolens.imaging.psf`.  With B this
+    matrix times the samples' distance, B·I·Bᵀ is what pixels collect of the irradiance I: exactly,
+    where I has no frequency that a multiple of the samples' own takes to where β has one.
+
+    Args:
+        size: pixels along a side.
+        subsamples: samples a pixel.
+        like: gives precision and device.
 
     Returns:
-        (size, subsamples·(size + 2)); columns sum to 1/subsamples² per axis pair, so that a unit of
-        flux spread over cells of area (pitch/subsamples)² comes out as a unit.
+        (size, subsamples·(size + 2)).  The pixels' shares of a sample add up to one within the
+        window.
     """
     pixel = torch.arange(size, dtype=like.dtype, device=like.device) - 0.5 * (size - 1)
     return quadratic_b_spline(fine_grid(size, subsamples, like) - pixel[:, None])

@@ -20,6 +20,7 @@ _AIRY_RADII = 10.0
 _FLUX = 0.01
 # Largest displacement of the image by the Fourier transform, of its distance from the middle.
 _DISTORTION = 0.01
+# Every third ray tells how distances bend.
 _SOME = 3
 
 
@@ -202,7 +203,6 @@ def sphere_term(fit: PupilFit, half_window: float) -> tuple[Tensor, Tensor]:
     wavefront, wave = fit.wavefront, _wave(fit.wavefront)
     blur = 1.22 * wave[:, None] / (fit.high - fit.low)
     reach = (_farthest(wavefront) + _AIRY_RADII * blur).clamp(max=half_window)
-    # It is smooth: some of the rays tell.
     some = (slice(None), slice(None, None, _SOME), slice(None, None, _SOME))
     lit, curvature = (wavefront.coverage > 0.0)[some], wavefront.curvature
     middle = 0.5 * (fit.low + fit.high)
@@ -230,9 +230,13 @@ def _wave(wavefront: Wavefront) -> Tensor:
 
 
 def _farthest(wavefront: Wavefront) -> Tensor:
-    """(N, 2), mm, of the rays that pass: largest |x| and |y| on the sensor from the centre."""
-    lit = (wavefront.coverage > 0.0)[..., None]
-    return torch.where(lit, wavefront.landing.abs(), 0.0).amax((1, 2))
+    """(N, 2), mm, of the rays that pass: largest |x| and |y| on the sensor from the centre.
+
+    Rays whose cells pass less than half of their light lie outside the beam.
+    """
+    share = wavefront.coverage
+    lit = (share > 0.0) & (share >= 0.5 * share.amax((1, 2), keepdim=True))
+    return torch.where(lit[..., None], wavefront.landing.abs(), 0.0).amax((1, 2))
 
 
 def _enough(needed: float) -> int:
