@@ -1,9 +1,8 @@
-"""A camera as one Lightning module: lens, scene, renderer, readout, reconstruction and loss."""
+"""A camera as one Lightning module: a lens, how it looks, reconstruction and loss."""
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import lightning
@@ -12,30 +11,26 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
-from dolens.imaging.psf import axial_point_spread_functions
-from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.readout import Readout
-from dolens.imaging.scene import Scene, pinhole_image
 from dolens.optics.lens import Lens
+from dolens.optimize.operands import View, operand
 from dolens.optimize.variables import DesignVariables
 from dolens.reconstruction import (
+    RelativisticDiscriminators,
     Restoration,
     RestorationLoss,
     psnr_db,
     structural_similarity,
 )
-
-# Streams of random numbers that must not meet: (what, stage) → an offset of the seed.
-_STREAMS = {"train": 0, "val": 1, "test": 2}
-_STREAM_STRIDE, _NOISE_OFFSET = 1 << 40, 1 << 39
+from experiments.adversary import Adversary
+from experiments.views.base import Imaging, Views
 
 
 class CameraModule(lightning.LightningModule):
-    """End-to-end training of a camera on planes at several depths, or on scenes with depth.
+    """End-to-end training of a camera.
 
-    A batch of textures is imaged at every depth, or once with a depth for each texel, and read out,
-    and one network restores all the images without being told the depth.  The loss reaches the
-    network and the lens's variables.
+    A batch of textures is imaged in several ways (at depths, or at places of the field), read out,
+    and one network restores all the images without being told which.  The loss reaches the network
+    and the lens's variables.
 
     All random numbers are functions of the seed and the step, so that a resumed run repeats an
     uninterrupted one.
@@ -43,119 +38,103 @@ class CameraModule(lightning.LightningModule):
     Args:
         lens: the lens; its other parameters stay as they are.
         experiment: name of the experiment; a checkpoint of another one is refused.
-        scene: depths and wavelengths.
-        renderer: makes the training images.
-        readout: what the sensor makes of them.
+        views: images the textures.
         network: restores them.
         loss: compares display-encoded images.
         optimizer: parameter groups → optimizer.
         learning_rates: `optics` and `network`.
         scheduler: optimizer → scheduler, stepped once a training step; or None.
         variables: settings of `DesignVariables`; empty or None trains the network alone.
-        evaluation_pupil_samples: `pupil_samples` of the renderer that makes the validation and test
-            images; by default the training renderer's own.
-        depth_norm: p of the power mean that joins the depths' losses; see `loss_over_depths`.
-        psf_size: pixels along each side of the point spread functions.
-        psf_pupil_samples: their strata along each side of the pupil.
-        seed: of rendering and noise.
+        discriminator: judges the restored images besides; None for no adversarial term.
+        operands: what the lens must be besides, as of a merit function: Σ (weight·deviation)² is
+            added to the loss.
+        view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
     """
 
     def __init__(
         self,
         lens: Lens,
         experiment: str,
-        scene: Scene,
-        renderer: RayRenderer,
-        readout: Readout,
+        views: Imaging,
         network: Restoration,
         loss: RestorationLoss,
         optimizer: Callable[..., torch.optim.Optimizer],
         learning_rates: Mapping[str, float],
         scheduler: Callable[..., Any] | None = None,
         variables: Mapping[str, Mapping[str, Any] | None] | None = None,
-        evaluation_pupil_samples: int | None = None,
-        depth_norm: float = 1.0,
-        psf_size: int = 65,
-        psf_pupil_samples: int = 48,
-        seed: int = 0,
+        discriminator: RelativisticDiscriminators | None = None,
+        operands: Sequence[Mapping[str, Any]] = (),
+        view_norm: float = 1.0,
     ) -> None:
         super().__init__()
         self.lens = lens.requires_grad_(False)
         self.variables = DesignVariables(lens, variables or {})
         self.variables.write_to(self.lens)
+        self.operands = [operand(settings, lens) for settings in operands]
         self.network = network
         self.loss = loss
+        self.adversary = Adversary(discriminator, learning_rates) if discriminator else None
         self.experiment = experiment
-        self.scene = scene
-        self.renderer = renderer
-        self.evaluation_renderer = replace(
-            renderer, pupil_samples=evaluation_pupil_samples or renderer.pupil_samples
-        )
+        self.views = views
         self.optimizer = optimizer
         self.scheduler = scheduler
         self.learning_rates = dict(learning_rates)
-        self.readout = readout
-        if not depth_norm >= 1.0:
-            raise InputError(f"depth_norm must be at least 1, not {depth_norm}")
-        self.depth_norm = depth_norm
-        self.psf_size = psf_size
-        self.psf_pupil_samples = psf_pupil_samples
-        self.seed = seed
+        if not view_norm >= 1.0:
+            raise InputError(f"view_norm must be at least 1, not {view_norm}")
+        self.view_norm = view_norm
         self.step_seconds: list[float] = []
         self.optics_seconds: list[float] = []
         self._evaluations: list[dict[str, Tensor]] = []
         self._step_started = self._optics_started = 0.0
-        scene.check(lens.system())
+        views.check(lens)
         missing = {"optics", "network"} - set(self.learning_rates)
         if missing:
             raise InputError(f"learning_rates: '{missing.pop()}' is missing (optics and network)")
 
-    # ---------------------------------------------------------------- imaging and restoration
+    # ---------------------------------------------------------------- restoration and loss
 
-    def truth(self, textures: Tensor) -> Tensor:
-        """(B, 3, H, W), display-encoded: what a distortion-free pinhole sees."""
-        colours = self.scene.colours(textures)
-        return linear_to_srgb(pinhole_image(colours, self.renderer.sensor))
+    def restore(self, taken: Views, functions: Tensor | None) -> Tensor:
+        """(B, V, 3, H, W), display-encoded.
 
-    def raw_images(
-        self, textures: Tensor, renderer: RayRenderer, seed: int, values: Mapping[str, Tensor]
-    ) -> Tensor:
-        """(B, depths, 3, H, W), linear light, read out and developed."""
-        image = renderer.render(self.lens, self.scene, textures, seed, values)
-        generator = torch.Generator(image.device).manual_seed(seed + _NOISE_OFFSET)
-        return self.readout.develop(self.readout(image, generator))
-
-    def point_spread_functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
-        """(depths, 3, K, K) of the lens as it is, or None where the network asks for none."""
-        if not self.network.needs_point_spread_function:
-            return None
-        return axial_point_spread_functions(
-            self.lens,
-            self.scene,
-            self.renderer.sensor,
-            self.psf_size,
-            self.psf_pupil_samples,
-            values,
-        )
-
-    def restore(self, raw: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-        """(B, depths, 3, H, W), display-encoded, of raw images of that shape."""
-        restored = self.network(raw.flatten(0, 1), self.point_spread_functions(values))
-        return restored.unflatten(0, raw.shape[:2])
-
-    def loss_over_depths(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:
-        """The loss and its terms, of images (B, depths, 3, H, W).
-
-        Terms are means over the depths.  The total is the power mean (Σ L_d^p / D)^(1/p) of the
-        depths' totals with p = `depth_norm`: at p = 1 their mean, and the larger p is, the more
-        the worst depth counts, which is what an extended depth of field is for.
+        Args:
+            taken: what the sensor gave.
+            functions: point spread functions, or None where the network asks for none.
         """
-        rows = [self.loss(restored[:, d], truth[:, d]) for d in range(restored.shape[1])]
+        field = None if taken.field is None else taken.field.flatten(0, 1)
+        restored = self.network(taken.raw.flatten(0, 1), functions, field)
+        return restored.unflatten(0, taken.raw.shape[:2])
+
+    def loss_over_views(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:
+        """The loss and its terms, of images (B, V, 3, H, W).
+
+        Terms are means over the views.  The total is the power mean (Σ L_v^p / V)^(1/p) of the
+        views' totals with p = `view_norm`: at p = 1 their mean, and the larger p is, the more the
+        worst one counts, which is what an extended depth of field is for.
+        """
+        rows = [self.loss(restored[:, v], truth[:, v]) for v in range(restored.shape[1])]
         terms = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
         largest = terms["total"].detach().amax().clamp(min=torch.finfo(restored.dtype).tiny)
-        relative = (terms["total"] / largest) ** self.depth_norm
-        total = largest * relative.mean() ** (1.0 / self.depth_norm)
+        relative = (terms["total"] / largest) ** self.view_norm
+        total = largest * relative.mean() ** (1.0 / self.view_norm)
         return {name: value.mean() for name, value in terms.items()} | {"total": total}
+
+    def penalty(self, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """What the operands add to the loss, and their values by label."""
+        found: dict[str, Tensor] = {}
+        total = torch.zeros((), device=self.lens.device)
+        if self.operands:
+            view = View(self.lens.system(values), self.lens.primary_wavelength, None)
+            for entry in self.operands:
+                for label, value in entry.values(view).items():
+                    found[label] = value.detach()
+                    total = total + (entry.weight * entry.deviation(value)).square()
+        return total, found
+
+    def _functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
+        """Point spread functions of the lens as it is, where the network asks for them."""
+        if not self.network.needs_point_spread_function:
+            return None
+        return self.views.point_spread_functions(self.lens, values)
 
     # ---------------------------------------------------------------- training
 
@@ -184,6 +163,11 @@ class CameraModule(lightning.LightningModule):
             "lr_scheduler": {"scheduler": self.scheduler(optimizer), "interval": "step"},
         }
 
+    def on_train_epoch_start(self) -> None:
+        """Let the renderer look at the lens as it is now; not when an epoch is resumed within."""
+        if self.trainer.fit_loop.epoch_loop.batch_progress.current.ready == 0:
+            self.views.prepare(self.lens, self.variables())
+
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
         """Start the step's clock."""
         self._step_started = time.perf_counter()
@@ -192,14 +176,16 @@ class CameraModule(lightning.LightningModule):
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
         started = time.perf_counter()
         values = self.variables()
-        raw = self.raw_images(batch, self.renderer, self._seed("train", self.global_step), values)
+        taken = self.views.take(self.lens, values, batch, "train", self.global_step)
+        functions = self._functions(values)
         self.optics_seconds.append(time.perf_counter() - started)
-        if raw.requires_grad:
+        if taken.raw.requires_grad:
             # The image's gradient is the network's last; what comes after it is the lens's.
-            raw.register_hook(self._start_optics_backward)
-        restored = self.restore(raw, values)
-        truth = self.truth(batch)[:, None].expand_as(restored)
-        terms = self.loss_over_depths(restored, truth.to(restored.dtype))
+            taken.raw.register_hook(self._start_optics_backward)
+        restored = self.restore(taken, functions)
+        truth = taken.truth.to(restored.dtype)
+        terms = self.loss_over_views(restored, truth)
+        penalty, operands = self.penalty(values)
         with torch.no_grad():
             psnr = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1)).mean()
         self.log("train/loss", terms["total"], prog_bar=True)
@@ -207,7 +193,14 @@ class CameraModule(lightning.LightningModule):
         for name, value in terms.items():
             if name != "total":
                 self.log(f"train/{name}", value)
-        return terms["total"]
+        for label, value in operands.items():
+            self.log(f"operand/{label}", value.float())
+        total = terms["total"] + penalty.to(restored.dtype)
+        if self.adversary is not None:
+            term, numbers = self.adversary(truth.flatten(0, 1), restored.flatten(0, 1))
+            self.log_dict({f"train/{name}": value for name, value in numbers.items()})
+            total = total + term
+        return total
 
     def on_after_backward(self) -> None:
         """Close the optics' share of the backward pass."""
@@ -224,7 +217,7 @@ class CameraModule(lightning.LightningModule):
         self.log("cost/step_s", self.step_seconds[-1])
         self.log("cost/optics_s", self.optics_seconds[-1])
         self.log("cost/network_s", self.step_seconds[-1] - self.optics_seconds[-1])
-        self.log("cost/rays", float(self.renderer.rays_per_image(self.scene)))
+        self.log("cost/rays", float(self.views.rays()))
         with torch.no_grad():
             for name, value in self._variable_numbers().items():
                 self.log(f"variables/{name}", value)
@@ -232,23 +225,20 @@ class CameraModule(lightning.LightningModule):
     def _start_optics_backward(self, gradient: Tensor) -> None:
         self._optics_started = time.perf_counter()
 
-    def _seed(self, stage: str, index: int) -> int:
-        return (self.seed * len(_STREAMS) + _STREAMS[stage]) * _STREAM_STRIDE + index
-
     # ---------------------------------------------------------------- evaluation
 
     def evaluation_images(
         self, batch: Tensor, stage: str, index: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Truth (B, 3, H, W), raw and restored (B, depths, 3, H, W), display-encoded.
+        """Truth, raw and restored (B, V, 3, H, W), display-encoded.
 
         The same stage and index give the same images of the same camera.
         """
         with torch.no_grad():
             values = self.variables()
-            raw = self.raw_images(batch, self.evaluation_renderer, self._seed(stage, index), values)
-            restored = self.restore(raw, values)
-            return self.truth(batch), linear_to_srgb(raw), restored.clamp(0.0, 1.0)
+            taken = self.views.take(self.lens, values, batch, stage, index)
+            restored = self.restore(taken, self._functions(values))
+            return taken.truth, linear_to_srgb(taken.raw), restored.clamp(0.0, 1.0)
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
         """Measure on the validation photographs."""
@@ -268,17 +258,12 @@ class CameraModule(lightning.LightningModule):
 
     def _evaluate(self, batch: Tensor, stage: str, index: int) -> None:
         truth, raw, restored = self.evaluation_images(batch, stage, index)
-        loss = self.loss_over_depths(
-            restored, truth[:, None].expand_as(restored).to(restored.dtype)
-        )
-        row = {"loss": loss["total"].expand(len(batch), restored.shape[1])}
+        loss = self.loss_over_views(restored, truth.to(restored.dtype))
+        row = {"loss": loss["total"].expand(truth.shape[:2])}
         for name, image in (("", restored), ("raw_", raw)):
-            row[f"{name}psnr_db"] = torch.stack(
-                [psnr_db(image[:, d], truth) for d in range(image.shape[1])], 1
-            )
-            row[f"{name}ssim"] = torch.stack(
-                [structural_similarity(image[:, d], truth) for d in range(image.shape[1])], 1
-            )
+            for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
+                found = measure(image.flatten(0, 1), truth.flatten(0, 1).to(image.dtype))
+                row[f"{name}{metric}"] = found.unflatten(0, truth.shape[:2])
         self._evaluations.append(row)
 
     def _log_evaluations(self, stage: str) -> None:
@@ -286,19 +271,22 @@ class CameraModule(lightning.LightningModule):
         if not rows:
             return
         for name in rows[0]:
-            by_depth = torch.cat([row[name] for row in rows]).mean(dim=0).float()
+            by_view = torch.cat([row[name] for row in rows]).mean(dim=0).float()
             headline = name in ("loss", "psnr_db")
-            self.log(f"{stage}/{name}", by_depth.mean(), prog_bar=headline)
+            self.log(f"{stage}/{name}", by_view.mean(), prog_bar=headline)
             if name != "loss":
-                for label, value in zip(self.scene.labels(), by_depth, strict=True):
+                for label, value in zip(self.views.labels(), by_view, strict=True):
                     self.log(f"{stage}/{name}/{label}", value)
-                self.log(f"{stage}/{name}/worst", by_depth.min())
+                self.log(f"{stage}/{name}/worst", by_view.min())
 
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
         numbers = {f"variables/{n}": float(v) for n, v in self._variable_numbers().items()}
+        if isinstance(getattr(self.network, "pretrained", None), bool):
+            numbers["network/pretrained"] = float(self.network.pretrained)
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
-        numbers["cost/rays"] = float(self.renderer.rays_per_image(self.scene))
+        numbers["cost/rays"] = float(self.views.rays())
+        numbers |= self.views.numbers()
         if self.step_seconds:
             numbers["cost/step_s"] = statistics.median(self.step_seconds)
             numbers["cost/optics_s"] = statistics.median(self.optics_seconds)
@@ -321,6 +309,9 @@ class CameraModule(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say whose checkpoint it is, in plain values."""
         checkpoint["dolens"] = self._identity()
+        checkpoint["dolens_views"] = self.views.state()
+        if self.adversary is not None:
+            checkpoint["dolens_adversary"] = self.adversary.optimizer.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another experiment before any weight is loaded."""
@@ -333,6 +324,9 @@ class CameraModule(lightning.LightningModule):
                     f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
                     f"{value!r}; resume with the experiment and settings that wrote it"
                 )
+        self.views.load_state(self.lens, checkpoint.get("dolens_views", {}))
+        if self.adversary is not None:
+            self.adversary.optimizer.load_state_dict(checkpoint["dolens_adversary"])
 
     def _identity(self) -> dict[str, Any]:
         return {

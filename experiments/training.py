@@ -145,7 +145,7 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
             flat[name] = str(node)
 
     # What `module` holds refers to the other groups and would only repeat them.
-    left_out = ("hydra", "module", "lens", "callbacks", "logger", "trainer")
+    left_out = ("hydra", "module", "views", "lens", "callbacks", "logger", "trainer")
     chosen = [key for key in cfg if key not in left_out]
     visit(OmegaConf.to_container(OmegaConf.masked_copy(cfg, chosen), resolve=True), "")
     return {"experiment": HydraConfig.get().runtime.choices.get("experiment"), **flat}

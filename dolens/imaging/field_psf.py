@@ -12,12 +12,17 @@ from dolens.imaging.plane_points import (
     pinhole_points,
     plane_points,
 )
+from dolens.imaging.propagation import DiffractionSettings
 from dolens.imaging.psf import splat
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.sampling import square_to_disc, stratified_square
 from dolens.imaging.scene import Scene
+from dolens.imaging.wave_psf import wave_kernels
 from dolens.optics.system import OpticalSystem
+
+# Strata of the pupil along each side, for the light of a function that rays do not make.
+_LIGHT_SAMPLES = 32
 
 
 class FieldFunctions(NamedTuple):
@@ -94,6 +99,63 @@ def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
         kept = functions.sum((-2, -1)) / total.clamp(min=torch.finfo(total.dtype).tiny)
         lost = torch.where(total > 0.0, 1.0 - kept, 0.0).max()
     return FieldFunctions(functions, total[:, 0], lost)
+
+
+def wave_point_spread_functions(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    size: int,
+    distortion: bool,
+    symmetric: bool,
+    backend: str,
+    settings: DiffractionSettings | None = None,
+) -> FieldFunctions:
+    """The same with diffraction: of the wavefronts of the points that functions are centred on.
+
+    Each function keeps the share of light that rays give it; what diffraction spreads beyond the
+    window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
+    finely diffraction is computed.
+    """
+    planes, channels = len(scene.depths), len(scene.wavelengths)
+    if distortion:
+        rows, columns = chief_ray_points(system, scene, points, pupil, pitch, backend)
+    else:
+        rows, columns = pinhole_points(points, pitch, planes, channels)
+    options = {"dtype": torch.float64, "device": system.device}
+    depth = torch.tensor(scene.depths, **options)[:, None]
+    scale = pitch / torch.tensor(scene.magnifications(system), **options)[:, None]
+    shape = (len(points[0]), planes, channels)
+    positions = torch.stack(
+        [
+            (columns.double() * scale).expand(shape),
+            (-rows.double() * scale).expand(shape),
+            (-depth).expand(shape),
+        ],
+        -1,
+    )
+    wavelengths = torch.tensor(scene.wavelengths, **options).expand(shape)
+    centres = torch.stack(points, -1)[:, None, None].expand(*shape, 2)
+    kernels = wave_kernels(
+        system,
+        positions.reshape(-1, 3),
+        wavelengths.reshape(-1),
+        centres.reshape(-1, 2),
+        pitch,
+        size,
+        settings,
+        backend,
+    ).reshape(*shape, size, size)
+    with torch.no_grad():
+        disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
+        seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+        light = seen.weight.sum(-1)
+    total = kernels.sum((-2, -1))
+    share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
+    lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
+    return FieldFunctions(kernels * share[..., None, None], light[:, 0], lost)
 
 
 def sampled_disc(

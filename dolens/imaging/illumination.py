@@ -13,7 +13,7 @@ from dolens.imaging.stop_rays import even_points
 from dolens.optics.system import OpticalSystem
 
 # Points along the radius of a symmetric lens, or along each side of the sensor.
-_RADII, _SIDE = 33, 13
+_RADII, _SIDE = 65, 13
 
 
 @torch.no_grad()
@@ -24,13 +24,13 @@ def relative_illumination(
     pupil: ExitPupil,
     symmetric: bool,
     backend: str,
-    rays: int = 1024,
+    rays: int = 2048,
 ) -> Tensor:
     """Irradiance of every pixel under a uniform scene, over that on the axis.
 
     The mean of cos⁴ over the exit pupil as each pixel sees it, vignetting included.  It is found at
-    some points, and interpolated: linearly in the squared radius for a lens of rotational symmetry,
-    else bicubically.
+    some points and interpolated: bicubically, or linearly along the radius of a lens of rotational
+    symmetry (where an edge begins to cut, light is lost in proportion to the radius).
 
     Args:
         system: the lens.
@@ -54,13 +54,13 @@ def relative_illumination(
     disc = tuple(d.expand(max(_RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
     if symmetric:
         x, y = sensor.positions(*grid)
-        squared = x * x + y * y
-        low, high = float(squared.min()), float(squared.max())
-        radius = torch.linspace(low, high, _RADII, **options).sqrt()
+        distance = torch.hypot(x, y)
+        low, high = float(distance.min()), float(distance.max())
+        radius = torch.linspace(low, high, _RADII, **options)
         points = (radius, torch.zeros_like(radius))
         _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
         light = weight.sum(-1)
-        place = (squared - low) * ((_RADII - 1) / max(high - low, 1e-300))
+        place = (distance - low) * ((_RADII - 1) / max(high - low, 1e-300))
         first = place.long().clamp(max=_RADII - 2)
         between = (place - first).to(light)
         return torch.lerp(light[:, first], light[:, first + 1], between)

@@ -16,7 +16,6 @@ from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import trace_surfaces, trace_to_plane
 
 # The paraxial pupil is widened a little, so that the real one lies within it.
 _PUPIL_MARGIN = 1.02
@@ -56,7 +55,7 @@ def axial_point_spread_functions(
     scene.check(system)
     u, v = regular_square(pupil_samples, system.dtype, system.device)
     disc_x, disc_y = square_to_disc(u, v)
-    functions = []
+    rays, wavelengths = [], torch.tensor(scene.wavelengths, dtype=torch.float64)
     for depth in scene.depths:
         for wavelength in scene.wavelengths:
             with torch.no_grad():
@@ -66,27 +65,25 @@ def axial_point_spread_functions(
             dz = (pupil.z + depth).expand(dx.shape)
             n = dz / torch.sqrt(dx * dx + dy * dy + dz * dz)
             zero = torch.zeros_like(n)
-            ray = Components(zero, zero, zero - depth, dx / dz * n, dy / dz * n, n)
-            x, y, valid = _on_sensor(system, ray, wavelength, backend)
-            # A Lambertian point sends cos⁴ over the pupil plane, like a pixel does backwards.
-            weight = torch.where(valid, n**4, zero)
-            total = weight.sum()
-            if not bool(total > 0.0):
-                raise InputError(f"no light from the axis at {depth:g} mm reaches the sensor")
-            columns = size // 2 - x / sensor.pixel_pitch
-            rows = size // 2 + y / sensor.pixel_pitch
-            functions.append(splat(rows, columns, weight / total, size, backend))
-    return torch.stack(functions).reshape(len(scene.depths), len(scene.wavelengths), size, size)
+            rays.append(Components(zero, zero, zero - depth, dx / dz * n, dy / dz * n, n))
+    shape = (len(scene.depths), len(scene.wavelengths), disc_x.numel())
+    ray = Components(*(torch.stack(each).reshape(shape) for each in zip(*rays, strict=True)))
+    x, y, valid = _on_sensor(system, ray, wavelengths.to(system.device)[:, None], backend)
+    # A Lambertian point sends cos⁴ over the pupil plane, like a pixel does backwards.
+    weight = torch.where(valid, ray.n**4, 0.0)
+    total = weight.sum(-1)
+    if not bool((total > 0.0).all()):
+        dark = scene.depths[int(torch.nonzero(total <= 0.0)[0, 0])]
+        raise InputError(f"no light from the axis at {dark:g} mm reaches the sensor")
+    columns = size // 2 - x / sensor.pixel_pitch
+    rows = size // 2 + y / sensor.pixel_pitch
+    return splat(rows, columns, weight / total[..., None], size, backend)
 
 
 def _on_sensor(
-    system: OpticalSystem, ray: Components, wavelength: float, backend: str
+    system: OpticalSystem, ray: Components, wavelength: Tensor, backend: str
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Where rays meet the sensor, x and y in mm, and which of them got there."""
-    if backend == "reference":
-        traced = trace_surfaces(system, ray, wavelength)
-        traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
-        return traced.ray.x, traced.ray.y, traced.valid
     rays = Rays.from_components(ray, wavelength)
     hit = trace_rays(system, rays, backend, 1.0, record=False, first=1, last=None)
     return hit.position[..., 0], hit.position[..., 1], hit.valid

@@ -13,6 +13,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.imaging.pupil import aim, sampled_exit_pupil
 from dolens.imaging.random_numbers import random_words, uniform
+from dolens.imaging.renderer import Unprepared
 from dolens.imaging.replay import replay
 from dolens.imaging.sampling import square_to_disc, stratified_square
 from dolens.imaging.scene import Scene, texture_coordinates, texture_origin
@@ -30,7 +31,7 @@ _SEED_RANGE = 2**63 - 1
 
 
 @dataclass(frozen=True)
-class RayRenderer:
+class RayRenderer(Unprepared):
     """Monte Carlo rendering: jittered points of each pixel, a stratified sampling of the pupil.
 
     Each pixel sends `pupil_samples`² rays: one from a random point of the pixel through a random

@@ -126,6 +126,17 @@ class Scene(ABC):
                     f"the first vertex, and the lens's front edge is at {front:g}"
                 )
 
+    @property
+    def middle_depth(self) -> float:
+        """The depth next to the middle of the range in vergence, which blur goes by."""
+        middle = 0.5 * (1.0 / min(self.depths) + 1.0 / max(self.depths))
+        return min(self.depths, key=lambda depth: abs(1.0 / depth - middle))
+
+    @property
+    def middle_wavelength(self) -> float:
+        """The middle wavelength in order, or the longer one of two."""
+        return sorted(self.wavelengths)[len(self.wavelengths) // 2]
+
     def plane_labels(self) -> list[str]:
         """Depths of the planes, in metres: `8m`, `4.5m`."""
         return [f"{depth / 1000.0:g}m" for depth in self.depths]

@@ -1,7 +1,7 @@
 """A lens as pure functions see it: tensors and names, no state."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -67,6 +67,28 @@ class OpticalSystem:
     def device(self) -> torch.device:
         """Where the lens lives."""
         return self.sensor_distance.device
+
+    def double(self) -> "OpticalSystem":
+        """The same lens in double precision; gradients flow back to its own tensors."""
+        return replace(
+            self,
+            surfaces=[
+                replace(s, parameters={n: p.double() for n, p in s.parameters.items()})
+                for s in self.surfaces
+            ],
+            thicknesses=[gap.double() for gap in self.thicknesses],
+            sensor_distance=self.sensor_distance.double(),
+            elements=[
+                replace(e, parameters={n: p.double() for n, p in e.parameters.items()})
+                for e in self.elements
+            ],
+        )
+
+    def opened(self) -> "OpticalSystem":
+        """The same lens with apertures that clip nothing."""
+        return replace(
+            self, surfaces=[replace(s, aperture=s.aperture.opened()) for s in self.surfaces]
+        )
 
 
 def is_rotationally_symmetric(system: OpticalSystem) -> bool:

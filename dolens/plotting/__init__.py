@@ -8,6 +8,7 @@ from dolens.plotting.history import history_figure
 from dolens.plotting.layout import layout_figure
 from dolens.plotting.matrix import matrix_figure
 from dolens.plotting.modulation import modulation_figure
+from dolens.plotting.pareto import Point, pareto_figure, pareto_front
 from dolens.plotting.psf import psf_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
@@ -15,6 +16,7 @@ from dolens.plotting.spots import spots_figure
 from dolens.plotting.yields import yield_figure
 
 __all__ = [
+    "Point",
     "before_after_figure",
     "comparison_figure",
     "curves_figure",
@@ -23,6 +25,8 @@ __all__ = [
     "layout_figure",
     "matrix_figure",
     "modulation_figure",
+    "pareto_figure",
+    "pareto_front",
     "psf_figure",
     "ray_fans_figure",
     "rms_curves_figure",

@@ -23,41 +23,55 @@ def comparison_figure(
     labels: Sequence[str],
     psnr: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
-    """The truth at the left; raw images above restored ones, one column a depth.
+    """Raw images above restored ones, one column a view, and the truth: at the left where it is the
+    same for all, else above them.
 
     Args:
-        truth: (3, H, W), display-encoded in [0, 1].
-        raw: (depths, 3, H, W), the same.
-        restored: (depths, 3, H, W), the same.
-        labels: one a depth.
-        psnr: {"raw": dB per depth, "restored": dB per depth} for the titles, or None for none.
+        truth: (3, H, W), or (views, 3, H, W), display-encoded in [0, 1].
+        raw: (views, 3, H, W), the same.
+        restored: (views, 3, H, W), the same.
+        labels: one a view.
+        psnr: {"raw": dB per view, "restored": dB per view} for the titles, or None for none.
 
     Returns:
         A figure whose pictures are not interpolated.
     """
-    if raw.ndim != 4 or raw.shape != restored.shape or raw.shape[1:] != truth.shape:
+    if (
+        raw.ndim != 4
+        or raw.shape != restored.shape
+        or truth.shape not in (raw.shape, raw.shape[1:])
+    ):
         raise InputError(
-            "expected truth (3, H, W), raw and restored (depths, 3, H, W), not "
+            "expected truth (3, H, W) or as the others, raw and restored (views, 3, H, W), not "
             f"{tuple(truth.shape)}, {tuple(raw.shape)}, {tuple(restored.shape)}"
         )
-    depths = len(raw)
-    if len(labels) != depths:
-        raise InputError(f"{depths} depths need as many labels, not {len(labels)}")
+    views = len(raw)
+    if len(labels) != views:
+        raise InputError(f"{views} views need as many labels, not {len(labels)}")
+    if truth.ndim == 4 and torch.equal(truth, truth[:1].expand_as(truth)):
+        truth = truth[0]
     images = {"raw": raw, "restored": restored}
+    if truth.ndim == 4:
+        images = {"truth": truth, **images}
+    beside = int(truth.ndim == 3)
 
     height, width = truth.shape[-2:]
     panel = min(max(width / _DPI, _SMALLEST), _LARGEST)
-    size = (panel * (depths + 1) + 0.2, 2.0 * (panel * height / width + 0.4))
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.add_gridspec(2, depths + 1)
-    axes = figure.add_subplot(grid[:, 0])
-    _show(axes, truth)
-    axes.set_title("truth", fontsize=SMALL)
+    tall = panel * height / width + 0.4
+    figure = Figure(
+        figsize=(panel * (views + beside) + 0.2, len(images) * tall), layout="constrained"
+    )
+    grid = figure.add_gridspec(len(images), views + beside)
+    if beside:
+        axes = figure.add_subplot(grid[:, 0])
+        _show(axes, truth)
+        axes.set_title("truth", fontsize=SMALL)
     for row, (name, stack) in enumerate(images.items()):
         for column, (image, label) in enumerate(zip(stack, labels, strict=True)):
-            axes = figure.add_subplot(grid[row, column + 1])
+            axes = figure.add_subplot(grid[row, column + beside])
             _show(axes, image)
-            quality = "" if psnr is None else f": {float(psnr[name][column]):.1f} dB"
+            known = psnr is not None and name in psnr
+            quality = f": {float(psnr[name][column]):.1f} dB" if known else ""
             axes.set_title(f"{name}, {label}{quality}", fontsize=SMALL)
     return figure
 

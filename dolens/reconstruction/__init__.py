@@ -1,33 +1,55 @@
 """From the sensor image to the picture: networks, deconvolution, losses, image quality."""
 
-from dolens.reconstruction.losses import RestorationLoss, mean_squared_error, total_variation
-from dolens.reconstruction.perceptual import (
-    PerceptualWeightsUnavailable,
-    VGG16Features,
-    load_vgg16_weights,
-    perceptual_loss,
+from dolens.reconstruction.adversarial import (
+    RelativisticDiscriminators,
+    relativistic_discriminator_loss,
+    relativistic_generator_loss,
 )
+from dolens.reconstruction.backbones import Backbone, load_backbone
+from dolens.reconstruction.discriminators import GlobalDiscriminator, PatchDiscriminator
+from dolens.reconstruction.feature_pyramid import FeaturePyramid
+from dolens.reconstruction.field_coordinates import field_channels
+from dolens.reconstruction.losses import (
+    RestorationLoss,
+    mean_absolute_error,
+    mean_squared_error,
+    total_variation,
+)
+from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
 from dolens.reconstruction.quality import psnr_db, structural_similarity
 from dolens.reconstruction.restoration import (
+    FeaturePyramidRestoration,
     Restoration,
     UNetRestoration,
     WienerUNetRestoration,
 )
+from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.wiener import wiener_deconvolve
 
 __all__ = [
-    "PerceptualWeightsUnavailable",
+    "Backbone",
+    "FeaturePyramid",
+    "FeaturePyramidRestoration",
+    "GlobalDiscriminator",
+    "PatchDiscriminator",
+    "PretrainedWeightsUnavailable",
+    "RelativisticDiscriminators",
     "Restoration",
     "RestorationLoss",
     "UNet",
     "UNetRestoration",
     "VGG16Features",
     "WienerUNetRestoration",
+    "field_channels",
+    "load_backbone",
     "load_vgg16_weights",
+    "mean_absolute_error",
     "mean_squared_error",
     "perceptual_loss",
     "psnr_db",
+    "relativistic_discriminator_loss",
+    "relativistic_generator_loss",
     "structural_similarity",
     "total_variation",
     "wiener_deconvolve",

@@ -1,4 +1,4 @@
-"""The training loss of equation S20: squared error, total variation, perceptual error."""
+"""The training loss of equation S20: squared error, total variation, perceptual error, and L1."""
 
 import difflib
 import logging
@@ -8,12 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.reconstruction.perceptual import (
-    PerceptualWeightsUnavailable,
-    VGG16Features,
-    load_vgg16_weights,
-    perceptual_loss,
-)
+from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
+from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 
 logger = logging.getLogger(__name__)
 
@@ -26,9 +22,18 @@ def mean_squared_error(restored: Tensor, truth: Tensor) -> Tensor:
     Raises:
         ValueError: the shapes differ (they are not broadcast).
     """
-    if restored.shape != truth.shape:
-        raise ValueError(f"restored {tuple(restored.shape)} and truth {tuple(truth.shape)} differ")
+    _check_shapes(restored, truth)
     return (restored - truth).square().mean()
+
+
+def mean_absolute_error(restored: Tensor, truth: Tensor) -> Tensor:
+    """Return the mean of |restored − truth| over all elements, a scalar.
+
+    Raises:
+        ValueError: the shapes differ (they are not broadcast).
+    """
+    _check_shapes(restored, truth)
+    return (restored - truth).abs().mean()
 
 
 def total_variation(image: Tensor) -> Tensor:
@@ -50,9 +55,10 @@ def total_variation(image: Tensor) -> Tensor:
 class RestorationLoss(nn.Module):
     """Equation S20, with means in place of the norms so that weights do not depend on size.
 
-        total = mse_weight · mse + tv_weight · tv + perceptual_weight · perceptual
+        total = mse_weight · mse + tv_weight · tv + perceptual_weight · perceptual + l1_weight · l1
 
-    Total variation is that of the restored image.
+    Total variation is that of the restored image.  The L1 term is not of S20; it is the content
+    loss that other networks are trained with.
 
     Args:
         mse_weight: α₁.
@@ -61,13 +67,14 @@ class RestorationLoss(nn.Module):
         perceptual: "vgg16" requires the perceptual term; "auto" leaves it out, with a warning,
             where VGG-16's weights cannot be had; "none" leaves it out.
         vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`.
+        l1_weight: of the mean absolute error; at 0 it is not computed.
 
     Attributes:
         perceptual_available: whether the perceptual term is part of the loss.
 
     Raises:
         InputError: a negative weight, another word for `perceptual`, or a wrong weights file.
-        PerceptualWeightsUnavailable: `perceptual="vgg16"` and no weights were found.
+        PretrainedWeightsUnavailable: `perceptual="vgg16"` and no weights were found.
     """
 
     def __init__(
@@ -77,9 +84,15 @@ class RestorationLoss(nn.Module):
         perceptual_weight: float = 1e-2,
         perceptual: str = "auto",
         vgg16_weights: str | None = None,
+        l1_weight: float = 0.0,
     ) -> None:
         super().__init__()
-        self.weights = {"mse": mse_weight, "tv": tv_weight, "perceptual": perceptual_weight}
+        self.weights = {
+            "mse": mse_weight,
+            "tv": tv_weight,
+            "perceptual": perceptual_weight,
+            "l1": l1_weight,
+        }
         for term, weight in self.weights.items():
             if not (weight >= 0 and math.isfinite(weight)):
                 raise InputError(f"{term}_weight={weight}: must be finite and at least 0")
@@ -98,8 +111,8 @@ class RestorationLoss(nn.Module):
         """Compare sRGB images (B, 3, H, W).
 
         Returns:
-            Scalars by name: "mse", "tv" and, where available, "perceptual", all unweighted,
-            and "total", their weighted sum.
+            Scalars by name: "mse", "tv" and, where they are part of the loss, "l1" and
+            "perceptual", all unweighted, and "total", their weighted sum.
 
         Raises:
             ValueError: the shapes differ.
@@ -108,6 +121,8 @@ class RestorationLoss(nn.Module):
             "mse": mean_squared_error(restored, truth),
             "tv": total_variation(restored),
         }
+        if self.weights["l1"] > 0:
+            terms["l1"] = mean_absolute_error(restored, truth)
         for features in self._features:
             # Never below float32, or a half-precision batch would round the weights for good.
             dtype = torch.promote_types(restored.dtype, torch.float32)
@@ -123,6 +138,11 @@ class RestorationLoss(nn.Module):
         return {"total": total, **terms}
 
 
+def _check_shapes(restored: Tensor, truth: Tensor) -> None:
+    if restored.shape != truth.shape:
+        raise ValueError(f"restored {tuple(restored.shape)} and truth {tuple(truth.shape)} differ")
+
+
 def _check_choice(perceptual: str) -> None:
     if perceptual in PERCEPTUAL_CHOICES:
         return
@@ -134,7 +154,7 @@ def _check_choice(perceptual: str) -> None:
 def _find_features(perceptual: str, vgg16_weights: str | None) -> tuple[VGG16Features, ...]:
     try:
         return (VGG16Features(load_vgg16_weights(vgg16_weights)),)
-    except PerceptualWeightsUnavailable as error:
+    except PretrainedWeightsUnavailable as error:
         if perceptual == "vgg16":
             raise
         logger.warning("TRAINING WITHOUT THE PERCEPTUAL TERM: %s", error)

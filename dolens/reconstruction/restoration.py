@@ -8,6 +8,9 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
+from dolens.reconstruction.backbones import load_backbone
+from dolens.reconstruction.feature_pyramid import FeaturePyramid
+from dolens.reconstruction.field_coordinates import FIELD_CHANNELS, with_field_channels
 from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.wiener import wiener_deconvolve
 
@@ -15,25 +18,38 @@ COLORS = 3
 
 
 class Restoration(nn.Module):
-    """What every restoring network offers: `forward(raw, point_spread_functions)`.
+    """What every restoring network offers: `forward(raw, point_spread_functions, field)`.
 
-    `needs_point_spread_function` tells the caller whether to compute the point spread
-    functions at all; where it is False they are ignored and may be None.
+    `needs_point_spread_function` and `needs_field` tell the caller whether to compute the point
+    spread functions and the field coordinates at all; where one is False they are ignored and
+    may be None.  `pretrained` tells whether any of the network began with trained weights.
     """
 
     needs_point_spread_function: ClassVar[bool]
+    needs_field: bool = False
+    pretrained: bool = False
 
-    def forward(self, raw: Tensor, point_spread_functions: Tensor | None = None) -> Tensor:
+    def forward(
+        self,
+        raw: Tensor,
+        point_spread_functions: Tensor | None = None,
+        field: Tensor | None = None,
+    ) -> Tensor:
         """Restore a picture from a sensor image.
 
         Args:
             raw: sensor image in linear light, (B, 3, H, W).
             point_spread_functions: (D, 3, K, K) for D depths, K odd, each centred on the pixel
                 (K//2, K//2) and of unit sum where the lens loses no light; or None.
+            field: where on the sensor each pixel lies, (B, 2, H, W): x and y over half the
+                sensor's diagonal, so that its corners have radius 1; or None.
 
         Returns:
             (B, 3, H, W), sRGB-encoded, not clamped, in the dtype of the network: a float64
             lens may stand before a float32 network, and gradients reach it.
+
+        Raises:
+            InputError: what the network needs is None or of another shape.
         """
         raise NotImplementedError
 
@@ -43,26 +59,100 @@ class Restoration(nn.Module):
         return next(self.parameters()).dtype
 
 
-class UNetRestoration(Restoration):
-    """A U-Net alone, as in the supplement: encoded + UNet(encoded), encoded = sRGB(raw).
+class ResidualRestoration(Restoration):
+    """A network alone, which gives what the encoded image lacks.
+
+        restored = encoded + network(encoded),   encoded = sRGB(raw),
+
+    or network([encoded, x, y, r²]) with field coordinates: see `field_channels`.
+
+    Args:
+        network: maps (B, 3, H, W), or (B, 6, H, W) with field coordinates, to (B, 3, H, W).
+        field_coordinates: whether the network is told where on the sensor a pixel lies, as
+            blur varies over the field.
+    """
+
+    needs_point_spread_function: ClassVar[bool] = False
+
+    def __init__(self, network: nn.Module, field_coordinates: bool) -> None:
+        super().__init__()
+        self.needs_field = field_coordinates
+        self.network = network
+
+    def forward(
+        self,
+        raw: Tensor,
+        point_spread_functions: Tensor | None = None,
+        field: Tensor | None = None,
+    ) -> Tensor:
+        """Restore (B, 3, H, W) linear light to (B, 3, H, W) sRGB; see `Restoration.forward`.
+
+        Raises:
+            InputError: `field` is needed, and is None or not of shape (B, 2, H, W).
+        """
+        encoded = linear_to_srgb(raw.to(self.dtype))
+        if not self.needs_field:
+            return encoded + self.network(encoded)
+        if field is None:
+            raise InputError(
+                f"{type(self).__name__} with field_coordinates=true needs `field`, the pixels' "
+                "coordinates on the sensor, got None: give (B, 2, H, W), or field_coordinates=false"
+            )
+        return encoded + self.network(with_field_channels(encoded, field))
+
+
+class UNetRestoration(ResidualRestoration):
+    """A U-Net alone, as in the supplement.
 
     It begins as the identity on the encoded image.
 
     Args:
         width: channels of the U-Net's first stage.
         depth: number of its halvings.
+        field_coordinates: whether it is told where on the sensor a pixel lies.
     """
 
-    needs_point_spread_function: ClassVar[bool] = False
+    def __init__(self, width: int = 16, depth: int = 3, field_coordinates: bool = False) -> None:
+        channels = _channels(field_coordinates)
+        network = UNet(channels, COLORS, width=width, depth=depth, zero_output=True)
+        super().__init__(network, field_coordinates)
 
-    def __init__(self, width: int = 16, depth: int = 3) -> None:
-        super().__init__()
-        self.network = UNet(COLORS, COLORS, width=width, depth=depth, zero_output=True)
 
-    def forward(self, raw: Tensor, point_spread_functions: Tensor | None = None) -> Tensor:
-        """Restore (B, 3, H, W) linear light to (B, 3, H, W) sRGB; see `Restoration.forward`."""
-        encoded = linear_to_srgb(raw.to(self.dtype))
-        return encoded + self.network(encoded)
+class FeaturePyramidRestoration(ResidualRestoration):
+    """The generator of DeblurGAN-v2, a feature pyramid over a classifier's layers.
+
+    It begins as the identity on the encoded image.
+
+    Args:
+        backbone: "mobilenet_v2" or "googlenet", the Inception network.
+        stages: of the backbone, from 2 to 5; 5, as in the original, sees at 1/32.
+        width_multiplier: of a MobileNetV2's channels; trained weights are published for 1.
+        pyramid_channels: of the pyramid, a multiple of 4; see `FeaturePyramid`.
+        field_coordinates: whether it is told where on the sensor a pixel lies.
+        weights: "imagenet" requires trained weights for the backbone; "auto" starts at random,
+            with a warning, where they cannot be had; "none" starts at random.
+        weights_file: a file of them; None for the torch cache, then torchvision's download.
+
+    Raises:
+        InputError: a word or a number that is not allowed, or a wrong file.
+        PretrainedWeightsUnavailable: `weights="imagenet"` and none were found.
+    """
+
+    def __init__(
+        self,
+        backbone: str = "mobilenet_v2",
+        stages: int = 5,
+        width_multiplier: float = 1.0,
+        pyramid_channels: int = 64,
+        field_coordinates: bool = False,
+        weights: str = "auto",
+        weights_file: str | None = None,
+    ) -> None:
+        channels = _channels(field_coordinates)
+        layers = load_backbone(backbone, channels, stages, width_multiplier, weights, weights_file)
+        network = FeaturePyramid(layers, COLORS, pyramid_channels, zero_output=True)
+        super().__init__(network, field_coordinates)
+        self.pretrained = layers.pretrained
 
 
 class WienerUNetRestoration(Restoration):
@@ -101,7 +191,12 @@ class WienerUNetRestoration(Restoration):
         self.log_noise_to_signal = nn.Parameter(torch.full((COLORS,), math.log(noise_to_signal)))
         self.network = UNet(2 * COLORS, COLORS, width=width, depth=depth, zero_output=True)
 
-    def forward(self, raw: Tensor, point_spread_functions: Tensor | None = None) -> Tensor:
+    def forward(
+        self,
+        raw: Tensor,
+        point_spread_functions: Tensor | None = None,
+        field: Tensor | None = None,
+    ) -> Tensor:
         """Restore (B, 3, H, W) linear light to (B, 3, H, W) sRGB; see `Restoration.forward`.
 
         Raises:
@@ -126,3 +221,7 @@ class WienerUNetRestoration(Restoration):
         )
         encoded = linear_to_srgb(deconvolved)
         return encoded + self.network(torch.cat([encoded, linear_to_srgb(raw)], dim=1))
+
+
+def _channels(field_coordinates: bool) -> int:
+    return COLORS + FIELD_CHANNELS if field_coordinates else COLORS

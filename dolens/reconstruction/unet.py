@@ -5,6 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dolens.errors import InputError
+from dolens.reconstruction.padding import pad_to_multiple
 
 
 class UNet(nn.Module):
@@ -69,7 +70,9 @@ class UNet(nn.Module):
         and the result is cropped.
         """
         height, width = image.shape[-2:]
-        features = _pad_to_multiple(image, 2**self.depth)
+        # At least two cells a side: batch normalisation cannot train on a single value a
+        # channel, which one small image would leave at the coarsest stage.
+        features = pad_to_multiple(image, 2**self.depth, cells=2)
         skips: list[Tensor] = []
         for stage, block in enumerate(self.down):
             if stage > 0:
@@ -96,14 +99,3 @@ def _block(before: int, after: int) -> nn.Sequential:
 
 def _two_blocks(before: int, after: int) -> nn.Sequential:
     return nn.Sequential(*_block(before, after), *_block(after, after))
-
-
-def _pad_to_multiple(image: Tensor, multiple: int) -> Tensor:
-    # At least two cells a side: batch normalisation cannot train on a single value a channel,
-    # which one small image would leave at the coarsest stage.
-    rows, columns = (
-        max(2, -(-length // multiple)) * multiple - length for length in image.shape[-2:]
-    )
-    if rows == 0 and columns == 0:
-        return image
-    return functional.pad(image, (0, columns, 0, rows), mode="replicate")

@@ -8,7 +8,6 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.imaging.psf import axial_point_spread_functions
 from dolens.plotting import (
     comparison_figure,
     layout_figure,
@@ -83,30 +82,28 @@ class CameraPictures(lightning.Callback):
 @torch.no_grad()
 def camera_figures(module: CameraModule, textures: Tensor, stage: str) -> dict[str, Figure]:
     """Figures of a camera by name: images, point_spread_functions, layout."""
-    labels = module.scene.labels()
+    views = module.views
     # Evaluation mode: the picture shows the network as it is measured, and leaves its statistics.
     training = module.network.training
     module.network.eval()
-    truth, raw, restored = (x.cpu() for x in module.evaluation_images(textures, stage, 0))
+    truth, raw, restored = (x.cpu()[0] for x in module.evaluation_images(textures, stage, 0))
     module.network.train(training)
-    psfs = axial_point_spread_functions(
-        module.lens, module.scene, module.renderer.sensor, module.psf_size, 96
-    )
+    functions = views.point_spread_functions(module.lens, module.variables(), 96).detach()
     quality = {
-        "raw": psnr_db(raw[0], truth.expand_as(raw[0])).tolist(),
-        "restored": psnr_db(restored[0], truth.expand_as(restored[0])).tolist(),
+        "raw": psnr_db(raw, truth).tolist(),
+        "restored": psnr_db(restored, truth).tolist(),
     }
     return {
-        "images": comparison_figure(truth[0], raw[0], restored[0], labels, quality),
+        "images": comparison_figure(truth, raw, restored, views.labels(), quality),
         "point_spread_functions": psf_figure(
-            psfs.cpu(),
-            module.scene.plane_labels(),
-            module.renderer.sensor.pixel_pitch,
+            functions.cpu(),
+            views.psf_labels(),
+            views.sensor.pixel_pitch,
             "Point spread functions",
         ),
         "layout": layout_figure(
             copy.deepcopy(module.lens).cpu(),
-            object_distance=module.scene.depths[0],
+            object_distance=views.object_distance,
             title=module.lens.name,
         ),
     }

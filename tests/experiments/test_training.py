@@ -27,6 +27,11 @@ EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experime
 UNTESTED = ["test=false", "objective=train/loss"]
 UNPICTURED = ["callbacks.pictures=null"]
 WAVEFRONT_CODING = ["experiment=wavefront_coding", *TINY, *TINY_NETWORK]
+# The same with the renderer that chooses.
+BY_PLAN = [
+    *(e for e in WAVEFRONT_CODING if e not in ("renderer=rays", "renderer.pupil_samples=2")),
+    "renderer.tolerance=4.0",
+]
 
 
 def last_state(folder: Path) -> dict:
@@ -125,14 +130,18 @@ def test_bounds_hold_by_projection(composed, tmp_path):
     assert max(abs(v) for v in plate) == pytest.approx(4e-5, rel=1e-6)
 
 
-@pytest.mark.parametrize("stop_after", [1, 3])
-def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path, stop_after):
-    # `stop_after` 1 and 3 are in the middle of an epoch of two steps.
+@pytest.mark.parametrize(
+    ("stop_after", "settings"), [(1, WAVEFRONT_CODING), (3, WAVEFRONT_CODING), (3, BY_PLAN)]
+)
+def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(
+    composed, tmp_path, stop_after, settings
+):
+    # `stop_after` 1 and 3 are in the middle of an epoch of two steps; a plan is made at its start.
     steps = f"+callbacks.last.every_n_train_steps={stop_after}"
-    run(composed(*WAVEFRONT_CODING, *UNTESTED, folder="whole"))
+    run(composed(*settings, *UNTESTED, folder="whole"))
     # Stopped by hand after some steps: the schedule is the whole run's.
     part = composed(
-        *WAVEFRONT_CODING,
+        *settings,
         *UNTESTED,
         steps,
         f"+trainer.max_steps={stop_after}",
@@ -140,7 +149,7 @@ def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path,
     )
     run(part)
     resumed = composed(
-        *WAVEFRONT_CODING,
+        *settings,
         *UNTESTED,
         f"ckpt_path={tmp_path / 'part' / 'checkpoints' / 'last.ckpt'}",
         folder="resumed",
@@ -150,6 +159,13 @@ def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path,
     assert whole.keys() == again.keys()
     for name, value in whole.items():
         assert torch.equal(value, again[name]), name
+
+
+def test_the_plan_of_the_renderer_is_among_the_metrics(composed, tmp_path):
+    run(composed(*BY_PLAN, *UNPICTURED, "trainer.max_epochs=1"))
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["auto/error_grey_levels"] <= metrics["auto/tolerance_grey_levels"] == 4.0
+    assert metrics["auto/plans"] == 1
 
 
 def test_a_float64_lens_works_beside_a_float32_network(composed, tmp_path):
@@ -174,12 +190,12 @@ READOUTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/readout").g
 @pytest.mark.parametrize("name", READOUTS)
 def test_read_noise_is_one_key_for_every_readout(composed, name):
     cfg = composed("experiment=wavefront_coding", f"readout={name}", "read_noise=0.005")
-    assert instantiate(cfg.module).keywords["readout"].read_noise == 0.005
+    assert instantiate(cfg.views).readout.read_noise == 0.005
 
 
 def test_the_default_readout_is_its_read_noise_alone(composed):
     cfg = composed("experiment=wavefront_coding")
-    assert instantiate(cfg.module).keywords["readout"] == Readout(read_noise=0.003)
+    assert instantiate(cfg.views).readout == Readout(read_noise=0.003)
 
 
 def test_a_camera_behind_colour_filters_trains_too(composed, tmp_path):
@@ -212,7 +228,7 @@ def test_the_paper_scale_composes_and_runs_two_steps(composed, tmp_path):
             f"loss.vgg16_weights={tmp_path / 'vgg16.pth'}",
             # 256×256 pixels and the whole path; fewer rays and channels, to take seconds.
             "renderer.pupil_samples=2",
-            "module.evaluation_pupil_samples=2",
+            "evaluation_renderer.pupil_samples=2",
             "network.width=4",
             "+trainer.max_steps=2",
             "+trainer.limit_val_batches=1",

@@ -9,6 +9,7 @@ import yaml
 
 from dolens import load_lens
 from dolens.errors import InputError
+from dolens.imaging.choice.probe import probe_image
 from dolens.imaging.field_psf import field_point_spread_functions
 from dolens.imaging.illumination import relative_illumination
 from dolens.imaging.psf import axial_point_spread_functions
@@ -250,6 +251,63 @@ def test_light_beyond_the_window_is_counted(root):
     assert float(found.lost) == pytest.approx(
         1.0 - float(kept) / float(found.light[0, 0]), abs=0.02
     )
+
+
+def test_waves_and_rays_show_the_same_but_for_fringes(root):
+    # Behind the plate aberrations are of many wavelengths, and what is left are a caustic's
+    # fringes; the product with a perfect pupil's transfer function has none of these.
+    lens = lens_by_name(root, "wavefront_coding")
+    sensor, scene = Sensor(40, 40, 0.0069), PlanarScene((8000.0,), LINES)
+    image = {}
+    for diffraction in ("none", "limit", "wave"):
+        renderer = PsfRenderer(
+            sensor, (1, 1), 64, 61, "pinhole", illumination="functions", diffraction=diffraction
+        )
+        image[diffraction] = renderer.render(lens, scene, probe_image(120, 120), 1)
+    errors = {
+        name: float((image[name] - image["wave"]).square().mean().sqrt()) / GREY
+        for name in ("none", "limit")
+    }
+    assert 0.5 < errors["none"] < 1.5
+    assert 0.5 < errors["limit"] < 1.5
+
+
+def test_a_perfect_pupil_s_diffraction_is_the_wave_s_where_the_lens_is_sharp(root):
+    lens = load_lens(root / "conf/lens/wavefront_coding.yaml").requires_grad_(False)
+    with torch.no_grad():
+        lens.sensor_distance.fill_(float(lens.first_order(object_distance=8000.0).image) - 10.5)
+    sensor, scene = Sensor(40, 40, 0.0069), PlanarScene((8000.0,), LINES[1:2])
+    image = {}
+    for diffraction in ("none", "limit", "wave"):
+        renderer = PsfRenderer(
+            sensor, (1, 1), 64, 61, "pinhole", illumination="functions", diffraction=diffraction
+        )
+        image[diffraction] = renderer.render(lens, scene, probe_image(120, 120)[:, :1], 1)
+    errors = {
+        name: float((image[name] - image["wave"]).square().mean().sqrt()) / GREY
+        for name in ("none", "limit")
+    }
+    assert errors["limit"] < 0.3 * errors["none"]
+
+
+def test_gradients_through_waves_are_finite_differences(root):
+    lens = lens_by_name(root, "wavefront_coding")
+    sensor, scene = Sensor(12, 12, 0.0069), PlanarScene((8000.0,), LINES[:1])
+    renderer = PsfRenderer(
+        sensor, (1, 1), 8, 41, "pinhole", illumination="functions", diffraction="wave"
+    )
+    textures = texture(60)[:, :1]
+    weight = texture(12)[:, None, :1] - 0.5
+
+    def value(x3):
+        return (renderer.render(lens, scene, textures, 4, {"surfaces.5.x3": x3}) * weight).sum()
+
+    x3 = torch.tensor(1.3e-5, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(value(x3), x3)
+    step = 1e-9
+    with torch.no_grad():
+        difference = (value(x3 + step) - value(x3 - step)) / (2.0 * step)
+    assert float(slope) == pytest.approx(float(difference), rel=1e-2)
 
 
 @pytest.mark.parametrize(

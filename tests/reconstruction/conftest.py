@@ -30,6 +30,15 @@ def torch_cache(tmp_path, monkeypatch):
     return tmp_path / "hub" / "checkpoints"
 
 
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Networks of many small layers: threads would wait for each other more than they work."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def vgg16_state():
     """A features-only state dict with VGG-16's shapes and random values."""

@@ -6,9 +6,10 @@ import torch
 
 from dolens.errors import InputError
 from dolens.reconstruction import (
-    PerceptualWeightsUnavailable,
+    PretrainedWeightsUnavailable,
     RestorationLoss,
     VGG16Features,
+    mean_absolute_error,
     mean_squared_error,
     perceptual_loss,
     total_variation,
@@ -25,9 +26,16 @@ def test_mean_squared_error_of_a_known_offset():
     torch.testing.assert_close(mean_squared_error(truth + 0.2, truth).item(), 0.04)
 
 
-def test_mean_squared_error_does_not_broadcast():
+def test_mean_absolute_error_of_offsets_of_either_sign():
+    truth = torch.rand(2, 3, 4, 6, dtype=torch.float64)
+    offset = torch.tensor([0.2, -0.4]).repeat(3)
+    torch.testing.assert_close(mean_absolute_error(truth + offset, truth).item(), 0.3)
+
+
+@pytest.mark.parametrize("error", [mean_squared_error, mean_absolute_error])
+def test_errors_do_not_broadcast(error):
     with pytest.raises(ValueError, match="differ"):
-        mean_squared_error(torch.zeros(2, 3, 4, 4), torch.zeros(1, 3, 4, 4))
+        error(torch.zeros(2, 3, 4, 4), torch.zeros(1, 3, 4, 4))
 
 
 def test_total_variation_of_a_ramp_is_the_sum_of_its_slopes():
@@ -60,6 +68,13 @@ def test_total_is_the_weighted_sum_of_unweighted_terms(vgg16_file, vgg16_state):
     total = 2.0 * terms["mse"] + 0.3 * terms["tv"] + 0.05 * terms["perceptual"]
     torch.testing.assert_close(terms["total"], total)
     assert all(value.ndim == 0 for value in terms.values())
+
+
+def test_the_l1_term_joins_where_it_has_a_weight():
+    restored, truth = images()
+    terms = RestorationLoss(0.0, 0.0, perceptual="none", l1_weight=0.7)(restored, truth)
+    assert terms["l1"] == mean_absolute_error(restored, truth)
+    torch.testing.assert_close(terms["total"], 0.7 * terms["l1"])
 
 
 def test_equal_images_leave_only_the_total_variation(vgg16_file):
@@ -128,7 +143,7 @@ def test_auto_without_weights_warns_once_and_trains(caplog):
 
 
 def test_vgg16_without_weights_refuses():
-    with pytest.raises(PerceptualWeightsUnavailable, match="no VGG-16 weights"):
+    with pytest.raises(PretrainedWeightsUnavailable, match="no VGG-16 weights"):
         RestorationLoss(perceptual="vgg16")
 
 
@@ -144,5 +159,6 @@ def test_another_word_gets_the_allowed_ones_and_the_nearest():
 
 
 def test_a_negative_weight_is_refused_by_name():
-    with pytest.raises(InputError, match=r"tv_weight=-1"):
-        RestorationLoss(tv_weight=-1, perceptual="none")
+    for name in ("tv_weight", "l1_weight"):
+        with pytest.raises(InputError, match=f"{name}=-1"):
+            RestorationLoss(perceptual="none", **{name: -1})

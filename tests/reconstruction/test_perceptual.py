@@ -2,6 +2,7 @@ import io
 import logging
 import pickle
 import socket
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,11 +10,12 @@ from torch.nn import functional
 
 from dolens.errors import InputError
 from dolens.reconstruction import (
-    PerceptualWeightsUnavailable,
+    PretrainedWeightsUnavailable,
     VGG16Features,
     load_vgg16_weights,
     perceptual,
     perceptual_loss,
+    torchvision_weights,
 )
 
 FILE_NAME = "vgg16-397923af.pth"
@@ -116,7 +118,7 @@ def test_a_download_is_announced_checked_and_kept(vgg16_file, torch_cache, monke
 
 
 def test_offline_the_message_names_the_three_ways(torch_cache):
-    with pytest.raises(PerceptualWeightsUnavailable) as caught:
+    with pytest.raises(PretrainedWeightsUnavailable) as caught:
         load_vgg16_weights(None)
     message = str(caught.value)
     assert isinstance(caught.value, InputError)
@@ -132,10 +134,10 @@ def test_a_server_that_never_answers_is_given_up(torch_cache, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/{FILE_NAME}"
         monkeypatch.setenv("no_proxy", "127.0.0.1")
-        monkeypatch.setattr(perceptual, "_URL", url)
-        monkeypatch.setattr(perceptual, "DOWNLOAD_TIMEOUT_S", 0.2)
+        monkeypatch.setattr(perceptual, "VGG16", replace(perceptual.VGG16, url=url))
+        monkeypatch.setattr(torchvision_weights, "DOWNLOAD_TIMEOUT_S", 0.2)
         monkeypatch.setattr(torch.hub, "download_url_to_file", REAL_DOWNLOAD)
-        with pytest.raises(PerceptualWeightsUnavailable, match="timed out"):
+        with pytest.raises(PretrainedWeightsUnavailable, match="timed out"):
             load_vgg16_weights(None)
     assert list(torch_cache.iterdir()) == []  # no half file is left for the next run
 
@@ -143,7 +145,7 @@ def test_a_server_that_never_answers_is_given_up(torch_cache, monkeypatch):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"absent\.pth: no such file") as caught:
         load_vgg16_weights(str(tmp_path / "absent.pth"))
-    assert not isinstance(caught.value, PerceptualWeightsUnavailable)
+    assert not isinstance(caught.value, PretrainedWeightsUnavailable)
 
 
 @pytest.mark.parametrize("content", [b"", b"not weights", pickle.dumps(print, protocol=2)])

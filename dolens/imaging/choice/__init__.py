@@ -1,0 +1,1 @@
+"""The choice among renderers: the cheapest model that stays within a stated error."""

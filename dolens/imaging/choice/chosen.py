@@ -1,0 +1,60 @@
+"""A renderer that was chosen, and what is known of it."""
+
+from dataclasses import dataclass
+
+import torch
+
+from dolens.imaging.choice.finding import Finding
+from dolens.imaging.psf_renderer import PsfRenderer
+from dolens.imaging.ray_renderer import RayRenderer
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A renderer, its precision, and how it was found.
+
+    Attributes:
+        renderer: what renders.
+        dtype: of rays and image.
+        findings: the decisions, with what each costs in grey levels.
+        error: RMS error on the probe image against rays, both without diffraction, grey levels;
+            0 is below what the reference can tell.
+        uncertainty: of that error, grey levels.
+        tolerance: grey levels that were asked for.
+        seconds: that choosing took.
+    """
+
+    renderer: PsfRenderer | RayRenderer
+    dtype: torch.dtype
+    findings: tuple[Finding, ...]
+    error: float
+    uncertainty: float
+    tolerance: float
+    seconds: float
+
+    def lines(self) -> list[str]:
+        """The plan, for people: a line a decision."""
+        model = "psf" if isinstance(self.renderer, PsfRenderer) else "rays"
+        return [
+            f"renderer auto: {model}, error {self.error:.2g} of {self.tolerance:g} grey levels "
+            f"(±{self.uncertainty:.2g}) on the probe image, planned in {self.seconds:.1f} s",
+            *(f"  {finding}" for finding in self.findings),
+        ]
+
+    def numbers(self) -> dict[str, float]:
+        """The plan as metrics."""
+        renderer = self.renderer
+        numbers = {
+            "auto/error_grey_levels": self.error,
+            "auto/uncertainty_grey_levels": self.uncertainty,
+            "auto/tolerance_grey_levels": self.tolerance,
+            "auto/plan_s": self.seconds,
+            "auto/pupil_samples": float(renderer.pupil_samples),
+            "auto/precision_bits": float(torch.finfo(self.dtype).bits),
+            "auto/by_rays": float(isinstance(renderer, RayRenderer)),
+        }
+        if isinstance(renderer, PsfRenderer):
+            numbers["auto/fields"] = float(renderer.fields[0] * renderer.fields[1])
+            numbers["auto/psf_pixels"] = float(renderer.size)
+            numbers["auto/diffraction"] = float(renderer.diffraction != "none")
+        return numbers

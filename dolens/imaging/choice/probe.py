@@ -1,0 +1,87 @@
+"""Probe images with the statistics of photographs, and errors that kernels would make on them.
+
+Photographs have power spectra that fall with the square of the frequency (Field, J. Opt. Soc. Am. A
+4, 2379, 1987).  The error that a change of point spread function makes on such an image follows
+from the change's spectrum alone.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+# Of photographs in linear light: the mean, and the standard deviation.
+MEAN, CONTRAST = 0.4, 0.2
+GREY_LEVEL = 1.0 / 255.0
+# The longest wave that is taken into account, texels.
+_LONGEST = 256
+
+
+def probe_image(height: int, width: int, seed: int = 0) -> Tensor:
+    """(1, 3, height, width), float64, linear light: 1/f noise, the same in no two colours.
+
+    Values are kept within [0, 1], which touches one pixel in fifty.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(3, height, width, generator=generator, dtype=torch.float64)
+    spectrum = torch.fft.rfft2(noise) / _frequency(height, width).clamp(min=1.0 / _LONGEST)
+    spectrum[:, 0, 0] = 0.0
+    image = torch.fft.irfft2(spectrum, s=(height, width))
+    image = MEAN + CONTRAST * image / image.std(dim=(-2, -1), keepdim=True)
+    return image.clamp(0.0, 1.0)[None]
+
+
+def probe_power(side: int) -> Tensor:
+    """The probe's power at the frequencies of `rfft2`, (side, side/2 + 1), float64.
+
+    Σ power · |H|² is the mean square of the image that a filter of transfer function H makes of it.
+    """
+    frequency = _frequency(side, side)
+    power = 1.0 / frequency.clamp(min=1.0 / _LONGEST).square()
+    # Frequencies with two signs stand for both of them.
+    twice = torch.full((side // 2 + 1,), 2.0, dtype=torch.float64)
+    twice[0] = 1.0
+    if side % 2 == 0:
+        twice[-1] = 1.0
+    power = power * twice
+    power[0, 0] = 0.0
+    power = power * (CONTRAST**2 / power.sum())
+    power[0, 0] = MEAN**2
+    return power
+
+
+def grey_levels(difference: Tensor) -> Tensor:
+    """RMS error, in grey levels of 1/255, that differences of kernels make on the probe.
+
+    Args:
+        difference: (..., K, K).
+
+    Returns:
+        (...), float64: 255 · √(Σ power · |spectrum|²).
+    """
+    side = max(128, 2 * math.ceil(difference.shape[-1] / 2))
+    spectrum = torch.fft.rfft2(difference.double(), s=(side, side))
+    squared = spectrum.real.square() + spectrum.imag.square()
+    power = probe_power(side).to(difference.device)
+    return (squared * power).sum((-2, -1)).sqrt() / GREY_LEVEL
+
+
+def blurred_grey_levels(kernels: Tensor, transfer: Tensor) -> Tensor:
+    """RMS error, in grey levels, of leaving out a filter behind kernels.
+
+    Args:
+        kernels: (..., K, K).
+        transfer: (side, side/2 + 1), the filter's transfer function at the frequencies of `rfft2`.
+    """
+    side = transfer.shape[0]
+    spectrum = torch.fft.rfft2(kernels.double(), s=(side, side))
+    squared = spectrum.real.square() + spectrum.imag.square()
+    power = probe_power(side).to(kernels.device) * (1.0 - transfer).square()
+    return (squared * power).sum((-2, -1)).sqrt() / GREY_LEVEL
+
+
+def _frequency(height: int, width: int) -> Tensor:
+    """Cycles a texel at the frequencies of `rfft2`."""
+    down = torch.fft.fftfreq(height, dtype=torch.float64)
+    across = torch.fft.rfftfreq(width, dtype=torch.float64)
+    return torch.hypot(down[:, None], across[None])

@@ -1,0 +1,92 @@
+"""The converged image of a probe by rays, on some windows of the sensor, and errors against it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.imaging.choice.probe import GREY_LEVEL
+from dolens.imaging.ray_renderer import RayRenderer
+from dolens.imaging.scene import PlanarScene
+from dolens.imaging.sensor import Sensor
+from dolens.optics.lens import Lens
+
+_WINDOWS, _SIDE = 3, 24
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Two renders of windows of a sensor, alike but for their samples.
+
+    Attributes:
+        windows: top row and left column of each, and its height and width.
+        images: of each window, (2, D, C, height, width).
+    """
+
+    windows: tuple[tuple[int, int, int, int], ...]
+    images: tuple[Tensor, ...]
+
+    @property
+    def noise(self) -> float:
+        """RMS noise of the mean of both renders, grey levels."""
+        squares = [(one - two).square() / 4.0 for one, two in self.images]
+        return _rms(squares)
+
+    @property
+    def uncertainty(self) -> float:
+        """Grey levels below which an error is lost in that noise: the noise of its estimate."""
+        values = sum(pair[0].numel() for pair in self.images)
+        return self.noise * (2.0 / values) ** 0.25
+
+    def error(self, image: Tensor) -> float:
+        """RMS error of an image (1, D, C, height, width) of the sensor, without the noise of the
+        reference, in grey levels.
+        """
+        squares = []
+        for (top, left, height, width), pair in zip(self.windows, self.images, strict=True):
+            part = image[0, ..., top : top + height, left : left + width].to(pair)
+            squares.append((part - pair.mean(0)).square())
+        return math.sqrt(max(_rms(squares) ** 2 - self.noise**2, 0.0))
+
+
+@torch.no_grad()
+def reference(
+    lens: Lens, scene: PlanarScene, sensor: Sensor, texture: Tensor, pupil_samples: int, seed: int
+) -> Reference:
+    """Render a texture by rays on windows at the sensor's middle, edges and corners."""
+    height, width = min(_SIDE, sensor.height), min(_SIDE, sensor.width)
+    rows, columns = (
+        sorted({round(i * (side - part) / (_WINDOWS - 1)) for i in range(_WINDOWS)})
+        for side, part in ((sensor.height, height), (sensor.width, width))
+    )
+    windows = tuple((top, left, height, width) for top in rows for left in columns)
+    images = []
+    for window in windows:
+        renderer = RayRenderer(sensor.window(*window), pupil_samples)
+        pair = [renderer.render(lens, scene, texture, 2 * seed + i)[0] for i in range(2)]
+        images.append(torch.stack(pair))
+    return Reference(windows, tuple(images))
+
+
+def _rms(squares: list[Tensor]) -> float:
+    total = sum(float(s.double().sum()) for s in squares)
+    return math.sqrt(total / sum(s.numel() for s in squares)) / GREY_LEVEL
+
+
+def rays_samples(
+    lens: Lens, scene: PlanarScene, sensor: Sensor, texture: Tensor, tolerance: float
+) -> tuple[int, float]:
+    """Strata along each side of the pupil that `RayRenderer` needs, and the noise they leave.
+
+    Noise falls at least with the root of the number of samples, so a coarse render tells.
+
+    Returns:
+        The strata, from 1 to 64, and the noise in grey levels.
+    """
+    coarse = 4
+    found = reference(lens, scene, sensor, texture, coarse, seed=7)
+    # Of one render: √2 times that of the mean of two.
+    noise = math.sqrt(2.0) * found.noise
+    side = min(max(math.ceil(coarse * noise / tolerance), 1), 64)
+    return side, noise * coarse / side

@@ -1,0 +1,65 @@
+"""The blur of a perfect lens's finite aperture, put behind geometric point spread functions.
+
+The product of the geometric transfer function and the perfect pupil's is right in both limits, of
+rays that all meet in a point and of aberrations of many wavelengths.  In between it errs; how much,
+a wave calculation tells.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dolens.imaging.pupil import ExitPupil
+
+
+def diffraction_transfer(
+    height: int, width: int, pitch: float, wavelength: float, f_number: float
+) -> Tensor:
+    """The incoherent transfer function of a perfect, round pupil.
+
+    (2/π)·(arccos s - s·√(1 - s²)), with s the frequency over 1/(λN), and zero beyond it (Goodman,
+    Introduction to Fourier Optics).
+
+    Args:
+        height: of the transform.
+        width: of the transform.
+        pitch: of the pixels, mm.
+        wavelength: nm.
+        f_number: N, that the light works with: 1/(2·sin u').
+
+    Returns:
+        (height, width/2 + 1), float64, at the frequencies of `rfft2`.
+    """
+    down = torch.fft.fftfreq(height, dtype=torch.float64)
+    across = torch.fft.rfftfreq(width, dtype=torch.float64)
+    cutoff = pitch / (wavelength * 1e-6 * f_number)
+    s = (torch.hypot(down[:, None], across[None]) / cutoff).clamp(max=1.0)
+    return (torch.arccos(s) - s * (1.0 - s * s).sqrt()) * (2.0 / math.pi)
+
+
+def working_f_number(pupil: ExitPupil, sensor_z: float) -> float:
+    """1/(2·sin u') of the axial beam, u' the angle of its edge in air."""
+    return 0.5 * math.hypot(sensor_z - pupil.z, pupil.axial_radius) / pupil.axial_radius
+
+
+def with_diffraction_limit(
+    functions: Tensor, pitch: float, wavelengths: Sequence[float], f_number: float
+) -> Tensor:
+    """Functions (..., C, K, K) blurred by the perfect pupil's diffraction at C wavelengths.
+
+    What this spreads beyond the window, 2λN/(π²r) of the light beyond radius r, is given back in
+    proportion, so that each function keeps its sum.
+    """
+    size = functions.shape[-1]
+    # As wide as the Airy disc's share beyond it is small, lest its other side come back in.
+    side = max(2 * size, 128)
+    transfer = torch.stack(
+        [diffraction_transfer(side, side, pitch, w, f_number) for w in wavelengths]
+    ).to(functions)
+    spectrum = torch.fft.rfft2(functions, s=(side, side)) * transfer
+    blurred = torch.fft.irfft2(spectrum, s=(side, side))[..., :size, :size]
+    kept = blurred.sum((-2, -1), keepdim=True)
+    total = functions.sum((-2, -1), keepdim=True)
+    return blurred * torch.where(kept > 0.0, total / torch.where(kept > 0.0, kept, 1.0), 0.0)

@@ -1,0 +1,49 @@
+"""Discriminators that train beside the network."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from dolens.errors import InputError
+from dolens.reconstruction import RelativisticDiscriminators
+
+
+class Adversary(nn.Module):
+    """Discriminators and their own optimizer: a step of theirs for each of the network's.
+
+    Lightning's automatic optimization knows the network's optimizer alone; this one is stepped by
+    hand, and its state goes into the checkpoint by the camera module.
+
+    Args:
+        discriminators: what judges.
+        learning_rates: with `discriminator`; by default that of the `network`.
+    """
+
+    def __init__(
+        self, discriminators: RelativisticDiscriminators, learning_rates: Mapping[str, float]
+    ) -> None:
+        super().__init__()
+        rate = learning_rates.get("discriminator", learning_rates.get("network"))
+        if rate is None or not rate > 0.0:
+            raise InputError(f"learning_rates.discriminator: {rate}; allowed: above 0")
+        self.discriminators = discriminators
+        self.optimizer = torch.optim.Adam(discriminators.parameters(), lr=rate, betas=(0.5, 0.99))
+
+    def forward(self, real: Tensor, fake: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step of the discriminators, and what they add to the network's loss.
+
+        Args:
+            real: true images, (B, 3, H, W), display-encoded.
+            fake: restored ones.
+
+        Returns:
+            The weighted adversarial term, and numbers to log.
+        """
+        own = self.discriminators.discriminator_loss(real, fake)
+        self.optimizer.zero_grad()
+        own.backward()
+        self.optimizer.step()
+        term = self.discriminators.generator_loss(real, fake)
+        numbers = {"discriminator": own.detach(), "adversarial": term.detach()}
+        return self.discriminators.weight * term, numbers

@@ -1,0 +1,1 @@
+"""What things cost and how wrong they are, measured side by side."""

@@ -1,0 +1,87 @@
+"""Traces: error against double precision, and time, by precision and by what traces."""
+
+import copy
+
+import torch
+
+from dolens.optics.lens import Lens
+from dolens.optics.rays import Rays
+from experiments.measurements.renders import Subject
+from experiments.measurements.timing import by_turns
+
+_DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def trace_rows(
+    subject: Subject, backends: tuple[str, ...], rays: int, seconds: float
+) -> list[dict[str, float | str]]:
+    """A row for each precision and backend: error of sensor points in µm, ns a ray and surface.
+
+    Args:
+        subject: the lens.
+        backends: of `reference`, `cpu`, `cuda`.
+        rays: how many.
+        seconds: that timing may take.
+    """
+    lenses = {
+        (name, backend): _lens(subject.lens, dtype, backend)
+        for name, dtype in _DTYPES.items()
+        for backend in backends
+    }
+    given = {name: _rays(lenses[name, backends[0]], rays) for name in _DTYPES}
+    true = lenses["float64", "reference"].trace(given["float64"])
+    surfaces = len(subject.lens.surfaces)
+    times = {}
+    for backward in (False, True):
+        calls = {
+            key: lambda lens=lens, key=key, b=backward: _trace(lens, given[key[0]], b)
+            for key, lens in lenses.items()
+        }
+        times[backward] = by_turns(calls, seconds)
+    rows = []
+    for (name, backend), lens in lenses.items():
+        hit = lens.trace(given[name])
+        both = hit.valid & true.valid
+        error = (hit.position.detach().double() - true.position.detach())[both].abs().max()
+        rows.append(
+            {
+                "scene": subject.name,
+                "part": "trace",
+                "model": backend,
+                "setting": f"{backend}, {name}",
+                "error_um": 1e3 * float(error),
+                "forward_ns": 1e9 * times[False][name, backend] / (rays * surfaces),
+                "with_gradient_ns": 1e9 * times[True][name, backend] / (rays * surfaces),
+            }
+        )
+    return rows
+
+
+def _lens(lens: Lens, dtype: torch.dtype, backend: str) -> Lens:
+    changed = copy.deepcopy(lens).to(dtype).requires_grad_(True)
+    changed.backend = backend
+    return changed
+
+
+@torch.no_grad()
+def _rays(lens: Lens, count: int) -> Rays:
+    """Parallel rays, a little off the axis, that fill the entrance pupil."""
+    pupil = lens.first_order().entrance_pupil
+    generator = torch.Generator().manual_seed(0)
+    disc = torch.rand(2, count, generator=generator, dtype=torch.float64) - 0.5
+    slope = 0.02
+    x, y = disc * float(pupil.diameter) * 0.95
+    position = torch.stack((x, y - slope * float(pupil.z), torch.zeros_like(x)), -1)
+    direction = torch.tensor([0.0, slope, 1.0], dtype=torch.float64)
+    direction = (direction / direction.norm()).expand(position.shape)
+    return Rays(position.to(lens.dtype), direction.to(lens.dtype), lens.primary_wavelength)
+
+
+def _trace(lens: Lens, rays: Rays, backward: bool) -> None:
+    if not backward:
+        with torch.no_grad():
+            lens.trace(rays)
+        return
+    hit = lens.trace(rays)
+    torch.where(hit.valid[..., None], hit.position, 0.0).square().mean().backward()
+    lens.zero_grad()

@@ -1,0 +1,83 @@
+"""What every way of looking offers to the camera module."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+from dolens.imaging.sensor import Sensor
+from dolens.optics.lens import Lens
+
+# Streams of random numbers that must not meet: an offset of the seed for each stage, and one for
+# the sensor's noise.
+_STAGES = {"train": 0, "val": 1, "test": 2}
+_STRIDE, NOISE_OFFSET = 1 << 40, 1 << 39
+
+
+class Views(NamedTuple):
+    """B textures, each imaged in V ways.
+
+    Attributes:
+        truth: (B, V, 3, H, W), display-encoded: what an ideal camera would have taken.
+        raw: (B, V, 3, H, W), linear light, read out and developed.
+        field: (B, V, 2, H, W), where each pixel lies on the sensor, x and y over half its diagonal;
+            None where that is the same for all.
+    """
+
+    truth: Tensor
+    raw: Tensor
+    field: Tensor | None = None
+
+
+class Imaging(Protocol):
+    """A scene, renderers and a readout.
+
+    All random numbers are functions of the seed, the stage and the index.
+    """
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixels of one image."""
+
+    @property
+    def object_distance(self) -> float:
+        """Of the scene, mm in front of the first vertex; for drawings."""
+
+    def labels(self) -> Sequence[str]:
+        """Names of the evaluation's views, for metrics."""
+
+    def psf_labels(self) -> Sequence[str]:
+        """Names of the point spread functions."""
+
+    def check(self, lens: Lens) -> None:
+        """Raise `InputError` where the lens cannot look at the scene."""
+
+    def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
+        """Look at the lens as it is now, at the start of an epoch."""
+
+    def take(
+        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+    ) -> Views:
+        """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`."""
+
+    def point_spread_functions(
+        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+    ) -> Tensor:
+        """(views, 3, K, K), of the training's views."""
+
+    def rays(self) -> int:
+        """Rays that a training image takes."""
+
+    def numbers(self) -> dict[str, float]:
+        """What it has to say of itself, as metrics."""
+
+    def state(self) -> dict[str, Any]:
+        """What it found, as plain values for a checkpoint."""
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
+        """Go on with what another one's `state` held."""
+
+
+def seed_of(seed: int, stage: str, index: int) -> int:
+    """A seed of its own for every batch of every stage."""
+    return (seed * len(_STAGES) + _STAGES[stage]) * _STRIDE + index

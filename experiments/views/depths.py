@@ -1,0 +1,123 @@
+"""Every texture at every depth of a scene: what an extended depth of field is about."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.imaging.color import linear_to_srgb
+from dolens.imaging.psf import axial_point_spread_functions
+from dolens.imaging.readout import Readout
+from dolens.imaging.renderer import Renderer
+from dolens.imaging.scene import Scene, pinhole_image
+from dolens.imaging.sensor import Sensor
+from dolens.optics.lens import Lens
+from experiments.views.base import NOISE_OFFSET, Views, seed_of
+
+
+class DepthViews:
+    """Textured planes at several depths, in front of the whole sensor.
+
+    The truth is what a distortion-free pinhole sees.
+
+    Args:
+        scene: depths and wavelengths.
+        renderer: makes the training images.
+        readout: what the sensor makes of them.
+        evaluation_renderer: makes the validation and test images, of the same sensor; None: the
+            training renderer, which then judges its own approximations.
+        psf_size: pixels along each side of the point spread functions that networks ask for.
+        psf_pupil_samples: their strata along each side of the pupil.
+        seed: of rendering and noise.
+
+    Raises:
+        InputError: the renderers' sensors differ.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        renderer: Renderer,
+        readout: Readout,
+        evaluation_renderer: Renderer | None = None,
+        psf_size: int = 65,
+        psf_pupil_samples: int = 48,
+        seed: int = 0,
+    ) -> None:
+        self.scene = scene
+        self.renderer = renderer
+        self.readout = readout
+        self.evaluation_renderer = evaluation_renderer or renderer
+        self.psf_size = psf_size
+        self.psf_pupil_samples = psf_pupil_samples
+        self.seed = seed
+        if self.evaluation_renderer.sensor != renderer.sensor:
+            raise InputError(
+                f"evaluation_renderer.sensor: {self.evaluation_renderer.sensor} is not that of "
+                f"the training renderer, {renderer.sensor}"
+            )
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixels of one image."""
+        return self.renderer.sensor
+
+    @property
+    def object_distance(self) -> float:
+        """The first depth."""
+        return self.scene.depths[0]
+
+    def labels(self) -> list[str]:
+        """The depths."""
+        return self.scene.labels()
+
+    def psf_labels(self) -> list[str]:
+        """The planes' depths."""
+        return self.scene.plane_labels()
+
+    def check(self, lens: Lens) -> None:
+        """Raise `InputError` where a depth lies inside the lens."""
+        self.scene.check(lens.system())
+
+    def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
+        """Let the training renderer look at the lens as it is now."""
+        self.renderer.prepare(lens, self.scene, values)
+
+    def take(
+        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+    ) -> Views:
+        """Image textures at every depth."""
+        renderer = self.renderer if stage == "train" else self.evaluation_renderer
+        seed = seed_of(self.seed, stage, index)
+        image = renderer.render(lens, self.scene, textures, seed, values)
+        generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
+        raw = self.readout.develop(self.readout(image, generator))
+        truth = linear_to_srgb(pinhole_image(self.scene.colours(textures), self.sensor))
+        return Views(truth[:, None].expand_as(raw), raw)
+
+    def point_spread_functions(
+        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+    ) -> Tensor:
+        """(depths, 3, K, K), on the axis."""
+        samples = pupil_samples or self.psf_pupil_samples
+        return axial_point_spread_functions(
+            lens, self.scene, self.sensor, self.psf_size, samples, values
+        )
+
+    def rays(self) -> int:
+        """Rays that a training image takes."""
+        return self.renderer.rays_per_image(self.scene)
+
+    def numbers(self) -> dict[str, float]:
+        """The renderer's."""
+        return self.renderer.numbers()
+
+    def state(self) -> dict[str, Any]:
+        """The renderer's."""
+        return self.renderer.state()
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
+        """Give it back to the renderer."""
+        self.renderer.load_state(lens, state)

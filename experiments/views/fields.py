@@ -1,0 +1,258 @@
+"""Textures on windows drawn from the whole field: how a large sensor trains on a small machine."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.imaging.color import linear_to_srgb
+from dolens.imaging.plane_points import chief_ray_points
+from dolens.imaging.psf_renderer import PsfRenderer
+from dolens.imaging.pupil import sampled_exit_pupil
+from dolens.imaging.ray_renderer import RayRenderer
+from dolens.imaging.readout import Readout
+from dolens.imaging.scene import PlanarScene, texture_origin
+from dolens.imaging.sensor import Sensor
+from dolens.imaging.texture import bilinear
+from dolens.optics.backend import choose_backend
+from dolens.optics.lens import Lens
+from experiments.views.base import NOISE_OFFSET, Views, seed_of
+
+# The golden angle, by which neighbouring textures' windows lie apart in azimuth.
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+EVERYWHERE = "field"
+
+
+class FieldViews:
+    """Each texture on a window of a large sensor, imaged as it is there.
+
+    Training windows are drawn evenly from the sensor.  Every evaluation texture is imaged in zones:
+    windows at fractions of the half diagonal, at azimuths that go around from texture to texture,
+    and one drawn evenly from the whole field, `field`.
+
+    The truth is the texture where the chief rays of the reference wavelength look: distortion,
+    which a camera's calibration undoes, is part of it, and lateral colour is not.
+
+    Args:
+        scene: one depth, and wavelengths.
+        sensor: the whole of it.
+        renderer: makes the training images; its sensor says how large windows are.
+        readout: what the sensor makes of them.
+        evaluation_renderer: makes the validation and test images; None: the training renderer.
+        zones: fractions of the half diagonal, by name.
+        seed: of windows, rendering and noise.
+
+    Raises:
+        InputError: several depths, a window larger than the sensor, or other pixels.
+    """
+
+    def __init__(
+        self,
+        scene: PlanarScene,
+        sensor: Sensor,
+        renderer: PsfRenderer | RayRenderer,
+        readout: Readout,
+        evaluation_renderer: PsfRenderer | RayRenderer | None = None,
+        zones: Mapping[str, float] | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.scene = scene
+        self.whole = sensor
+        self.renderer = renderer
+        self.readout = readout
+        self.evaluation_renderer = evaluation_renderer or renderer
+        self.zones = dict(zones or {"axis": 0.0, "0.5": 0.5, "0.7": 0.7, "full": 1.0})
+        self.seed = seed
+        window = renderer.sensor
+        if len(scene.depths) != 1:
+            raise InputError(f"scene.depths: {len(scene.depths)} of them; allowed: one")
+        if window.pixel_pitch != sensor.pixel_pitch:
+            raise InputError(
+                f"renderer.sensor.pixel_pitch: {window.pixel_pitch} is not the sensor's, "
+                f"{sensor.pixel_pitch}"
+            )
+        if window.height > sensor.height or window.width > sensor.width:
+            raise InputError(
+                f"renderer.sensor: a window of {window.height}×{window.width} pixels is larger "
+                f"than the sensor, {sensor.height}×{sensor.width}"
+            )
+        for name, share in self.zones.items():
+            if not 0.0 <= share <= 1.0:
+                raise InputError(f"views.zones.{name}: {share}; allowed: 0 (axis) to 1 (corner)")
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixels of one window."""
+        return self.renderer.sensor
+
+    @property
+    def object_distance(self) -> float:
+        """The scene's depth."""
+        return self.scene.depths[0]
+
+    def labels(self) -> list[str]:
+        """The zones, and the whole field."""
+        return [*self.zones, EVERYWHERE]
+
+    def psf_labels(self) -> list[str]:
+        """The zones."""
+        return list(self.zones)
+
+    def check(self, lens: Lens) -> None:
+        """Raise `InputError` where the depth lies inside the lens."""
+        self.scene.check(lens.system())
+
+    def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
+        """Settings say everything."""
+
+    def take(
+        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+    ) -> Views:
+        """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
+        renderer = self.renderer if stage == "train" else self.evaluation_renderer
+        seed = seed_of(self.seed, stage, index)
+        rows = []
+        for i, texture in enumerate(textures):
+            windows = self._windows(stage, index * len(textures) + i)
+            rows.append(
+                [
+                    self._take(lens, values, texture, renderer, window, seed + len(windows) * i + j)
+                    for j, window in enumerate(windows)
+                ]
+            )
+        truth, image, field = (
+            torch.stack([torch.stack([view[k] for view in row]) for row in rows]) for k in range(3)
+        )
+        generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
+        return Views(truth, self.readout.develop(self.readout(image, generator)), field)
+
+    def _take(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        texture: Tensor,
+        renderer: PsfRenderer | RayRenderer,
+        window: Sensor,
+        seed: int,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Truth and image, (3, H, W), and field, (2, H, W), of one texture in one window."""
+        with torch.no_grad():
+            rows, columns = self._looked_at(lens, values, window)
+            # The texture lies where the window looks, to a whole texel.
+            centre = (float(rows.mean().round()), float(columns.mean().round()))
+            row, column = texture_origin(texture.shape[-2:], centre)
+            truth = linear_to_srgb(
+                bilinear(texture, (rows + row).float(), (columns + column).float())
+            )
+        scene = replace(self.scene, texture_centre=centre)
+        image = replace(renderer, sensor=window).render(lens, scene, texture[None], seed, values)
+        return truth, image[0, 0], self._field(window, texture)
+
+    def _looked_at(
+        self, lens: Lens, values: Mapping[str, Tensor], window: Sensor
+    ) -> tuple[Tensor, Tensor]:
+        """Rows and columns of the pinhole's image where the chief rays of pixels look, (H, W)."""
+        system = lens.system(values)
+        backend = choose_backend(system, lens.backend)
+        wavelengths = (lens.primary_wavelength,)
+        scene = PlanarScene(self.scene.depths, wavelengths)
+        pupil = sampled_exit_pupil(system, wavelengths, window, backend)
+        points = window.positions(*self._pixels(window, system.device))
+        shape = (window.height, window.width)
+        seen = chief_ray_points(
+            system, scene, tuple(p.reshape(-1) for p in points), pupil, window.pixel_pitch, backend
+        )
+        return tuple(c[:, 0, 0].double().reshape(shape) for c in seen)
+
+    def _field(self, window: Sensor, like: Tensor) -> Tensor:
+        """(2, H, W): x and y of the pixels over half the sensor's diagonal."""
+        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
+        return torch.stack(window.positions(*self._pixels(window, like.device))).to(like) / half
+
+    def _pixels(self, window: Sensor, device: torch.device) -> Sequence[Tensor]:
+        options = {"dtype": torch.float64, "device": device}
+        return torch.meshgrid(
+            torch.arange(window.height, **options),
+            torch.arange(window.width, **options),
+            indexing="ij",
+        )
+
+    # ---------------------------------------------------------------- where
+
+    def _windows(self, stage: str, number: int) -> list[Sensor]:
+        """The windows of texture `number` of a stage."""
+        generator = torch.Generator().manual_seed(seed_of(self.seed, stage, number))
+        top, left = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+        anywhere = self._window(top, left)
+        if stage == "train":
+            return [anywhere]
+        return [*(self._zone(share, number) for share in self.zones.values()), anywhere]
+
+    def _window(self, down: float, across: float) -> Sensor:
+        """The window at shares of the way down and across that it can go."""
+        window = self.sensor
+        top = round(down * (self.whole.height - window.height))
+        left = round(across * (self.whole.width - window.width))
+        return self.whole.window(top, left, window.height, window.width)
+
+    def _zone(self, share: float, number: int) -> Sensor:
+        """The window about a point at a share of the half diagonal, or as far as windows reach."""
+        height, width = self.whole.height, self.whole.width
+        radius = 0.5 * share * math.hypot(height, width)
+        angle = number * _GOLDEN_ANGLE
+        # Beyond the sides only the diagonals lead on.
+        if radius > 0.5 * min(height, width):
+            corner = math.atan2(height, width)
+            angle = (corner, math.pi - corner, math.pi + corner, -corner)[number % 4]
+        down, across = radius * math.sin(angle), radius * math.cos(angle)
+        places = []
+        for offset, side, part in (
+            (down, height, self.sensor.height),
+            (across, width, self.sensor.width),
+        ):
+            free = side - part
+            place = 0.5 * free + offset
+            places.append(min(max(place / free, 0.0), 1.0) if free else 0.0)
+        return self._window(*places)
+
+    # ---------------------------------------------------------------- what it says
+
+    def point_spread_functions(
+        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+    ) -> Tensor:
+        """(zones, 3, K, K), at the middles of the zones' windows."""
+        found = []
+        for share in self.zones.values():
+            window = self._zone(share, 0)
+            renderer = PsfRenderer(
+                window, (1, 1), pupil_samples or 32, self._psf_size(), jitter=False
+            )
+            system = lens.system(values)
+            backend = choose_backend(system, lens.backend)
+            pupil = sampled_exit_pupil(system, self.scene.wavelengths, window, backend)
+            functions = renderer.point_spread_functions(system, self.scene, pupil, 0, backend)
+            found.append(functions.functions[0, 0])
+        return torch.stack(found)
+
+    def _psf_size(self) -> int:
+        """The training renderer's window, if it has one."""
+        return getattr(self.renderer, "size", 65)
+
+    def rays(self) -> int:
+        """Rays that a training window takes."""
+        return self.renderer.rays_per_image(self.scene)
+
+    def numbers(self) -> dict[str, float]:
+        """Nothing that the settings do not say."""
+        return {}
+
+    def state(self) -> dict[str, Any]:
+        """Nothing was found."""
+        return {}
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
+        """There is nothing to take up."""

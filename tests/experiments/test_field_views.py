@@ -1,0 +1,162 @@
+"""A large sensor seen through windows: where they lie, and that what they show is what is there."""
+
+import json
+import math
+
+import pytest
+import torch
+import yaml
+
+from dolens.errors import InputError
+from dolens.imaging.choice.probe import probe_image
+from dolens.imaging.color import srgb_to_linear
+from dolens.imaging.psf_renderer import PsfRenderer
+from dolens.imaging.ray_renderer import RayRenderer
+from dolens.imaging.readout import Readout
+from dolens.imaging.scene import PlanarScene
+from dolens.imaging.sensor import Sensor
+from dolens.prescriptions import lens_from_prescription
+from experiments.training import run
+from experiments.views.fields import FieldViews
+
+LINES = (656.2725, 587.5618, 486.1327)
+WHOLE = Sensor(400, 500, 0.08)
+
+
+def field_views(renderer=None, **settings):
+    renderer = renderer or PsfRenderer(Sensor(32, 40, 0.08), (1, 1), 24, 15)
+    return FieldViews(PlanarScene((1e5,), LINES), WHOLE, renderer, Readout(), **settings)
+
+
+def doublet(root, stop=None):
+    prescription = yaml.safe_load((root / "conf/lens/large_fov_doublet.yaml").read_text())
+    if stop is not None:
+        prescription["surfaces"]["4"]["semi_diameter"] = stop
+    return lens_from_prescription(prescription, torch.float32).requires_grad_(False)
+
+
+def test_zones_lie_at_their_shares_of_the_half_diagonal():
+    views = field_views()
+    half = 0.5 * math.hypot(WHOLE.height, WHOLE.width)
+    for number in range(9):
+        windows = views._windows("test", number)
+        shares = [math.hypot(w.centre_row, w.centre_column) / half for w in windows[:-1]]
+        assert shares[0] < 0.01
+        assert shares[1] == pytest.approx(0.5, abs=0.01)
+        # As far as a window reaches: its outer corner is the sensor's.
+        assert shares[3] == pytest.approx(1.0 - math.hypot(32, 40) / (2 * half), abs=0.01)
+
+
+def test_training_windows_fill_the_field():
+    views = field_views()
+    windows = [views._windows("train", number)[0] for number in range(400)]
+    rows = torch.tensor([w.centre_row for w in windows]) / (WHOLE.height - 32)
+    columns = torch.tensor([w.centre_column for w in windows]) / (WHOLE.width - 40)
+    for places in (rows, columns):
+        assert float(places.abs().max()) <= 0.5
+        # Uniform over a side: mean 0 and deviation √(1/12), to three standard errors.
+        assert abs(float(places.mean())) < 3 * math.sqrt(1 / 12 / 400)
+        assert float(places.std()) == pytest.approx(math.sqrt(1 / 12), rel=0.1)
+
+
+def test_the_truth_is_registered_with_what_the_lens_shows(root):
+    """A stop of a hundredth: a pinhole camera with the doublet's distortion, sharp everywhere."""
+    lens = doublet(root, stop=0.05)
+    texture = probe_image(64, 72, seed=2).float()
+    views = field_views(RayRenderer(Sensor(32, 40, 0.08), 8))
+    taken = views.take(lens, {}, texture, "test", 1)
+    assert taken.raw.shape == taken.truth.shape == (1, 5, 3, 32, 40)
+    truth = srgb_to_linear(taken.truth)
+    light = taken.raw.mean((-2, -1), keepdim=True) / truth.mean((-2, -1), keepdim=True)
+    error = (taken.raw / light - truth)[:, :, 1]
+    # Green, free of lateral colour: what is left are the pixel's box and a tenth of a pixel.
+    contrast = (truth[:, :, 1] - truth[:, :, 1].mean((-2, -1), keepdim=True)).square().mean()
+    assert float(error.square().mean((0, 2, 3)).max()) < 0.1 * float(contrast)
+    # One pixel off would be three times as bad at least.
+    moved = (taken.raw / light).roll(1, -1)[:, :, 1] - truth[:, :, 1]
+    inner = (..., slice(2, -2), slice(2, -2))
+    assert float(moved[inner].square().mean()) > 3.0 * float(error[inner].square().mean())
+
+
+def test_functions_and_rays_show_the_same(root):
+    lens, texture = doublet(root), probe_image(72, 80, seed=3).float()
+    sensor = Sensor(32, 40, 0.08)
+    by_rays, by_functions = (
+        field_views(renderer).take(lens, {}, texture, "test", 0).raw
+        for renderer in (RayRenderer(sensor, 24), PsfRenderer(sensor, (2, 2), 24, 21))
+    )
+    error = (by_rays - by_functions).square().mean((0, 2, 3, 4)).sqrt() * 255
+    assert float(error.max()) < 1.0
+
+
+def test_every_pixel_knows_its_place_in_the_field(root):
+    taken = field_views().take(doublet(root), {}, probe_image(72, 80).float(), "test", 0)
+    radius = taken.field.norm(dim=2)
+    assert float(radius[0, 0].max()) < 0.1
+    assert float(radius.max()) == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_same_index_gives_the_same_views(root):
+    lens, texture, views = doublet(root), probe_image(72, 80).float(), field_views()
+    one, again, other = (views.take(lens, {}, texture, "train", i).raw for i in (4, 4, 5))
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+
+
+def test_a_lens_moves_by_what_windows_show(root):
+    lens, texture = doublet(root), probe_image(72, 80).float()
+    curvature = lens.surfaces["1"].curvature.detach().clone().requires_grad_()
+    taken = field_views().take(lens, {"surfaces.1.curvature": curvature}, texture, "train", 0)
+    (slope,) = torch.autograd.grad(taken.raw.square().mean(), curvature)
+    assert math.isfinite(float(slope))
+    assert float(slope) != 0.0
+    assert not taken.truth.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"zones": {"far": 1.5}}, "zones.far"),
+        ({"renderer": PsfRenderer(Sensor(32, 32, 0.01))}, "pixel_pitch"),
+        ({"renderer": PsfRenderer(Sensor(500, 32, 0.08))}, "larger"),
+    ],
+)
+def test_settings_out_of_range_are_errors(settings, message):
+    with pytest.raises(InputError, match=message):
+        field_views(**settings)
+
+
+@pytest.mark.parametrize("discriminator", ["none", "double_scale"])
+def test_the_experiment_runs_whole(composed, tmp_path, discriminator):
+    run(
+        composed(
+            "experiment=large_fov_doublet",
+            "renderer.sensor.height=32",
+            "renderer.sensor.width=32",
+            "renderer.fields=[1,1]",
+            "renderer.size=15",
+            "evaluation_renderer.pupil_samples=3",
+            "data.margin=12",
+            "data.steps_per_epoch=2",
+            "data.evaluation_crops_per_photograph=1",
+            "trainer.max_epochs=1",
+            "+trainer.limit_val_batches=1",
+            "+trainer.limit_test_batches=1",
+            "+trainer.enable_progress_bar=false",
+            "network.width_multiplier=0.25",
+            "network.weights=none",
+            f"discriminator={discriminator}",
+            "loss.perceptual=none",
+        )
+    )
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    for zone in ("axis", "0.5", "0.7", "full", "field"):
+        assert math.isfinite(metrics[f"test/psnr_db/{zone}"])
+    assert metrics["operand/edge_thickness/1"] > 0.0
+    assert ("train/adversarial" in metrics) == (discriminator == "double_scale")
+    # The focal length is held by the last curvature.
+    lens = yaml.safe_load((tmp_path / "run/lens/final.yaml").read_text())
+    assert float(lens_from_prescription(lens).first_order().efl) == pytest.approx(
+        67.57969, rel=1e-5
+    )
+    assert (tmp_path / "run/figures/images.png").is_file()

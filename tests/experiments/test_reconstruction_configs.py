@@ -1,0 +1,50 @@
+"""Each file of the reconstruction's groups makes what it is a choice of."""
+
+import logging
+
+import pytest
+import torch
+from hydra.utils import instantiate
+
+from dolens.imaging.color import linear_to_srgb
+from dolens.reconstruction import RelativisticDiscriminators, Restoration, RestorationLoss
+
+EXPERIMENT = "experiment=wavefront_coding"
+
+
+@pytest.mark.parametrize("coordinates", ["false", "true"])
+@pytest.mark.parametrize("name", ["unet", "feature_pyramid"])
+def test_networks_alone_begin_as_the_encoded_image(composed, name, coordinates, caplog):
+    cfg = composed(EXPERIMENT, f"network={name}", f"network.field_coordinates={coordinates}")
+    if name == "feature_pyramid":
+        cfg.network.weights = "none"
+    with caplog.at_level(logging.WARNING):
+        network = instantiate(cfg.network)
+    assert isinstance(network, Restoration) and caplog.records == []
+    assert network.needs_field == (coordinates == "true")
+    raw = torch.rand(1, 3, 32, 40)
+    assert torch.equal(network(raw, field=torch.rand(1, 2, 32, 40)), linear_to_srgb(raw))
+
+
+@pytest.mark.parametrize("name", ["restoration", "deblurgan"])
+def test_losses_weigh_their_terms_as_written(composed, name):
+    cfg = composed(EXPERIMENT, f"loss={name}", "loss.perceptual=none", "loss.l1_weight=0.5")
+    loss = instantiate(cfg.loss)
+    assert isinstance(loss, RestorationLoss)
+    assert loss.weights == {key: cfg.loss[f"{key}_weight"] for key in loss.weights}
+
+
+def test_no_discriminator_is_none(composed):
+    assert instantiate(composed(EXPERIMENT, "discriminator=none").discriminator) is None
+
+
+def test_the_double_scale_discriminators_train_and_judge(composed):
+    cfg = composed(EXPERIMENT, "discriminator=double_scale", "discriminator.weight=0.02")
+    discriminators = instantiate(cfg.discriminator)
+    assert isinstance(discriminators, RelativisticDiscriminators)
+    assert discriminators.weight == 0.02
+    real, fake = torch.rand(2, 2, 3, 32, 32)
+    for loss in (discriminators.discriminator_loss, discriminators.generator_loss):
+        assert loss(real, fake).isfinite()
+    names = {name.split(".")[1] for name, _ in discriminators.named_parameters()}
+    assert names == {"local", "global"}
