@@ -17,7 +17,7 @@ from dolens.imaging.psf import splat
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.sampling import square_to_disc, stratified_square
-from dolens.imaging.scene import PlanarScene
+from dolens.imaging.scene import Scene
 from dolens.imaging.wave_psf import wave_kernels
 from dolens.optics.system import OpticalSystem
 
@@ -42,7 +42,7 @@ class FieldFunctions(NamedTuple):
 
 def field_point_spread_functions(
     system: OpticalSystem,
-    scene: PlanarScene,
+    scene: Scene,
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     pitch: float,
@@ -103,7 +103,7 @@ def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
 
 def wave_point_spread_functions(
     system: OpticalSystem,
-    scene: PlanarScene,
+    scene: Scene,
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     pitch: float,

@@ -100,7 +100,7 @@ def convolve_patches(
     transforms again.
 
     Args:
-        textures: (B, C, H, W).
+        textures: (B, D or 1, C or 1, H, W).
         kernels: (N, D or 1, C or 1, K, K), K odd, sums of quadratic B-splines.
         layout: N patches.
         origin: row and column of the texture that pixel (0, 0) looks at, where there are no
@@ -112,8 +112,11 @@ def convolve_patches(
     Returns:
         (B, D, C, height, width).
     """
-    planes = kernels.shape[1] if coordinates is None else coordinates.rows.shape[0]
-    settings = (tuple(layout), origin, (planes, *image_size), coordinates, backend)
+    sizes = [textures.shape[1:3], kernels.shape[1:3]]
+    if coordinates is not None:
+        sizes.append(coordinates.rows.shape[:2])
+    shape = (*torch.broadcast_shapes(*sizes), *image_size)
+    settings = (tuple(layout), origin, shape, coordinates, backend)
     return _Convolution.apply(textures, kernels, settings)
 
 
@@ -122,11 +125,11 @@ class _Convolution(torch.autograd.Function):
     def forward(ctx: Any, textures: Tensor, kernels: Tensor, settings: tuple[Any, ...]):  # noqa: ANN205
         ctx.save_for_backward(textures, kernels)
         ctx.settings = settings
-        layout, _, (planes, height, width), _, _ = settings
-        image = textures.new_zeros((textures.shape[0], planes, textures.shape[1], height, width))
+        layout, _, shape, _, _ = settings
+        image = textures.new_zeros((textures.shape[0], *shape))
         for node, patch in enumerate(layout):
             tile = _Tile(textures, kernels.shape[-1], patch, settings)
-            seen = tile.see(tile.texture_spectrum()[:, None] * tile.kernel_spectrum(kernels[node]))
+            seen = tile.see(tile.texture_spectrum() * tile.kernel_spectrum(kernels[node]))
             image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
         return image
 
@@ -141,10 +144,10 @@ class _Convolution(torch.autograd.Function):
             part = gradient[..., patch.top : patch.bottom, patch.left : patch.right]
             spectrum = tile.of_seen(patch.weight * part)
             if of_kernels is not None:
-                product = (tile.texture_spectrum()[:, None].conj() * spectrum).sum(0)
+                product = (tile.texture_spectrum().conj() * spectrum).sum(0)
                 of_kernels[node] = tile.of_kernel(product, kernels[node].shape)
             if of_textures is not None:
-                product = (tile.kernel_spectrum(kernels[node]).conj() * spectrum).sum(1)
+                product = tile.kernel_spectrum(kernels[node]).conj() * spectrum
                 tile.add_to_texture(product, of_textures)
         return of_textures, of_kernels, None
 
@@ -155,8 +158,8 @@ class _Tile:
     def __init__(
         self, textures: Tensor, size: int, patch: Patch, settings: tuple[Any, ...]
     ) -> None:
-        _, origin, (planes, _, _), coordinates, self.backend = settings
-        self.textures, self.size, self.planes = textures, size, planes
+        _, origin, self.shape, coordinates, self.backend = settings
+        self.textures, self.size = textures, size
         self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
         self.coordinates = None
         if coordinates is None:
@@ -177,7 +180,7 @@ class _Tile:
         self.transform = (fast_length(height + size - 1), fast_length(width + size - 1))
 
     def texture_spectrum(self) -> Tensor:
-        """(B, C, ...)."""
+        """(B, D or 1, C or 1, ...)."""
         part = self.textures.index_select(-2, self.rows).index_select(-1, self.columns)
         return torch.fft.rfft2(part, s=self.transform)
 
@@ -203,7 +206,7 @@ class _Tile:
         image = image[..., first : first + height, first : first + width]
         if self.coordinates is None:
             return image
-        image = image.expand(-1, self.planes, -1, -1, -1)
+        image = image.expand(-1, *self.shape[:2], -1, -1)
         flat, rows, columns = self._lookup_arguments(image)
         seen = spline_lookup(flat, rows, columns, self.backend)
         return seen.reshape(*image.shape[:3], self.height, self.width)
@@ -223,15 +226,13 @@ class _Tile:
 
     def of_kernel(self, spectrum: Tensor, shape: torch.Size) -> Tensor:
         """(D or 1, C or 1, K, K) of the sum over the batch."""
-        spectrum = self._sharpened(spectrum)
-        for dim in (0, 1):
-            if shape[dim] == 1:
-                spectrum = spectrum.sum(dim, keepdim=True)
+        spectrum = self._sharpened(spectrum).sum_to_size(*shape[:2], *spectrum.shape[-2:])
         kernel = torch.fft.irfft2(spectrum, s=self.transform)
         return kernel[..., : self.size, : self.size]
 
     def add_to_texture(self, spectrum: Tensor, of_textures: Tensor) -> None:
-        """Add the gradient (B, C, ...) to the texture's; its edge takes what lies beyond."""
+        """Add the gradient (B, D, C, ...) to the texture's; its edge takes what lies beyond."""
+        spectrum = spectrum.sum_to_size(*of_textures.shape[:3], *spectrum.shape[-2:])
         part = torch.fft.irfft2(spectrum, s=self.transform)
         part = part[..., : len(self.rows), : len(self.columns)]
         gathered = part.new_zeros((*part.shape[:-1], of_textures.shape[-1]))

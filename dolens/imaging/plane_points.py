@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.pupil import ExitPupil, aim
-from dolens.imaging.scene import PlanarScene
+from dolens.imaging.scene import Scene
 from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
@@ -36,7 +36,7 @@ class PlanePoints(NamedTuple):
 
 def plane_points(
     system: OpticalSystem,
-    scene: PlanarScene,
+    scene: Scene,
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     disc: tuple[Tensor, Tensor],
@@ -122,7 +122,7 @@ def pupil_rays(
 @torch.no_grad()
 def chief_ray_points(
     system: OpticalSystem,
-    scene: PlanarScene,
+    scene: Scene,
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     pitch: float,

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.sampling import regular_square, square_to_disc
-from dolens.imaging.scene import PlanarScene
+from dolens.imaging.scene import Scene
 from dolens.imaging.sensor import Sensor
 from dolens.kernels import splatting
 from dolens.optics.backend import choose_backend, trace_rays
@@ -23,7 +23,7 @@ _PUPIL_MARGIN = 1.02
 
 def axial_point_spread_functions(
     lens: Lens,
-    scene: PlanarScene,
+    scene: Scene,
     sensor: Sensor,
     size: int = 65,
     pupil_samples: int = 64,

@@ -19,14 +19,14 @@ from dolens.imaging.illumination import relative_illumination
 from dolens.imaging.patch_convolution import (
     Coordinates,
     Patch,
-    convolve_patches,
     node_positions,
     patches,
 )
+from dolens.imaging.plane_blur import PlaneBlur
 from dolens.imaging.plane_points import chief_ray_points
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.renderer import Unprepared
-from dolens.imaging.scene import PlanarScene, texture_origin
+from dolens.imaging.scene import PlanarScene, Scene, texture_origin
 from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import choose_backend, say_once
 from dolens.optics.lens import Lens
@@ -97,7 +97,7 @@ class PsfRenderer(Unprepared):
                     f"allowed: {', '.join(allowed)}"
                 )
 
-    def rays_per_image(self, scene: PlanarScene) -> int:
+    def rays_per_image(self, scene: Scene) -> int:
         """Rays traced for the functions of one render, where the lens has no symmetry."""
         channels = len(scene.wavelengths) if self.colours == "each" else 1
         return self.fields[0] * self.fields[1] * self.pupil_samples**2 * channels
@@ -105,33 +105,29 @@ class PsfRenderer(Unprepared):
     def render(
         self,
         lens: Lens,
-        scene: PlanarScene,
+        scene: Scene,
         textures: Tensor,
         seed: int,
         values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """Image textures at every depth of a scene; as `RayRenderer.render`.
+        """Image textures as a scene shows them; as `RayRenderer.render`.
 
         Args:
             lens: the lens; its precision is that of rays and image.
-            scene: depths and wavelengths.
-            textures: (B, C, H, W), linear light, a channel for each wavelength.
+            scene: planes, wavelengths, and what textures mean.
+            textures: (B, channels, H, W), linear light, as the scene takes them.
             seed: of the points in the pupil's strata.
             values: lens parameters to use instead of the stored ones.
 
         Returns:
-            (B, depths, C, height, width), linear light.  Differentiable in the lens's parameters,
-            `values` and the textures.
+            (B, images, C, height, width), linear light; of a planar scene an image for each depth.
+            Differentiable in the lens's parameters, `values` and the textures.
 
         Raises:
-            InputError: a depth inside the lens, or channels that do not match the wavelengths.
+            InputError: a depth inside the lens, or channels that are not the scene's.
         """
-        if textures.dim() != 4 or textures.shape[1] != len(scene.wavelengths):
-            raise InputError(
-                f"textures must be (B, {len(scene.wavelengths)}, H, W), one channel a wavelength, "
-                f"not {tuple(textures.shape)}"
-            )
         textures = textures.to(device=lens.device, dtype=lens.dtype)
+        shown = scene.on_planes(textures)
         system = lens.system(values)
         backend = choose_backend(system, lens.backend, others=[textures])
         with torch.no_grad():
@@ -148,21 +144,14 @@ class PsfRenderer(Unprepared):
         layout = patches(sensor.height, sensor.width, *self.fields, textures)
         if self.illumination == "map":
             layout = self._illuminated(layout, system, scene, pupil, found.light, backend)
-        image = convolve_patches(
-            textures,
-            found.functions,
-            layout,
-            origin,
-            (sensor.height, sensor.width),
-            coordinates,
-            backend,
-        )
-        return image.expand(-1, len(scene.depths), -1, -1, -1)
+        area = (sensor.height, sensor.width)
+        blur = PlaneBlur(found.functions, layout, origin, area, coordinates, backend)
+        return scene.blend(shown, blur)
 
     def point_spread_functions(
         self,
         system: OpticalSystem,
-        scene: PlanarScene,
+        scene: Scene,
         pupil: ExitPupil,
         seed: int,
         backend: str,
@@ -212,7 +201,7 @@ class PsfRenderer(Unprepared):
         )
         return self.sensor.positions(row.reshape(-1), column.reshape(-1))
 
-    def shared(self, scene: PlanarScene) -> PlanarScene:
+    def shared(self, scene: Scene) -> PlanarScene:
         """The scene of the depths and wavelengths that have functions of their own."""
         depths = (scene.middle_depth,) if self.depths == "one" else scene.depths
         wavelengths = (scene.middle_wavelength,) if self.colours == "one" else scene.wavelengths
@@ -222,7 +211,7 @@ class PsfRenderer(Unprepared):
         self,
         layout: list[Patch],
         system: OpticalSystem,
-        scene: PlanarScene,
+        scene: Scene,
         pupil: ExitPupil,
         light: Tensor,
         backend: str,
@@ -246,7 +235,7 @@ class PsfRenderer(Unprepared):
     def _coordinates(
         self,
         system: OpticalSystem,
-        scene: PlanarScene,
+        scene: Scene,
         texture_size: tuple[int, int],
         pupil: ExitPupil,
         backend: str,

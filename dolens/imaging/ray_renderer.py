@@ -1,10 +1,10 @@
 """Backward-mode rendering: from pixels through the exit pupil and the lens to textured planes.
 
-Two implementations of one computation, with the same samples: fused kernels, and PyTorch's
-operations, the reference that they must equal.
+Two implementations of one computation, with the same samples: fused kernels, for planes that make
+images of their own, and PyTorch's operations, the reference that they must equal.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -16,9 +16,8 @@ from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.replay import replay
 from dolens.imaging.sampling import square_to_disc, stratified_square
-from dolens.imaging.scene import PlanarScene, texture_coordinates, texture_origin
+from dolens.imaging.scene import Scene, texture_coordinates, texture_origin
 from dolens.imaging.sensor import Sensor
-from dolens.imaging.texture import bilinear
 from dolens.kernels import rendering
 from dolens.kernels.view import View
 from dolens.optics.backend import choose_backend, say_once, trace_rays
@@ -66,7 +65,7 @@ class RayRenderer(Unprepared):
         if self.gradient_fraction < 1.0 and not self.replay:
             raise InputError("renderer: gradient_fraction below 1 needs replay")
 
-    def rays_per_image(self, scene: PlanarScene) -> int:
+    def rays_per_image(self, scene: Scene) -> int:
         """Rays traced through the lens for one render, all wavelengths together."""
         pixels = self.sensor.height * self.sensor.width
         return pixels * self.pupil_samples**2 * len(scene.wavelengths)
@@ -74,53 +73,51 @@ class RayRenderer(Unprepared):
     def render(
         self,
         lens: Lens,
-        scene: PlanarScene,
+        scene: Scene,
         textures: Tensor,
         seed: int,
         values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """Image textures at every depth of a scene.
+        """Image textures as a scene shows them.
 
         Args:
             lens: the lens; its precision is the rays'.
-            scene: depths and wavelengths.
-            textures: (B, C, H, W), linear light, a channel for each wavelength.
+            scene: planes, wavelengths, and what textures mean.
+            textures: (B, channels, H, W), linear light, as the scene takes them.
             seed: the same seed gives the same samples, whatever ran before.
             values: lens parameters to use instead of the stored ones.
 
         Returns:
-            (B, depths, C, height, width), linear light, in the lens's precision.  Differentiable
-            in the lens's parameters, `values` and the textures.
+            (B, images, C, height, width), linear light, in the lens's precision; of a planar scene
+            an image for each depth.  Differentiable in the lens's parameters, `values` and the
+            textures.
 
         Raises:
-            InputError: a depth inside the lens, or channels that do not match the wavelengths.
+            InputError: a depth inside the lens, or channels that are not the scene's.
         """
-        if textures.dim() != 4 or textures.shape[1] != len(scene.wavelengths):
-            raise InputError(
-                f"textures must be (B, {len(scene.wavelengths)}, H, W), one channel a wavelength, "
-                f"not {tuple(textures.shape)}"
-            )
         stored = {n: p for n, p in lens.named_parameters() if p.requires_grad}
         parameters = {**stored, **(values or {})}
         textures = textures.to(device=lens.device, dtype=lens.dtype)
+        shown = scene.on_planes(textures)
         system = lens.system(parameters)
         backend = choose_backend(system, lens.backend, others=[textures])
         now = lens.system({n: p.detach() for n, p in parameters.items()})
         scene.check(now)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, backend)
-        if backend == "cpu":
+        if backend == "cpu" and scene.separate_planes:
             return self._fused(system, scene, textures, view)
-        if backend == "cuda":
-            say_once("render: no fused renderer for cuda; the reference, with fused traces")
-        names = list(parameters)
+        if backend != "reference":
+            what = "cuda" if scene.separate_planes else "layers"
+            say_once(f"render: no fused renderer for {what}; the reference, with fused traces")
+        names, planes = list(parameters), len(shown)
 
-        def piece(i: int, textures: Tensor, *tensors: Tensor) -> Tensor:
-            system = lens.system(dict(zip(names, tensors, strict=True)))
+        def piece(i: int, *tensors: Tensor) -> Tensor:
+            system = lens.system(dict(zip(names, tensors[planes:], strict=True)))
             start, end = self._chunk(i)
             ray, weight = self._samples(system, view, start, end)
-            return self._shade(system, scene, view, textures, ray, weight, backend)
+            return self._shade(system, scene, view, tensors[:planes], ray, weight, backend)
 
-        tensors = [textures, *parameters.values()]
+        tensors = [*shown, *parameters.values()]
         sizes = [end - start for start, end in map(self._chunk, range(self._chunks))]
         if self.replay:
             flat = replay(piece, sizes, tensors, self._replayed(seed))
@@ -131,7 +128,7 @@ class RayRenderer(Unprepared):
     def _view(
         self,
         system: OpticalSystem,
-        scene: PlanarScene,
+        scene: Scene,
         texture_size: tuple[int, int],
         seed: int,
         backend: str,
@@ -174,9 +171,7 @@ class RayRenderer(Unprepared):
         generator = torch.Generator().manual_seed(seed % _SEED_RANGE)
         return torch.randperm(self._chunks, generator=generator)[:count].tolist()
 
-    def _fused(
-        self, system: OpticalSystem, scene: PlanarScene, textures: Tensor, view: View
-    ) -> Tensor:
+    def _fused(self, system: OpticalSystem, scene: Scene, textures: Tensor, view: View) -> Tensor:
         """The render in one kernel."""
         wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64)
         table = pack(system, wavelengths, -1.0, 1, len(system.surfaces), False)
@@ -220,29 +215,31 @@ class RayRenderer(Unprepared):
     def _shade(
         self,
         system: OpticalSystem,
-        scene: PlanarScene,
+        scene: Scene,
         view: View,
-        textures: Tensor,
+        shown: tuple[Tensor, ...],
         ray: Components,
         weight: Tensor,
         backend: str,
     ) -> Tensor:
-        """(B, depths, C, count): trace, meet each plane, look the texture up, sum the samples."""
-        origin, pitch = (view.texture_row, view.texture_column), view.pixel_pitch
+        """(B, images, C, count): trace, meet the planes, gather what they show."""
         channels = []
         for channel, wavelength in enumerate(scene.wavelengths):
             there, valid = _trace(system, ray, wavelength, backend)
             arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
-            by_depth = []
-            for depth, magnification in zip(view.depths, view.magnifications, strict=True):
-                t, _ = distance_to_plane(there, -depth, -1.0)
-                x = torch.addcmul(there.x, t, there.l)
-                y = torch.addcmul(there.y, t, there.m)
-                rows, columns = texture_coordinates(x, y, magnification, pitch, origin)
-                radiance = bilinear(textures[:, channel], rows, columns)
-                by_depth.append((radiance * arriving).sum(dim=-1))
-            channels.append(torch.stack(by_depth, dim=1))
+            places = _texture_places(view, there)
+            channels.append(scene.gather(shown, channel, places, arriving))
         return torch.stack(channels, dim=2)
+
+
+def _texture_places(view: View, there: Components) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows and columns of the texture where rays meet one plane after the other."""
+    origin = (view.texture_row, view.texture_column)
+    for depth, magnification in zip(view.depths, view.magnifications, strict=True):
+        t, _ = distance_to_plane(there, -depth, -1.0)
+        x = torch.addcmul(there.x, t, there.l)
+        y = torch.addcmul(there.y, t, there.m)
+        yield texture_coordinates(x, y, magnification, view.pixel_pitch, origin)
 
 
 def _trace(

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from dolens.imaging.scene import PlanarScene
+from dolens.imaging.scene import Scene
 from dolens.imaging.sensor import Sensor
 from dolens.optics.lens import Lens
 
@@ -20,19 +20,17 @@ class Renderer(Protocol):
     def render(
         self,
         lens: Lens,
-        scene: PlanarScene,
+        scene: Scene,
         textures: Tensor,
         seed: int,
         values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """Image textures (B, C, H, W) at every depth of a scene: (B, depths, C, height, width)."""
 
-    def rays_per_image(self, scene: PlanarScene) -> int:
+    def rays_per_image(self, scene: Scene) -> int:
         """Rays traced through the lens for one render, all wavelengths together."""
 
-    def prepare(
-        self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
-    ) -> None:
+    def prepare(self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None) -> None:
         """Look at the lens as it is now; `render` need not be called with the same one."""
 
     def numbers(self) -> dict[str, float]:
@@ -48,9 +46,7 @@ class Renderer(Protocol):
 class Unprepared:
     """A renderer whose settings say everything."""
 
-    def prepare(
-        self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
-    ) -> None:
+    def prepare(self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None) -> None:
         """Nothing depends on the lens."""
 
     def numbers(self) -> dict[str, float]:

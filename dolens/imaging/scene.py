@@ -1,7 +1,9 @@
-"""Planar scenes: textured planes at a few depths, and what an ideal pinhole sees of them."""
+"""Scenes of textured planes, and what an ideal pinhole sees of them."""
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -15,34 +17,45 @@ from dolens.optics.system import OpticalSystem
 REFERENCE_WAVELENGTH = 587.5618
 
 
+class Blur(Protocol):
+    """What a lens does to planes."""
+
+    def __call__(self, maps: Tensor) -> Tensor:
+        """Blurred maps (B, D or 1, C, height, width) of maps (B, D or 1, C or 1, H, W)."""
+
+    def white(self) -> Tensor:
+        """What maps of ones become, (D or 1, C or 1, height, width)."""
+
+
 @dataclass(frozen=True)
-class PlanarScene:
-    """A textured plane perpendicular to the axis, at one of several depths.
+class Scene(ABC):
+    """Planes perpendicular to the axis, and how what they show becomes images.
 
     A texture is mapped so that one texel covers one pixel as a distortion-free pinhole of the
-    lens's own magnification sees it: the plane is scaled with its depth, and the pinhole image
+    lens's own magnification sees it: a plane is scaled with its depth, and the pinhole image
     of a texture is the texture's central part.  Texel and pixel centres coincide.
 
+    Renderers know the light's way from a pixel to the planes; what is met there, and how the planes
+    share a pixel, the scene knows: `on_planes` once an image, then `gather` for rays or `blend` for
+    blurred planes.
+
     Attributes:
-        depths: mm in front of the first vertex.
-        wavelengths: nm, one for each of the texture's channels.
+        depths: of the planes, mm in front of the first vertex.
+        wavelengths: nm, one for each of the texture's colours.
         texture_centre: rows below and columns right of the axis, in the pinhole's image, where the
             texture's centre lies; (0, 0) but for windows of a larger sensor.
+        separate_planes: whether each plane makes an image of its own, as the fused kernels have it.
     """
 
     depths: tuple[float, ...]
     wavelengths: tuple[float, ...]
-    texture_centre: tuple[float, float]
+    texture_centre: tuple[float, float] = (0.0, 0.0)
 
-    def __init__(
-        self,
-        depths: Sequence[float],
-        wavelengths: Sequence[float],
-        texture_centre: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
-        object.__setattr__(self, "depths", tuple(float(d) for d in depths))
-        object.__setattr__(self, "wavelengths", tuple(float(w) for w in wavelengths))
-        object.__setattr__(self, "texture_centre", tuple(float(c) for c in texture_centre))
+    separate_planes: ClassVar[bool]
+
+    def __post_init__(self) -> None:
+        for name in ("depths", "wavelengths", "texture_centre"):
+            object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
         if not self.depths or not self.wavelengths:
             raise InputError("scene: depths (mm) and wavelengths (nm) must not be empty")
         for wavelength in self.wavelengths:
@@ -50,6 +63,55 @@ class PlanarScene:
                 raise InputError(
                     f"scene: wavelength {wavelength:g} nm is not between 100 and 20000"
                 )
+
+    @abstractmethod
+    def labels(self) -> list[str]:
+        """The images as metrics name them."""
+
+    @abstractmethod
+    def colours(self, textures: Tensor) -> Tensor:
+        """The channels of textures (B, ..., H, W) that are colours: (B, C, H, W)."""
+
+    @abstractmethod
+    def on_planes(self, textures: Tensor) -> tuple[Tensor, ...]:
+        """What the planes show, for `gather` and `blend`: each (B, D or 1, C or 1, H, W).
+
+        Raises:
+            InputError: the textures' channels are not those of this kind of scene.
+        """
+
+    @abstractmethod
+    def gather(
+        self,
+        shown: tuple[Tensor, ...],
+        channel: int,
+        places: Iterable[tuple[Tensor, Tensor]],
+        weight: Tensor,
+    ) -> Tensor:
+        """Light of pixels whose rays meet the planes at given places.
+
+        Args:
+            shown: of `on_planes`.
+            channel: the wavelength's number.
+            places: for each plane the texture's rows and columns, each (P, S) for P pixels of S
+                rays.
+            weight: (P, S), the rays' shares in the pixel's irradiance; zero for one that is lost.
+
+        Returns:
+            (B, images, P).
+        """
+
+    @abstractmethod
+    def blend(self, shown: tuple[Tensor, ...], blur: Blur) -> Tensor:
+        """Images of planes that are blurred one by one.
+
+        Args:
+            shown: of `on_planes`.
+            blur: what the lens does to each plane.
+
+        Returns:
+            (B, images, C, height, width).
+        """
 
     def check(self, system: OpticalSystem) -> None:
         """Raise `InputError` where a depth is not in front of the whole lens."""
@@ -75,8 +137,8 @@ class PlanarScene:
         """The middle wavelength in order, or the longer one of two."""
         return sorted(self.wavelengths)[len(self.wavelengths) // 2]
 
-    def labels(self) -> list[str]:
-        """Depths as metrics name them, in metres: `8m`, `4.5m`."""
+    def plane_labels(self) -> list[str]:
+        """Depths of the planes, in metres: `8m`, `4.5m`."""
         return [f"{depth / 1000.0:g}m" for depth in self.depths]
 
     @torch.no_grad()
@@ -88,8 +150,55 @@ class PlanarScene:
         ]
 
 
+@dataclass(frozen=True)
+class PlanarScene(Scene):
+    """A textured plane at one of several depths: an image for each of them.
+
+    Textures are (B, C, H, W), linear light, a channel for each wavelength.
+    """
+
+    separate_planes: ClassVar[bool] = True
+
+    def labels(self) -> list[str]:
+        """The depths, as metrics name them."""
+        return self.plane_labels()
+
+    def colours(self, textures: Tensor) -> Tensor:
+        """The textures as they are."""
+        return textures
+
+    def on_planes(self, textures: Tensor) -> tuple[Tensor, ...]:
+        """The textures, one for all planes: (B, 1, C, H, W)."""
+        if textures.dim() != 4 or textures.shape[1] != len(self.wavelengths):
+            raise InputError(
+                f"textures must be (B, {len(self.wavelengths)}, H, W), one channel a wavelength, "
+                f"not {tuple(textures.shape)}"
+            )
+        return (textures[:, None],)
+
+    def gather(
+        self,
+        shown: tuple[Tensor, ...],
+        channel: int,
+        places: Iterable[tuple[Tensor, Tensor]],
+        weight: Tensor,
+    ) -> Tensor:
+        """The weighted sum over each pixel's rays, (B, D, P); see `Scene.gather`."""
+        (textures,) = shown
+        sums = [
+            (bilinear(textures[:, 0, channel], rows, columns) * weight).sum(dim=-1)
+            for rows, columns in places
+        ]
+        return torch.stack(sums, dim=1)
+
+    def blend(self, shown: tuple[Tensor, ...], blur: Blur) -> Tensor:
+        """Each blurred plane is an image, (B, D, C, height, width); see `Scene.blend`."""
+        (textures,) = shown
+        return blur(textures).expand(-1, len(self.depths), -1, -1, -1)
+
+
 def texture_origin(size: tuple[int, int], centre: tuple[float, float]) -> tuple[float, float]:
-    """Row and column of the axis in a texture of `size` texels; see `PlanarScene`."""
+    """Row and column of the axis in a texture of `size` texels; see `Scene`."""
     (height, width), (row, column) = size, centre
     return 0.5 * (height - 1) - row, 0.5 * (width - 1) - column
 
@@ -119,9 +228,9 @@ def pinhole_image(
     """What a distortion-free pinhole of the lens's magnification sees: the ground truth.
 
     Args:
-        textures: (..., H, W), as `PlanarScene` maps them.
+        textures: (..., H, W), as `Scene` maps them.
         sensor: its pixels; where H - height is odd, pixel centres fall between texels.
-        texture_centre: of `PlanarScene`.
+        texture_centre: of `Scene`.
 
     Returns:
         (..., height, width): the textures' values at the pixel centres.

@@ -11,7 +11,7 @@ from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.imaging.readout import Readout
 from dolens.imaging.renderer import Renderer
-from dolens.imaging.scene import PlanarScene, pinhole_image
+from dolens.imaging.scene import Scene, pinhole_image
 from dolens.imaging.sensor import Sensor
 from dolens.optics.lens import Lens
 from experiments.views.base import NOISE_OFFSET, Views, seed_of
@@ -38,7 +38,7 @@ class DepthViews:
 
     def __init__(
         self,
-        scene: PlanarScene,
+        scene: Scene,
         renderer: Renderer,
         readout: Readout,
         evaluation_renderer: Renderer | None = None,
@@ -74,8 +74,8 @@ class DepthViews:
         return self.scene.labels()
 
     def psf_labels(self) -> list[str]:
-        """The depths."""
-        return self.scene.labels()
+        """The planes' depths."""
+        return self.scene.plane_labels()
 
     def check(self, lens: Lens) -> None:
         """Raise `InputError` where a depth lies inside the lens."""
@@ -94,7 +94,7 @@ class DepthViews:
         image = renderer.render(lens, self.scene, textures, seed, values)
         generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
         raw = self.readout.develop(self.readout(image, generator))
-        truth = linear_to_srgb(pinhole_image(textures, self.sensor))
+        truth = linear_to_srgb(pinhole_image(self.scene.colours(textures), self.sensor))
         return Views(truth[:, None].expand_as(raw), raw)
 
     def point_spread_functions(

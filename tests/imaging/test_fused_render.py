@@ -217,7 +217,8 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     renderer, system = RayRenderer(SMALL, 3), lens.system()
     view = renderer._view(system, scene, (40, 43), 0, "reference")
     ray, weight = renderer._samples(system, view, 0, 180)
-    images = [renderer._shade(system, scene, view, texture(40), ray, weight, backend)
+    shown = scene.on_planes(texture(40))
+    images = [renderer._shade(system, scene, view, shown, ray, weight, backend)
               for backend in ("reference", "cpu")]  # fmt: skip
     assert torch.allclose(*images, rtol=1e-11, atol=0)
 

@@ -11,6 +11,7 @@ from dolens.imaging.patch_convolution import (
     node_positions,
     patches,
 )
+from dolens.imaging.plane_blur import uniform_image
 from dolens.imaging.psf import splat
 
 
@@ -22,7 +23,8 @@ def random(*shape, seed=0):
 def defining_sum(textures, kernels, layout, origin, size):
     """Σ weight · Σ kernel(e) · T(origin + p - e), the texture's edge going on beyond it."""
     (height, width), reach = size, kernels.shape[-1] // 2
-    image = torch.zeros(len(textures), kernels.shape[1], textures.shape[1], height, width).double()
+    shape = torch.broadcast_shapes(textures.shape[1:3], kernels.shape[1:3])
+    image = torch.zeros(len(textures), *shape, height, width).double()
     for kernel, patch in zip(kernels, layout, strict=True):
         for i in range(patch.top, patch.bottom):
             for j in range(patch.left, patch.right):
@@ -32,7 +34,7 @@ def defining_sum(textures, kernels, layout, origin, size):
                 columns = (origin[1] + j + reach - torch.arange(2 * reach + 1)).clamp(
                     0, textures.shape[-1] - 1
                 )
-                seen = textures[:, None][..., rows, :][..., columns]
+                seen = textures[..., rows, :][..., columns]
                 weight = patch.weight[i - patch.top, j - patch.left]
                 image[..., i, j] += weight * (seen * kernel).sum((-2, -1))
     return image
@@ -40,12 +42,25 @@ def defining_sum(textures, kernels, layout, origin, size):
 
 @pytest.mark.parametrize("nodes", [(1, 1), (2, 3), (4, 1)])
 @pytest.mark.parametrize("origin", [(3, 2), (-4, 9)])
-def test_patches_make_the_defining_sum(nodes, origin):
-    textures = random(2, 3, 15, 17)
-    kernels = random(nodes[0] * nodes[1], 2, 3, 5, 5, seed=1)
+@pytest.mark.parametrize("shapes", [((1, 3), (2, 3)), ((2, 3), (1, 1)), ((2, 1), (2, 3))])
+def test_patches_make_the_defining_sum(nodes, origin, shapes):
+    textures = random(2, *shapes[0], 15, 17)
+    kernels = random(nodes[0] * nodes[1], *shapes[1], 5, 5, seed=1)
     layout = patches(11, 9, *nodes, textures)
     image = convolve_patches(textures, kernels, layout, origin, (11, 9), None, "reference")
     assert torch.allclose(image, defining_sum(textures, kernels, layout, origin, (11, 9)))
+
+
+def test_a_texture_of_ones_takes_the_kernels_sums():
+    kernels, ones = random(6, 2, 1, 5, 5), torch.ones(1, 1, 1, 15, 17, dtype=torch.float64)
+    layout = patches(11, 9, 2, 3, kernels)
+    own = [p._replace(weight=p.weight * random(3, 1, 1, seed=i)) for i, p in enumerate(layout)]
+    for given, channels in ((layout, 1), (own, 3)):
+        three = ones.expand(1, 1, channels, 15, 17)
+        image = convolve_patches(three, kernels, given, (3, 2), (11, 9), None, "reference")
+        found = uniform_image(kernels, given, (11, 9))
+        assert found.shape == (2, channels, 11, 9)
+        assert torch.allclose(found, image[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("nodes", [(1, 1), (2, 2), (3, 5)])
@@ -80,7 +95,7 @@ def plain_coordinates(planes, channels, height, width, top, left):
 
 def test_looking_at_every_texel_in_turn_is_the_plain_convolution(backend):
     # The lookup's splines and the filter that undoes them cancel at whole texels.
-    textures, kernels = random(1, 2, 30, 30), random(4, 2, 2, 5, 5, seed=1)
+    textures, kernels = random(1, 1, 2, 30, 30), random(4, 2, 2, 5, 5, seed=1)
     layout = patches(12, 10, 2, 2, textures)
     plain = convolve_patches(textures, kernels, layout, (7, 8), (12, 10), None, backend)
     coordinates = plain_coordinates(2, 2, 12, 10, 7, 8)
@@ -91,7 +106,7 @@ def test_looking_at_every_texel_in_turn_is_the_plain_convolution(backend):
 def test_a_point_s_spline_is_looked_up_anywhere(backend):
     # With a kernel of a point's spline at the centre the image is the texture, box-filtered:
     # Σ T[k]·β²(c - k), whatever fraction of a texel c lies at.
-    textures = random(1, 1, 40, 40)
+    textures = random(1, 1, 1, 40, 40)
     kernel = splat(*(torch.full((1,), 4.0, dtype=torch.float64),) * 2, torch.ones(1).double(), 9)
     layout = patches(10, 10, 1, 1, textures)
     rows = 12.3 + 1.02 * torch.arange(10.0).double()[:, None].expand(10, 10)
@@ -107,15 +122,14 @@ def test_a_point_s_spline_is_looked_up_anywhere(backend):
 
     place = torch.arange(40.0).double()
     down, across = spline(rows[:, :1] - place), spline(columns[:1].T - place)
-    assert torch.allclose(image, down @ textures[0, 0] @ across.T, atol=1e-6)
+    assert torch.allclose(image, down @ textures[0, 0, 0] @ across.T, atol=1e-6)
 
 
 @pytest.mark.parametrize("looked", [False, True])
-@pytest.mark.parametrize("shared", [False, True])
-def test_gradients_are_those_of_the_sum(looked, shared, backend):
-    textures = random(1, 2, 8, 7).requires_grad_()
-    channels = 1 if shared else 2
-    kernels = random(2, channels, channels, 3, 3, seed=1).requires_grad_()
+@pytest.mark.parametrize("shapes", [((1, 2), (2, 2)), ((1, 2), (1, 1)), ((2, 1), (2, 2))])
+def test_gradients_are_those_of_the_sum(looked, shapes, backend):
+    textures = random(1, *shapes[0], 8, 7).requires_grad_()
+    kernels = random(2, *shapes[1], 3, 3, seed=1).requires_grad_()
     layout = patches(4, 3, 1, 2, textures)
     coordinates = None
     if looked:

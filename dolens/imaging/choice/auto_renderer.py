@@ -20,7 +20,7 @@ from dolens.imaging.choice.probe import probe_image
 from dolens.imaging.choice.reference import Reference, rays_samples, reference
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.scene import PlanarScene
+from dolens.imaging.scene import PlanarScene, Scene
 from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
@@ -67,14 +67,14 @@ class AutoRenderer:
         self.plans = 0
         self._other: Lens | None = None
 
-    def rays_per_image(self, scene: PlanarScene) -> int:
+    def rays_per_image(self, scene: Scene) -> int:
         """Rays traced for one render; 0 before there is a plan."""
         return 0 if self.choice is None else self.choice.renderer.rays_per_image(scene)
 
     def render(
         self,
         lens: Lens,
-        scene: PlanarScene,
+        scene: Scene,
         textures: Tensor,
         seed: int,
         values: Mapping[str, Tensor] | None = None,
@@ -96,9 +96,7 @@ class AutoRenderer:
         return image.to(lens.dtype)
 
     @torch.no_grad()
-    def prepare(
-        self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
-    ) -> None:
+    def prepare(self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None) -> None:
         """Measure what the plan errs by for the lens as it is now; plan anew where it is too much,
         and where there is none.
         """
@@ -157,7 +155,7 @@ class AutoRenderer:
 
     @torch.no_grad()
     def make_plan(
-        self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
+        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
     ) -> Choice:
         """Choose, measure on the probe image, log; the choice is kept for `render`."""
         started = time.perf_counter()
@@ -166,13 +164,14 @@ class AutoRenderer:
         single, double = (copy.deepcopy(current).to(d) for d in (torch.float32, torch.float64))
         backend = choose_backend(double.system(), lens.backend)
         texture, whole = self._probe(scene)
+        planes = replace(whole, texture_centre=scene.texture_centre)
         judge = reference(single, whole, self.sensor, texture, _REFERENCE_SAMPLES, self.seed)
         tightened, best = 1.0, None
         for _ in range(_ROUNDS):
             found = plan(
                 single.system(),
                 double.system(),
-                scene,
+                planes,
                 self.sensor,
                 tightened * self.tolerance,
                 self.gradients,
@@ -191,8 +190,8 @@ class AutoRenderer:
         renderer, dtype, findings = found.renderer, found.dtype, list(found.findings)
         surfaces = len(lens.surfaces)
         samples, noise = rays_samples(single, whole, self.sensor, texture, self.tolerance)
-        times = rays_cost(self.sensor, samples**2, scene, surfaces) / psf_cost(
-            renderer, scene, surfaces
+        times = rays_cost(self.sensor, samples**2, planes, surfaces) / psf_cost(
+            renderer, planes, surfaces
         )
         # Rays know no diffraction.
         of_rays = math.hypot(noise, found.without_diffraction if self.diffraction else 0.0)
@@ -209,6 +208,9 @@ class AutoRenderer:
             error = self._measured(renderer, dtype, single, double, texture, whole, judge)
         else:
             findings.insert(0, Finding("model", "psf", error, verdict))
+            if not scene.separate_planes:
+                because = "not measured: the probe's planes make images of their own"
+                findings.append(Finding("occlusion", "blurred planes", 0.0, because))
         self._other = (single if dtype == torch.float32 else double).requires_grad_(False)
         self.choice = Choice(
             renderer,
@@ -229,13 +231,13 @@ class AutoRenderer:
             )
         return self.choice
 
-    def _probe(self, scene: PlanarScene) -> tuple[Tensor, PlanarScene]:
+    def _probe(self, scene: Scene) -> tuple[Tensor, PlanarScene]:
         """A texture that covers the sensor, and the scene with it in its place."""
         sensor = self.sensor
         size = (sensor.height + 2 * _MARGIN, sensor.width + 2 * _MARGIN)
         texture = probe_image(*size, self.seed)[:, [i % 3 for i in range(len(scene.wavelengths))]]
         centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
-        return texture, replace(scene, texture_centre=centre)
+        return texture, PlanarScene(scene.depths, scene.wavelengths, centre)
 
     def _measured(
         self,
