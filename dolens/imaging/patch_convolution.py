@@ -80,6 +80,9 @@ def _hat(length: int, count: int, node: int, like: Tensor) -> tuple[int, int, Te
         return 0, length, torch.ones_like(place).to(like)
     spacing = (length - 1) / (count - 1)
     weight = (1.0 - (place - node * spacing).abs() / spacing).clamp(min=0.0)
+    if count == 2:
+        # All patches are then the whole, and share what is done to the texture.
+        return 0, length, weight.to(like)
     inside = torch.nonzero(weight > 0.0).flatten()
     first, end = int(inside[0]), int(inside[-1]) + 1
     return first, end, weight[first:end].to(like)
@@ -127,8 +130,9 @@ class _Convolution(torch.autograd.Function):
         ctx.settings = settings
         layout, _, shape, _, _ = settings
         image = textures.new_zeros((textures.shape[0], *shape))
+        tile = None
         for node, patch in enumerate(layout):
-            tile = _Tile(textures, kernels.shape[-1], patch, settings)
+            tile = _tile(tile, textures, kernels.shape[-1], patch, settings)
             seen = tile.see(tile.texture_spectrum() * tile.kernel_spectrum(kernels[node]))
             image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
         return image
@@ -139,8 +143,9 @@ class _Convolution(torch.autograd.Function):
         textures, kernels = ctx.saved_tensors
         of_textures = torch.zeros_like(textures) if ctx.needs_input_grad[0] else None
         of_kernels = torch.zeros_like(kernels) if ctx.needs_input_grad[1] else None
+        tile = None
         for node, patch in enumerate(ctx.settings[0]):
-            tile = _Tile(textures, kernels.shape[-1], patch, ctx.settings)
+            tile = _tile(tile, textures, kernels.shape[-1], patch, ctx.settings)
             part = gradient[..., patch.top : patch.bottom, patch.left : patch.right]
             spectrum = tile.of_seen(patch.weight * part)
             if of_kernels is not None:
@@ -152,6 +157,15 @@ class _Convolution(torch.autograd.Function):
         return of_textures, of_kernels, None
 
 
+def _tile(
+    last: "_Tile | None", textures: Tensor, size: int, patch: Patch, settings: tuple[Any, ...]
+) -> "_Tile":
+    """The tile of a patch: the last one where that has the same area, as two nodes a side do."""
+    if last is not None and last.area == patch[:4]:
+        return last
+    return _Tile(textures, size, patch, settings)
+
+
 class _Tile:
     """The part of the texture that a patch sees, and the transforms between the two."""
 
@@ -159,7 +173,8 @@ class _Tile:
         self, textures: Tensor, size: int, patch: Patch, settings: tuple[Any, ...]
     ) -> None:
         _, origin, self.shape, coordinates, self.backend = settings
-        self.textures, self.size = textures, size
+        self.textures, self.size, self.area = textures, size, patch[:4]
+        self._spectrum: Tensor | None = None
         self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
         self.coordinates = None
         if coordinates is None:
@@ -181,8 +196,10 @@ class _Tile:
 
     def texture_spectrum(self) -> Tensor:
         """(B, D or 1, C or 1, ...)."""
-        part = self.textures.index_select(-2, self.rows).index_select(-1, self.columns)
-        return torch.fft.rfft2(part, s=self.transform)
+        if self._spectrum is None:
+            part = self.textures.index_select(-2, self.rows).index_select(-1, self.columns)
+            self._spectrum = torch.fft.rfft2(part, s=self.transform)
+        return self._spectrum
 
     def kernel_spectrum(self, kernel: Tensor) -> Tensor:
         """(D or 1, C or 1, ...), with what a lookup's splines do undone."""

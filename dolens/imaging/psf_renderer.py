@@ -1,8 +1,8 @@
 """Rendering by point spread functions on a grid of fields, convolved in overlapping patches."""
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.diffraction_limit import with_diffraction_limit, working_f_number
+from dolens.imaging.distortion import chief_ray_map, distortion
 from dolens.imaging.field_psf import (
     FieldFunctions,
     field_point_spread_functions,
@@ -23,7 +24,6 @@ from dolens.imaging.patch_convolution import (
     patches,
 )
 from dolens.imaging.plane_blur import PlaneBlur
-from dolens.imaging.plane_points import chief_ray_points
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.scene import PlanarScene, Scene, texture_origin
@@ -127,26 +127,110 @@ class PsfRenderer(Unprepared):
             InputError: a depth inside the lens, or channels that are not the scene's.
         """
         textures = textures.to(device=lens.device, dtype=lens.dtype)
-        shown = scene.on_planes(textures)
         system = lens.system(values)
         backend = choose_backend(system, lens.backend, others=[textures])
         with torch.no_grad():
             scene.check(system)
             pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
         found = self.point_spread_functions(system, scene, pupil, seed, backend)
+        self._warn_of_loss(found)
+        size = (textures.shape[-2], textures.shape[-1])
+        coordinates, origin = self._coordinates(system, scene, size, pupil, backend)
+        return self._blurred(system, scene, textures, found, coordinates, origin, pupil, backend)
+
+    def render_windows(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        windows: Sequence[Sensor],
+        centres: Sequence[tuple[float, float]],
+        seed: int,
+        values: Mapping[str, Tensor] | None = None,
+    ) -> Tensor:
+        """Image each texture on a window of its own of the renderer's sensor, all at once.
+
+        Rays of all windows are traced together, through a pupil that serves the whole sensor, and
+        one set of polynomials says where the windows look.
+
+        Args:
+            lens: as of `render`, and the others.
+            scene: of all windows.
+            textures: (W, channels, h, w).
+            windows: W of one size.
+            centres: where each texture's centre lies; see `Scene`.
+            seed: of the points in the pupil's strata.
+            values: lens parameters.
+
+        Returns:
+            (W, images, C, height, width).
+        """
+        textures = textures.to(device=lens.device, dtype=lens.dtype)
+        system = lens.system(values)
+        backend = choose_backend(system, lens.backend, others=[textures])
+        with torch.no_grad():
+            scene.check(system)
+            pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+            looks = None
+            if self.registration == "chief_rays":
+                looks = distortion(system, scene, self.sensor, pupil, backend)
+        parts = [replace(self, sensor=window) for window in windows]
+        x, y = zip(*(part.points() for part in parts), strict=True)
+        found = self.point_spread_functions(
+            system, scene, pupil, seed, backend, (torch.cat(x), torch.cat(y))
+        )
+        self._warn_of_loss(found)
+        nodes, size = self.fields[0] * self.fields[1], (textures.shape[-2], textures.shape[-1])
+        images = []
+        for i, (part, centre) in enumerate(zip(parts, centres, strict=True)):
+            own = slice(i * nodes, (i + 1) * nodes)
+            functions = found._replace(functions=found.functions[own], light=found.light[own])
+            placed = replace(scene, texture_centre=centre)
+            if looks is None:
+                coordinates, origin = part._coordinates(system, placed, size, pupil, backend)
+            else:
+                row, column = texture_origin(size, centre)
+                down, across = looks.seen_by(part.sensor)
+                coordinates, origin = Coordinates(down + row, across + column), (0, 0)
+            images.append(
+                part._blurred(
+                    system,
+                    placed,
+                    textures[i : i + 1],
+                    functions,
+                    coordinates,
+                    origin,
+                    pupil,
+                    backend,
+                )
+            )
+        return torch.cat(images)
+
+    def _blurred(
+        self,
+        system: OpticalSystem,
+        scene: Scene,
+        textures: Tensor,
+        found: FieldFunctions,
+        coordinates: Coordinates | None,
+        origin: tuple[int, int],
+        pupil: ExitPupil,
+        backend: str,
+    ) -> Tensor:
+        """The image by functions that are known, of pixels that look where coordinates say."""
+        area = (self.sensor.height, self.sensor.width)
+        layout = patches(*area, *self.fields, textures)
+        if self.illumination == "map":
+            layout = self._illuminated(layout, system, scene, pupil, found.light, backend)
+        blur = PlaneBlur(found.functions, layout, origin, area, coordinates, backend)
+        return scene.blend(scene.on_planes(textures), blur)
+
+    def _warn_of_loss(self, found: FieldFunctions) -> None:
         if float(found.lost) > _NOTABLE_LOSS:
             say_once(
                 f"renderer psf: {100 * float(found.lost):.0f} % of a function's light falls beyond "
                 f"its {self.size} pixels; a larger renderer.size keeps it"
             )
-        sensor, size = self.sensor, (textures.shape[-2], textures.shape[-1])
-        coordinates, origin = self._coordinates(system, scene, size, pupil, backend)
-        layout = patches(sensor.height, sensor.width, *self.fields, textures)
-        if self.illumination == "map":
-            layout = self._illuminated(layout, system, scene, pupil, found.light, backend)
-        area = (sensor.height, sensor.width)
-        blur = PlaneBlur(found.functions, layout, origin, area, coordinates, backend)
-        return scene.blend(shown, blur)
 
     def point_spread_functions(
         self,
@@ -155,32 +239,37 @@ class PsfRenderer(Unprepared):
         pupil: ExitPupil,
         seed: int,
         backend: str,
+        points: tuple[Tensor, Tensor] | None = None,
     ) -> FieldFunctions:
-        """The functions at the grid's points, row after row; differentiable in the system."""
+        """The functions at the grid's points, row after row, or at others.
+
+        Differentiable in the system.
+        """
         shared, pitch = self.shared(scene), self.sensor.pixel_pitch
-        distortion, symmetric = self.registration == "chief_rays", is_rotationally_symmetric(system)
+        points = points or self.points()
+        centred, symmetric = self.registration == "chief_rays", is_rotationally_symmetric(system)
         if self.diffraction == "wave":
             return wave_point_spread_functions(
                 system,
                 shared,
-                self.points(),
+                points,
                 pupil,
                 pitch,
                 self.size,
-                distortion,
+                centred,
                 symmetric,
                 backend,
             )
         found = field_point_spread_functions(
             system,
             shared,
-            self.points(),
+            points,
             pupil,
             pitch,
             self.size,
             self.pupil_samples,
             seed if self.jitter else None,
-            distortion,
+            centred,
             symmetric,
             backend,
         )
@@ -248,19 +337,14 @@ class PsfRenderer(Unprepared):
             left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
             if top.is_integer() and left.is_integer():
                 return None, (int(top), int(left))
-        options = {"dtype": torch.float64, "device": system.device}
-        rows, columns = torch.meshgrid(
-            torch.arange(sensor.height, **options),
-            torch.arange(sensor.width, **options),
-            indexing="ij",
-        )
         if self.registration == "pinhole":
+            options = {"dtype": torch.float64, "device": system.device}
+            rows, columns = torch.meshgrid(
+                torch.arange(sensor.height, **options),
+                torch.arange(sensor.width, **options),
+                indexing="ij",
+            )
             shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
             return Coordinates((rows + top).expand(shape), (columns + left).expand(shape)), (0, 0)
-        points = sensor.positions(rows.reshape(-1), columns.reshape(-1))
-        seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch, backend)
-        down, across = (
-            (c.double().permute(1, 2, 0) + start).unflatten(-1, (sensor.height, sensor.width))
-            for c, start in zip(seen, (row, column), strict=True)
-        )
-        return Coordinates(down, across), (0, 0)
+        down, across = chief_ray_map(system, scene, sensor, pupil, backend)
+        return Coordinates(down + row, across + column), (0, 0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import trace_rays
-from dolens.optics.paraxial import exit_pupil
+from dolens.optics.paraxial_numbers import ParaxialNumbers
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces
@@ -122,11 +122,12 @@ def axial_exit_pupil(
     Raises:
         InputError: no ray from the sensor's centre gets through.
     """
-    z = float(exit_pupil(system, wavelengths[len(wavelengths) // 2]).z)
+    first_order = ParaxialNumbers.of(system)
+    z, _ = first_order.exit_pupil(wavelengths[len(wavelengths) // 2])
     options = {"dtype": system.dtype, "device": system.device}
     sensor_z = system.vertices[-1]
     distance = abs(z - float(sensor_z))
-    paraxial = min(float(exit_pupil(system, w).diameter) / 2.0 for w in wavelengths)
+    paraxial = min(first_order.exit_pupil(w)[1] for w in wavelengths) / 2.0
     angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
     origin = torch.zeros((), **options)
     # The stop's paraxial image may be far larger than what other apertures let through.

@@ -4,8 +4,8 @@ Two implementations of one computation, with the same samples: fused kernels, fo
 images of their own, and PyTorch's operations, the reference that they must equal.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -69,6 +69,27 @@ class RayRenderer(Unprepared):
         """Rays traced through the lens for one render, all wavelengths together."""
         pixels = self.sensor.height * self.sensor.width
         return pixels * self.pupil_samples**2 * len(scene.wavelengths)
+
+    def render_windows(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        windows: Sequence[Sensor],
+        centres: Sequence[tuple[float, float]],
+        seed: int,
+        values: Mapping[str, Tensor] | None = None,
+    ) -> Tensor:
+        """Image each texture on a window of its own; as `PsfRenderer.render_windows`.
+
+        Returns:
+            (W, images, C, height, width).
+        """
+        images = []
+        for i, (window, centre) in enumerate(zip(windows, centres, strict=True)):
+            renderer, placed = replace(self, sensor=window), replace(scene, texture_centre=centre)
+            images.append(renderer.render(lens, placed, textures[i : i + 1], seed + i, values))
+        return torch.cat(images)
 
     def render(
         self,

@@ -11,7 +11,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.texture import bilinear
-from dolens.optics.paraxial import chief_ray_magnification
+from dolens.optics.paraxial_numbers import ParaxialNumbers
 from dolens.optics.system import OpticalSystem
 
 REFERENCE_WAVELENGTH = 587.5618
@@ -144,8 +144,9 @@ class Scene(ABC):
     @torch.no_grad()
     def magnifications(self, system: OpticalSystem) -> list[float]:
         """|image height / object height| of the paraxial chief ray, at each depth."""
+        first_order = ParaxialNumbers.of(system)
         return [
-            abs(float(chief_ray_magnification(system, REFERENCE_WAVELENGTH, depth)))
+            abs(first_order.chief_ray_magnification(REFERENCE_WAVELENGTH, depth))
             for depth in self.depths
         ]
 

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
-from dolens.imaging.plane_points import chief_ray_points
+from dolens.imaging.distortion import chief_ray_map, distortion
 from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.pupil import sampled_exit_pupil
+from dolens.imaging.pupil import axial_exit_pupil, sampled_exit_pupil
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.readout import Readout
 from dolens.imaging.scene import PlanarScene, texture_origin
@@ -114,59 +114,51 @@ class FieldViews:
     ) -> Views:
         """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
         renderer = self.renderer if stage == "train" else self.evaluation_renderer
-        seed = seed_of(self.seed, stage, index)
-        rows = []
-        for i, texture in enumerate(textures):
-            windows = self._windows(stage, index * len(textures) + i)
-            rows.append(
-                [
-                    self._take(lens, values, texture, renderer, window, seed + len(windows) * i + j)
-                    for j, window in enumerate(windows)
-                ]
-            )
+        seed, count = seed_of(self.seed, stage, index), len(textures)
+        rows = [self._windows(stage, index * count + i) for i in range(count)]
+        windows = [window for row in rows for window in row]
+        repeated = textures.repeat_interleave(len(rows[0]), dim=0)
+        truth, centres = self._looked_at(lens, values, repeated, windows)
+        image = replace(renderer, sensor=self.whole).render_windows(
+            lens, self.scene, repeated, windows, centres, seed, values
+        )
+        field = torch.stack([self._field(window, textures) for window in windows])
         truth, image, field = (
-            torch.stack([torch.stack([view[k] for view in row]) for row in rows]) for k in range(3)
+            t.unflatten(0, (count, len(rows[0]))) for t in (truth, image[:, 0], field)
         )
         generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
         return Views(truth, self.readout.develop(self.readout(image, generator)), field)
 
-    def _take(
+    @torch.no_grad()
+    def _looked_at(
         self,
         lens: Lens,
         values: Mapping[str, Tensor],
-        texture: Tensor,
-        renderer: PsfRenderer | RayRenderer,
-        window: Sensor,
-        seed: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Truth and image, (3, H, W), and field, (2, H, W), of one texture in one window."""
-        with torch.no_grad():
-            rows, columns = self._looked_at(lens, values, window)
-            # The texture lies where the window looks, to a whole texel.
-            centre = (float(rows.mean().round()), float(columns.mean().round()))
-            row, column = texture_origin(texture.shape[-2:], centre)
-            truth = linear_to_srgb(
-                bilinear(texture, (rows + row).float(), (columns + column).float())
-            )
-        scene = replace(self.scene, texture_centre=centre)
-        image = replace(renderer, sensor=window).render(lens, scene, texture[None], seed, values)
-        return truth, image[0, 0], self._field(window, texture)
+        textures: Tensor,
+        windows: Sequence[Sensor],
+    ) -> tuple[Tensor, list[tuple[float, float]]]:
+        """What chief rays of windows see of textures (W, 3, h, w): (W, 3, H, W), display-encoded.
 
-    def _looked_at(
-        self, lens: Lens, values: Mapping[str, Tensor], window: Sensor
-    ) -> tuple[Tensor, Tensor]:
-        """Rows and columns of the pinhole's image where the chief rays of pixels look, (H, W)."""
+        Textures lie where their windows look, to a whole texel: `texture_centre` of each.
+        """
         system = lens.system(values)
         backend = choose_backend(system, lens.backend)
         wavelengths = (lens.primary_wavelength,)
         scene = PlanarScene(self.scene.depths, wavelengths)
-        pupil = sampled_exit_pupil(system, wavelengths, window, backend)
-        points = window.positions(*self._pixels(window, system.device))
-        shape = (window.height, window.width)
-        seen = chief_ray_points(
-            system, scene, tuple(p.reshape(-1) for p in points), pupil, window.pixel_pitch, backend
-        )
-        return tuple(c[:, 0, 0].double().reshape(shape) for c in seen)
+        pupil = axial_exit_pupil(system, wavelengths, backend)
+        looks = distortion(system, scene, self.whole, pupil, backend)
+        truth, centres = [], []
+        for texture, window in zip(textures, windows, strict=True):
+            if looks is None:
+                seen = chief_ray_map(system, scene, window, pupil, backend)
+            else:
+                seen = looks.seen_by(window)
+            rows, columns = (c[0, 0] for c in seen)
+            centre = (float(rows.mean().round()), float(columns.mean().round()))
+            row, column = texture_origin(texture.shape[-2:], centre)
+            truth.append(bilinear(texture, (rows + row).float(), (columns + column).float()))
+            centres.append(centre)
+        return linear_to_srgb(torch.stack(truth)), centres
 
     def _field(self, window: Sensor, like: Tensor) -> Tensor:
         """(2, H, W): x and y of the pixels over half the sensor's diagonal."""
