@@ -100,7 +100,7 @@ def convolve_patches(
     """Σ over nodes of weight · (texture ∗ kernel), at the image's pixels.
 
     A texture's edge goes on beyond it.  Memory is that of one patch at a time: the backward pass
-    transforms again.
+    transforms again what several patches see.
 
     Args:
         textures: (B, D or 1, C or 1, H, W).
@@ -126,7 +126,6 @@ def convolve_patches(
 class _Convolution(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, textures: Tensor, kernels: Tensor, settings: tuple[Any, ...]):  # noqa: ANN205
-        ctx.save_for_backward(textures, kernels)
         ctx.settings = settings
         layout, _, shape, _, _ = settings
         image = textures.new_zeros((textures.shape[0], *shape))
@@ -135,46 +134,59 @@ class _Convolution(torch.autograd.Function):
             tile = _tile(tile, textures, kernels.shape[-1], patch, settings)
             seen = tile.see(tile.texture_spectrum() * tile.kernel_spectrum(kernels[node]))
             image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
+        # Where all patches see the same texels, their spectrum is kept for the way back.
+        spectrum = tile.texture_spectrum() if len({p[:4] for p in layout}) == 1 else None
+        ctx.save_for_backward(textures, kernels, spectrum)
         return image
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        textures, kernels = ctx.saved_tensors
+        textures, kernels, spectrum = ctx.saved_tensors
         of_textures = torch.zeros_like(textures) if ctx.needs_input_grad[0] else None
         of_kernels = torch.zeros_like(kernels) if ctx.needs_input_grad[1] else None
         tile = None
         for node, patch in enumerate(ctx.settings[0]):
-            tile = _tile(tile, textures, kernels.shape[-1], patch, ctx.settings)
+            tile = _tile(tile, textures, kernels.shape[-1], patch, ctx.settings, spectrum)
             part = gradient[..., patch.top : patch.bottom, patch.left : patch.right]
-            spectrum = tile.of_seen(patch.weight * part)
+            seen = tile.of_seen(patch.weight * part)
             if of_kernels is not None:
-                product = (tile.texture_spectrum().conj() * spectrum).sum(0)
+                product = (tile.texture_spectrum().conj() * seen).sum(0)
                 of_kernels[node] = tile.of_kernel(product, kernels[node].shape)
             if of_textures is not None:
-                product = tile.kernel_spectrum(kernels[node]).conj() * spectrum
+                product = tile.kernel_spectrum(kernels[node]).conj() * seen
                 tile.add_to_texture(product, of_textures)
         return of_textures, of_kernels, None
 
 
 def _tile(
-    last: "_Tile | None", textures: Tensor, size: int, patch: Patch, settings: tuple[Any, ...]
+    last: "_Tile | None",
+    textures: Tensor,
+    size: int,
+    patch: Patch,
+    settings: tuple[Any, ...],
+    spectrum: Tensor | None = None,
 ) -> "_Tile":
     """The tile of a patch: the last one where that has the same area, as two nodes a side do."""
     if last is not None and last.area == patch[:4]:
         return last
-    return _Tile(textures, size, patch, settings)
+    return _Tile(textures, size, patch, settings, spectrum)
 
 
 class _Tile:
     """The part of the texture that a patch sees, and the transforms between the two."""
 
     def __init__(
-        self, textures: Tensor, size: int, patch: Patch, settings: tuple[Any, ...]
+        self,
+        textures: Tensor,
+        size: int,
+        patch: Patch,
+        settings: tuple[Any, ...],
+        spectrum: Tensor | None,
     ) -> None:
         _, origin, self.shape, coordinates, self.backend = settings
         self.textures, self.size, self.area = textures, size, patch[:4]
-        self._spectrum: Tensor | None = None
+        self._spectrum = spectrum
         self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
         self.coordinates = None
         if coordinates is None:
@@ -190,20 +202,33 @@ class _Tile:
             self.coordinates = Coordinates(rows - top, columns - left)
         self.seen_size = (height, width)
         reach = size // 2
-        self.rows = _clamped(top - reach, height + size - 1, textures.shape[-2], textures)
-        self.columns = _clamped(left - reach, width + size - 1, textures.shape[-1], textures)
+        self.first = (top - reach, left - reach)
+        # Texels up to a length that transforms are fast at cost less than zeros in their place;
+        # what they do to the image lies outside of what is seen.
         self.transform = (fast_length(height + size - 1), fast_length(width + size - 1))
+        self.rows = _clamped(top - reach, self.transform[0], textures.shape[-2], textures)
+        self.columns = _clamped(left - reach, self.transform[1], textures.shape[-1], textures)
 
     def texture_spectrum(self) -> Tensor:
         """(B, D or 1, C or 1, ...)."""
         if self._spectrum is None:
-            part = self.textures.index_select(-2, self.rows).index_select(-1, self.columns)
-            self._spectrum = torch.fft.rfft2(part, s=self.transform)
+            self._spectrum = torch.fft.rfft2(self._part(), s=self.transform)
         return self._spectrum
+
+    def _part(self) -> Tensor:
+        """The texels that are seen; a view where none lies beyond the texture's edge."""
+        (top, left), (height, width) = self.first, (len(self.rows), len(self.columns))
+        rows, columns = self.textures.shape[-2:]
+        if min(top, left) >= 0 and top + height <= rows and left + width <= columns:
+            return self.textures[..., top : top + height, left : left + width]
+        return self.textures.index_select(-2, self.rows).index_select(-1, self.columns)
 
     def kernel_spectrum(self, kernel: Tensor) -> Tensor:
         """(D or 1, C or 1, ...), with what a lookup's splines do undone."""
-        return self._sharpened(torch.fft.rfft2(kernel, s=self.transform))
+        # Rows that are padded with are not transformed.
+        height, width = self.transform
+        rows = torch.fft.rfft(kernel, n=width)
+        return self._sharpened(torch.fft.fft(rows, n=height, dim=-2))
 
     def _sharpened(self, spectrum: Tensor) -> Tensor:
         if self.coordinates is None:
@@ -218,9 +243,9 @@ class _Tile:
 
     def see(self, spectrum: Tensor) -> Tensor:
         """(B, D, C, height, width) of the patch from the product of the spectra."""
-        image = torch.fft.irfft2(spectrum, s=self.transform)
         first, (height, width) = self.size - 1, self.seen_size
-        image = image[..., first : first + height, first : first + width]
+        rows = torch.fft.ifft(spectrum, dim=-2)[..., first : first + height, :]
+        image = torch.fft.irfft(rows, n=self.transform[1])[..., first : first + width]
         if self.coordinates is None:
             return image
         image = image.expand(-1, *self.shape[:2], -1, -1)
@@ -244,14 +269,13 @@ class _Tile:
     def of_kernel(self, spectrum: Tensor, shape: torch.Size) -> Tensor:
         """(D or 1, C or 1, K, K) of the sum over the batch."""
         spectrum = self._sharpened(spectrum).sum_to_size(*shape[:2], *spectrum.shape[-2:])
-        kernel = torch.fft.irfft2(spectrum, s=self.transform)
-        return kernel[..., : self.size, : self.size]
+        rows = torch.fft.ifft(spectrum, dim=-2)[..., : self.size, :]
+        return torch.fft.irfft(rows, n=self.transform[1])[..., : self.size]
 
     def add_to_texture(self, spectrum: Tensor, of_textures: Tensor) -> None:
         """Add the gradient (B, D, C, ...) to the texture's; its edge takes what lies beyond."""
         spectrum = spectrum.sum_to_size(*of_textures.shape[:3], *spectrum.shape[-2:])
         part = torch.fft.irfft2(spectrum, s=self.transform)
-        part = part[..., : len(self.rows), : len(self.columns)]
         gathered = part.new_zeros((*part.shape[:-1], of_textures.shape[-1]))
         gathered.index_add_(-1, self.columns, part)
         of_textures.index_add_(-2, self.rows, gathered)

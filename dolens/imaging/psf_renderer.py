@@ -62,6 +62,7 @@ class PsfRenderer(Unprepared):
         colours: `each` wavelength has functions of its own, or `one`, the middle, serves all.
         diffraction: `none`: geometric functions; `limit`: these blurred by a perfect pupil's
             diffraction; `wave`: functions of the pupil's wavefront.
+        pupil: the disc that is sampled; None looks for it at each render, for the lens as it is.
         jitter: draw points in the pupil's strata anew for each seed, or take their centres.
     """
 
@@ -75,9 +76,12 @@ class PsfRenderer(Unprepared):
     colours: Literal["each", "one"] = "each"
     jitter: bool = True
     diffraction: Literal["none", "limit", "wave"] = "none"
+    pupil: ExitPupil | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(int(n) for n in self.fields))
+        if self.pupil is not None:
+            object.__setattr__(self, "pupil", ExitPupil(*map(float, self.pupil)))
         if len(self.fields) != 2 or min(self.fields) < 1:
             raise InputError(f"renderer: fields must be rows and columns, not {self.fields}")
         if self.size < 3 or self.size % 2 == 0:
@@ -131,7 +135,9 @@ class PsfRenderer(Unprepared):
         backend = choose_backend(system, lens.backend, others=[textures])
         with torch.no_grad():
             scene.check(system)
-            pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+            pupil = self.pupil or sampled_exit_pupil(
+                system, scene.wavelengths, self.sensor, backend
+            )
         found = self.point_spread_functions(system, scene, pupil, seed, backend)
         self._warn_of_loss(found)
         size = (textures.shape[-2], textures.shape[-1])
@@ -170,7 +176,9 @@ class PsfRenderer(Unprepared):
         backend = choose_backend(system, lens.backend, others=[textures])
         with torch.no_grad():
             scene.check(system)
-            pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+            pupil = self.pupil or sampled_exit_pupil(
+                system, scene.wavelengths, self.sensor, backend
+            )
             looks = None
             if self.registration == "chief_rays":
                 looks = distortion(system, scene, self.sensor, pupil, backend)
@@ -278,6 +286,15 @@ class PsfRenderer(Unprepared):
         f_number = working_f_number(pupil, float(system.vertices[-1].detach()))
         blurred = with_diffraction_limit(found.functions, pitch, shared.wavelengths, f_number)
         return found._replace(functions=blurred)
+
+    def with_pupil(
+        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
+    ) -> "PsfRenderer":
+        """The renderer with the pupil of the lens as it is, for a lens that hardly changes."""
+        system = lens.system(values)
+        backend = choose_backend(system, lens.backend)
+        pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        return replace(self, pupil=pupil)
 
     def points(self) -> tuple[Tensor, Tensor]:
         """x and y of the grid on the sensor, mm, each (fields,), double precision."""

@@ -50,7 +50,7 @@ class Contender:
     """A way of rendering.
 
     Attributes:
-        model: `rays`, `psf` or `auto`.
+        model: `rays`, `psf` or `auto`, and what tells its kind.
         setting: what tells it from others of its model.
         renderer: for the whole sensor.
         dtype: of the lens.
@@ -77,10 +77,11 @@ def render_contenders(
         tolerances: grey levels.
     """
     sensor, plans = subject.sensor, []
-    for tolerance in tolerances:
-        auto = AutoRenderer(sensor, tolerance)
-        auto.make_plan(subject.lens, subject.scene)
-        plans.append(Contender("auto", f"auto, {tolerance:g} grey levels", auto))
+    for model, diffraction in (("auto", False), ("auto with diffraction", True)):
+        for tolerance in tolerances:
+            auto = AutoRenderer(sensor, tolerance, diffraction=diffraction)
+            auto.make_plan(subject.lens, subject.scene)
+            plans.append(Contender(model, f"{model}, {tolerance:g} grey levels", auto))
     found = [Contender("rays", f"{n * n} rays", RayRenderer(sensor, n)) for n in samples]
     size = max(
         (p.renderer.choice.renderer.size for p in plans

@@ -12,7 +12,7 @@ from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.distortion import chief_ray_map, distortion
 from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.pupil import axial_exit_pupil, sampled_exit_pupil
+from dolens.imaging.pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.readout import Readout
 from dolens.imaging.scene import PlanarScene, texture_origin
@@ -67,6 +67,7 @@ class FieldViews:
         self.evaluation_renderer = evaluation_renderer or renderer
         self.zones = dict(zones or {"axis": 0.0, "0.5": 0.5, "0.7": 0.7, "full": 1.0})
         self.seed = seed
+        self._pupil: ExitPupil | None = None
         window = renderer.sensor
         if len(scene.depths) != 1:
             raise InputError(f"scene.depths: {len(scene.depths)} of them; allowed: one")
@@ -107,7 +108,10 @@ class FieldViews:
         self.scene.check(lens.system())
 
     def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
-        """Settings say everything."""
+        """Find the pupil that training windows share until the next time."""
+        if isinstance(self.renderer, PsfRenderer):
+            whole = replace(self.renderer, sensor=self.whole)
+            self._pupil = whole.with_pupil(lens, self.scene, values).pupil
 
     def take(
         self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
@@ -119,9 +123,10 @@ class FieldViews:
         windows = [window for row in rows for window in row]
         repeated = textures.repeat_interleave(len(rows[0]), dim=0)
         truth, centres = self._looked_at(lens, values, repeated, windows)
-        image = replace(renderer, sensor=self.whole).render_windows(
-            lens, self.scene, repeated, windows, centres, seed, values
-        )
+        renderer = replace(renderer, sensor=self.whole)
+        if stage == "train" and self._pupil is not None:
+            renderer = replace(renderer, pupil=self._pupil)
+        image = renderer.render_windows(lens, self.scene, repeated, windows, centres, seed, values)
         field = torch.stack([self._field(window, textures) for window in windows])
         truth, image, field = (
             t.unflatten(0, (count, len(rows[0]))) for t in (truth, image[:, 0], field)
@@ -243,8 +248,10 @@ class FieldViews:
         return {}
 
     def state(self) -> dict[str, Any]:
-        """Nothing was found."""
-        return {}
+        """The pupil of training windows."""
+        return {} if self._pupil is None else {"pupil": list(self._pupil)}
 
     def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
-        """There is nothing to take up."""
+        """Go on with it."""
+        if "pupil" in state:
+            self._pupil = ExitPupil(*map(float, state["pupil"]))
