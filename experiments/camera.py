@@ -22,6 +22,7 @@ from dolens.reconstruction import (
     structural_similarity,
 )
 from experiments.adversary import Adversary
+from experiments.lens_least_squares import LensLeastSquares
 from experiments.views.base import Imaging, Views
 
 
@@ -41,7 +42,7 @@ class CameraModule(lightning.LightningModule):
         views: images the textures.
         network: restores them.
         loss: compares display-encoded images.
-        optimizer: parameter groups → optimizer.
+        optimizer: parameter groups → optimizer; a `CameraOptimizer` may move the lens apart.
         learning_rates: `optics` and `network`.
         scheduler: optimizer → scheduler, stepped once a training step; or None.
         variables: settings of `DesignVariables`; empty or None trains the network alone.
@@ -77,6 +78,7 @@ class CameraModule(lightning.LightningModule):
         self.experiment = experiment
         self.views = views
         self.optimizer = optimizer
+        self.lens_steps: LensLeastSquares | None = getattr(optimizer, "lens_steps", None)
         self.scheduler = scheduler
         self.learning_rates = dict(learning_rates)
         if not view_norm >= 1.0:
@@ -86,6 +88,7 @@ class CameraModule(lightning.LightningModule):
         self.optics_seconds: list[float] = []
         self._evaluations: list[dict[str, Tensor]] = []
         self._step_started = self._optics_started = 0.0
+        self._step, self._batch = 0, torch.empty(0)
         views.check(lens)
         missing = {"optics", "network"} - set(self.learning_rates)
         if missing:
@@ -147,7 +150,7 @@ class CameraModule(lightning.LightningModule):
                 "name": "network",
             }
         ]
-        if len(self.variables):
+        if len(self.variables) and self.lens_steps is None:
             groups.append(
                 {
                     "params": [self.variables.scaled],
@@ -169,23 +172,14 @@ class CameraModule(lightning.LightningModule):
             self.views.prepare(self.lens, self.variables())
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
-        """Start the step's clock."""
+        """Start the step's clock; the number of the step is that of its random numbers."""
+        self._step, self._batch = self.global_step, batch
         self._step_started = time.perf_counter()
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
-        started = time.perf_counter()
-        values = self.variables()
-        taken = self.views.take(self.lens, values, batch, "train", self.global_step)
-        functions = self._functions(values)
-        self.optics_seconds.append(time.perf_counter() - started)
-        if taken.raw.requires_grad:
-            # The image's gradient is the network's last; what comes after it is the lens's.
-            taken.raw.register_hook(self._start_optics_backward)
-        restored = self.restore(taken, functions)
+        taken, restored, terms, total, operands = self._forward(batch)
         truth = taken.truth.to(restored.dtype)
-        terms = self.loss_over_views(restored, truth)
-        penalty, operands = self.penalty(values)
         with torch.no_grad():
             psnr = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1)).mean()
         self.log("train/loss", terms["total"], prog_bar=True)
@@ -195,12 +189,63 @@ class CameraModule(lightning.LightningModule):
                 self.log(f"train/{name}", value)
         for label, value in operands.items():
             self.log(f"operand/{label}", value.float())
-        total = terms["total"] + penalty.to(restored.dtype)
         if self.adversary is not None:
             term, numbers = self.adversary(truth.flatten(0, 1), restored.flatten(0, 1))
             self.log_dict({f"train/{name}": value for name, value in numbers.items()})
             total = total + term
         return total
+
+    def _forward(
+        self, batch: Tensor
+    ) -> tuple[Views, Tensor, dict[str, Tensor], Tensor, dict[str, Tensor]]:
+        """Views, restored images, terms of the loss, its sum with the penalty, and operands."""
+        started = time.perf_counter()
+        values = self.variables()
+        taken = self.views.take(self.lens, values, batch, "train", self._step)
+        functions = self._functions(values)
+        self.optics_seconds.append(time.perf_counter() - started)
+        if taken.raw.requires_grad:
+            # The image's gradient is the network's last; what comes after it is the lens's.
+            taken.raw.register_hook(self._start_optics_backward)
+        restored = self.restore(taken, functions)
+        terms = self.loss_over_views(restored, taken.truth.to(restored.dtype))
+        penalty, operands = self.penalty(values)
+        return taken, restored, terms, terms["total"] + penalty.to(restored.dtype), operands
+
+    def _move_lens(self, batch: Tensor) -> None:
+        """A step of least squares for the lens, tried on the batch that the network has seen."""
+        seconds = len(self.optics_seconds)
+        # Trials leave no trace in the network's running statistics.
+        kept = {name: buffer.clone() for name, buffer in self.network.named_buffers()}
+
+        def loss() -> float:
+            return float(self._forward(batch)[3])
+
+        spots = self.views.spots(self.lens, self.lens_steps.rings, self.lens_steps.arms)
+        pitch = self.views.sensor.pixel_pitch
+        found = self.lens_steps.step(self.lens, self.variables, spots, pitch, loss)
+        with torch.no_grad():
+            for name, buffer in self.network.named_buffers():
+                buffer.copy_(kept[name])
+        # What the trials' optics cost is the step's.
+        self.optics_seconds[seconds - 1 :] = [sum(self.optics_seconds[seconds - 1 :])]
+        self.log_dict({f"lens_step/{name}": value for name, value in found.items()})
+
+    def optimizer_step(
+        self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None
+    ) -> None:
+        """Step; move the lens, if that is done apart; project its variables onto their bounds (S17)
+        and store them in it.  A checkpoint of this step has it all.
+        """
+        super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        if not len(self.variables):
+            return
+        if self.lens_steps is not None:
+            self.lens_steps.gather(self.variables)
+            if self.lens_steps.is_due(self._step + 1):
+                self._move_lens(self._batch)
+        self.variables.project()
+        self.variables.write_to(self.lens)
 
     def on_after_backward(self) -> None:
         """Close the optics' share of the backward pass."""
@@ -209,10 +254,7 @@ class CameraModule(lightning.LightningModule):
             self._optics_started = 0.0
 
     def on_train_batch_end(self, outputs: Any, batch: Tensor, batch_idx: int) -> None:
-        """Project the variables onto their bounds (S17), store them in the lens, log the cost."""
-        if len(self.variables):
-            self.variables.project()
-            self.variables.write_to(self.lens)
+        """Log the cost."""
         self.step_seconds.append(time.perf_counter() - self._step_started)
         self.log("cost/step_s", self.step_seconds[-1])
         self.log("cost/optics_s", self.optics_seconds[-1])
@@ -287,6 +329,8 @@ class CameraModule(lightning.LightningModule):
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.views.rays())
         numbers |= self.views.numbers()
+        if self.lens_steps is not None:
+            numbers |= self.lens_steps.numbers()
         if self.step_seconds:
             numbers["cost/step_s"] = statistics.median(self.step_seconds)
             numbers["cost/optics_s"] = statistics.median(self.optics_seconds)
@@ -310,6 +354,8 @@ class CameraModule(lightning.LightningModule):
         """Say whose checkpoint it is, in plain values."""
         checkpoint["dolens"] = self._identity()
         checkpoint["dolens_views"] = self.views.state()
+        if self.lens_steps is not None:
+            checkpoint["dolens_lens_steps"] = self.lens_steps.state()
         if self.adversary is not None:
             checkpoint["dolens_adversary"] = self.adversary.optimizer.state_dict()
 
@@ -325,6 +371,8 @@ class CameraModule(lightning.LightningModule):
                     f"{value!r}; resume with the experiment and settings that wrote it"
                 )
         self.views.load_state(self.lens, checkpoint.get("dolens_views", {}))
+        if self.lens_steps is not None and "dolens_lens_steps" in checkpoint:
+            self.lens_steps.load_state(checkpoint["dolens_lens_steps"])
         if self.adversary is not None:
             self.adversary.optimizer.load_state_dict(checkpoint["dolens_adversary"])
 

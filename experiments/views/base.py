@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 from torch import Tensor
 
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.lens import Lens
 
 # Streams of random numbers that must not meet: an offset of the seed for each stage, and one for
@@ -64,6 +65,9 @@ class Imaging(Protocol):
         self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
     ) -> Tensor:
         """(views, 3, K, K), of the training's views."""
+
+    def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
+        """Rays of spots that stand for what the views see, one entry for each object distance."""
 
     def rays(self) -> int:
         """Rays that a training image takes."""

@@ -13,6 +13,7 @@ from dolens.imaging.readout import Readout
 from dolens.imaging.renderer import Renderer
 from dolens.imaging.scene import Scene, pinhole_image
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.optics.lens import Lens
 from experiments.views.base import NOISE_OFFSET, Views, seed_of
 
@@ -105,6 +106,21 @@ class DepthViews:
         return axial_point_spread_functions(
             lens, self.scene, self.sensor, self.psf_size, samples, values
         )
+
+    def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
+        """Of each depth: on the axis, and towards the sensor's edges."""
+        half = 0.35 * self.sensor.pixel_pitch * min(self.sensor.height, self.sensor.width)
+        found = []
+        scales = self.scene.magnifications(lens.system())
+        for depth, magnification in zip(self.scene.depths, scales, strict=True):
+            height = half / magnification
+            fields = [(0.0, 0.0), (0.0, height), (height, 0.0)]
+            found.append(
+                gaussian_quadrature(
+                    lens, fields, self.scene.wavelengths, rings, arms, depth, symmetry=False
+                )
+            )
+        return found
 
     def rays(self) -> int:
         """Rays that a training image takes."""

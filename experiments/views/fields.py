@@ -17,6 +17,7 @@ from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.readout import Readout
 from dolens.imaging.scene import PlanarScene, texture_origin
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.imaging.texture import bilinear
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
@@ -238,6 +239,15 @@ class FieldViews:
     def _psf_size(self) -> int:
         """The training renderer's window, if it has one."""
         return getattr(self.renderer, "size", 65)
+
+    def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
+        """Of the zones."""
+        depth = self.scene.depths[0]
+        (magnification,) = self.scene.magnifications(lens.system())
+        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
+        fields = [(0.0, share * half / magnification) for share in sorted(set(self.zones.values()))]
+        wavelengths = self.scene.wavelengths
+        return [gaussian_quadrature(lens, fields, wavelengths, rings, arms, depth, symmetry=False)]
 
     def rays(self) -> int:
         """Rays that a training window takes."""

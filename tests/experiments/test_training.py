@@ -32,6 +32,11 @@ BY_PLAN = [
     *(e for e in WAVEFRONT_CODING if e not in ("renderer=rays", "renderer.pupil_samples=2")),
     "renderer.tolerance=4.0",
 ]
+BY_LEAST_SQUARES = [
+    *WAVEFRONT_CODING,
+    "optimizer.lens=dls",
+    "optimizer.least_squares.every=2",
+]
 
 
 def last_state(folder: Path) -> dict:
@@ -131,12 +136,19 @@ def test_bounds_hold_by_projection(composed, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("stop_after", "settings"), [(1, WAVEFRONT_CODING), (3, WAVEFRONT_CODING), (3, BY_PLAN)]
+    ("stop_after", "settings"),
+    [
+        (1, WAVEFRONT_CODING),
+        (3, WAVEFRONT_CODING),
+        (3, BY_PLAN),
+        (3, BY_LEAST_SQUARES),
+    ],
 )
 def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(
     composed, tmp_path, stop_after, settings
 ):
     # `stop_after` 1 and 3 are in the middle of an epoch of two steps; a plan is made at its start.
+    # Least squares, every two steps, has gathered the gradient of one.
     steps = f"+callbacks.last.every_n_train_steps={stop_after}"
     run(composed(*settings, *UNTESTED, folder="whole"))
     # Stopped by hand after some steps: the schedule is the whole run's.
