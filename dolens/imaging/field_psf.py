@@ -17,7 +17,7 @@ from dolens.imaging.psf import splat
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.sampling import square_to_disc, stratified_square
-from dolens.imaging.scene import Scene
+from dolens.imaging.scene import PlanarScene, Scene
 from dolens.imaging.wave_psf import wave_kernels
 from dolens.optics.system import OpticalSystem
 
@@ -52,6 +52,7 @@ def field_point_spread_functions(
     distortion: bool,
     symmetric: bool,
     backend: str,
+    followed: float | None = None,
 ) -> FieldFunctions:
     """Geometric point spread functions at points of the sensor.
 
@@ -72,6 +73,9 @@ def field_point_spread_functions(
             a pinhole sees it.
         symmetric: whether the lens has rotational symmetry.
         backend: what traces and splats.
+        followed: wavelength, nm, whose chief rays the scene is taken to move with as the lens
+            changes: gradients then are of functions about that chief ray, and leave out what
+            distortion moves the image as a whole by.  None: gradients are those of the image.
     """
     count = distinct_radii(points) if symmetric else len(points[0])
     disc = sampled_disc(count, pupil_samples, seed, system)
@@ -82,9 +86,31 @@ def field_point_spread_functions(
     else:
         centre = pinhole_points(points, pitch, planes, channels)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
+    if followed is not None and torch.is_grad_enabled():
+        down, across = _moved(system, scene, points, pupil, pitch, symmetric, backend, followed)
+        rows, columns = rows + down, columns + across
     return splatted(
         PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight), size, backend
     )
+
+
+def _moved(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    symmetric: bool,
+    backend: str,
+    wavelength: float,
+) -> tuple[Tensor, Tensor]:
+    """Zeros (N, D, 1, 1) whose gradients are those of a wavelength's chief rays."""
+    one = PlanarScene(scene.depths, (wavelength,), scene.texture_centre)
+    middle = torch.zeros(1, 1, dtype=system.dtype, device=system.device)
+    count = distinct_radii(points) if symmetric else len(points[0])
+    disc = (middle.expand(count, 1), middle.expand(count, 1))
+    seen = plane_points(system, one, points, pupil, disc, pitch, symmetric, backend)
+    return seen.rows - seen.rows.detach(), seen.columns - seen.columns.detach()
 
 
 def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:

@@ -153,6 +153,7 @@ class PsfRenderer(Unprepared):
         centres: Sequence[tuple[float, float]],
         seed: int,
         values: Mapping[str, Tensor] | None = None,
+        followed: float | None = None,
     ) -> Tensor:
         """Image each texture on a window of its own of the renderer's sensor, all at once.
 
@@ -167,6 +168,7 @@ class PsfRenderer(Unprepared):
             centres: where each texture's centre lies; see `Scene`.
             seed: of the points in the pupil's strata.
             values: lens parameters.
+            followed: see `field_point_spread_functions`; functions with diffraction ignore it.
 
         Returns:
             (W, images, C, height, width).
@@ -185,7 +187,7 @@ class PsfRenderer(Unprepared):
         parts = [replace(self, sensor=window) for window in windows]
         x, y = zip(*(part.points() for part in parts), strict=True)
         found = self.point_spread_functions(
-            system, scene, pupil, seed, backend, (torch.cat(x), torch.cat(y))
+            system, scene, pupil, seed, backend, (torch.cat(x), torch.cat(y)), followed
         )
         self._warn_of_loss(found)
         nodes, size = self.fields[0] * self.fields[1], (textures.shape[-2], textures.shape[-1])
@@ -248,6 +250,7 @@ class PsfRenderer(Unprepared):
         seed: int,
         backend: str,
         points: tuple[Tensor, Tensor] | None = None,
+        followed: float | None = None,
     ) -> FieldFunctions:
         """The functions at the grid's points, row after row, or at others.
 
@@ -280,6 +283,7 @@ class PsfRenderer(Unprepared):
             centred,
             symmetric,
             backend,
+            followed,
         )
         if self.diffraction == "none":
             return found

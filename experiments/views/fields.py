@@ -36,7 +36,8 @@ class FieldViews:
     and one drawn evenly from the whole field, `field`.
 
     The truth is the texture where the chief rays of the reference wavelength look: distortion,
-    which a camera's calibration undoes, is part of it, and lateral colour is not.
+    which a camera's calibration undoes, is part of it, and lateral colour is not.  It moves with
+    the lens, and the renderer is told so: else gradients would hold the image where it is.
 
     Args:
         scene: one depth, and wavelengths.
@@ -127,7 +128,16 @@ class FieldViews:
         renderer = replace(renderer, sensor=self.whole)
         if stage == "train" and self._pupil is not None:
             renderer = replace(renderer, pupil=self._pupil)
-        image = renderer.render_windows(lens, self.scene, repeated, windows, centres, seed, values)
+        image = renderer.render_windows(
+            lens,
+            self.scene,
+            repeated,
+            windows,
+            centres,
+            seed,
+            values,
+            lens.primary_wavelength,
+        )
         field = torch.stack([self._field(window, textures) for window in windows])
         truth, image, field = (
             t.unflatten(0, (count, len(rows[0]))) for t in (truth, image[:, 0], field)
