@@ -113,6 +113,29 @@ def test_a_lens_moves_by_what_windows_show(root):
     assert not taken.truth.requires_grad
 
 
+def test_gradients_are_of_sharpness_and_not_of_where_the_image_lies(root):
+    """Against differences of images by rays, whose truth moves with the lens as distortion does."""
+    lens = doublet(root).double()
+    texture = probe_image(96, 104, seed=5).double().expand(3, -1, -1, -1)
+    sensor = Sensor(32, 40, 0.08)
+    by_rays = field_views(RayRenderer(sensor, 20))
+    by_functions = field_views(PsfRenderer(sensor, (2, 2), 32, 21))
+    start = lens.surfaces["1"].curvature.detach().clone()
+
+    def loss(views, curvature):
+        taken = views.take(lens, {"surfaces.1.curvature": curvature}, texture, "test", 0)
+        return (taken.raw - srgb_to_linear(taken.truth)).square().mean()
+
+    h = 2e-4
+    wanted = float(loss(by_rays, start + h) - loss(by_rays, start - h)) / (2.0 * h)
+    curvature = start.requires_grad_()
+    (found,) = torch.autograd.grad(loss(by_functions, curvature), curvature)
+    (held,) = torch.autograd.grad(loss(by_rays, curvature), curvature)
+    assert float(found) == pytest.approx(wanted, rel=0.08)
+    # What rays say where the truth is taken to stand still: that is what must not be learned from.
+    assert abs(float(held) - wanted) > 0.2 * abs(wanted)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
