@@ -12,13 +12,13 @@ from dolens.imaging.plane_points import (
     pinhole_points,
     plane_points,
 )
-from dolens.imaging.propagation import DiffractionSettings
 from dolens.imaging.psf import splat
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.sampling import square_to_disc, stratified_square
 from dolens.imaging.scene import PlanarScene, Scene
-from dolens.imaging.wave_psf import wave_kernels
+from dolens.imaging.wave.propagation import DiffractionSettings
+from dolens.imaging.wave.wave_psf import wave_kernels
 from dolens.optics.system import OpticalSystem
 
 # Strata of the pupil along each side, for the light of a function that rays do not make.

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.diffraction_limit import with_diffraction_limit, working_f_number
 from dolens.imaging.distortion import chief_ray_map, distortion
 from dolens.imaging.field_psf import (
     FieldFunctions,
@@ -28,6 +27,7 @@ from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.scene import PlanarScene, Scene, texture_origin
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.wave.diffraction_limit import with_diffraction_limit, working_f_number
 from dolens.optics.backend import choose_backend, say_once
 from dolens.optics.lens import Lens
 from dolens.optics.system import OpticalSystem, is_rotationally_symmetric

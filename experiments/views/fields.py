@@ -172,7 +172,9 @@ class FieldViews:
             rows, columns = (c[0, 0] for c in seen)
             centre = (float(rows.mean().round()), float(columns.mean().round()))
             row, column = texture_origin(texture.shape[-2:], centre)
-            truth.append(bilinear(texture, (rows + row).to(texture), (columns + column).to(texture)))
+            truth.append(
+                bilinear(texture, (rows + row).to(texture), (columns + column).to(texture))
+            )
             centres.append(centre)
         return linear_to_srgb(torch.stack(truth)), centres
 

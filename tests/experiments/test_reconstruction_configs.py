@@ -1,13 +1,18 @@
 """Each file of the reconstruction's groups makes what it is a choice of."""
 
+import json
 import logging
+import math
 
+import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
+from PIL import Image
 
 from dolens.imaging.color import linear_to_srgb
 from dolens.reconstruction import RelativisticDiscriminators, Restoration, RestorationLoss
+from experiments.training import run
 
 EXPERIMENT = "experiment=wavefront_coding"
 
@@ -48,3 +53,39 @@ def test_the_double_scale_discriminators_train_and_judge(composed):
         assert loss(real, fake).isfinite()
     names = {name.split(".")[1] for name, _ in discriminators.named_parameters()}
     assert names == {"local", "global"}
+
+
+def test_the_paper_s_doublet_trains_on_whole_sensors(composed, tmp_path):
+    """The whole path of the full scale, at sizes and widths that take seconds."""
+    images, generator = tmp_path / "images", np.random.default_rng(0)
+    images.mkdir()
+    for i in range(6):
+        pixels = generator.integers(0, 256, (150, 160, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(images / f"{i}.png")
+    run(
+        composed(
+            "experiment=large_fov_doublet_paper",
+            f"data.root={images}",
+            "views.sensor.height=64",
+            "views.sensor.width=64",
+            "views.sensor.pixel_pitch=0.5",
+            "renderer.sensor.pixel_pitch=0.5",
+            "renderer.fields=[3,3]",
+            "renderer.size=15",
+            "evaluation_renderer.pupil_samples=2",
+            "network.weights=none",
+            "network.width_multiplier=0.25",
+            "network.pyramid_channels=8",
+            "discriminator.discriminators.local.width=4",
+            "discriminator.discriminators.global.width=4",
+            "loss.perceptual=none",
+            "+trainer.max_steps=2",
+            "+trainer.limit_val_batches=1",
+            "+trainer.limit_test_batches=1",
+            "+trainer.enable_progress_bar=false",
+            "callbacks.pictures=null",
+        )
+    )
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert math.isfinite(metrics["test/psnr_db/field"])
+    assert metrics["train/adversarial"] > 0.0

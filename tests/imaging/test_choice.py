@@ -13,11 +13,11 @@ from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.cost import psf_cost
 from dolens.imaging.choice.probe import GREY_LEVEL, grey_levels, probe_image, probe_power
 from dolens.imaging.choice.reference import reference
-from dolens.imaging.diffraction_limit import diffraction_transfer, with_diffraction_limit
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.wave.diffraction_limit import diffraction_transfer, with_diffraction_limit
 from dolens.prescriptions import lens_from_prescription
 
 LINES = (656.2725, 587.5618, 486.1327)

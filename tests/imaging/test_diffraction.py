@@ -11,11 +11,11 @@ from scipy.special import j0, j1, jn_zeros
 
 from dolens import Lens, load_lens
 from dolens.errors import InputError
-from dolens.imaging.diffraction import direct_field, fourier_field
-from dolens.imaging.object_points import ObjectPoints
-from dolens.imaging.pupil_fit import fit_pupil, regular_pupil
-from dolens.imaging.reference_sphere import path_beyond
-from dolens.imaging.wavefront import pupil_wavefront
+from dolens.imaging.wave.diffraction import direct_field, fourier_field
+from dolens.imaging.wave.object_points import ObjectPoints
+from dolens.imaging.wave.pupil_fit import fit_pupil, regular_pupil
+from dolens.imaging.wave.reference_sphere import path_beyond
+from dolens.imaging.wave.wavefront import pupil_wavefront
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
 from dolens.optics.surfaces.even_asphere import EvenAsphere
 from dolens.optics.surfaces.plane import Plane

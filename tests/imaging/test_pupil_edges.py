@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dolens.imaging.pupil_edges import coverage
+from dolens.imaging.wave.pupil_edges import coverage
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle, Unlimited
 
 

@@ -12,15 +12,15 @@ from scipy.special import j1
 from dolens import load_lens
 from dolens.errors import InputError
 from dolens.imaging import wave_psf
-from dolens.imaging.object_points import ObjectPoints
-from dolens.imaging.pixel_integration import fine_grid, pixel_matrix, quadratic_b_spline
-from dolens.imaging.propagation import DiffractionSettings, choose_propagation
 from dolens.imaging.psf import axial_point_spread_functions, splat
-from dolens.imaging.pupil_fit import fit_pupil, regular_pupil
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
-from dolens.imaging.wave_psf import propagation, wave_kernels
-from dolens.imaging.wavefront import pupil_wavefront
+from dolens.imaging.wave.object_points import ObjectPoints
+from dolens.imaging.wave.pixel_integration import fine_grid, pixel_matrix, quadratic_b_spline
+from dolens.imaging.wave.propagation import DiffractionSettings, choose_propagation
+from dolens.imaging.wave.pupil_fit import fit_pupil, regular_pupil
+from dolens.imaging.wave.wave_psf import propagation, wave_kernels
+from dolens.imaging.wave.wavefront import pupil_wavefront
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from tests.imaging.perfect_lenses import ellipse, hyperbola, pinhole
 

@@ -9,11 +9,11 @@ from scipy.integrate import dblquad
 
 from dolens import Lens, load_lens
 from dolens.errors import InputError
-from dolens.imaging.entrance_beam import find_beam
-from dolens.imaging.object_points import ObjectPoints
-from dolens.imaging.pupil_fit import chebyshev, fit_pupil
 from dolens.imaging.stop_rays import land
-from dolens.imaging.wavefront import Wavefront, pupil_wavefront
+from dolens.imaging.wave.entrance_beam import find_beam
+from dolens.imaging.wave.object_points import ObjectPoints
+from dolens.imaging.wave.pupil_fit import chebyshev, fit_pupil
+from dolens.imaging.wave.wavefront import Wavefront, pupil_wavefront
 from dolens.optics.elements import Element
 from dolens.optics.surfaces.conic import Conic
 from dolens.optics.surfaces.plane import Plane

@@ -10,10 +10,10 @@ from dolens.imaging.choice.finding import Finding
 from dolens.imaging.choice.grid import SAMPLES, WINDOW_SHARE, choose_fields, window_finding
 from dolens.imaging.choice.probe import blurred_grey_levels, grey_levels
 from dolens.imaging.choice.survey import Survey, spread_pixels, survey
-from dolens.imaging.diffraction_limit import diffraction_transfer, with_diffraction_limit
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.wave.diffraction_limit import diffraction_transfer, with_diffraction_limit
 from dolens.optics.system import OpticalSystem
 
 # Points of the sensor where functions are compared.

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.diffraction_limit import working_f_number
 from dolens.imaging.field_psf import (
     sampled_disc,
     splatted,
@@ -18,10 +17,11 @@ from dolens.imaging.plane_points import (
     pinhole_points,
     plane_points,
 )
-from dolens.imaging.propagation import DiffractionSettings
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.wave.diffraction_limit import working_f_number
+from dolens.imaging.wave.propagation import DiffractionSettings
 from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
 
 # The plastic number's sequence fills a square evenly (Roberts, 2018).

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.entrance_beam import EntranceBeam, box_grid, find_beam, launched
-from dolens.imaging.object_flux import axial_flux, flux_density, path_before
-from dolens.imaging.object_points import ObjectPoints
-from dolens.imaging.pupil_edges import coverage
-from dolens.imaging.reference_sphere import chief_ray_landings, sphere_curvature, to_sphere
+from dolens.imaging.wave.entrance_beam import EntranceBeam, box_grid, find_beam, launched
+from dolens.imaging.wave.object_flux import axial_flux, flux_density, path_before
+from dolens.imaging.wave.object_points import ObjectPoints
+from dolens.imaging.wave.pupil_edges import coverage
+from dolens.imaging.wave.reference_sphere import chief_ray_landings, sphere_curvature, to_sphere
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.rays import Components, Rays
@@ -43,7 +43,7 @@ class Wavefront:
         area: (N, S, S), of the ray's cell, in direction cosines.
         amplitude: (N, S, S), root of the flux per area in direction cosines: amplitude²·area is the
             flux of a whole cell over that of the axial point of the same object plane through the
-            paraxial entrance pupil (see `dolens.imaging.object_flux`).
+            paraxial entrance pupil (see `dolens.imaging.wave.object_flux`).
         coverage: (N, S, S), from 0 to 1: the share of the cell that all apertures pass.
         valid: (N, S, S), bool: the ray reaches the sensor, clipped or not, and so do its
             neighbours.  The others have finite numbers, no coverage and no gradient.

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.pupil_fit import PupilFit, RegularPupil
-from dolens.imaging.reference_sphere import path_beyond
-from dolens.imaging.wavefront import MM_PER_NM, Wavefront
+from dolens.imaging.wave.pupil_fit import PupilFit, RegularPupil
+from dolens.imaging.wave.reference_sphere import path_beyond
+from dolens.imaging.wave.wavefront import MM_PER_NM, Wavefront
 
 METHODS = ("auto", "fourier", "direct")
 # Fewest samples across a pupil, so that its edge is where it belongs, and most.

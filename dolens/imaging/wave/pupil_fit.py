@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.pupil_edges import coverage
-from dolens.imaging.wavefront import Wavefront
+from dolens.imaging.wave.pupil_edges import coverage
+from dolens.imaging.wave.wavefront import Wavefront
 
 # Rays so many cells outside the pupil take part, so that nothing is extrapolated at its edge.
 _AROUND = 1

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.pupil_fit import RegularPupil
-from dolens.imaging.reference_sphere import path_beyond
 from dolens.imaging.replay import replay
-from dolens.imaging.wavefront import MM_PER_NM, Wavefront
+from dolens.imaging.wave.pupil_fit import RegularPupil
+from dolens.imaging.wave.reference_sphere import path_beyond
+from dolens.imaging.wave.wavefront import MM_PER_NM, Wavefront
 
 # Pairs of ray and sensor point at a time in direct integration: some 100 bytes each.
 _CHUNK = 1 << 18

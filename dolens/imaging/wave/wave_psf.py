@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.diffraction import direct_field, fourier_field
-from dolens.imaging.object_points import ObjectPoints
-from dolens.imaging.pixel_integration import fine_grid, pixel_matrix
-from dolens.imaging.propagation import (
+from dolens.imaging.replay import replay
+from dolens.imaging.wave.diffraction import direct_field, fourier_field
+from dolens.imaging.wave.object_points import ObjectPoints
+from dolens.imaging.wave.pixel_integration import fine_grid, pixel_matrix
+from dolens.imaging.wave.propagation import (
     DiffractionSettings,
     Propagation,
     choose_propagation,
@@ -18,9 +19,8 @@ from dolens.imaging.propagation import (
     fourier_samples,
     subsamples,
 )
-from dolens.imaging.pupil_fit import PupilFit, RegularPupil, fit_pupil, regular_pupil
-from dolens.imaging.replay import replay
-from dolens.imaging.wavefront import Wavefront, pupil_wavefront
+from dolens.imaging.wave.pupil_fit import PupilFit, RegularPupil, fit_pupil, regular_pupil
+from dolens.imaging.wave.wavefront import Wavefront, pupil_wavefront
 from dolens.optics.backend import say_once
 from dolens.optics.system import OpticalSystem
 

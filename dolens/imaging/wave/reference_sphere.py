@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.object_points import ObjectPoints
+from dolens.imaging.wave.object_points import ObjectPoints
 from dolens.optics.aiming import aim
 from dolens.optics.backend import trace_rays
 from dolens.optics.paraxial import exit_pupil

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.imaging.object_points import ObjectPoints
+from dolens.imaging.wave.object_points import ObjectPoints
 from dolens.optics.aiming import launch
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import to_lens_axes

@@ -8,7 +8,7 @@ not change.
 import torch
 from torch import Tensor
 
-from dolens.imaging.object_points import ObjectPoints
+from dolens.imaging.wave.object_points import ObjectPoints
 from dolens.optics.paraxial import matrix_to_stop
 from dolens.optics.system import OpticalSystem
 
