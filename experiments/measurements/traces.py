@@ -1,14 +1,18 @@
 """Traces: error against double precision, and time, by precision and by what traces."""
 
 import copy
+import math
+from unittest import mock
 
 import torch
 
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
+from dolens.optics.surfaces import base, newton
 from experiments.measurements.renders import Subject
 from experiments.measurements.timing import by_turns
 
+_NEWTON_STEPS = (0, 1, 2, 3, 4, 5, 6, 8, 12)
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -54,6 +58,46 @@ def trace_rows(
                 "with_gradient_ns": 1e9 * times[True][name, backend] / (rays * surfaces),
             }
         )
+    return rows + _newton_rows(lenses["float64", "reference"], given["float64"], subject, seconds)
+
+
+def _newton_rows(
+    lens: Lens, given: Rays, subject: Subject, seconds: float
+) -> list[dict[str, float | str]]:
+    """A row for each number of Newton's steps that is too small, up to the first that is enough;
+    none are counted that derivatives take besides.
+
+    The rule that ends the iteration, √ε of the way, is not a setting of the library; its number of
+    steps is held down here to see what the rule buys.
+    """
+    with mock.patch.object(base, "find_root", wraps=base.find_root) as iteration:
+        true = lens.trace(given)
+    if not iteration.called:
+        # Spheres and conics have closed forms.
+        return []
+    surfaces, count = len(lens.surfaces), given.position[..., 0].numel()
+    rows = []
+    for steps in _NEWTON_STEPS:
+        with mock.patch.object(newton, "MAX_STEPS", steps):
+            hit = lens.trace(given)
+            calls = {b: lambda b=b: _trace(lens, given, b) for b in (False, True)}
+            times = by_turns(calls, seconds)
+        both = hit.valid & true.valid
+        moved = (hit.position.detach() - true.position.detach())[both].abs()
+        error = float(moved.max()) if moved.numel() else math.inf
+        rows.append(
+            {
+                "scene": subject.name,
+                "part": "trace",
+                "model": "Newton's steps",
+                "setting": f"{steps} of Newton's steps, float64",
+                "error_um": 1e3 * error,
+                "forward_ns": 1e9 * times[False] / (count * surfaces),
+                "with_gradient_ns": 1e9 * times[True] / (count * surfaces),
+            }
+        )
+        if error == 0.0:
+            break
     return rows
 
 

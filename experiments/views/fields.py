@@ -31,7 +31,7 @@ EVERYWHERE = "field"
 class FieldViews:
     """Each texture on a window of a large sensor, imaged as it is there.
 
-    Training windows are drawn evenly from the sensor.  Every evaluation texture is imaged in zones:
+    Training windows are drawn from the whole field.  Every evaluation texture is imaged in zones:
     windows at fractions of the half diagonal, at azimuths that go around from texture to texture,
     and one drawn evenly from the whole field, `field`.
 
@@ -46,6 +46,8 @@ class FieldViews:
         readout: what the sensor makes of them.
         evaluation_renderer: makes the validation and test images; None: the training renderer.
         zones: fractions of the half diagonal, by name.
+        training_windows: `radius`: drawn evenly from the distances to the middle, so that no zone
+            is rare; `area`: from the whole sensor, of which corners are a small part.
         seed: of windows, rendering and noise.
 
     Raises:
@@ -60,6 +62,7 @@ class FieldViews:
         readout: Readout,
         evaluation_renderer: PsfRenderer | RayRenderer | None = None,
         zones: Mapping[str, float] | None = None,
+        training_windows: str = "radius",
         seed: int = 0,
     ) -> None:
         self.scene = scene
@@ -69,6 +72,11 @@ class FieldViews:
         self.evaluation_renderer = evaluation_renderer or renderer
         self.zones = dict(zones or {"axis": 0.0, "0.5": 0.5, "0.7": 0.7, "full": 1.0})
         self.seed = seed
+        if training_windows not in ("radius", "area"):
+            raise InputError(
+                f"views.training_windows: '{training_windows}' is unknown; allowed: radius, area"
+            )
+        self.training_windows = training_windows
         self._pupil: ExitPupil | None = None
         window = renderer.sensor
         if len(scene.depths) != 1:
@@ -196,11 +204,30 @@ class FieldViews:
     def _windows(self, stage: str, number: int) -> list[Sensor]:
         """The windows of texture `number` of a stage."""
         generator = torch.Generator().manual_seed(seed_of(self.seed, stage, number))
+        if stage == "train" and self.training_windows == "radius":
+            return [self._at_radius(generator)]
         top, left = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
         anywhere = self._window(top, left)
         if stage == "train":
             return [anywhere]
         return [*(self._zone(share, number) for share in self.zones.values()), anywhere]
+
+    def _at_radius(self, generator: torch.Generator) -> Sensor:
+        """A window whose distance from the middle is drawn evenly from none to the corner's."""
+        free = self.whole.height - self.sensor.height, self.whole.width - self.sensor.width
+        drawn = torch.rand(1, generator=generator, dtype=torch.float64)
+        radius = 0.5 * math.hypot(*free) * float(drawn)
+        while True:
+            drawn = torch.rand(1, generator=generator, dtype=torch.float64)
+            angle = 2.0 * math.pi * float(drawn)
+            down, across = radius * math.sin(angle), radius * math.cos(angle)
+            if abs(down) <= 0.5 * free[0] and abs(across) <= 0.5 * free[1]:
+                break
+        places = (
+            0.5 + offset / side if side else 0.0
+            for offset, side in zip((down, across), free, strict=True)
+        )
+        return self._window(*places)
 
     def _window(self, down: float, across: float) -> Sensor:
         """The window at shares of the way down and across that it can go."""

@@ -47,8 +47,23 @@ def test_zones_lie_at_their_shares_of_the_half_diagonal():
         assert shares[3] == pytest.approx(1.0 - math.hypot(32, 40) / (2 * half), abs=0.01)
 
 
-def test_training_windows_fill_the_field():
+def test_training_windows_are_at_all_distances_alike():
     views = field_views()
+    reach = 0.5 * math.hypot(WHOLE.height - 32, WHOLE.width - 40)
+    windows = [views._windows("train", number)[0] for number in range(400)]
+    shares = torch.tensor([math.hypot(w.centre_row, w.centre_column) / reach for w in windows])
+    # Uniform from 0 to 1, to three standard errors.
+    assert float(shares.max()) <= 1.001
+    assert abs(float(shares.mean()) - 0.5) < 3 * math.sqrt(1 / 12 / 400)
+    assert float(shares.std()) == pytest.approx(math.sqrt(1 / 12), rel=0.1)
+    # On all sides.
+    for name in ("centre_row", "centre_column"):
+        signs = torch.tensor([getattr(w, name) > 0 for w in windows]).double()
+        assert abs(float(signs.mean()) - 0.5) < 3 * math.sqrt(0.25 / 400)
+
+
+def test_training_windows_fill_the_field():
+    views = field_views(training_windows="area")
     windows = [views._windows("train", number)[0] for number in range(400)]
     rows = torch.tensor([w.centre_row for w in windows]) / (WHOLE.height - 32)
     columns = torch.tensor([w.centre_column for w in windows]) / (WHOLE.width - 40)
@@ -140,6 +155,7 @@ def test_gradients_are_of_sharpness_and_not_of_where_the_image_lies(root):
     ("settings", "message"),
     [
         ({"zones": {"far": 1.5}}, "zones.far"),
+        ({"training_windows": "corners"}, "training_windows"),
         ({"renderer": PsfRenderer(Sensor(32, 32, 0.01))}, "pixel_pitch"),
         ({"renderer": PsfRenderer(Sensor(500, 32, 0.08))}, "larger"),
     ],
