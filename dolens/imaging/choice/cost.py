@@ -9,9 +9,12 @@ from dolens.imaging.sensor import Sensor
 
 # Nanoseconds: a ray and surface, forward and back; a ray's lookup of a texel, forward and back; a
 # point of a transform, over the logarithm of their number; a pixel's lookup between pixels; a ray's
-# splat.  Measured by scripts/renderers.py.
-_SURFACE, _TEXEL, _TRANSFORM, _LOOKUP, _SPLAT = 9.0, 12.0, 0.4, 60.0, 30.0
+# splat; a ray and surface of the illumination's map; what a render, and each of its nodes, takes
+# whatever its size.  From the times of experiment=speed_vs_error.
+_SURFACE, _TEXEL, _TRANSFORM, _LOOKUP, _SPLAT = 5.5, 7.0, 0.6, 35.0, 30.0
+_MAPPED, _RENDER, _NODE = 12.0, 4e6, 1e6
 _TRANSFORMS = 6  # of texture, kernel and image, forward and back
+_MAP_RAYS = 65 * 2048  # of each colour, in a symmetric lens
 
 
 def rays_cost(
@@ -35,11 +38,11 @@ def psf_cost(renderer: PsfRenderer, scene: PlanarScene, surfaces: int, images: i
     ]
     points = sides[0] * sides[1]
     transforms = nodes * _TRANSFORMS * channels * depths * images
-    cost = transforms * points * math.log2(points) * _TRANSFORM
+    cost = _RENDER + nodes * _NODE + transforms * points * math.log2(points) * _TRANSFORM
     cost += renderer.rays_per_image(scene) * (surfaces * _SURFACE + depths * _SPLAT)
     pixels = sensor.height * sensor.width * channels
     if renderer.registration == "chief_rays":
-        cost += pixels * (surfaces * _SURFACE + 4 * depths * images * _LOOKUP)
+        cost += pixels * 4 * depths * images * _LOOKUP
     if renderer.illumination == "map":
-        cost += 65 * 2048 * channels * surfaces * _SURFACE + pixels * _LOOKUP
+        cost += _MAP_RAYS * channels * surfaces * _MAPPED + pixels * _LOOKUP
     return cost
