@@ -26,6 +26,7 @@ from experiments.views.base import NOISE_OFFSET, Views, seed_of
 # The golden angle, by which neighbouring textures' windows lie apart in azimuth.
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 EVERYWHERE = "field"
+WINDOWS = ("circle", "radius", "area")
 
 
 class FieldViews:
@@ -46,8 +47,9 @@ class FieldViews:
         readout: what the sensor makes of them.
         evaluation_renderer: makes the validation and test images; None: the training renderer.
         zones: fractions of the half diagonal, by name.
-        training_windows: `radius`: drawn evenly from the distances to the middle, so that no zone
-            is rare; `area`: from the whole sensor, of which corners are a small part.
+        training_windows: `circle`: drawn evenly from the area of the circle about the sensor, so
+            that the edge of the field counts by its area; `radius`: evenly from the distances to
+            the middle; `area`: from the sensor, of which corners are a small part.
         seed: of windows, rendering and noise.
 
     Raises:
@@ -62,7 +64,7 @@ class FieldViews:
         readout: Readout,
         evaluation_renderer: PsfRenderer | RayRenderer | None = None,
         zones: Mapping[str, float] | None = None,
-        training_windows: str = "radius",
+        training_windows: str = "circle",
         seed: int = 0,
     ) -> None:
         self.scene = scene
@@ -72,9 +74,10 @@ class FieldViews:
         self.evaluation_renderer = evaluation_renderer or renderer
         self.zones = dict(zones or {"axis": 0.0, "0.5": 0.5, "0.7": 0.7, "full": 1.0})
         self.seed = seed
-        if training_windows not in ("radius", "area"):
+        if training_windows not in WINDOWS:
             raise InputError(
-                f"views.training_windows: '{training_windows}' is unknown; allowed: radius, area"
+                f"views.training_windows: '{training_windows}' is unknown; allowed: "
+                f"{', '.join(WINDOWS)}"
             )
         self.training_windows = training_windows
         self._pupil: ExitPupil | None = None
@@ -204,19 +207,20 @@ class FieldViews:
     def _windows(self, stage: str, number: int) -> list[Sensor]:
         """The windows of texture `number` of a stage."""
         generator = torch.Generator().manual_seed(seed_of(self.seed, stage, number))
-        if stage == "train" and self.training_windows == "radius":
-            return [self._at_radius(generator)]
+        if stage == "train" and self.training_windows != "area":
+            return [self._in_circle(generator)]
         top, left = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
         anywhere = self._window(top, left)
         if stage == "train":
             return [anywhere]
         return [*(self._zone(share, number) for share in self.zones.values()), anywhere]
 
-    def _at_radius(self, generator: torch.Generator) -> Sensor:
-        """A window whose distance from the middle is drawn evenly from none to the corner's."""
+    def _in_circle(self, generator: torch.Generator) -> Sensor:
+        """A window whose distance from the middle is drawn, and then its direction."""
         free = self.whole.height - self.sensor.height, self.whole.width - self.sensor.width
         drawn = torch.rand(1, generator=generator, dtype=torch.float64)
-        radius = 0.5 * math.hypot(*free) * float(drawn)
+        share = float(drawn) if self.training_windows == "radius" else math.sqrt(float(drawn))
+        radius = 0.5 * math.hypot(*free) * share
         while True:
             drawn = torch.rand(1, generator=generator, dtype=torch.float64)
             angle = 2.0 * math.pi * float(drawn)

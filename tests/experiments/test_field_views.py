@@ -47,13 +47,16 @@ def test_zones_lie_at_their_shares_of_the_half_diagonal():
         assert shares[3] == pytest.approx(1.0 - math.hypot(32, 40) / (2 * half), abs=0.01)
 
 
-def test_training_windows_are_at_all_distances_alike():
-    views = field_views()
+@pytest.mark.parametrize(("kind", "power"), [("circle", 2.0), ("radius", 1.0)])
+def test_training_windows_are_at_all_distances(kind, power):
+    """Even in the distance's square, the area of a circle, or in the distance itself."""
+    views = field_views(training_windows=kind)
     reach = 0.5 * math.hypot(WHOLE.height - 32, WHOLE.width - 40)
     windows = [views._windows("train", number)[0] for number in range(400)]
-    shares = torch.tensor([math.hypot(w.centre_row, w.centre_column) / reach for w in windows])
+    distance = [math.hypot(w.centre_row, w.centre_column) / reach for w in windows]
+    shares = torch.tensor(distance) ** power
     # Uniform from 0 to 1, to three standard errors.
-    assert float(shares.max()) <= 1.001
+    assert float(shares.max()) <= 1.01
     assert abs(float(shares.mean()) - 0.5) < 3 * math.sqrt(1 / 12 / 400)
     assert float(shares.std()) == pytest.approx(math.sqrt(1 / 12), rel=0.1)
     # On all sides.
