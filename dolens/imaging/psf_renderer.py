@@ -131,13 +131,7 @@ class PsfRenderer(Unprepared):
             InputError: a depth inside the lens, or channels that are not the scene's.
         """
         textures = textures.to(device=lens.device, dtype=lens.dtype)
-        system = lens.system(values)
-        backend = choose_backend(system, lens.backend, others=[textures])
-        with torch.no_grad():
-            scene.check(system)
-            pupil = self.pupil or sampled_exit_pupil(
-                system, scene.wavelengths, self.sensor, backend
-            )
+        system, backend, pupil = self._begin(lens, scene, textures, values)
         found = self.point_spread_functions(system, scene, pupil, seed, backend)
         self._warn_of_loss(found)
         size = (textures.shape[-2], textures.shape[-1])
@@ -174,13 +168,8 @@ class PsfRenderer(Unprepared):
             (W, images, C, height, width).
         """
         textures = textures.to(device=lens.device, dtype=lens.dtype)
-        system = lens.system(values)
-        backend = choose_backend(system, lens.backend, others=[textures])
+        system, backend, pupil = self._begin(lens, scene, textures, values)
         with torch.no_grad():
-            scene.check(system)
-            pupil = self.pupil or sampled_exit_pupil(
-                system, scene.wavelengths, self.sensor, backend
-            )
             looks = None
             if self.registration == "chief_rays":
                 looks = distortion(system, scene, self.sensor, pupil, backend)
@@ -215,6 +204,23 @@ class PsfRenderer(Unprepared):
                 )
             )
         return torch.cat(images)
+
+    def _begin(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        values: Mapping[str, Tensor] | None,
+    ) -> tuple[OpticalSystem, str, ExitPupil]:
+        """The system, what traces it, and its pupil; a scene within the lens is refused."""
+        system = lens.system(values)
+        backend = choose_backend(system, lens.backend, others=[textures])
+        with torch.no_grad():
+            scene.check(system)
+            pupil = self.pupil
+            if pupil is None:
+                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        return system, backend, pupil
 
     def _blurred(
         self,
