@@ -88,7 +88,9 @@ class CameraModule(lightning.LightningModule):
         self.optics_seconds: list[float] = []
         self._evaluations: list[dict[str, Tensor]] = []
         self._step_started = self._optics_started = 0.0
-        self._step, self._batch = 0, torch.empty(0)
+        # Of the lens as it begins, so that a resumed run measures steps as an uninterrupted one.
+        steps = self.lens_steps if len(self.variables) else None
+        self._spots = views.spots(self.lens, steps.rings, steps.arms) if steps else []
         views.check(lens)
         missing = {"optics", "network"} - set(self.learning_rates)
         if missing:
@@ -173,13 +175,24 @@ class CameraModule(lightning.LightningModule):
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
         """Start the step's clock; the number of the step is that of its random numbers."""
-        self._step, self._batch = self.global_step, batch
+        self._step = self.global_step
         self._step_started = time.perf_counter()
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
-        taken, restored, terms, total, operands = self._forward(batch)
+        started = time.perf_counter()
+        values = self.variables()
+        taken = self.views.take(self.lens, values, batch, "train", self.global_step)
+        functions = self._functions(values)
+        self.optics_seconds.append(time.perf_counter() - started)
+        if taken.raw.requires_grad:
+            # The image's gradient is the network's last; what comes after it is the lens's.
+            taken.raw.register_hook(self._start_optics_backward)
+        restored = self.restore(taken, functions)
         truth = taken.truth.to(restored.dtype)
+        terms = self.loss_over_views(restored, truth)
+        penalty, operands = self.penalty(values)
+        total = terms["total"] + penalty.to(restored.dtype)
         with torch.no_grad():
             psnr = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1)).mean()
         self.log("train/loss", terms["total"], prog_bar=True)
@@ -195,42 +208,6 @@ class CameraModule(lightning.LightningModule):
             total = total + term
         return total
 
-    def _forward(
-        self, batch: Tensor
-    ) -> tuple[Views, Tensor, dict[str, Tensor], Tensor, dict[str, Tensor]]:
-        """Views, restored images, terms of the loss, its sum with the penalty, and operands."""
-        started = time.perf_counter()
-        values = self.variables()
-        taken = self.views.take(self.lens, values, batch, "train", self._step)
-        functions = self._functions(values)
-        self.optics_seconds.append(time.perf_counter() - started)
-        if taken.raw.requires_grad:
-            # The image's gradient is the network's last; what comes after it is the lens's.
-            taken.raw.register_hook(self._start_optics_backward)
-        restored = self.restore(taken, functions)
-        terms = self.loss_over_views(restored, taken.truth.to(restored.dtype))
-        penalty, operands = self.penalty(values)
-        return taken, restored, terms, terms["total"] + penalty.to(restored.dtype), operands
-
-    def _move_lens(self, batch: Tensor) -> None:
-        """A step of least squares for the lens, tried on the batch that the network has seen."""
-        seconds = len(self.optics_seconds)
-        # Trials leave no trace in the network's running statistics.
-        kept = {name: buffer.clone() for name, buffer in self.network.named_buffers()}
-
-        def loss() -> float:
-            return float(self._forward(batch)[3])
-
-        spots = self.views.spots(self.lens, self.lens_steps.rings, self.lens_steps.arms)
-        pitch = self.views.sensor.pixel_pitch
-        found = self.lens_steps.step(self.lens, self.variables, spots, pitch, loss)
-        with torch.no_grad():
-            for name, buffer in self.network.named_buffers():
-                buffer.copy_(kept[name])
-        # What the trials' optics cost is the step's.
-        self.optics_seconds[seconds - 1 :] = [sum(self.optics_seconds[seconds - 1 :])]
-        self.log_dict({f"lens_step/{name}": value for name, value in found.items()})
-
     def optimizer_step(
         self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None
     ) -> None:
@@ -243,7 +220,9 @@ class CameraModule(lightning.LightningModule):
         if self.lens_steps is not None:
             self.lens_steps.gather(self.variables)
             if self.lens_steps.is_due(self._step + 1):
-                self._move_lens(self._batch)
+                pitch = self.views.sensor.pixel_pitch
+                found = self.lens_steps.step(self.lens, self.variables, self._spots, pitch)
+                self.log_dict({f"lens_step/{name}": value for name, value in found.items()})
         self.variables.project()
         self.variables.write_to(self.lens)
 

@@ -16,9 +16,11 @@ from dolens.optimize.variables import DesignVariables
 
 logger = logging.getLogger(__name__)
 
-# A step that gains this part of what was foretold is kept; from the second on rays may move
-# farther the next time, and up to the third less far (Nocedal and Wright, algorithm 4.1).
-_KEPT, _GOOD, _POOR = 1e-4, 0.75, 0.25
+# Where the slope along the last step has kept more than this part of itself, rays may move farther
+# the next time, and where it has turned round less far.
+_STEADY, _LONGER, _SHORTER = 0.5, 1.25, 0.7
+# Never less far than this part of the first step.
+_LEAST_REACH = 0.02
 
 
 class CameraOptimizer:
@@ -54,8 +56,9 @@ class LensLeastSquares:
     """Moves a lens once for some steps of the network, by the gradient they have gathered.
 
     The step minimises the loss's linear model while rays move no farther than `reach`; see
-    `trusted_step`.  It is tried on the batch at hand: where the loss does not fall the lens stays,
-    and rays may move half as far the next time.
+    `trusted_step`.  Batches are small and differ, so that a trial on one of them would tell little;
+    the next gradient, of other batches, tells how the last step was: where the loss still falls
+    along it, rays may move farther, and where it rises less far.
 
     Args:
         every: steps of the network between two of the lens.
@@ -72,8 +75,8 @@ class LensLeastSquares:
     def __init__(
         self,
         every: int = 5,
-        reach: float = 0.3,
-        most: float = 1.0,
+        reach: float = 0.1,
+        most: float = 0.5,
         damping: float = 1e-3,
         rings: int = 4,
         arms: int = 8,
@@ -87,9 +90,11 @@ class LensLeastSquares:
             )
         self.every, self.most, self.damping = int(every), float(most), float(damping)
         self.rings, self.arms = int(rings), int(arms)
-        self.reach = float(reach)
-        self.kept = self.refused = 0
+        self.least, self.reach = _LEAST_REACH * float(reach), float(reach)
+        self.taken = 0
         self._gathered: Tensor | None = None
+        self._last: Tensor | None = None
+        self._slope = 0.0
 
     def is_due(self, steps: int) -> bool:
         """Whether the lens moves after so many steps of the network."""
@@ -104,74 +109,63 @@ class LensLeastSquares:
 
     @torch.no_grad()
     def step(
-        self,
-        lens: Lens,
-        variables: DesignVariables,
-        spots: list[SpotRays],
-        pitch: float,
-        loss: Callable[[], float],
+        self, lens: Lens, variables: DesignVariables, spots: list[SpotRays], pitch: float
     ) -> dict[str, float]:
         """One step, by the gradient that was gathered; it is used up.
 
         Args:
-            lens: where accepted values are stored.
+            lens: where the values are stored.
             variables: u.
-            spots: of the lens.
+            spots: rays of the lens.
             pitch: of the pixels, mm.
-            loss: of the variables as they are, always of the same batch.
 
         Returns:
-            Numbers to log: `reach` (pixels), `gain_ratio`, `moved` (RMS, pixels).
+            Numbers to log: `reach` (pixels), `slope_kept` by the last step, `moved` (RMS, pixels).
         """
-        gradient, self._gathered = self._gathered, None
-        if gradient is None:
+        gathered, self._gathered = self._gathered, None
+        if gathered is None:
             return {}
+        gradient = gathered.double().cpu()
         if not bool(torch.isfinite(gradient).all()):
             logger.warning("the lens's gradient is not finite: it does not move this time")
             return {}
-        scaled, point = variables.scaled, variables.scaled.detach().clone()
+        numbers = {}
+        if self._last is not None and self._slope < 0.0:
+            kept = float(gradient @ self._last) / self._slope
+            if kept > _STEADY:
+                self.reach = min(_LONGER * self.reach, self.most)
+            elif kept < 0.0:
+                self.reach = max(_SHORTER * self.reach, self.least)
+            numbers["slope_kept"] = kept
+        scaled, point = variables.scaled, variables.scaled.detach().double().cpu()
         moves = ray_moves(lens, variables, spots, self.damping)
-        lower, upper = (
-            (bound - point).double().cpu() for bound in (variables.lower, variables.upper)
-        )
+        lower, upper = (b.double().cpu() - point for b in (variables.lower, variables.upper))
         found = trusted_step(
             gradient, moves, self.reach * pitch, lower.clamp(max=0.0), upper.clamp(min=0.0)
         )
-        if not found.predicted > 0.0:
-            return {}
-        before = loss()
-        scaled.copy_(point + found.step.to(point))
+        scaled.copy_(point + found.step)
         variables.project()
-        ratio = (before - loss()) / found.predicted
-        moved = float((moves @ found.step).norm()) / pitch
-        if not ratio > _KEPT:
-            scaled.copy_(point)
-            self.refused += 1
-            moved = 0.0
-        else:
-            self.kept += 1
-        if not ratio > _POOR:
-            self.reach *= 0.5
-        elif ratio > _GOOD:
-            self.reach = min(1.5 * self.reach, self.most)
         variables.write_to(lens)
-        return {"reach": self.reach, "gain_ratio": ratio, "moved": moved}
+        self.taken += 1
+        self._last, self._slope = found.step, float(gradient @ found.step)
+        return numbers | {"reach": self.reach, "moved": float((moves @ found.step).norm()) / pitch}
 
     def numbers(self) -> dict[str, float]:
-        """How many steps were kept and refused."""
-        return {"lens_steps/kept": float(self.kept), "lens_steps/refused": float(self.refused)}
+        """How many steps were taken, and how far rays may move now (pixels)."""
+        return {"lens_steps/taken": float(self.taken), "lens_steps/reach": self.reach}
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps, the gradient gathered so far included."""
-        gathered = None if self._gathered is None else self._gathered.clone()
         return {
             "reach": self.reach,
-            "kept": self.kept,
-            "refused": self.refused,
-            "gathered": gathered,
+            "taken": self.taken,
+            "gathered": None if self._gathered is None else self._gathered.clone(),
+            "last": None if self._last is None else self._last.clone(),
+            "slope": self._slope,
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on with it."""
-        self.reach, self.kept = float(state["reach"]), int(state["kept"])
-        self.refused, self._gathered = int(state["refused"]), state["gathered"]
+        self.reach, self.taken = float(state["reach"]), int(state["taken"])
+        self._gathered, self._last = state["gathered"], state["last"]
+        self._slope = float(state["slope"])

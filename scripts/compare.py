@@ -71,6 +71,8 @@ def main(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     runs: dict[str, dict[int, dict[str, float]]] = {}
     for folder in given.folders:
+        if not (folder / "metrics.json").is_file():
+            parser.error(f"{folder} is no finished run folder: metrics.json is missing")
         name, seed, metrics = read_run(folder)
         runs.setdefault(name, {})[seed] = metrics
     if given.against is not None and given.against not in runs:

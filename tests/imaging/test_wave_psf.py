@@ -11,10 +11,10 @@ from scipy.special import j1
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.imaging import wave_psf
 from dolens.imaging.psf import axial_point_spread_functions, splat
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.wave import wave_psf
 from dolens.imaging.wave.object_points import ObjectPoints
 from dolens.imaging.wave.pixel_integration import fine_grid, pixel_matrix, quadratic_b_spline
 from dolens.imaging.wave.propagation import DiffractionSettings, choose_propagation
