@@ -64,7 +64,7 @@ def test_a_camera_is_trained_on_scenes_with_depth(composed, tmp_path, renderer):
         )
     )
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())
-    assert math.isfinite(metrics["test/psnr_db/1-8m"])
+    assert math.isfinite(metrics["test/psnr_db/4.5-8m"])
     assert (tmp_path / "run/figures/images.png").is_file()
 
 
