@@ -22,12 +22,12 @@ def test_the_lenses_pupils_and_magnifications(root, name, wavelength):
     numbers = ParaxialNumbers.of(system)
     z, diameter = numbers.exit_pupil(wavelength)
     wanted = exit_pupil(system, wavelength)
-    assert z == pytest.approx(float(wanted.z), rel=1e-12)
-    assert diameter == pytest.approx(float(wanted.diameter), rel=1e-12)
+    assert z == pytest.approx(float(wanted.z.detach()), rel=1e-12)
+    assert diameter == pytest.approx(float(wanted.diameter.detach()), rel=1e-12)
     for depth in (500.0, 1e6):
         found = numbers.chief_ray_magnification(wavelength, depth)
         assert found == pytest.approx(
-            float(chief_ray_magnification(system, wavelength, depth)), rel=1e-11
+            float(chief_ray_magnification(system, wavelength, depth).detach()), rel=1e-11
         )
 
 
