@@ -174,8 +174,7 @@ class CameraModule(lightning.LightningModule):
             self.views.prepare(self.lens, self.variables())
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
-        """Start the step's clock; the number of the step is that of its random numbers."""
-        self._step = self.global_step
+        """Start the step's clock."""
         self._step_started = time.perf_counter()
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
@@ -215,11 +214,12 @@ class CameraModule(lightning.LightningModule):
         and store them in it.  A checkpoint of this step has it all.
         """
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+        # `global_step` counts this step only when this method is done.
         if not len(self.variables):
             return
         if self.lens_steps is not None:
             self.lens_steps.gather(self.variables)
-            if self.lens_steps.is_due(self._step + 1):
+            if self.lens_steps.is_due(self.global_step + 1):
                 pitch = self.views.sensor.pixel_pitch
                 found = self.lens_steps.step(self.lens, self.variables, self._spots, pitch)
                 self.log_dict({f"lens_step/{name}": value for name, value in found.items()})

@@ -1,5 +1,6 @@
 """Where every pixel of a sensor looks: distortion and lateral colour, as smooth maps."""
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -84,28 +85,50 @@ def distortion(
 
 
 @torch.no_grad()
-def chief_ray_map(
-    system: OpticalSystem, scene: Scene, sensor: Sensor, pupil: ExitPupil, backend: str
-) -> tuple[Tensor, Tensor]:
-    """Where the chief rays of all pixels meet the planes of a scene.
+def chief_ray_maps(
+    system: OpticalSystem,
+    scene: Scene,
+    sensor: Sensor,
+    windows: Sequence[Sensor],
+    pupil: ExitPupil,
+    backend: str,
+) -> list[tuple[Tensor, Tensor]]:
+    """Where the chief rays of windows' pixels meet the planes of a scene.
 
-    Arguments as of `distortion`, whose polynomials are used where there are any; else a ray is
-    traced for each pixel.
+    One set of polynomials serves all windows; where it is not enough, each window has its own, or
+    a ray for each of its pixels.  Arguments as of `distortion`, and:
+
+    Args:
+        windows: of the sensor; the sensor itself is one.
 
     Returns:
-        Rows and columns from the axis in the image of a pinhole, each (D, C, height, width), double
-        precision, no gradient.
+        Of each window rows and columns from the axis in the image of a pinhole, each
+        (D, C, height, width), double precision, no gradient.
     """
     found = distortion(system, scene, sensor, pupil, backend)
     if found is not None:
-        return found.seen_by(sensor)
+        return [found.seen_by(window) for window in windows]
+    return [_by_itself(system, scene, sensor, window, pupil, backend) for window in windows]
+
+
+def _by_itself(
+    system: OpticalSystem,
+    scene: Scene,
+    sensor: Sensor,
+    window: Sensor,
+    pupil: ExitPupil,
+    backend: str,
+) -> tuple[Tensor, Tensor]:
+    """Of a window for whose sensor there are no polynomials."""
+    if window != sensor:
+        return chief_ray_maps(system, scene, window, [window], pupil, backend)[0]
     options = {"dtype": torch.float64, "device": system.device}
     row, column = torch.meshgrid(
-        torch.arange(sensor.height, **options),
-        torch.arange(sensor.width, **options),
+        torch.arange(window.height, **options),
+        torch.arange(window.width, **options),
         indexing="ij",
     )
-    return _seen(system, scene, sensor, pupil, backend, row, column).unbind(0)
+    return _seen(system, scene, window, pupil, backend, row, column).unbind(0)
 
 
 def _seen(

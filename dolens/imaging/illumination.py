@@ -13,7 +13,9 @@ from dolens.imaging.stop_rays import even_points
 from dolens.optics.system import OpticalSystem
 
 # Points along the radius of a symmetric lens, or along each side of the sensor.
-_RADII, _SIDE = 65, 13
+RADII, _SIDE = 65, 13
+# Through the pupil, for each of them and each wavelength.
+RAYS = 2048
 
 
 @torch.no_grad()
@@ -24,7 +26,7 @@ def relative_illumination(
     pupil: ExitPupil,
     symmetric: bool,
     backend: str,
-    rays: int = 2048,
+    rays: int = RAYS,
 ) -> Tensor:
     """Irradiance of every pixel under a uniform scene, over that on the axis.
 
@@ -51,17 +53,17 @@ def relative_illumination(
     )
     # No two of them on one circle: strata lie on rings, which an aperture's edge takes as wholes.
     spiral = even_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
-    disc = tuple(d.expand(max(_RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
+    disc = tuple(d.expand(max(RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
     if symmetric:
         x, y = sensor.positions(*grid)
         distance = torch.hypot(x, y)
         low, high = float(distance.min()), float(distance.max())
-        radius = torch.linspace(low, high, _RADII, **options)
+        radius = torch.linspace(low, high, RADII, **options)
         points = (radius, torch.zeros_like(radius))
         _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
         light = weight.sum(-1)
-        place = (distance - low) * ((_RADII - 1) / max(high - low, 1e-300))
-        first = place.long().clamp(max=_RADII - 2)
+        place = (distance - low) * ((RADII - 1) / max(high - low, 1e-300))
+        first = place.long().clamp(max=RADII - 2)
         between = (place - first).to(light)
         return torch.lerp(light[:, first], light[:, first + 1], between)
     rows = torch.linspace(0.0, height - 1.0, _SIDE, **options)

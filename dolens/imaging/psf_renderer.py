@@ -3,13 +3,13 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.distortion import chief_ray_map, distortion
+from dolens.imaging.distortion import chief_ray_maps
 from dolens.imaging.field_psf import (
     FieldFunctions,
     field_point_spread_functions,
@@ -36,6 +36,14 @@ logger = logging.getLogger(__name__)
 
 # A window that loses more of a function's light than this is worth a warning.
 _NOTABLE_LOSS = 0.01
+
+
+class _View(NamedTuple):
+    """Textures (B, channels, H, W) on a window of a sensor, and where their centre lies."""
+
+    sensor: Sensor
+    texture_centre: tuple[float, float]
+    textures: Tensor
 
 
 @dataclass(frozen=True)
@@ -130,13 +138,9 @@ class PsfRenderer(Unprepared):
         Raises:
             InputError: a depth inside the lens, or channels that are not the scene's.
         """
-        textures = textures.to(device=lens.device, dtype=lens.dtype)
-        system, backend, pupil = self._begin(lens, scene, textures, values)
-        found = self.point_spread_functions(system, scene, pupil, seed, backend)
-        self._warn_of_loss(found)
-        size = (textures.shape[-2], textures.shape[-1])
-        coordinates, origin = self._coordinates(system, scene, size, pupil, backend)
-        return self._blurred(system, scene, textures, found, coordinates, origin, pupil, backend)
+        views = [_View(self.sensor, scene.texture_centre, textures)]
+        (image,) = self._render(lens, scene, views, seed, values)
+        return image
 
     def render_windows(
         self,
@@ -167,60 +171,51 @@ class PsfRenderer(Unprepared):
         Returns:
             (W, images, C, height, width).
         """
-        textures = textures.to(device=lens.device, dtype=lens.dtype)
-        system, backend, pupil = self._begin(lens, scene, textures, values)
-        with torch.no_grad():
-            looks = None
-            if self.registration == "chief_rays":
-                looks = distortion(system, scene, self.sensor, pupil, backend)
-        parts = [replace(self, sensor=window) for window in windows]
-        x, y = zip(*(part.points() for part in parts), strict=True)
-        found = self.point_spread_functions(
-            system, scene, pupil, seed, backend, (torch.cat(x), torch.cat(y)), followed
-        )
-        self._warn_of_loss(found)
-        nodes, size = self.fields[0] * self.fields[1], (textures.shape[-2], textures.shape[-1])
-        images = []
-        for i, (part, centre) in enumerate(zip(parts, centres, strict=True)):
-            own = slice(i * nodes, (i + 1) * nodes)
-            functions = found._replace(functions=found.functions[own], light=found.light[own])
-            placed = replace(scene, texture_centre=centre)
-            if looks is None:
-                coordinates, origin = part._coordinates(system, placed, size, pupil, backend)
-            else:
-                row, column = texture_origin(size, centre)
-                down, across = looks.seen_by(part.sensor)
-                coordinates, origin = Coordinates(down + row, across + column), (0, 0)
-            images.append(
-                part._blurred(
-                    system,
-                    placed,
-                    textures[i : i + 1],
-                    functions,
-                    coordinates,
-                    origin,
-                    pupil,
-                    backend,
-                )
-            )
-        return torch.cat(images)
+        views = [
+            _View(window, centre, texture[None])
+            for window, centre, texture in zip(windows, centres, textures, strict=True)
+        ]
+        return torch.cat(self._render(lens, scene, views, seed, values, followed))
 
-    def _begin(
+    def _render(
         self,
         lens: Lens,
         scene: Scene,
-        textures: Tensor,
+        views: Sequence[_View],
+        seed: int,
         values: Mapping[str, Tensor] | None,
-    ) -> tuple[OpticalSystem, str, ExitPupil]:
-        """The system, what traces it, and its pupil; a scene within the lens is refused."""
+        followed: float | None = None,
+    ) -> list[Tensor]:
+        """Images (B, images, C, height, width) of views of the sensor, all rays traced at once."""
+        options = {"device": lens.device, "dtype": lens.dtype}
+        textures = [view.textures.to(**options) for view in views]
         system = lens.system(values)
-        backend = choose_backend(system, lens.backend, others=[textures])
+        backend = choose_backend(system, lens.backend, others=textures)
         with torch.no_grad():
             scene.check(system)
             pupil = self.pupil
             if pupil is None:
                 pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
-        return system, backend, pupil
+        parts = [replace(self, sensor=view.sensor) for view in views]
+        x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
+        found = self.point_spread_functions(system, scene, pupil, seed, backend, (x, y), followed)
+        self._warn_of_loss(found)
+        looks = [None] * len(views)
+        if self.registration == "chief_rays":
+            windows = [view.sensor for view in views]
+            looks = chief_ray_maps(system, scene, self.sensor, windows, pupil, backend)
+        nodes, images = self.fields[0] * self.fields[1], []
+        for i, (part, view, look) in enumerate(zip(parts, views, looks, strict=True)):
+            own = slice(i * nodes, (i + 1) * nodes)
+            functions = found._replace(functions=found.functions[own], light=found.light[own])
+            placed = replace(scene, texture_centre=view.texture_centre)
+            coordinates, origin = part._coordinates(placed, textures[i], look)
+            images.append(
+                part._blurred(
+                    system, placed, textures[i], functions, coordinates, origin, pupil, backend
+                )
+            )
+        return images
 
     def _blurred(
         self,
@@ -349,29 +344,26 @@ class PsfRenderer(Unprepared):
         ]
 
     def _coordinates(
-        self,
-        system: OpticalSystem,
-        scene: Scene,
-        texture_size: tuple[int, int],
-        pupil: ExitPupil,
-        backend: str,
+        self, scene: Scene, textures: Tensor, look: tuple[Tensor, Tensor] | None
     ) -> tuple[Coordinates | None, tuple[int, int]]:
-        """Where pixels look in the texture, or where the first does if the others follow on."""
+        """Where pixels look in the texture, or where the first does if the others follow on.
+
+        `look` is where chief rays meet the scene, None for a pinhole's.
+        """
         sensor = self.sensor
-        row, column = texture_origin(texture_size, scene.texture_centre)
-        if self.registration == "pinhole":
-            top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
-            left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
-            if top.is_integer() and left.is_integer():
-                return None, (int(top), int(left))
-        if self.registration == "pinhole":
-            options = {"dtype": torch.float64, "device": system.device}
-            rows, columns = torch.meshgrid(
-                torch.arange(sensor.height, **options),
-                torch.arange(sensor.width, **options),
-                indexing="ij",
-            )
-            shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
-            return Coordinates((rows + top).expand(shape), (columns + left).expand(shape)), (0, 0)
-        down, across = chief_ray_map(system, scene, sensor, pupil, backend)
-        return Coordinates(down + row, across + column), (0, 0)
+        row, column = texture_origin((textures.shape[-2], textures.shape[-1]), scene.texture_centre)
+        if look is not None:
+            down, across = look
+            return Coordinates(down + row, across + column), (0, 0)
+        top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
+        left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
+        if top.is_integer() and left.is_integer():
+            return None, (int(top), int(left))
+        options = {"dtype": torch.float64, "device": textures.device}
+        rows, columns = torch.meshgrid(
+            torch.arange(sensor.height, **options),
+            torch.arange(sensor.width, **options),
+            indexing="ij",
+        )
+        shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
+        return Coordinates((rows + top).expand(shape), (columns + left).expand(shape)), (0, 0)

@@ -60,6 +60,17 @@ def aim(
     )
 
 
+def paraxial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> ExitPupil:
+    """The pupil at the middle wavelength, its radius the least of all; no ray is traced.
+
+    Enough for chief rays, which are aimed at its centre.
+    """
+    first_order = ParaxialNumbers.of(system)
+    z, _ = first_order.exit_pupil(wavelengths[len(wavelengths) // 2])
+    radius = min(first_order.exit_pupil(w)[1] for w in wavelengths) / 2.0
+    return ExitPupil(z, radius, radius)
+
+
 @torch.no_grad()
 def sampled_exit_pupil(
     system: OpticalSystem,
@@ -122,12 +133,10 @@ def axial_exit_pupil(
     Raises:
         InputError: no ray from the sensor's centre gets through.
     """
-    first_order = ParaxialNumbers.of(system)
-    z, _ = first_order.exit_pupil(wavelengths[len(wavelengths) // 2])
+    z, paraxial, _ = paraxial_exit_pupil(system, wavelengths)
     options = {"dtype": system.dtype, "device": system.device}
     sensor_z = system.vertices[-1]
     distance = abs(z - float(sensor_z))
-    paraxial = min(first_order.exit_pupil(w)[1] for w in wavelengths) / 2.0
     angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
     origin = torch.zeros((), **options)
     # The stop's paraxial image may be far larger than what other apertures let through.

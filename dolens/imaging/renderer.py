@@ -1,7 +1,7 @@
 """What every renderer offers."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from torch import Tensor
 
@@ -48,6 +48,12 @@ class Unprepared:
 
     def prepare(self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None) -> None:
         """Nothing depends on the lens."""
+
+    def with_pupil(
+        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
+    ) -> Self:
+        """The renderer with what it may keep of the lens's pupil; here nothing."""
+        return self
 
     def numbers(self) -> dict[str, float]:
         """Nothing that the settings do not say."""

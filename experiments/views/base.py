@@ -9,10 +9,10 @@ from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.lens import Lens
 
-# Streams of random numbers that must not meet: an offset of the seed for each stage, and one for
-# the sensor's noise.
+# Streams of random numbers that must not meet: an offset of the seed for each stage, and others for
+# the sensor's noise and for what is drawn into scenes.
 _STAGES = {"train": 0, "val": 1, "test": 2}
-_STRIDE, NOISE_OFFSET = 1 << 40, 1 << 39
+_STRIDE, NOISE_OFFSET, SCENE_OFFSET = 1 << 40, 1 << 39, 1 << 38
 
 
 class Views(NamedTuple):

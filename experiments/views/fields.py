@@ -10,9 +10,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
-from dolens.imaging.distortion import chief_ray_map, distortion
+from dolens.imaging.distortion import chief_ray_maps
 from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
+from dolens.imaging.pupil import ExitPupil, paraxial_exit_pupil, sampled_exit_pupil
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.readout import Readout
 from dolens.imaging.scene import PlanarScene, texture_origin
@@ -172,15 +172,11 @@ class FieldViews:
         backend = choose_backend(system, lens.backend)
         wavelengths = (lens.primary_wavelength,)
         scene = PlanarScene(self.scene.depths, wavelengths)
-        pupil = axial_exit_pupil(system, wavelengths, backend)
-        looks = distortion(system, scene, self.whole, pupil, backend)
+        pupil = paraxial_exit_pupil(system, wavelengths)
+        looks = chief_ray_maps(system, scene, self.whole, windows, pupil, backend)
         truth, centres = [], []
-        for texture, window in zip(textures, windows, strict=True):
-            if looks is None:
-                seen = chief_ray_map(system, scene, window, pupil, backend)
-            else:
-                seen = looks.seen_by(window)
-            rows, columns = (c[0, 0] for c in seen)
+        for texture, look in zip(textures, looks, strict=True):
+            rows, columns = (c[0, 0] for c in look)
             centre = (float(rows.mean().round()), float(columns.mean().round()))
             row, column = texture_origin(texture.shape[-2:], centre)
             truth.append(

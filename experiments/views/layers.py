@@ -10,11 +10,8 @@ from dolens.errors import InputError
 from dolens.imaging.layers import LayeredScene
 from dolens.optics.lens import Lens
 from experiments.data.occluders import with_occluders
-from experiments.views.base import Views, seed_of
+from experiments.views.base import SCENE_OFFSET, Views, seed_of
 from experiments.views.depths import DepthViews
-
-# A stream of random numbers beside those of rendering and noise.
-_OFFSET = 1 << 38
 
 
 class LayerViews(DepthViews):
@@ -43,7 +40,7 @@ class LayerViews(DepthViews):
     ) -> Views:
         """One image of each texture."""
         if textures.shape[1] == len(self.scene.wavelengths):
-            seed = seed_of(self.seed, stage, index) + _OFFSET
+            seed = seed_of(self.seed, stage, index) + SCENE_OFFSET
             generator = torch.Generator().manual_seed(seed)
             near, far = self.scene.depths[0], self.scene.depths[-1]
             textures = with_occluders(textures, near, far, self.occluders, generator)

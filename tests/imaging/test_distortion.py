@@ -5,7 +5,7 @@ import torch
 import yaml
 
 from dolens.imaging import distortion as module
-from dolens.imaging.distortion import chief_ray_map, distortion
+from dolens.imaging.distortion import chief_ray_maps, distortion
 from dolens.imaging.plane_points import chief_ray_points
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.pupil import axial_exit_pupil
@@ -41,7 +41,7 @@ def test_polynomials_are_the_chief_rays_to_a_thousandth_of_a_pixel(root, name):
     system, sensor = lens_of(root, name).system(), SENSORS[name]
     scene = PlanarScene((5000.0, 9000.0), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    found = chief_ray_map(system, scene, sensor, pupil, "reference")
+    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
     for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
         assert float((one - other).abs().max()) < 1e-3
 
@@ -62,7 +62,7 @@ def test_where_polynomials_are_not_enough_every_pixel_has_its_ray(root, monkeypa
     scene = PlanarScene((5000.0,), LINES)
     pupil = axial_exit_pupil(system, LINES)
     assert distortion(system, scene, sensor, pupil, "reference") is None
-    found = chief_ray_map(system, scene, sensor, pupil, "reference")
+    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
     for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
         assert torch.equal(one, other)
 

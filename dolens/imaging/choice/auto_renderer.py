@@ -112,9 +112,7 @@ class AutoRenderer:
         error = self._measured(choice.renderer, choice.dtype, single, double, texture, whole, judge)
         if error <= max(self.tolerance, choice.error):
             seconds = choice.seconds + time.perf_counter() - started
-            renderer = choice.renderer
-            if isinstance(renderer, PsfRenderer):
-                renderer = renderer.with_pupil(lens, scene, values)
+            renderer = choice.renderer.with_pupil(lens, scene, values)
             self.choice = replace(choice, renderer=renderer, error=error, seconds=seconds)
             logger.info("renderer auto: the plan still serves, error %.2g grey levels", error)
             return
@@ -214,8 +212,7 @@ class AutoRenderer:
             if not scene.separate_planes:
                 because = "not measured: the probe's planes make images of their own"
                 findings.append(Finding("occlusion", "blurred planes", 0.0, because))
-        if isinstance(renderer, PsfRenderer):
-            renderer = renderer.with_pupil(lens, scene, values)
+        renderer = renderer.with_pupil(lens, scene, values)
         self._other = (single if dtype == torch.float32 else double).requires_grad_(False)
         self.choice = Choice(
             renderer,

@@ -2,6 +2,7 @@
 
 import math
 
+from dolens.imaging.illumination import RADII, RAYS
 from dolens.imaging.patch_convolution import fast_length
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.scene import PlanarScene
@@ -14,7 +15,6 @@ from dolens.imaging.sensor import Sensor
 _SURFACE, _TEXEL, _TRANSFORM, _LOOKUP, _SPLAT = 5.5, 7.0, 0.6, 35.0, 30.0
 _MAPPED, _RENDER, _NODE = 12.0, 4e6, 1e6
 _TRANSFORMS = 6  # of texture, kernel and image, forward and back
-_MAP_RAYS = 65 * 2048  # of each colour, in a symmetric lens
 
 
 def rays_cost(
@@ -44,5 +44,5 @@ def psf_cost(renderer: PsfRenderer, scene: PlanarScene, surfaces: int, images: i
     if renderer.registration == "chief_rays":
         cost += pixels * 4 * depths * images * _LOOKUP
     if renderer.illumination == "map":
-        cost += _MAP_RAYS * channels * surfaces * _MAPPED + pixels * _LOOKUP
+        cost += RADII * RAYS * channels * surfaces * _MAPPED + pixels * _LOOKUP
     return cost
