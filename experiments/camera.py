@@ -191,7 +191,10 @@ class CameraModule(lightning.LightningModule):
         truth = taken.truth.to(restored.dtype)
         terms = self.loss_over_views(restored, truth)
         penalty, operands = self.penalty(values)
-        total = terms["total"] + penalty.to(restored.dtype)
+        total = terms["total"]
+        if self.lens_steps is None:
+            # Steps of least squares know the operands themselves.
+            total = total + penalty.to(restored.dtype)
         with torch.no_grad():
             psnr = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1)).mean()
         self.log("train/loss", terms["total"], prog_bar=True)
@@ -220,8 +223,11 @@ class CameraModule(lightning.LightningModule):
         if self.lens_steps is not None:
             self.lens_steps.gather(self.variables)
             if self.lens_steps.is_due(self.global_step + 1):
-                pitch = self.views.sensor.pixel_pitch
-                found = self.lens_steps.step(self.lens, self.variables, self._spots, pitch)
+                pitch, group = self.views.sensor.pixel_pitch, optimizer.param_groups[0]
+                share = group["lr"] / self.learning_rates["network"]
+                found = self.lens_steps.step(
+                    self.lens, self.variables, self._spots, pitch, self.operands, share
+                )
                 self.log_dict({f"lens_step/{name}": value for name, value in found.items()})
         self.variables.project()
         self.variables.write_to(self.lens)

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -11,6 +11,8 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.lens import Lens
+from dolens.optimize.operand_model import OperandModel
+from dolens.optimize.operands import Operand
 from dolens.optimize.trusted_step import ray_moves, trusted_step
 from dolens.optimize.variables import DesignVariables
 
@@ -55,10 +57,10 @@ class CameraOptimizer:
 class LensLeastSquares:
     """Moves a lens once for some steps of the network, by the gradient they have gathered.
 
-    The step minimises the loss's linear model while rays move no farther than `reach`; see
-    `trusted_step`.  Batches are small and differ, so that a trial on one of them would tell little;
-    the next gradient, of other batches, tells how the last step was: where the loss still falls
-    along it, rays may move farther, and where it rises less far.
+    The step minimises the loss's linear model and the operands while rays move no farther than
+    `reach`; see `trusted_step`.  Batches are small and differ, so that a trial on one of them would
+    tell little; the next gradient, of other batches, tells how the last step was: where the loss
+    still falls along it, rays may move farther, and where it rises less far.
 
     Args:
         every: steps of the network between two of the lens.
@@ -109,7 +111,13 @@ class LensLeastSquares:
 
     @torch.no_grad()
     def step(
-        self, lens: Lens, variables: DesignVariables, spots: list[SpotRays], pitch: float
+        self,
+        lens: Lens,
+        variables: DesignVariables,
+        spots: list[SpotRays],
+        pitch: float,
+        operands: Sequence[Operand] = (),
+        share: float = 1.0,
     ) -> dict[str, float]:
         """One step, by the gradient that was gathered; it is used up.
 
@@ -118,12 +126,14 @@ class LensLeastSquares:
             variables: u.
             spots: rays of the lens.
             pitch: of the pixels, mm.
+            operands: what the lens must be besides; the gradient is without them.
+            share: of the reach, as a schedule has it.
 
         Returns:
             Numbers to log: `reach` (pixels), `slope_kept` by the last step, `moved` (RMS, pixels).
         """
         gathered, self._gathered = self._gathered, None
-        if gathered is None:
+        if gathered is None or not share > 0.0:
             return {}
         gradient = gathered.double().cpu()
         if not bool(torch.isfinite(gradient).all()):
@@ -140,15 +150,20 @@ class LensLeastSquares:
         scaled, point = variables.scaled, variables.scaled.detach().double().cpu()
         moves = ray_moves(lens, variables, spots, self.damping)
         lower, upper = (b.double().cpu() - point for b in (variables.lower, variables.upper))
-        found = trusted_step(
-            gradient, moves, self.reach * pitch, lower.clamp(max=0.0), upper.clamp(min=0.0)
+        step = trusted_step(
+            gradient,
+            moves,
+            self.reach * share * pitch,
+            lower.clamp(max=0.0),
+            upper.clamp(min=0.0),
+            OperandModel.of(lens, variables, operands, None) if operands else None,
         )
-        scaled.copy_(point + found.step)
+        scaled.copy_(point + step)
         variables.project()
         variables.write_to(lens)
         self.taken += 1
-        self._last, self._slope = found.step, float(gradient @ found.step)
-        return numbers | {"reach": self.reach, "moved": float((moves @ found.step).norm()) / pitch}
+        self._last, self._slope = step, float(gradient @ step)
+        return numbers | {"reach": self.reach, "moved": float((moves @ step).norm()) / pitch}
 
     def numbers(self) -> dict[str, float]:
         """How many steps were taken, and how far rays may move now (pixels)."""

@@ -14,6 +14,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.image_quality import ImageQuality, QualityValues, without_edges
 from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.operand_model import OperandModel
 from dolens.optimize.operands import Operand, UnreachableField, View
 from dolens.optimize.variables import DesignVariables
 
@@ -156,14 +157,10 @@ class MeritValue:
             models.append(model.of_variables(matrix))
             self._focus = None if of_lens is None else of_lens @ matrix
         if self.operands:
-            jacobian = self.operand_derivatives()
-            deviations, weight = torch.tensor(
-                [(item.deviation, item.weight) for item in self.operands], dtype=torch.float64
-            ).unbind(1)
-            # A limit that is kept has no slope.
-            targets = torch.tensor([operand.target is not None for operand, _, _ in self._found])
-            matters = weight * ((deviations != 0.0) | targets)
-            models.append(LinearModel.of_rows(weight * deviations, matters[:, None] * jacobian))
+            owners, _, values = zip(*self._found, strict=True)
+            found = torch.stack([value.detach().reshape(()).double().cpu() for value in values])
+            model = OperandModel(owners, found, self.operand_derivatives())
+            models.append(model.near(found.new_zeros(model.derivatives.shape[1])))
         return LinearModel.join(models)
 
     def operand_derivatives(self) -> Tensor:

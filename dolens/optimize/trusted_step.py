@@ -9,10 +9,14 @@ least squares minimises
 so that the rays' residuals need not be known one by one: the sum that counts is what back-
 propagation through the whole camera gives.  What the rays add is the measure of a step: not how far
 variables move but how far rays do, whatever the variables' units and however they work together.
-Here κ follows from how far rays may move at once, and that from how well the loss was foretold.
+κ, the damping, is what lets rays move as far as they may.
+
+Operands are known better than by their gradient: their residuals and rows are in the sum as they
+are.  A steep limit stops the step that meets it, where its gradient would throw the next one back.
 """
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -22,17 +26,15 @@ from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.optimize.bounded_step import bounded_step
 from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.operand_model import OperandModel
 from dolens.optimize.variables import DesignVariables
 
 # Of the strongest variable's effect: variables are damped as if they moved rays by no less.
 _LEAST_COLUMN = 1e-6
-
-
-class TrustedStep(NamedTuple):
-    """A step δ (P,) of the variables u, and by how much it should lower the loss."""
-
-    step: Tensor
-    predicted: float
+# The damping is sought between what is certainly enough and this part of it, ...
+_LEAST_DAMPING = 1e-12
+# ... until rays move as far as they may to this part, in no more turns than these.
+_CLOSE, _TURNS = 1e-6, 80
 
 
 def ray_moves(
@@ -69,28 +71,111 @@ def ray_moves(
 
 
 def trusted_step(
-    gradient: Tensor, moves: Tensor, reach: float, lower: Tensor, upper: Tensor
-) -> TrustedStep:
-    """The step that lowers a loss most while rays move no farther than `reach` (RMS, mm).
+    gradient: Tensor,
+    moves: Tensor,
+    reach: float,
+    lower: Tensor,
+    upper: Tensor,
+    operands: OperandModel | None = None,
+) -> Tensor:
+    """The step δ (P,) within bounds that lowers g·δ + Σ (operands' residuals)² most while |Rδ|,
+    how far rays move, is no more than `reach`.
 
-    Without bounds it is δ = -reach · M⁻¹g/√(gᵀM⁻¹g) with M = RᵀR; within bounds, what minimises the
-    same model there.
+    Without operands and bounds it is δ = -reach · M⁻¹g/√(gᵀM⁻¹g) with M = RᵀR.
 
     Args:
-        gradient: ∂L/∂u, (P,).
+        gradient: g = ∂L/∂u, (P,), without the operands' share.
         moves: R of `ray_moves`.
-        reach: mm, above 0.
+        reach: RMS, mm, above 0.
         lower: (P,), at most zero: bounds of δ.
         upper: (P,), at least zero.
+        operands: where δ = 0; None for none.
     """
     gradient = gradient.detach().double().cpu()
-    # R⁻ᵀg, of which the rows' residuals are a multiple.
-    slope = torch.linalg.solve_triangular(moves.T, gradient[:, None], upper=False)[:, 0]
-    norm = float(slope.norm())
-    if not norm > 0.0:
-        return TrustedStep(torch.zeros_like(gradient), 0.0)
-    root = (0.5 * norm / reach) ** 0.5
-    model = LinearModel(0.0, root * moves, 0.5 * slope / root)
-    negligible = torch.full_like(gradient, 1e-12) * model.column_norms.square()
-    step = bounded_step(model, negligible, lower, upper).step
-    return TrustedStep(step, model.reduction(step))
+    still = torch.zeros_like(gradient)
+    slope = gradient
+    if operands is not None:
+        model = operands.near(still)
+        slope = gradient + 2.0 * model.root.T @ model.right
+    # What is minimised is convex, so that |R⁻ᵀ slope|·|Rδ| ≥ -slope·δ ≥ κ|Rδ|².
+    enough = float(_in_rays(slope, moves).norm()) / reach
+    if not enough > 0.0:
+        return still
+
+    def at(damping: float) -> tuple[Tensor, float]:
+        step = _damped(gradient, moves, damping, lower, upper, operands)
+        return step, float((moves @ step).norm()) / reach
+
+    low, high = math.log(_LEAST_DAMPING * enough), math.log(enough)
+    step, moved = at(math.exp(low))
+    if moved <= 1.0:
+        return step
+    step, least = at(enough)
+    # Rays move less the more they are damped, in inverse proportion where nothing holds them back.
+    far, near = math.log(moved), math.log(max(least, 1e-300))
+    for turn in range(_TURNS):
+        if abs(near) < _CLOSE:
+            break
+        middle = low + (high - low) * far / (far - near)
+        if turn % 3 == 2 or not low < middle < high:
+            middle = 0.5 * (low + high)
+        found, moved = at(math.exp(middle))
+        if moved > 1.0:
+            low, far = middle, math.log(moved)
+        else:
+            step, high, near = found, middle, math.log(max(moved, 1e-300))
+    return step
+
+
+def _in_rays(gradient: Tensor, moves: Tensor) -> Tensor:
+    """R⁻ᵀg, of which the rays' residuals are a multiple."""
+    return torch.linalg.solve_triangular(moves.T, gradient[:, None], upper=False)[:, 0]
+
+
+def _damped(
+    gradient: Tensor,
+    moves: Tensor,
+    damping: float,
+    lower: Tensor,
+    upper: Tensor,
+    operands: OperandModel | None,
+) -> Tensor:
+    """The step that minimises g·δ + κ|Rδ|² + Σ (operands' residuals)² within bounds."""
+    root = damping**0.5
+    rays = LinearModel(0.0, root * moves, 0.5 / root * _in_rays(gradient, moves))
+    negligible = 1e-12 * rays.column_norms.square()
+    step = torch.zeros_like(gradient)
+    if operands is None:
+        return bounded_step(rays, negligible, lower, upper).step
+
+    # Which limits are broken follows from the step: quadratic pieces, each solved exactly, until
+    # the solution of one lies in it.  On the way there the sum is made least along each line.
+    rows = operands.near(step)
+    for _ in range(_TURNS):
+        model = LinearModel.join([rays, rows])
+        towards = bounded_step(model, negligible, lower, upper).step - step
+
+        def slope(share: float, step: Tensor = step, towards: Tensor = towards) -> float:
+            there = step + share * towards
+            rays = 2.0 * damping * moves.T @ (moves @ there)
+            return float((gradient + rays + operands.gradient(there)) @ towards)
+
+        share = 1.0 if slope(1.0) <= 0.0 else _root(slope)
+        step = step + share * towards
+        piece, rows = rows, operands.near(step)
+        same = torch.equal(piece.root, rows.root) and torch.equal(piece.right, rows.right)
+        if same or not bool((share * towards).abs().amax() > _CLOSE**2 * step.abs().amax()):
+            break
+    return step
+
+
+def _root(slope: Callable[[float], float]) -> float:
+    """Where a function that rises from below zero to above it on [0, 1] vanishes."""
+    low, high = 0.0, 1.0
+    while high - low > 1e-9 * high and high > 1e-18:
+        middle = 0.5 * (low + high)
+        if slope(middle) > 0.0:
+            high = middle
+        else:
+            low = middle
+    return low

@@ -1,0 +1,82 @@
+"""Operands near a point, as residuals that are linear in the variables between their limits."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.optics.lens import Lens
+from dolens.optics.row_jacobian import jacobian_of
+from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.operands import Operand, View
+from dolens.optimize.variables import DesignVariables
+
+
+@dataclass(frozen=True)
+class OperandModel:
+    """Values v + V·δ of operands at a step δ (P,).  Double precision, CPU.
+
+    Attributes:
+        operands: of each value its own; one that has several values is there several times.
+        values: v (n,), each in its own unit.
+        derivatives: V (n, P), by the variables.
+    """
+
+    operands: tuple[Operand, ...]
+    values: Tensor
+    derivatives: Tensor
+
+    @staticmethod
+    def of(
+        lens: Lens,
+        variables: DesignVariables,
+        operands: Sequence[Operand],
+        object_distance: float | None,
+    ) -> "OperandModel":
+        """At the variables' values.
+
+        Args:
+            lens: that they belong to.
+            variables: u.
+            operands: none is allowed.
+            object_distance: mm in front of the first vertex; None for infinity.
+
+        Raises:
+            UnreachableField: a chief ray does not reach the stop.
+        """
+        if not operands:
+            empty = torch.zeros(0, dtype=torch.float64)
+            return OperandModel((), empty, empty.new_zeros(0, variables.scaled.numel()))
+        with torch.enable_grad():
+            view = View(lens.system(variables()), lens.primary_wavelength, object_distance)
+            found = [(entry, v) for entry in operands for v in entry.values(view).values()]
+            values = torch.stack([value.reshape(()) for _, value in found])
+            derivatives = jacobian_of(values, [variables.scaled])
+        owners = tuple(entry for entry, _ in found)
+        return OperandModel(owners, values.detach().double().cpu(), derivatives.double().cpu())
+
+    def gradient(self, step: Tensor) -> Tensor:
+        """Of Σ (weight·deviation)² after a step, by the variables, (P,)."""
+        weight, deviations = self._at(step)
+        return 2.0 * self.derivatives.T @ (weight.square() * deviations)
+
+    def near(self, step: Tensor) -> LinearModel:
+        """Residuals of the targets, and of the limits that are broken after a step.
+
+        A limit that is kept there has no slope.  The model is of steps from v, not from there.
+        """
+        weight, deviations = self._at(step)
+        targets = torch.tensor([entry.target is not None for entry in self.operands]).bool()
+        weight = weight * ((deviations != 0.0) | targets)
+        # What a value is compared with: the target, or the limit that is next to it.
+        wanted = self.values + self.derivatives @ step - deviations
+        return LinearModel.of_rows(
+            weight * (self.values - wanted), weight[:, None] * self.derivatives
+        )
+
+    def _at(self, step: Tensor) -> tuple[Tensor, Tensor]:
+        after = self.values + self.derivatives @ step
+        found = [(o.weight, o.deviation(v)) for o, v in zip(self.operands, after, strict=True)]
+        pairs = torch.tensor(found, dtype=torch.float64).reshape(-1, 2)
+        return pairs[:, 0], pairs[:, 1]
