@@ -57,7 +57,8 @@ def random_crop(
         flip_vertical: mirror top and bottom with probability 1/2.
 
     Returns:
-        (3, height, width) float32, linear light in [0, 1].
+        (3, height, width) float32, linear light in [0, 1]; of a photograph with depth
+        (4, height, width), mm last, that of the nearest pixel.
 
     Raises:
         InputError: a size below 1, a seed or index below 0, a scale range out of order.
@@ -192,13 +193,17 @@ def _cut(
     size: tuple[int, int],
 ) -> Tensor:
     (top, left), (height, width) = corner, region
-    linear = linear_light(photo.encoded[:, top : top + height, left : left + width])
-    if region == tuple(size):
-        return linear
-    resized = interpolate(
-        linear[None], size=tuple(size), mode="bicubic", align_corners=False, antialias=True
-    )
-    return resized[0].clamp_(0.0, 1.0)
+    crop = linear_light(photo.encoded[:, top : top + height, left : left + width])
+    depth = None if photo.depth is None else photo.depth[top : top + height, left : left + width]
+    if region != tuple(size):
+        resized = interpolate(
+            crop[None], size=tuple(size), mode="bicubic", align_corners=False, antialias=True
+        )
+        crop = resized[0].clamp_(0.0, 1.0)
+        if depth is not None:
+            # Between two depths there is no surface.
+            depth = interpolate(depth[None, None], size=tuple(size), mode="nearest-exact")[0, 0]
+    return crop if depth is None else torch.cat((crop, depth[None]))
 
 
 def _grid(photo: Photograph, region: tuple[int, int], count: int) -> tuple[int, int]:

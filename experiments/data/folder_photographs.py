@@ -2,7 +2,7 @@
 
 import logging
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -25,17 +25,25 @@ class FolderPhotographs(Sequence[Photograph]):
         paths: the files, in the order of their numbers.
         cache_bytes: decoded pixels kept in memory, in each process; the latest photograph is
             kept whatever its size.
+        read: reads a file; raises `InputError` where it cannot.
 
     Raises:
         InputError: there are no paths.
     """
 
-    def __init__(self, folder: Path, paths: Sequence[Path], cache_bytes: int = 2**28) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        paths: Sequence[Path],
+        cache_bytes: int = 2**28,
+        read: Callable[[Path], Photograph] = read_photograph,
+    ) -> None:
         if len(paths) == 0:
             raise InputError(f"{folder}: no photographs; allowed: at least one")
         self.folder = folder
         self.paths = list(paths)
         self.cache_bytes = cache_bytes
+        self._decode = read
         self._cache: OrderedDict[int, Photograph] = OrderedDict()
         self._cached_bytes = 0
         self._unreadable = torch.zeros(len(self.paths), dtype=torch.bool).share_memory_()
@@ -74,7 +82,7 @@ class FolderPhotographs(Sequence[Photograph]):
         if self._unreadable[number]:
             return None
         try:
-            photograph = read_photograph(self.paths[number])
+            photograph = self._decode(self.paths[number])
         except InputError as error:
             self._unreadable[number] = True
             _log.warning(
@@ -89,7 +97,7 @@ class FolderPhotographs(Sequence[Photograph]):
 
     def _keep(self, number: int, photograph: Photograph) -> None:
         self._cache[number] = photograph
-        self._cached_bytes += photograph.encoded.numel()
+        self._cached_bytes += photograph.nbytes
         while self._cached_bytes > self.cache_bytes and len(self._cache) > 1:
             _, dropped = self._cache.popitem(last=False)
-            self._cached_bytes -= dropped.encoded.numel()
+            self._cached_bytes -= dropped.nbytes

@@ -145,7 +145,7 @@ class ImageFolderDataModule(CropDataModule):
 
     def _list(self, folder: Path) -> list[Path]:
         """The files under a folder, without those whose header Pillow refuses."""
-        paths = list_photographs(folder, self.extensions)
+        paths = self._listed_files(folder)
         if not self.verify:
             return paths
         readable: list[Path] = []
@@ -165,6 +165,10 @@ class ImageFolderDataModule(CropDataModule):
         if skipped:
             _log.warning("skipped %d unreadable files of %d in %s", skipped, len(paths), folder)
         return readable
+
+    def _listed_files(self, folder: Path) -> list[Path]:
+        """The photographs' files under a folder; none is opened."""
+        return list_photographs(folder, self.extensions)
 
     def _divided(self, paths: list[Path], bounds: list[float]) -> list[list[Path]]:
         """Parts of the files with hashes up to each bound, and the rest; none is empty."""

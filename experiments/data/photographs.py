@@ -49,13 +49,15 @@ class Photograph:
     Attributes:
         name: how messages name it, as a rule its path.
         encoded: (3, height, width) uint8, sRGB-encoded.
+        depth: (height, width) float32, mm, or None where nothing is known of it.
 
     Raises:
-        InputError: `encoded` has another shape or dtype, or no pixels.
+        InputError: `encoded` has another shape or dtype, or no pixels; or the depth another size.
     """
 
     name: str
     encoded: Tensor
+    depth: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.encoded.shape)
@@ -69,6 +71,16 @@ class Photograph:
                 f"photograph {self.name}: {self.encoded.dtype} of shape {shape}; "
                 "allowed: torch.uint8 of shape (3, height, width), not empty"
             )
+        if self.depth is not None and self.depth.shape != self.encoded.shape[1:]:
+            raise InputError(
+                f"photograph {self.name}: {self.height}×{self.width} pixels and a depth map of "
+                f"{'×'.join(map(str, self.depth.shape))}; allowed: the same size"
+            )
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes in memory."""
+        return self.encoded.nbytes + (0 if self.depth is None else self.depth.nbytes)
 
     @property
     def height(self) -> int:

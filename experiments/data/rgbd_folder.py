@@ -1,0 +1,69 @@
+"""Photographs with depth maps, from any folder of both."""
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dolens.errors import InputError
+from experiments.data.depth_maps import ENDINGS, depth_map_of, is_depth_map, read_depth_map
+from experiments.data.folder_photographs import FolderPhotographs
+from experiments.data.image_folder import ImageFolderDataModule
+from experiments.data.photographs import Photograph, read_photograph
+
+
+class RgbdFolderDataModule(ImageFolderDataModule):
+    """Crops of photographs with their depth as a fourth channel, mm; for `scene=layers`.
+
+    Beside each photograph lies its depth map: `hall.jpg` and `hall_depth.png`.
+
+    Args:
+        root: the folder, searched recursively; split as `ImageFolderDataModule` says.
+        depth_suffix: what a depth map's name has after the photograph's.
+        depth_unit: mm per unit of the maps' numbers: 1 for millimetres (Kinect), 1000 for metres,
+            0.2 for the TUM benchmark's 5000 a metre.
+        **settings: those of `ImageFolderDataModule`.
+
+    Raises:
+        InputError: an argument is out of range; at set-up, a photograph has no depth map.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        depth_suffix: str = "_depth",
+        depth_unit: float = 1.0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(root, **settings)
+        if not depth_suffix:
+            raise InputError("data.depth_suffix: empty; allowed: such as _depth")
+        if not 0.0 < depth_unit < math.inf:
+            raise InputError(f"data.depth_unit: {depth_unit}; allowed: mm per unit, above 0")
+        self.depth_suffix, self.depth_unit = depth_suffix, float(depth_unit)
+
+    def load_split(self, split: str) -> FolderPhotographs:
+        """The photographs of a split with their depths, none of them decoded yet."""
+        read = partial(_read, suffix=self.depth_suffix, unit=self.depth_unit)
+        return FolderPhotographs(self.root, self.paths[split], self.cache_bytes, read)
+
+    def _listed_files(self, folder: Path) -> list[Path]:
+        """Photographs alone, each of which must have a depth map."""
+        files = super()._listed_files(folder)
+        photographs = [path for path in files if not is_depth_map(path, self.depth_suffix)]
+        missing = [p for p in photographs if depth_map_of(p, self.depth_suffix) is None]
+        if missing:
+            first = missing[0]
+            raise InputError(
+                f"{first}: no depth map beside it (nor beside {len(missing) - 1} others); allowed: "
+                f"{first.stem}{self.depth_suffix} with the ending {', '.join(ENDINGS)}"
+            )
+        return photographs
+
+
+def _read(path: Path, suffix: str, unit: float) -> Photograph:
+    """A photograph and its depth map."""
+    photograph, beside = read_photograph(path), depth_map_of(path, suffix)
+    if beside is None:
+        raise InputError(f"{path}: its depth map is no longer there")
+    return Photograph(photograph.name, photograph.encoded, read_depth_map(beside, unit))
