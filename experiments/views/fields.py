@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.choice.auto_renderer import AutoRenderer
+from dolens.imaging.choice.auto_windows import AutoWindows
 from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.distortion import chief_ray_maps
 from dolens.imaging.psf_renderer import PsfRenderer
@@ -22,11 +24,9 @@ from dolens.imaging.texture import bilinear
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from experiments.views.base import NOISE_OFFSET, Views, seed_of
+from experiments.views.field_windows import FieldWindows
 
-# The golden angle, by which neighbouring textures' windows lie apart in azimuth.
-_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 EVERYWHERE = "field"
-WINDOWS = ("circle", "radius", "area")
 
 
 class FieldViews:
@@ -43,7 +43,8 @@ class FieldViews:
     Args:
         scene: one depth, and wavelengths.
         sensor: the whole of it.
-        renderer: makes the training images; its sensor says how large windows are.
+        renderer: makes the training images; its sensor says how large windows are.  An
+            `AutoRenderer` is asked for what the zones need.
         readout: what the sensor makes of them.
         evaluation_renderer: makes the validation and test images; None: the training renderer.
         zones: fractions of the half diagonal, by name.
@@ -53,14 +54,15 @@ class FieldViews:
         seed: of windows, rendering and noise.
 
     Raises:
-        InputError: several depths, a window larger than the sensor, or other pixels.
+        InputError: several depths, a window larger than the sensor, or other pixels; nothing but
+            an `AutoRenderer` to evaluate by.
     """
 
     def __init__(
         self,
         scene: PlanarScene,
         sensor: Sensor,
-        renderer: PsfRenderer | RayRenderer,
+        renderer: PsfRenderer | RayRenderer | AutoRenderer,
         readout: Readout,
         evaluation_renderer: PsfRenderer | RayRenderer | None = None,
         zones: Mapping[str, float] | None = None,
@@ -74,13 +76,8 @@ class FieldViews:
         self.evaluation_renderer = evaluation_renderer or renderer
         self.zones = dict(zones or {"axis": 0.0, "0.5": 0.5, "0.7": 0.7, "full": 1.0})
         self.seed = seed
-        if training_windows not in WINDOWS:
-            raise InputError(
-                f"views.training_windows: '{training_windows}' is unknown; allowed: "
-                f"{', '.join(WINDOWS)}"
-            )
-        self.training_windows = training_windows
         self._pupil: ExitPupil | None = None
+        self._auto: AutoWindows | None = None
         window = renderer.sensor
         if len(scene.depths) != 1:
             raise InputError(f"scene.depths: {len(scene.depths)} of them; allowed: one")
@@ -97,6 +94,12 @@ class FieldViews:
         for name, share in self.zones.items():
             if not 0.0 <= share <= 1.0:
                 raise InputError(f"views.zones.{name}: {share}; allowed: 0 (axis) to 1 (corner)")
+        self.windows = FieldWindows(sensor, window.height, window.width, training_windows)
+        if isinstance(self.evaluation_renderer, AutoRenderer):
+            raise InputError("evaluation_renderer: windows are evaluated by rays or psf, not auto")
+        if isinstance(renderer, AutoRenderer):
+            windows = {name: self.windows.zone(share, 0) for name, share in self.zones.items()}
+            self._auto = AutoWindows(renderer, sensor, windows)
 
     @property
     def sensor(self) -> Sensor:
@@ -121,8 +124,10 @@ class FieldViews:
         self.scene.check(lens.system())
 
     def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
-        """Find the pupil that training windows share until the next time."""
-        if isinstance(self.renderer, PsfRenderer):
+        """Find what training windows share until the next time: the renderer, and the pupil."""
+        if self._auto is not None:
+            self._auto.prepare(lens, self.scene, values)
+        elif isinstance(self.renderer, PsfRenderer):
             whole = replace(self.renderer, sensor=self.whole)
             self._pupil = whole.with_pupil(lens, self.scene, values).pupil
 
@@ -130,15 +135,14 @@ class FieldViews:
         self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
     ) -> Views:
         """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
-        renderer = self.renderer if stage == "train" else self.evaluation_renderer
         seed, count = seed_of(self.seed, stage, index), len(textures)
-        rows = [self._windows(stage, index * count + i) for i in range(count)]
+        rows = [self._shown(stage, index * count + i) for i in range(count)]
         windows = [window for row in rows for window in row]
         repeated = textures.repeat_interleave(len(rows[0]), dim=0)
         truth, centres = self._looked_at(lens, values, repeated, windows)
-        renderer = replace(renderer, sensor=self.whole)
-        if stage == "train" and self._pupil is not None:
-            renderer = replace(renderer, pupil=self._pupil)
+        renderer = replace(self.evaluation_renderer, sensor=self.whole)
+        if stage == "train":
+            renderer = self._training_renderer(lens, values)
         image = renderer.render_windows(
             lens,
             self.scene,
@@ -149,12 +153,31 @@ class FieldViews:
             values,
             lens.primary_wavelength,
         )
-        field = torch.stack([self._field(window, textures) for window in windows])
+        field = torch.stack([self.windows.coordinates(window, textures) for window in windows])
         truth, image, field = (
             t.unflatten(0, (count, len(rows[0]))) for t in (truth, image[:, 0], field)
         )
         generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
         return Views(truth, self.readout.develop(self.readout(image, generator)), field)
+
+    def _shown(self, stage: str, number: int) -> list[Sensor]:
+        """The windows of texture `number` of a stage."""
+        generator = torch.Generator().manual_seed(seed_of(self.seed, stage, number))
+        if stage == "train":
+            return [self.windows.training(generator)]
+        zones = [self.windows.zone(share, number) for share in self.zones.values()]
+        return [*zones, self.windows.anywhere(generator)]
+
+    def _training_renderer(
+        self, lens: Lens, values: Mapping[str, Tensor]
+    ) -> PsfRenderer | RayRenderer:
+        """Of the whole sensor."""
+        if self._auto is None:
+            renderer = replace(self.renderer, sensor=self.whole)
+            return renderer if self._pupil is None else replace(renderer, pupil=self._pupil)
+        if self._auto.choice is None:
+            self._auto.prepare(lens, self.scene, values)
+        return self._auto.choice.renderer
 
     @torch.no_grad()
     def _looked_at(
@@ -185,86 +208,13 @@ class FieldViews:
             centres.append(centre)
         return linear_to_srgb(torch.stack(truth)), centres
 
-    def _field(self, window: Sensor, like: Tensor) -> Tensor:
-        """(2, H, W): x and y of the pixels over half the sensor's diagonal."""
-        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
-        return torch.stack(window.positions(*self._pixels(window, like.device))).to(like) / half
-
-    def _pixels(self, window: Sensor, device: torch.device) -> Sequence[Tensor]:
-        options = {"dtype": torch.float64, "device": device}
-        return torch.meshgrid(
-            torch.arange(window.height, **options),
-            torch.arange(window.width, **options),
-            indexing="ij",
-        )
-
-    # ---------------------------------------------------------------- where
-
-    def _windows(self, stage: str, number: int) -> list[Sensor]:
-        """The windows of texture `number` of a stage."""
-        generator = torch.Generator().manual_seed(seed_of(self.seed, stage, number))
-        if stage == "train" and self.training_windows != "area":
-            return [self._in_circle(generator)]
-        top, left = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
-        anywhere = self._window(top, left)
-        if stage == "train":
-            return [anywhere]
-        return [*(self._zone(share, number) for share in self.zones.values()), anywhere]
-
-    def _in_circle(self, generator: torch.Generator) -> Sensor:
-        """A window whose distance from the middle is drawn, and then its direction."""
-        free = self.whole.height - self.sensor.height, self.whole.width - self.sensor.width
-        drawn = torch.rand(1, generator=generator, dtype=torch.float64)
-        share = float(drawn) if self.training_windows == "radius" else math.sqrt(float(drawn))
-        radius = 0.5 * math.hypot(*free) * share
-        while True:
-            drawn = torch.rand(1, generator=generator, dtype=torch.float64)
-            angle = 2.0 * math.pi * float(drawn)
-            down, across = radius * math.sin(angle), radius * math.cos(angle)
-            if abs(down) <= 0.5 * free[0] and abs(across) <= 0.5 * free[1]:
-                break
-        places = (
-            0.5 + offset / side if side else 0.0
-            for offset, side in zip((down, across), free, strict=True)
-        )
-        return self._window(*places)
-
-    def _window(self, down: float, across: float) -> Sensor:
-        """The window at shares of the way down and across that it can go."""
-        window = self.sensor
-        top = round(down * (self.whole.height - window.height))
-        left = round(across * (self.whole.width - window.width))
-        return self.whole.window(top, left, window.height, window.width)
-
-    def _zone(self, share: float, number: int) -> Sensor:
-        """The window about a point at a share of the half diagonal, or as far as windows reach."""
-        height, width = self.whole.height, self.whole.width
-        radius = 0.5 * share * math.hypot(height, width)
-        angle = number * _GOLDEN_ANGLE
-        # Beyond the sides only the diagonals lead on.
-        if radius > 0.5 * min(height, width):
-            corner = math.atan2(height, width)
-            angle = (corner, math.pi - corner, math.pi + corner, -corner)[number % 4]
-        down, across = radius * math.sin(angle), radius * math.cos(angle)
-        places = []
-        for offset, side, part in (
-            (down, height, self.sensor.height),
-            (across, width, self.sensor.width),
-        ):
-            free = side - part
-            place = 0.5 * free + offset
-            places.append(min(max(place / free, 0.0), 1.0) if free else 0.0)
-        return self._window(*places)
-
-    # ---------------------------------------------------------------- what it says
-
     def point_spread_functions(
         self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
     ) -> Tensor:
         """(zones, 3, K, K), at the middles of the zones' windows."""
         found = []
         for share in self.zones.values():
-            window = self._zone(share, 0)
+            window = self.windows.zone(share, 0)
             renderer = PsfRenderer(
                 window, (1, 1), pupil_samples or 32, self._psf_size(), jitter=False
             )
@@ -277,6 +227,8 @@ class FieldViews:
 
     def _psf_size(self) -> int:
         """The training renderer's window, if it has one."""
+        if self._auto is not None and self._auto.choice is not None:
+            return self._auto.choice.renderer.size
         return getattr(self.renderer, "size", 65)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
@@ -289,18 +241,25 @@ class FieldViews:
         return [gaussian_quadrature(lens, fields, wavelengths, rings, arms, depth, symmetry=False)]
 
     def rays(self) -> int:
-        """Rays that a training window takes."""
-        return self.renderer.rays_per_image(self.scene)
+        """Rays that a training window takes; 0 before a renderer is chosen."""
+        renderer = self.renderer
+        if self._auto is not None and self._auto.choice is not None:
+            renderer = self._auto.choice.renderer
+        return renderer.rays_per_image(self.scene)
 
     def numbers(self) -> dict[str, float]:
-        """Nothing that the settings do not say."""
-        return {}
+        """What was chosen, where it was."""
+        return {} if self._auto is None else self._auto.numbers()
 
     def state(self) -> dict[str, Any]:
-        """The pupil of training windows."""
+        """The pupil of training windows, or the renderer that was chosen."""
+        if self._auto is not None:
+            return self._auto.state()
         return {} if self._pupil is None else {"pupil": list(self._pupil)}
 
     def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
         """Go on with it."""
-        if "pupil" in state:
+        if self._auto is not None:
+            self._auto.load_state(state)
+        elif "pupil" in state:
             self._pupil = ExitPupil(*map(float, state["pupil"]))

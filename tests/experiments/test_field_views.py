@@ -18,6 +18,7 @@ from dolens.imaging.sensor import Sensor
 from dolens.prescriptions import lens_from_prescription
 from experiments.training import run
 from experiments.views.fields import FieldViews
+from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET
 
 LINES = (656.2725, 587.5618, 486.1327)
 WHOLE = Sensor(400, 500, 0.08)
@@ -39,7 +40,7 @@ def test_zones_lie_at_their_shares_of_the_half_diagonal():
     views = field_views()
     half = 0.5 * math.hypot(WHOLE.height, WHOLE.width)
     for number in range(9):
-        windows = views._windows("test", number)
+        windows = views._shown("test", number)
         shares = [math.hypot(w.centre_row, w.centre_column) / half for w in windows[:-1]]
         assert shares[0] < 0.01
         assert shares[1] == pytest.approx(0.5, abs=0.01)
@@ -52,7 +53,7 @@ def test_training_windows_are_at_all_distances(kind, power):
     """Even in the distance's square, the area of a circle, or in the distance itself."""
     views = field_views(training_windows=kind)
     reach = 0.5 * math.hypot(WHOLE.height - 32, WHOLE.width - 40)
-    windows = [views._windows("train", number)[0] for number in range(400)]
+    windows = [views._shown("train", number)[0] for number in range(400)]
     distance = [math.hypot(w.centre_row, w.centre_column) / reach for w in windows]
     shares = torch.tensor(distance) ** power
     # Uniform from 0 to 1, to three standard errors.
@@ -67,7 +68,7 @@ def test_training_windows_are_at_all_distances(kind, power):
 
 def test_training_windows_fill_the_field():
     views = field_views(training_windows="area")
-    windows = [views._windows("train", number)[0] for number in range(400)]
+    windows = [views._shown("train", number)[0] for number in range(400)]
     rows = torch.tensor([w.centre_row for w in windows]) / (WHOLE.height - 32)
     columns = torch.tensor([w.centre_column for w in windows]) / (WHOLE.width - 40)
     for places in (rows, columns):
@@ -172,23 +173,9 @@ def test_settings_out_of_range_are_errors(settings, message):
 def test_the_experiment_runs_whole(composed, tmp_path, discriminator):
     run(
         composed(
-            "experiment=large_fov_doublet",
-            "renderer.sensor.height=32",
-            "renderer.sensor.width=32",
-            "renderer.fields=[1,1]",
-            "renderer.size=15",
-            "evaluation_renderer.pupil_samples=3",
-            "data.margin=12",
-            "data.steps_per_epoch=2",
-            "data.evaluation_crops_per_photograph=1",
-            "trainer.max_epochs=1",
-            "+trainer.limit_val_batches=1",
-            "+trainer.limit_test_batches=1",
-            "+trainer.enable_progress_bar=false",
-            "network.width_multiplier=0.25",
-            "network.weights=none",
+            *TINY_DOUBLET,
+            *FIXED_WINDOWS,
             f"discriminator={discriminator}",
-            "loss.perceptual=none",
         )
     )
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())

@@ -13,7 +13,7 @@ from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import lens_from_prescription
 from experiments.lens_least_squares import CameraOptimizer, LensLeastSquares
 from experiments.training import run
-from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
+from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY, TINY_DOUBLET, TINY_NETWORK
 
 DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=2"]
 
@@ -80,22 +80,8 @@ def test_a_doublet_holds_its_focal_length(composed, tmp_path):
     """The solve holds it through the steps of least squares too."""
     run(
         composed(
-            "experiment=large_fov_doublet",
-            "renderer.sensor.height=32",
-            "renderer.sensor.width=32",
-            "renderer.fields=[1,1]",
-            "renderer.size=15",
-            "evaluation_renderer.pupil_samples=2",
-            "data.margin=12",
-            "data.steps_per_epoch=4",
-            "data.evaluation_crops_per_photograph=1",
-            "trainer.max_epochs=1",
-            "+trainer.limit_val_batches=1",
-            "+trainer.limit_test_batches=1",
-            "+trainer.enable_progress_bar=false",
-            "network.width_multiplier=0.25",
-            "network.weights=none",
-            "loss.perceptual=none",
+            *TINY_DOUBLET,
+            *FIXED_WINDOWS,
             *DLS,
         )
     )

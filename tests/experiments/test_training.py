@@ -16,7 +16,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from PIL import Image
-from tiny_experiment import TINY, TINY_NETWORK
+from tiny_experiment import TINY, TINY_DOUBLET, TINY_NETWORK
 
 from dolens import load_lens
 from dolens.errors import InputError
@@ -139,15 +139,18 @@ def test_bounds_hold_by_projection(composed, tmp_path):
     ("stop_after", "settings"),
     [
         (1, WAVEFRONT_CODING),
+        (2, WAVEFRONT_CODING),
         (3, WAVEFRONT_CODING),
         (3, BY_PLAN),
         (3, BY_LEAST_SQUARES),
+        (3, TINY_DOUBLET),
     ],
 )
 def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(
     composed, tmp_path, stop_after, settings
 ):
-    # `stop_after` 1 and 3 are in the middle of an epoch of two steps; a plan is made at its start.
+    # `stop_after` 1 and 3 are in the middle of an epoch of two steps, 2 is the end of the first; a
+    # plan is made at an epoch's start.
     # Least squares, every two steps, has gathered the gradient of one.
     steps = f"+callbacks.last.every_n_train_steps={stop_after}"
     run(composed(*settings, *UNTESTED, folder="whole"))

@@ -1,4 +1,4 @@
-"""The default experiment at a size that trains in seconds; the path is the same."""
+"""Experiments at a size that trains in seconds; the path is the same."""
 
 TINY = [
     "renderer.sensor.height=24",
@@ -19,3 +19,22 @@ TINY = [
     "loss.perceptual=none",
 ]
 TINY_NETWORK = ["network.width=4", "network.depth=2"]
+
+TINY_DOUBLET = [
+    "experiment=large_fov_doublet",
+    "renderer.sensor.height=32",
+    "renderer.sensor.width=32",
+    "evaluation_renderer.pupil_samples=2",
+    "data.margin=12",
+    "data.steps_per_epoch=2",
+    "data.evaluation_crops_per_photograph=1",
+    "trainer.max_epochs=2",
+    "+trainer.limit_val_batches=1",
+    "+trainer.limit_test_batches=1",
+    "+trainer.enable_progress_bar=false",
+    "trainer.log_every_n_steps=1",
+    "network.width_multiplier=0.25",
+    "network.weights=none",
+    "loss.perceptual=none",
+]
+FIXED_WINDOWS = ["renderer=psf_window", "renderer.fields=[1,1]", "renderer.size=15"]

@@ -5,14 +5,14 @@ import logging
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.choice.chosen import Choice
+from dolens.imaging.choice.chosen import Choice, settings_of
 from dolens.imaging.choice.cost import psf_cost, rays_cost
 from dolens.imaging.choice.finding import Finding
 from dolens.imaging.choice.plan import plan
@@ -104,7 +104,7 @@ class AutoRenderer:
             self.make_plan(lens, scene, values)
             return
         started = time.perf_counter()
-        current = _with_values(lens, values)
+        current = with_values(lens, values)
         single, double = (copy.deepcopy(current).to(d) for d in (torch.float32, torch.float64))
         texture, whole = self._probe(scene)
         judge = reference(single, whole, self.sensor, texture, _REFERENCE_SAMPLES, self.seed)
@@ -131,11 +131,9 @@ class AutoRenderer:
         if self.choice is None:
             return {}
         renderer = self.choice.renderer
-        settings = {f.name: getattr(renderer, f.name) for f in fields(renderer)}
-        del settings["sensor"]
         return {
             "model": "psf" if isinstance(renderer, PsfRenderer) else "rays",
-            "settings": {n: list(v) if isinstance(v, tuple) else v for n, v in settings.items()},
+            "settings": settings_of(renderer),
             "bits": torch.finfo(self.choice.dtype).bits,
             "error": self.choice.error,
             "uncertainty": self.choice.uncertainty,
@@ -161,7 +159,7 @@ class AutoRenderer:
         """Choose, measure on the probe image, log; the choice is kept for `render`."""
         started = time.perf_counter()
         self.plans += 1
-        current = _with_values(lens, values)
+        current = with_values(lens, values)
         single, double = (copy.deepcopy(current).to(d) for d in (torch.float32, torch.float64))
         backend = choose_backend(double.system(), lens.backend)
         texture, whole = self._probe(scene)
@@ -258,7 +256,7 @@ class AutoRenderer:
         return judge.error(renderer.render(lens, scene, texture, self.seed + 1))
 
 
-def _with_values(lens: Lens, values: Mapping[str, Tensor] | None) -> Lens:
+def with_values(lens: Lens, values: Mapping[str, Tensor] | None) -> Lens:
     """The lens with some of its parameters replaced."""
     changed = copy.deepcopy(lens)
     parameters = dict(changed.named_parameters())

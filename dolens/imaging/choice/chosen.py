@@ -1,6 +1,7 @@
 """A renderer that was chosen, and what is known of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 
@@ -58,3 +59,9 @@ class Choice:
             numbers["auto/psf_pixels"] = float(renderer.size)
             numbers["auto/diffraction"] = float(renderer.diffraction != "none")
         return numbers
+
+
+def settings_of(renderer: PsfRenderer | RayRenderer) -> dict[str, Any]:
+    """All settings but the sensor, as plain values that a checkpoint can hold."""
+    settings = {f.name: getattr(renderer, f.name) for f in fields(renderer) if f.name != "sensor"}
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in settings.items()}

@@ -1,7 +1,7 @@
 """How many point spread functions a sensor needs, and where they are centred."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +22,7 @@ from dolens.optics.system import OpticalSystem
 SAMPLES = 48
 # The share of the tolerance that interpolation between fields, and light beyond windows, may take.
 FIELDS_SHARE, WINDOW_SHARE = 0.6, 0.25
+REGISTRATIONS = ("pinhole", "chief_rays")
 _GRIDS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25)
 _LARGEST = 511  # window, pixels
 
@@ -43,11 +44,13 @@ def choose_fields(
     truth: Survey,
     tolerance: float,
     backend: str,
+    registrations: Sequence[str] = REGISTRATIONS,
 ) -> Layout:
     """The cheapest grid whose interpolated functions are those of the points in between."""
     surfaces = len(system.surfaces)
     candidates = sorted(
-        _candidates(truth, sensor, tolerance), key=lambda r: psf_cost(r, scene, surfaces)
+        _candidates(truth, sensor, tolerance, registrations),
+        key=lambda r: psf_cost(r, scene, surfaces),
     )
     if not candidates:
         raise InputError(
@@ -75,9 +78,11 @@ def choose_fields(
     return Layout(renderer, Finding("fields", chosen, error, why))
 
 
-def _candidates(truth: Survey, sensor: Sensor, tolerance: float) -> Iterator[PsfRenderer]:
+def _candidates(
+    truth: Survey, sensor: Sensor, tolerance: float, registrations: Sequence[str]
+) -> Iterator[PsfRenderer]:
     longer = max(sensor.height, sensor.width)
-    for registration in ("pinhole", "chief_rays"):
+    for registration in registrations:
         distortion = registration == "chief_rays"
         if distortion and truth.chief is None:
             continue

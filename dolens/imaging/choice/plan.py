@@ -1,13 +1,20 @@
 """What a scene needs of a renderer, found from a few probe rays, in grey levels."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dolens.imaging.choice.finding import Finding
-from dolens.imaging.choice.grid import SAMPLES, WINDOW_SHARE, choose_fields, window_finding
+from dolens.imaging.choice.grid import (
+    REGISTRATIONS,
+    SAMPLES,
+    WINDOW_SHARE,
+    choose_fields,
+    window_finding,
+)
 from dolens.imaging.choice.probe import blurred_grey_levels, grey_levels
 from dolens.imaging.choice.survey import Survey, spread_pixels, survey
 from dolens.imaging.psf_renderer import PsfRenderer
@@ -63,6 +70,7 @@ def plan(
     gradients: bool,
     diffraction: bool,
     backend: str,
+    registrations: Sequence[str] = REGISTRATIONS,
 ) -> Plan:
     """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
 
@@ -75,13 +83,16 @@ def plan(
         gradients: whether the lens's gradients matter too.
         diffraction: whether it may be modelled.
         backend: what traces.
+        registrations: that may be chosen, of `PsfRenderer`.
 
     Raises:
         InputError: functions are too wide for any window.
     """
     rows, columns = spread_pixels(sensor, _POINTS)
     truth = survey(precise, scene, sensor, rows, columns, SAMPLES, backend)
-    layout = choose_fields(precise, scene, sensor, rows, columns, truth, tolerance, backend)
+    layout = choose_fields(
+        precise, scene, sensor, rows, columns, truth, tolerance, backend, registrations
+    )
     renderer, distortion = layout.renderer, layout.renderer.registration == "chief_rays"
     functions = truth.functions(renderer.size, distortion)
     findings = [layout.finding, window_finding(truth, renderer.size, distortion)]

@@ -52,10 +52,18 @@ class Reference:
 
 @torch.no_grad()
 def reference(
-    lens: Lens, scene: PlanarScene, sensor: Sensor, texture: Tensor, pupil_samples: int, seed: int
+    lens: Lens,
+    scene: PlanarScene,
+    sensor: Sensor,
+    texture: Tensor,
+    pupil_samples: int,
+    seed: int,
+    side: int = _SIDE,
 ) -> Reference:
-    """Render a texture by rays on windows at the sensor's middle, edges and corners."""
-    height, width = min(_SIDE, sensor.height), min(_SIDE, sensor.width)
+    """Render a texture by rays on windows, `side` pixels wide, at the sensor's middle, edges and
+    corners.
+    """
+    height, width = min(side, sensor.height), min(side, sensor.width)
     rows, columns = (
         sorted({round(i * (side - part) / (_WINDOWS - 1)) for i in range(_WINDOWS)})
         for side, part in ((sensor.height, height), (sensor.width, width))

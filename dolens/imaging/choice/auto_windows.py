@@ -1,0 +1,255 @@
+"""A renderer for windows of a large sensor that is chosen by what the windows need."""
+
+import copy
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.imaging.choice.auto_renderer import AutoRenderer, with_values
+from dolens.imaging.choice.chosen import settings_of
+from dolens.imaging.choice.plan import Plan, plan
+from dolens.imaging.choice.probe import probe_image
+from dolens.imaging.choice.reference import Reference, reference
+from dolens.imaging.distortion import chief_ray_maps
+from dolens.imaging.psf_renderer import PsfRenderer
+from dolens.imaging.pupil import paraxial_exit_pupil
+from dolens.imaging.scene import PlanarScene
+from dolens.imaging.sensor import Sensor
+from dolens.optics.backend import choose_backend
+from dolens.optics.lens import Lens
+
+logger = logging.getLogger(__name__)
+
+# The reference's samples along each side of the pupil, and the sides of its parts of a window,
+# pixels; rounds of tightening.
+_REFERENCE_SAMPLES, _SIDE, _ROUNDS = 24, 12, 3
+_MARGIN = 32
+_DIFFRACTION = ("none", "limit", "wave")
+
+
+@dataclass(frozen=True)
+class WindowChoice:
+    """A renderer that serves all windows, and what is known of it.
+
+    Attributes:
+        renderer: its sensor is the whole one.
+        errors: by the windows' names, RMS on the probe image against rays, both without
+            diffraction, grey levels.
+        uncertainty: of these, the largest.
+        seconds: that choosing and measuring took.
+    """
+
+    renderer: PsfRenderer
+    errors: Mapping[str, float]
+    uncertainty: float
+    seconds: float
+
+    @property
+    def worst(self) -> float:
+        """The largest error."""
+        return max(self.errors.values())
+
+    def __str__(self) -> str:
+        renderer = self.renderer
+        errors = ", ".join(f"{name} {error:.2g}" for name, error in self.errors.items())
+        return (
+            f"{renderer.fields[0]}×{renderer.fields[1]} fields, {renderer.pupil_samples}² rays, "
+            f"{renderer.size} pixels, colours {renderer.colours}, diffraction "
+            f"{renderer.diffraction}; errors in grey levels: {errors} (±{self.uncertainty:.2g}); "
+            f"{self.seconds:.1f} s"
+        )
+
+
+class AutoWindows:
+    """Renders windows as the most demanding of some of them needs it.
+
+    Fields, window, rays and what is shared are planned for each of the windows by itself, as
+    `AutoRenderer` does for a sensor; the union of these plans is measured against rays on a probe
+    image in all of them.  Functions are centred on chief rays, so that they follow the lens.
+
+    Args:
+        auto: tolerance, whether gradients and diffraction matter, seed; its sensor is a window's.
+        sensor: the whole one.
+        windows: by name, of the whole sensor; all others are taken to be like some of these.
+    """
+
+    def __init__(self, auto: AutoRenderer, sensor: Sensor, windows: Mapping[str, Sensor]) -> None:
+        self.auto = auto
+        self.sensor = sensor
+        self.windows = dict(windows)
+        self.choice: WindowChoice | None = None
+        self.plans = 0
+
+    @torch.no_grad()
+    def prepare(
+        self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
+    ) -> None:
+        """Measure the choice for the lens as it is now; choose where there is none, or where it
+        errs too much.
+        """
+        started, before = time.perf_counter(), self.choice
+        trial = _Trial(self, with_values(lens, values), scene)
+        if before is not None:
+            renderer = before.renderer.with_pupil(lens, scene, values)
+            errors = trial.errors(renderer)
+            seconds = before.seconds + time.perf_counter() - started
+            if max(errors.values()) <= max(self.auto.tolerance, before.worst):
+                self.choice = WindowChoice(renderer, errors, trial.uncertainty, seconds)
+                logger.info("renderer auto, windows: still serves, %s", self.choice)
+                return
+        self.plans += 1
+        tightened, best = 1.0, None
+        for _ in range(_ROUNDS):
+            renderer = self._planned(trial, tightened * self.auto.tolerance)
+            renderer = renderer.with_pupil(lens, scene, values)
+            errors = trial.errors(renderer)
+            seconds = time.perf_counter() - started + (before.seconds if before else 0.0)
+            found = WindowChoice(renderer, errors, trial.uncertainty, seconds)
+            if best is None or found.worst < best.worst:
+                best = found
+            if found.worst <= self.auto.tolerance:
+                break
+            tightened *= max(0.25, 0.7 * self.auto.tolerance / found.worst)
+        self.choice = best
+        logger.info("renderer auto, windows: %s", best)
+        if best.worst > self.auto.tolerance:
+            logger.warning(
+                "renderer auto, windows: the tolerance of %g grey levels is not met: %.2g is the "
+                "best found",
+                self.auto.tolerance,
+                best.worst,
+            )
+
+    def _planned(self, trial: "_Trial", tolerance: float) -> PsfRenderer:
+        """The union of the windows' plans."""
+        plans = [trial.plan(i, tolerance) for i in range(len(trial.windows))]
+        if any(found.dtype == torch.float64 for found in plans) and trial.lens.dtype.itemsize < 8:
+            logger.warning(
+                "renderer auto, windows: rounding shows; windows are rendered in the lens's "
+                "precision, dtype=float64 would avoid it"
+            )
+        parts = [found.renderer for found in plans]
+        return PsfRenderer(
+            self.sensor,
+            tuple(max(part.fields[side] for part in parts) for side in (0, 1)),
+            max(part.pupil_samples for part in parts),
+            max(part.size for part in parts),
+            illumination="map" if any(p.illumination == "map" for p in parts) else "functions",
+            colours="each" if any(p.colours == "each" for p in parts) else "one",
+            diffraction=max((part.diffraction for part in parts), key=_DIFFRACTION.index),
+        )
+
+    def numbers(self) -> dict[str, float]:
+        """The choice as metrics, `auto/…`."""
+        if self.choice is None:
+            return {}
+        renderer, choice = self.choice.renderer, self.choice
+        return {f"auto/error_grey_levels/{n}": error for n, error in choice.errors.items()} | {
+            "auto/error_grey_levels": choice.worst,
+            "auto/uncertainty_grey_levels": choice.uncertainty,
+            "auto/tolerance_grey_levels": self.auto.tolerance,
+            "auto/plan_s": choice.seconds,
+            "auto/plans": float(self.plans),
+            "auto/pupil_samples": float(renderer.pupil_samples),
+            "auto/fields": float(renderer.fields[0] * renderer.fields[1]),
+            "auto/psf_pixels": float(renderer.size),
+            "auto/diffraction": float(renderer.diffraction != "none"),
+        }
+
+    def state(self) -> dict[str, Any]:
+        """The choice, as plain values."""
+        if self.choice is None:
+            return {}
+        return {
+            "settings": settings_of(self.choice.renderer),
+            "errors": dict(self.choice.errors),
+            "uncertainty": self.choice.uncertainty,
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on with a choice that was made before."""
+        if state:
+            renderer = PsfRenderer(sensor=self.sensor, **state["settings"])
+            self.choice = WindowChoice(renderer, state["errors"], state["uncertainty"], 0.0)
+
+
+class _Trial:
+    """Windows of a lens as it is, what they look at, and what rays make of it."""
+
+    def __init__(self, owner: AutoWindows, lens: Lens, scene: PlanarScene) -> None:
+        self.lens, self.scene, self.auto = lens, scene, owner.auto
+        self.names, self.windows = list(owner.windows), list(owner.windows.values())
+        self.single, self.double = (
+            copy.deepcopy(lens).to(d) for d in (torch.float32, torch.float64)
+        )
+        self.backend = choose_backend(self.double.system(), lens.backend)
+        self.centres = self._centres(owner.sensor)
+        self.textures = [self._texture(window) for window in self.windows]
+        self.judges: Sequence[Reference] = [
+            reference(
+                self.single,
+                replace(scene, texture_centre=centre),
+                window,
+                texture,
+                _REFERENCE_SAMPLES,
+                self.auto.seed,
+                _SIDE,
+            )
+            for window, centre, texture in zip(
+                self.windows, self.centres, self.textures, strict=True
+            )
+        ]
+
+    @property
+    def uncertainty(self) -> float:
+        """Of errors, grey levels."""
+        return max(judge.uncertainty for judge in self.judges)
+
+    def plan(self, number: int, tolerance: float) -> Plan:
+        """For one window by itself."""
+        scene = replace(self.scene, texture_centre=self.centres[number])
+        return plan(
+            self.single.system(),
+            self.double.system(),
+            scene,
+            self.windows[number],
+            tolerance,
+            self.auto.gradients,
+            self.auto.diffraction,
+            self.backend,
+            registrations=("chief_rays",),
+        )
+
+    def errors(self, renderer: PsfRenderer) -> dict[str, float]:
+        """RMS errors of the windows, rendered together; of the model without diffraction."""
+        renderer = replace(renderer, diffraction="none")
+        images = renderer.render_windows(
+            self.lens,
+            self.scene,
+            torch.cat(self.textures),
+            self.windows,
+            self.centres,
+            self.auto.seed + 1,
+        )
+        errors = [
+            judge.error(image[None]) for judge, image in zip(self.judges, images, strict=True)
+        ]
+        return dict(zip(self.names, errors, strict=True))
+
+    def _centres(self, sensor: Sensor) -> list[tuple[float, float]]:
+        """Where windows look, to a whole texel."""
+        system, wavelengths = self.double.system(), (self.scene.middle_wavelength,)
+        middle = PlanarScene(self.scene.depths, wavelengths)
+        pupil = paraxial_exit_pupil(system, wavelengths)
+        looks = chief_ray_maps(system, middle, sensor, self.windows, pupil, self.backend)
+        return [tuple(float(c.mean().round()) for c in look) for look in looks]
+
+    def _texture(self, window: Sensor) -> Tensor:
+        size = window.height + 2 * _MARGIN, window.width + 2 * _MARGIN
+        probe = probe_image(*size, self.auto.seed)
+        return probe[:, [i % 3 for i in range(len(self.scene.wavelengths))]]
