@@ -7,7 +7,7 @@ from unittest import mock
 import torch
 
 from dolens.optics.lens import Lens
-from dolens.optics.rays import Rays
+from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces import base, newton
 from experiments.measurements.renders import Subject
 from experiments.measurements.timing import by_turns
@@ -34,7 +34,6 @@ def trace_rows(
     }
     given = {name: _rays(lenses[name, backends[0]], rays) for name in _DTYPES}
     true = lenses["float64", "reference"].trace(given["float64"])
-    surfaces = len(subject.lens.surfaces)
     times = {}
     for backward in (False, True):
         calls = {
@@ -44,19 +43,10 @@ def trace_rows(
         times[backward] = by_turns(calls, seconds)
     rows = []
     for (name, backend), lens in lenses.items():
-        hit = lens.trace(given[name])
-        both = hit.valid & true.valid
-        error = (hit.position.detach().double() - true.position.detach())[both].abs().max()
+        name_of = f"{backend}, {name}"
+        spent = times[False][name, backend], times[True][name, backend]
         rows.append(
-            {
-                "scene": subject.name,
-                "part": "trace",
-                "model": backend,
-                "setting": f"{backend}, {name}",
-                "error_um": 1e3 * float(error),
-                "forward_ns": 1e9 * times[False][name, backend] / (rays * surfaces),
-                "with_gradient_ns": 1e9 * times[True][name, backend] / (rays * surfaces),
-            }
+            _row(subject, backend, name_of, _error(lens.trace(given[name]), true), spent, rays)
         )
     return rows + _newton_rows(lenses["float64", "reference"], given["float64"], subject, seconds)
 
@@ -75,30 +65,47 @@ def _newton_rows(
     if not iteration.called:
         # Spheres and conics have closed forms.
         return []
-    surfaces, count = len(lens.surfaces), given.position[..., 0].numel()
+    count = given.position[..., 0].numel()
     rows = []
     for steps in _NEWTON_STEPS:
         with mock.patch.object(newton, "MAX_STEPS", steps):
-            hit = lens.trace(given)
+            error = _error(lens.trace(given), true)
             calls = {b: lambda b=b: _trace(lens, given, b) for b in (False, True)}
             times = by_turns(calls, seconds)
-        both = hit.valid & true.valid
-        moved = (hit.position.detach() - true.position.detach())[both].abs()
-        error = float(moved.max()) if moved.numel() else math.inf
-        rows.append(
-            {
-                "scene": subject.name,
-                "part": "trace",
-                "model": "Newton's steps",
-                "setting": f"{steps} of Newton's steps, float64",
-                "error_um": 1e3 * error,
-                "forward_ns": 1e9 * times[False] / (count * surfaces),
-                "with_gradient_ns": 1e9 * times[True] / (count * surfaces),
-            }
-        )
+        name = f"{steps} of Newton's steps, float64"
+        spent = times[False], times[True]
+        rows.append(_row(subject, "Newton's steps", name, error, spent, count))
         if error == 0.0:
             break
     return rows
+
+
+def _error(hit: TracedRays, true: TracedRays) -> float:
+    """The largest distance on the sensor along x or y, mm; infinite where no ray arrives."""
+    both = hit.valid & true.valid
+    moved = (hit.position.detach().double() - true.position.detach())[both].abs()
+    return float(moved.max()) if moved.numel() else math.inf
+
+
+def _row(
+    subject: Subject,
+    model: str,
+    setting: str,
+    error: float,
+    seconds: tuple[float, float],
+    rays: int,
+) -> dict[str, float | str]:
+    """Of an error in mm, and seconds of all rays forward and with the gradient."""
+    forward, with_gradient = (1e9 * s / (rays * len(subject.lens.surfaces)) for s in seconds)
+    return {
+        "scene": subject.name,
+        "part": "trace",
+        "model": model,
+        "setting": setting,
+        "error_um": 1e3 * error,
+        "forward_ns": forward,
+        "with_gradient_ns": with_gradient,
+    }
 
 
 def _lens(lens: Lens, dtype: torch.dtype, backend: str) -> Lens:
