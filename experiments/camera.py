@@ -169,9 +169,12 @@ class CameraModule(lightning.LightningModule):
         }
 
     def on_train_epoch_start(self) -> None:
-        """Let the renderer look at the lens as it is now; not when an epoch is resumed within."""
-        if self.trainer.fit_loop.epoch_loop.batch_progress.current.ready == 0:
-            self.views.prepare(self.lens, self.variables())
+        """Let the renderer look at the lens as it is now.
+
+        Lightning does not come here when it resumes within an epoch: what was found at its start is
+        in the checkpoint.
+        """
+        self.views.prepare(self.lens, self.variables())
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
         """Start the step's clock."""

@@ -18,7 +18,7 @@ from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.sampling import square_to_disc, stratified_square
 from dolens.imaging.scene import PlanarScene, Scene
 from dolens.imaging.wave.propagation import DiffractionSettings
-from dolens.imaging.wave.wave_psf import wave_kernels
+from dolens.imaging.wave.wave_psf import propagation, wave_kernels
 from dolens.optics.system import OpticalSystem
 
 # Strata of the pupil along each side, for the light of a function that rays do not make.
@@ -145,6 +145,54 @@ def wave_point_spread_functions(
     window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
     finely diffraction is computed.
     """
+    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
+    shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
+    kernels = wave_kernels(system, *places, pitch, size, settings, backend)
+    kernels = kernels.reshape(*shape, size, size)
+    with torch.no_grad():
+        disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
+        seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+        light = seen.weight.sum(-1)
+    total = kernels.sum((-2, -1))
+    share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
+    lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
+    return FieldFunctions(kernels * share[..., None, None], light[:, 0], lost)
+
+
+def wave_cost(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    size: int,
+    distortion: bool,
+    backend: str,
+) -> tuple[int, str | None]:
+    """What functions of `wave_point_spread_functions` take.
+
+    Arguments as there.
+
+    Returns:
+        Samples of a pupil by Fourier transform, and why one of them needs direct integration, which
+        takes a thousand times as long; None where none does.
+    """
+    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
+    found = propagation(system, *places, pitch, size, None, backend)
+    direct = (reason for reason in found.reasons if reason.startswith("direct"))
+    return found.samples**2, next(direct, None)
+
+
+def _object_points(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    distortion: bool,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Object points (N·D·C, 3), mm, their wavelengths, nm, and the windows' centres, mm."""
     planes, channels = len(scene.depths), len(scene.wavelengths)
     if distortion:
         rows, columns = chief_ray_points(system, scene, points, pupil, pitch, backend)
@@ -164,24 +212,7 @@ def wave_point_spread_functions(
     )
     wavelengths = torch.tensor(scene.wavelengths, **options).expand(shape)
     centres = torch.stack(points, -1)[:, None, None].expand(*shape, 2)
-    kernels = wave_kernels(
-        system,
-        positions.reshape(-1, 3),
-        wavelengths.reshape(-1),
-        centres.reshape(-1, 2),
-        pitch,
-        size,
-        settings,
-        backend,
-    ).reshape(*shape, size, size)
-    with torch.no_grad():
-        disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
-        seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
-        light = seen.weight.sum(-1)
-    total = kernels.sum((-2, -1))
-    share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
-    lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
-    return FieldFunctions(kernels * share[..., None, None], light[:, 0], lost)
+    return positions.reshape(-1, 3), wavelengths.reshape(-1), centres.reshape(-1, 2)
 
 
 def sampled_disc(

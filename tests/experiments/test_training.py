@@ -141,8 +141,11 @@ def test_bounds_hold_by_projection(composed, tmp_path):
         (1, WAVEFRONT_CODING),
         (2, WAVEFRONT_CODING),
         (3, WAVEFRONT_CODING),
+        (1, BY_PLAN),
+        (2, BY_PLAN),
         (3, BY_PLAN),
         (3, BY_LEAST_SQUARES),
+        (2, TINY_DOUBLET),
         (3, TINY_DOUBLET),
     ],
 )
@@ -181,6 +184,14 @@ def test_the_plan_of_the_renderer_is_among_the_metrics(composed, tmp_path):
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["auto/error_grey_levels"] <= metrics["auto/tolerance_grey_levels"] == 4.0
     assert metrics["auto/plans"] == 1
+
+
+def test_every_epoch_looks_at_the_lens_anew(composed, tmp_path, caplog):
+    """A plan for the lens that training began with would err unnoticed."""
+    with caplog.at_level("INFO", "dolens.imaging.choice"):
+        run(composed(*BY_PLAN, *UNPICTURED, *UNTESTED, "trainer.max_epochs=3"))
+    looked = [r for r in caplog.messages if "still serves" in r or "the lens has changed" in r]
+    assert len(looked) == 2
 
 
 def test_a_float64_lens_works_beside_a_float32_network(composed, tmp_path):

@@ -261,9 +261,9 @@ def test_the_choice_is_explained(coding, triplet):
 
     rays = pupil_wavefront(hyperbola().system(), AXIS, 500.0, CENTRE, 24)
     pupil = regular_pupil(fit_pupil(rays), 96)
-    assert bool(choose_propagation(fit_pupil(rays), pupil, 0.05).fourier)
+    assert bool(choose_propagation(fit_pupil(rays), pupil.flux, 0.05).fourier)
     wrong = replace(pupil, flux=1.05 * pupil.flux)
-    chosen = choose_propagation(fit_pupil(rays), wrong, 0.05)
+    chosen = choose_propagation(fit_pupil(rays), wrong.flux, 0.05)
     assert chosen.reasons[0].startswith("direct: the flux through the fitted pupil errs by 0.05")
 
     dark = ObjectPoints.at_infinity([[0.0, 60.0]])

@@ -34,6 +34,8 @@ _SAMPLING, _SHARING, _DIFFRACTION, _PRECISION = 0.5, 0.25, 0.3, 0.1
 _SHARING_OF_GRADIENTS = 0.005
 # Points where wavefronts are asked.
 _WAVES = 4
+# Of all pupils whose waves a render may take: some ten seconds.
+_MOST_SAMPLES = 1 << 28
 # Pixels by which windows grow, for diffraction; the last is for comparison.
 _MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
 
@@ -103,10 +105,7 @@ def plan(
     ):
         renderer = replace(renderer, **{name: finding.chosen})
         findings.append(finding)
-    places = rows, columns
-    finding, without = _diffraction(
-        functions, truth, precise, scene, places, renderer, tolerance, backend
-    )
+    finding, without = _diffraction(functions, truth, precise, scene, renderer, tolerance, backend)
     if not diffraction:
         finding = Finding(
             "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
@@ -153,7 +152,6 @@ def _diffraction(
     truth: Survey,
     system: OpticalSystem,
     scene: PlanarScene,
-    places: tuple[Tensor, Tensor],
     renderer: PsfRenderer,
     tolerance: float,
     backend: str,
@@ -176,16 +174,33 @@ def _diffraction(
     error = float(torch.stack(errors).square().mean().sqrt())
     if error <= _DIFFRACTION * tolerance:
         return Finding("diffraction", "none", error, seen), error
-    few = slice(0, _WAVES)
     sensor, distortion = renderer.sensor, renderer.registration == "chief_rays"
-    found = survey(system, scene, sensor, *(p[few] for p in places), SAMPLES, backend)
+    # From the middle to a corner: what diffracts there may be beyond Fourier transforms.
+    share = torch.linspace(0.5, 1.0, _WAVES, dtype=torch.float64)
+    places = share * (sensor.height - 1), share * (sensor.width - 1)
+    found, again = (
+        survey(system, scene, sensor, *places, SAMPLES, backend, seed) for seed in (0, 1)
+    )
     # As wide as diffraction spreads light, within reason.
     size = renderer.size + 2 * min(math.ceil(8.0 * airy) + 2, _MARGINS[-1])
-    waves = found.waves(system, scene, sensor, places[0][few], places[1][few], size, distortion)
-    rays = found.functions(size, distortion).double()
+    at = (system, scene, sensor, *places, size, distortion)
+    samples, against = found.wave_cost(*at)
+    pupils = math.prod(renderer.fields) * len(scene.depths) * len(scene.wavelengths)
+    if against is None and pupils * samples > _MOST_SAMPLES:
+        against = f"{pupils} pupils of {math.isqrt(samples)}² samples are too many"
+    if against is not None:
+        # A perfect pupil's effect is then all that is known of it, and its size.
+        because = f"{seen}; not by waves: {against}"
+        return Finding("diffraction", "limit", error, because), error
+    waves = found.waves(*at)
+    pair = [s.functions(size, distortion).double() for s in (found, again)]
+    rays, noise = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
     limited = with_diffraction_limit(rays, pitch, scene.wavelengths, truth.f_number)
+    # Wavefronts have no noise of sampling: that of the rays is not diffraction.
+    noise = float(grey_levels(noise).square().mean())
     without, with_limit = (
-        float(grey_levels(f - waves).square().mean().sqrt()) for f in (rays, limited)
+        math.sqrt(max(float(grey_levels(f - waves).square().mean()) - noise, 0.0))
+        for f in (rays, limited)
     )
     if without <= _DIFFRACTION * tolerance:
         return Finding("diffraction", "none", without, f"{seen}; measured by waves"), without

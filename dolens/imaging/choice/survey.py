@@ -9,6 +9,7 @@ from dolens.errors import InputError
 from dolens.imaging.field_psf import (
     sampled_disc,
     splatted,
+    wave_cost,
     wave_point_spread_functions,
 )
 from dolens.imaging.plane_points import (
@@ -84,6 +85,28 @@ class Survey:
             # Near enough for a plan; direct integration would take minutes.
             DiffractionSettings(method="fourier"),
         ).functions
+
+    def wave_cost(
+        self,
+        system: OpticalSystem,
+        scene: PlanarScene,
+        sensor: Sensor,
+        rows: Tensor,
+        columns: Tensor,
+        size: int,
+        distortion: bool,
+    ) -> tuple[int, str | None]:
+        """Samples of a pupil of these points, and why Fourier transforms do not do; see there."""
+        return wave_cost(
+            system,
+            scene,
+            sensor.positions(rows, columns),
+            sampled_exit_pupil(system, scene.wavelengths, sensor, self.backend),
+            sensor.pixel_pitch,
+            size,
+            distortion,
+            self.backend,
+        )
 
     def light(self) -> Tensor:
         """(N, 1, C), relative illumination."""

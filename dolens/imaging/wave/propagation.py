@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.wave.pupil_fit import PupilFit, RegularPupil
+from dolens.imaging.wave.pupil_fit import PupilFit
 from dolens.imaging.wave.reference_sphere import path_beyond
 from dolens.imaging.wave.wavefront import MM_PER_NM, Wavefront
 
@@ -69,6 +69,7 @@ class Propagation:
             away from a linear function of the direction cosines, where light goes in the window.
         distortion: (N,), by which part of its distance from the window's middle light is displaced.
         flux_error: (N,), relative difference of fitted and traced flux.
+        samples: G, along each side of a pupil that a Fourier transform is of.
     """
 
     fourier: Tensor
@@ -77,12 +78,13 @@ class Propagation:
     sphere_term: Tensor
     distortion: Tensor
     flux_error: Tensor
+    samples: int = 0
 
 
 @torch.no_grad()
 def choose_propagation(
     fit: PupilFit,
-    pupil: RegularPupil,
+    flux: Tensor,
     half_window: float,
     settings: DiffractionSettings | None = None,
 ) -> Propagation:
@@ -96,7 +98,7 @@ def choose_propagation(
 
     Args:
         fit: of N pupils.
-        pupil: evaluated from it.
+        flux: (N,), of the pupils that are evaluated from it.
         half_window: mm, from the centre of the reference sphere to the sides of a square window.
         settings: None: the default ones.
     """
@@ -104,7 +106,7 @@ def choose_propagation(
     wavefront = fit.wavefront
     lit = wavefront.flux > 0.0
     term, distortion = sphere_term(fit, half_window)
-    error = torch.where(lit, pupil.flux / wavefront.flux - 1.0, 0.0)
+    error = torch.where(lit, flux / wavefront.flux - 1.0, 0.0)
     columns = (lit, fit.residual, term, distortion, wavefront.ended, error)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     reasons = []

@@ -5,7 +5,7 @@ cosines at the image, which a Fourier transform wants.  A few hundred of them de
 that give path difference, amplitude and crossings of apertures anywhere in the pupil.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -69,10 +69,6 @@ class RegularPupil:
     wavelength: Tensor
     index: Tensor
 
-    def __getitem__(self, which: Tensor) -> "RegularPupil":
-        """The pupils that an index chooses."""
-        return RegularPupil(*(getattr(self, field.name)[which] for field in fields(self)))
-
 
 def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
     """Fit a wavefront's rays by least squares.
@@ -128,31 +124,36 @@ def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
     )
 
 
-def regular_pupil(fit: PupilFit, samples: int) -> RegularPupil:
+def regular_pupil(fit: PupilFit, samples: int, which: Tensor | None = None) -> RegularPupil:
     """Evaluate a fit at the centres of G × G cells that cover the light.
 
     Args:
         fit: of N pupils.
         samples: G.
+        which: their numbers; None: all.
     """
-    wavefront = fit.wavefront
-    degree = fit.coefficients.shape[-1] - 1
-    step = torch.arange(samples, dtype=fit.low.dtype, device=fit.low.device)
+    which = slice(None) if which is None else which.to(fit.low.device)
+    wavefront, coefficients = fit.wavefront, fit.coefficients[which]
+    low, high = fit.low[which], fit.high[which]
+    degree = coefficients.shape[-1] - 1
+    step = torch.arange(samples, dtype=low.dtype, device=low.device)
     share = (step + 0.5) / samples
-    cosines = fit.low[..., None] + (fit.high - fit.low)[..., None] * share
-    unit = (cosines - fit.centre[..., None]) / fit.half_width[..., None]
+    cosines = low[..., None] + (high - low)[..., None] * share
+    unit = (cosines - fit.centre[which][..., None]) / fit.half_width[which][..., None]
     x, y = (chebyshev(unit[:, axis].clamp(-1.0, 1.0), degree)[0][:, None] for axis in (0, 1))
-    opd, whole, *crossings = (y.mT @ fit.coefficients @ x).unbind(1)
-    lit = (wavefront.coverage > 0.0).flatten(1).any(-1)
+    opd, whole, *crossings = (y.mT @ coefficients @ x).unbind(1)
+    lit = (wavefront.coverage[which] > 0.0).flatten(1).any(-1)
     passed = lit[:, None, None].to(opd.dtype).expand(opd.shape)
     apertures = wavefront.apertures.values()
     for aperture, x, y in zip(apertures, crossings[::2], crossings[1::2], strict=True):
         passed = torch.minimum(passed, coverage(aperture, x, y))
     amplitude = whole * passed
-    cell = ((fit.high - fit.low) / samples).prod(-1)
+    cell = ((high - low) / samples).prod(-1)
     # A cell that passes a share c has amplitude c, but flux c and not c².
     flux = (whole * amplitude).sum((-2, -1)) * cell
-    return RegularPupil(amplitude, opd, cosines, flux, wavefront.wavelength, wavefront.index)
+    return RegularPupil(
+        amplitude, opd, cosines, flux, wavefront.wavelength[which], wavefront.index[which]
+    )
 
 
 def chebyshev(u: Tensor, degree: int) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ from dolens.imaging.wave.propagation import (
     fourier_samples,
     subsamples,
 )
-from dolens.imaging.wave.pupil_fit import PupilFit, RegularPupil, fit_pupil, regular_pupil
+from dolens.imaging.wave.pupil_fit import PupilFit, fit_pupil, regular_pupil
 from dolens.imaging.wave.wavefront import Wavefront, pupil_wavefront
 from dolens.optics.backend import say_once
 from dolens.optics.system import OpticalSystem
@@ -32,6 +32,8 @@ Wavelengths = float | Sequence[float] | Tensor
 _DEGREES, _SHARE = (10, 16), 0.01
 # Numbers of a piece of work; more pupils than fit are done in pieces, and again for the gradient.
 _PIECE = 1 << 24
+# Functions that are evaluated for a pupil: path difference, amplitude, what passes, and crossings.
+_FUNCTIONS = 8
 
 
 def wave_kernels(
@@ -80,7 +82,7 @@ def wave_kernels(
     if settings.method != "auto":
         fourier = torch.full_like(fourier, settings.method == "fourier")
     if bool(fourier.all()):
-        return _by_fourier(found.pupil, window)
+        return _by_fourier(found, window)
     which = torch.nonzero(~fourier).flatten()
     if settings.method == "auto":
         for n in which.tolist():
@@ -98,7 +100,7 @@ def wave_kernels(
     direct = _by_integration(rays, window)
     if len(which) == len(found.points):
         return direct
-    return _by_fourier(found.pupil, window).index_copy(0, which, direct)
+    return _by_fourier(found, window).index_copy(0, which, direct)
 
 
 @torch.no_grad()
@@ -121,8 +123,13 @@ def propagation(
 class _Prepared:
     points: ObjectPoints
     fit: PupilFit
-    pupil: RegularPupil
-    chosen: Propagation
+    samples: int
+    chosen: Propagation | None
+
+    def pieces(self, beside: int = 0) -> Sequence[Tensor]:
+        """Numbers of the pupils, as many at a time as memory is meant for, beside a window."""
+        size = _FUNCTIONS * self.samples**2 + (self.samples + beside) ** 2
+        return torch.arange(len(self.fit.low)).split(max(1, _PIECE // size))
 
 
 @dataclass(frozen=True)
@@ -167,9 +174,12 @@ def _prepare(
     rays = pupil_wavefront(system, points, wavelength, centres, settings.rays, backend=backend)
     fit = _fitted(rays, settings)
     half_width = pitch * (0.5 * size + 1.0)
-    pupil = regular_pupil(fit, fourier_samples(fit, half_width, settings))
-    chosen = choose_propagation(fit, pupil, half_width, settings)
-    return _Prepared(points.to(rays.opd.dtype, rays.opd.device), fit, pupil, chosen)
+    points = points.to(rays.opd.dtype, rays.opd.device)
+    found = _Prepared(points, fit, fourier_samples(fit, half_width, settings), None)
+    with torch.no_grad():
+        flux = [regular_pupil(fit, found.samples, part).flux for part in found.pieces()]
+    chosen = choose_propagation(fit, torch.cat(flux), half_width, settings)
+    return replace(found, chosen=replace(chosen, samples=found.samples))
 
 
 def _fitted(wavefront: Wavefront, settings: DiffractionSettings) -> PupilFit:
@@ -181,23 +191,18 @@ def _fitted(wavefront: Wavefront, settings: DiffractionSettings) -> PupilFit:
     return fit_pupil(wavefront, _DEGREES[1])
 
 
-def _by_fourier(pupil: RegularPupil, window: _Window) -> Tensor:
-    x, y = window.grid(pupil.opd)
-    count = max(1, _PIECE // (len(x) + pupil.opd.shape[-1]) ** 2)
+def _by_fourier(found: _Prepared, window: _Window) -> Tensor:
+    x, y = window.grid(found.fit.low)
+    parts = found.pieces(len(x))
 
-    def kernels(pupil: RegularPupil) -> Tensor:
-        return window.integrated(fourier_field(pupil, x, y, window.dtype))
+    def piece(i: int, coefficients: Tensor) -> Tensor:
+        fit = replace(found.fit, coefficients=coefficients)
+        pupil = regular_pupil(fit, found.samples, parts[i])
+        return window.integrated(fourier_field(pupil, x, y, window.dtype)).movedim(0, -1)
 
-    if len(pupil.opd) <= count:
-        return kernels(pupil)
-    parts = torch.arange(len(pupil.opd)).split(count)
-
-    def piece(i: int, amplitude: Tensor, opd: Tensor) -> Tensor:
-        whole = replace(pupil, amplitude=amplitude, opd=opd)
-        return kernels(whole[parts[i].to(opd.device)]).movedim(0, -1)
-
-    sizes = [len(part) for part in parts]
-    return replay(piece, sizes, (pupil.amplitude, pupil.opd)).movedim(-1, 0)
+    if len(parts) == 1:
+        return piece(0, found.fit.coefficients).movedim(-1, 0)
+    return replay(piece, [len(part) for part in parts], (found.fit.coefficients,)).movedim(-1, 0)
 
 
 def _by_integration(wavefront: Wavefront, window: _Window) -> Tensor:
