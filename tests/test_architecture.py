@@ -17,6 +17,7 @@ ALLOWED = {
     "imaging": {"errors", "optics", "kernels"},
     "optimize": {"errors", "optics", "imaging"},
     "tolerancing": {"errors", "optics", "imaging"},
+    "alignment": {"errors", "optics", "imaging", "optimize"},
     "reconstruction": {"errors", "optics", "imaging"},
     "plotting": {"errors", "optics", "imaging"},
 }

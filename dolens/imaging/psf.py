@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.binning import bin_rays
 from dolens.imaging.sampling import regular_square, square_to_disc
 from dolens.imaging.scene import Scene
 from dolens.imaging.sensor import Sensor
@@ -112,24 +113,4 @@ def splat(
     rows, columns, weight = (t.reshape(count, points) for t in (rows, columns, weight))
     if backend == "cpu":
         return splatting.splat(rows, columns, weight, size).reshape(*shape, size, size)
-    row_taps, row_weights = spline_taps(rows)
-    column_taps, column_weights = spline_taps(columns)
-    first = torch.arange(count, device=weight.device)[:, None] * (size * size)
-    flat = torch.zeros(count * size * size, dtype=weight.dtype, device=weight.device)
-    for row, row_weight in zip(row_taps, row_weights, strict=True):
-        for column, column_weight in zip(column_taps, column_weights, strict=True):
-            inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
-            index = first + torch.where(inside, row * size + column, 0)
-            amount = torch.where(inside, weight * row_weight * column_weight, 0.0)
-            flat = flat.index_add(0, index.flatten(), amount.flatten())
-    return flat.reshape(*shape, size, size)
-
-
-def spline_taps(position: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-    """The three pixels under a quadratic B-spline at each position, and its values there."""
-    centre = torch.round(position.detach())
-    d = position - centre
-    weights = [0.5 * (0.5 - d) ** 2, 0.75 - d * d, 0.5 * (0.5 + d) ** 2]
-    # Far rays (only invalid ones are) must not overflow the integer index.
-    index = centre.clamp(-(2.0**30), 2.0**30).long()
-    return [index - 1, index, index + 1], weights
+    return bin_rays(rows, columns, weight, size, size).reshape(*shape, size, size)

@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.imaging.psf import splat, spline_taps
+from dolens.imaging.binning import spline_taps
+from dolens.imaging.psf import splat
 from dolens.kernels import splatting
 
 

@@ -22,6 +22,11 @@ class Circle:
         """Positive strictly inside: ρ² - r², mm²."""
         return self.semi_diameter**2 - torch.addcmul(x * x, y, y)
 
+    def depth(self, x: Tensor, y: Tensor) -> Tensor:
+        """How far inside the edge, mm; negative outside.  Differentiable but at the vertex."""
+        square = torch.addcmul(x * x, y, y)
+        return self.semi_diameter - square.clamp(min=torch.finfo(square.dtype).tiny).sqrt()
+
     @property
     def reach(self) -> float:
         """Distance of its farthest point from the vertex, mm."""
@@ -48,6 +53,10 @@ class Rectangle:
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Positive strictly inside: the distance to the nearest side, mm."""
         return torch.minimum(self.half_width_x - x.abs(), self.half_width_y - y.abs())
+
+    def depth(self, x: Tensor, y: Tensor) -> Tensor:
+        """How far inside the nearest side, mm; negative outside."""
+        return self.margin(x, y)
 
     @property
     def reach(self) -> float:
@@ -78,6 +87,10 @@ class Unlimited:
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Positive everywhere."""
         return torch.ones_like(x * y)
+
+    def depth(self, x: Tensor, y: Tensor) -> Tensor:
+        """Without an edge, its reach."""
+        return self.reach * self.margin(x, y)
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -123,6 +136,13 @@ class ClearAperture:
     def opened(self) -> "ClearAperture":
         """The same size with no edge and no obscuration: it clips nothing."""
         return ClearAperture(Unlimited(self.edge.reach))
+
+    def depth(self, x: Tensor, y: Tensor) -> Tensor:
+        """How far a point is from what stops light, mm, negative where it does; differentiable."""
+        inside = self.edge.depth(x, y)
+        if self.obscuration is None:
+            return inside
+        return torch.minimum(inside, -self.obscuration.depth(x, y))
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """A number that is positive where light passes; no gradient."""

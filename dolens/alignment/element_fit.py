@@ -1,0 +1,167 @@
+"""Which element of a lens is misaligned, and by how much: a fit of each, for many lenses at once.
+
+Every hypothesis is that one element has a pose of its own and all others are as designed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.alignment.spot_moments import LINEAR, MOMENTS, MeasuredMoments, MomentModel
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+# Centroids are all but linear in a pose: so few steps on them bring a true hypothesis near.
+_CENTROID_STEPS = 3
+# What a hypothesis moves, of one element.
+POSE = ("tilt_x", "tilt_y", "decenter_x", "decenter_y")
+# Damping of the first step, its factors after a step that helps and one that does not, and where
+# no step can help any more.
+_DAMPING, _EASE, _BRAKE, _STUCK = 1e-3, 0.1, 10.0, 1e10
+# A fit is done when a step would gain less than this of χ², far below the noise; or, once χ² is
+# more than so many times the count of moments, less than a share of the excess: such a hypothesis
+# is wrong, and its digits are worth no iterations.
+_ENOUGH, _WRONG, _SHARE = 1e-8, 10.0, 0.05
+
+
+@dataclass(frozen=True)
+class ElementFit:
+    """The best pose of one element for each of K measurements.
+
+    Attributes:
+        errors: (K, P), in the lens's units (radians, mm).
+        chi_squared: (K,), Σ (L⁻¹·(m - measured))².
+        converged: (K,), bool: no step would gain anything that matters.
+        iterations: most that any measurement took.
+    """
+
+    errors: Tensor
+    chi_squared: Tensor
+    converged: Tensor
+    iterations: int
+
+
+def element_names(lens: Lens, element: str) -> tuple[str, ...]:
+    """Names of an element's tilts and decentres.
+
+    Raises:
+        InputError: the lens has no such element.
+    """
+    names = tuple(f"elements.{element}.{part}" for part in POSE)
+    lens.variables(names)
+    return names
+
+
+@torch.no_grad()
+def fit_element(model: MomentModel, measured: MeasuredMoments, iterations: int = 20) -> ElementFit:
+    """Fit a model's parameters to each measurement by damped Gauss-Newton steps.
+
+    Marquardt's step solves (JᵀJ + λ·diag JᵀJ)·δ = -Jᵀr, with r and J the residuals and their
+    derivatives after whitening, and a λ of its own for each measurement.  It starts from the
+    design, where a displaced spot makes cubes of its distance; so centroids are fitted alone first.
+
+    Args:
+        model: of the parameters that may be off.
+        measured: K measurements of the model's spots.
+        iterations: at most, with all moments.
+    """
+    if iterations < 1:
+        raise InputError(f"iterations: {iterations}; allowed: 1 or more")
+    start = measured.moments.new_zeros(len(measured.moments), len(model.names))
+    near = _descend(model, measured, start, LINEAR, min(iterations, _CENTROID_STEPS))
+    found = _descend(model, measured, near.errors, MOMENTS, iterations)
+    return ElementFit(
+        found.errors, found.chi_squared, found.converged, near.iterations + found.iterations
+    )
+
+
+@torch.no_grad()
+def bounds(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Tensor:
+    """Least covariance (Cramér and Rao) of unbiased estimates from these moments: (JᵀJ)⁻¹.
+
+    Args:
+        model: of P parameters.
+        measured: K measurements, whose noise counts; what they measured does not.
+        errors: (K, P), where the lenses truly are.
+
+    Returns:
+        (K, P, P), in the lens's units squared.
+    """
+    _, jacobian = _whitened(model, measured, errors, MOMENTS)
+    # Radians and mm side by side: columns of one length keep the inverse accurate.
+    length = jacobian.norm(dim=1, keepdim=True)
+    r = torch.linalg.qr(jacobian / length, mode="r").R
+    inverse = torch.linalg.inv(r) / length.mT
+    return inverse @ inverse.mT
+
+
+def named_element(chi_squared: Sequence[Tensor] | Tensor) -> tuple[Tensor, Tensor]:
+    """The element that explains each measurement best, and how sure that is.
+
+    Hypotheses have equally many parameters and equal priors; a hypothesis's share is
+    exp(-χ²/2) over the sum of all.
+
+    Args:
+        chi_squared: (E, K), of each element's fit.
+
+    Returns:
+        Numbers of elements (K,), and shares (E, K) that sum to one over elements.
+    """
+    table = chi_squared if isinstance(chi_squared, Tensor) else torch.stack(list(chi_squared))
+    return table.argmin(0), torch.softmax(-0.5 * table, 0)
+
+
+def _descend(
+    model: MomentModel, measured: MeasuredMoments, start: Tensor, count: int, iterations: int
+) -> ElementFit:
+    """With the first `count` moments of each spot only."""
+    errors = start.clone()
+    residual, jacobian = _whitened(model, measured, errors, count)
+    cost = residual.square().sum(-1)
+    damping = torch.full_like(cost, _DAMPING)
+    converged = torch.zeros_like(cost, dtype=torch.bool)
+    used = 0
+    while used < iterations:
+        # Those that are done are left out, so that the slowest cost little.
+        at = torch.nonzero(~converged & (damping < _STUCK))[:, 0]
+        if len(at) == 0:
+            break
+        used += 1
+        r, j = residual[at], jacobian[at]
+        step = _damped_step(r, j, damping[at])
+        gain = r.square().sum(-1) - (r + (j @ step[..., None])[..., 0]).square().sum(-1)
+        tried = errors[at] + step
+        new_residual, new_jacobian = _whitened(model, measured[at], tried, count)
+        new_cost = new_residual.square().sum(-1)
+        better = new_cost < cost[at]
+        excess = (cost[at] - _WRONG * residual.shape[1]).clamp(min=0.0)
+        converged[at] = gain < _ENOUGH + _SHARE * excess
+        damping[at] *= torch.where(better, _EASE, _BRAKE)
+        kept = at[better]
+        errors[kept], cost[kept] = tried[better], new_cost[better]
+        residual[kept], jacobian[kept] = new_residual[better], new_jacobian[better]
+    return ElementFit(errors, cost, converged, used)
+
+
+def _damped_step(residual: Tensor, jacobian: Tensor, damping: Tensor) -> Tensor:
+    """(K, P), solved with the parameters scaled to columns of unit length."""
+    length = jacobian.norm(dim=1)
+    unit = jacobian / length[:, None]
+    normal = unit.mT @ unit + torch.diag_embed(damping[:, None].expand_as(length))
+    gradient = unit.mT @ residual[..., None]
+    return -torch.linalg.solve(normal, gradient)[..., 0] / length
+
+
+def _whitened(
+    model: MomentModel, measured: MeasuredMoments, errors: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
+    """Residuals (K, S·count) of unit variance, and their derivatives (K, S·count, P).
+
+    The first entries of L⁻¹·v are those that the first entries of v alone would give.
+    """
+    moments, jacobian = model.moments_and_jacobian(errors, measured.origin)
+    both = torch.cat([(moments - measured.moments)[..., None], jacobian], -1)
+    white = torch.linalg.solve_triangular(measured.factor, both, upper=False)[:, :, :count]
+    return white[..., 0].flatten(1), white[..., 1:].flatten(1, 2)

@@ -1,0 +1,204 @@
+"""What a sensor saw of point sources: simulated photon by photon, or read from a file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.imaging.sensor import Sensor
+from dolens.optics.lens import Lens
+from dolens.optics.rays import Rays
+
+_AT_A_TIME = 1 << 20
+# Light may pass the first rim of a tilted, curved surface that far out in its vertex plane.
+_REACH = 1.4
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Images of S sources.
+
+    Attributes:
+        images: (S, height, width), electrons, the dark level taken off.
+        mask: (S, height, width), where they can be trusted.
+        read_noise: RMS, electrons.
+        sensor: the pixels.
+    """
+
+    images: Tensor
+    mask: Tensor
+    read_noise: float
+    sensor: Sensor
+
+    @property
+    def totals(self) -> Tensor:
+        """(S,), electrons in trusted pixels."""
+        return torch.where(self.mask, self.images, 0.0).sum((-2, -1))
+
+    @property
+    def shares(self) -> Tensor:
+        """(S, height, width): images of sum 1 over the trusted pixels."""
+        return torch.where(self.mask, self.images, 0.0) / self.totals[:, None, None]
+
+    def centroids(self) -> Tensor:
+        """(S, 2), x and y, mm, of trusted pixels."""
+        return torch.stack([self.centroid_of(share) for share in self.shares])
+
+    def centroid_of(self, share: Tensor) -> Tensor:
+        """(2,), x and y, mm, of an image (height, width) of sum 1."""
+        options = {"dtype": share.dtype, "device": share.device}
+        rows = torch.arange(self.sensor.height, **options)
+        columns = torch.arange(self.sensor.width, **options)
+        x, y = self.sensor.positions(rows, columns)
+        return torch.stack([(share.sum(0) * x).sum(), (share.sum(1) * y).sum()])
+
+
+@torch.no_grad()
+def simulated(
+    lens: Lens,
+    sources: Tensor,
+    wavelength: float,
+    sensor: Sensor,
+    photons: int,
+    read_noise: float,
+    generator: torch.Generator,
+    full_well: float | None = None,
+) -> Measurement:
+    """Photons that leave each source in random directions and are counted where they land.
+
+    Rims are sharp, pixels are squares that count, and nothing is smoothed.
+
+    Args:
+        lens: as it stands.
+        sources: (S, 3), mm.
+        wavelength: nm.
+        sensor: the pixels.
+        photons: behind the lens, of each source; those beyond the sensor's edge are among them.
+        read_noise: RMS, electrons.
+        generator: of directions and noise.
+        full_well: electrons at which a pixel saturates, and is not trusted; None: never.
+
+    Raises:
+        InputError: no light passes.
+    """
+    images = []
+    for source in sources.double():
+        image = torch.zeros(sensor.height * sensor.width, dtype=torch.float64)
+        passed = 0
+        while passed < photons:
+            rays = _directions(lens, source, wavelength, generator)
+            hit = lens.trace(rays)
+            x, y = (c[hit.valid].double() for c in hit.position[:, :2].unbind(-1))
+            if not len(x):
+                raise InputError("no light from the source reaches the sensor plane")
+            x, y = x[: photons - passed], y[: photons - passed]
+            passed += len(x)
+            rows = 0.5 * (sensor.height - 1) - sensor.centre_row + y / sensor.pixel_pitch
+            columns = 0.5 * (sensor.width - 1) - sensor.centre_column - x / sensor.pixel_pitch
+            rows, columns = rows.round(), columns.round()
+            inside = (
+                (rows >= 0) & (rows < sensor.height) & (columns >= 0) & (columns < sensor.width)
+            )
+            place = (rows * sensor.width + columns)[inside].long()
+            image += torch.bincount(place, minlength=len(image))
+        noise = torch.randn(image.shape, generator=generator, dtype=torch.float64)
+        images.append((image + read_noise * noise).reshape(sensor.height, sensor.width))
+    stacked = torch.stack(images)
+    mask = torch.ones_like(stacked, dtype=torch.bool)
+    if full_well is not None:
+        mask = stacked < full_well
+    return Measurement(stacked, mask, read_noise, sensor)
+
+
+def _directions(lens: Lens, source: Tensor, wavelength: float, generator: torch.Generator) -> Rays:
+    """Rays of even density in solid angle, towards the first surface where it stands."""
+    system = lens.system()
+    axes = system.axes[0]
+    radius = _REACH * system.surfaces[0].semi_diameter
+    u, v, keep = torch.rand(3, _AT_A_TIME, generator=generator, dtype=torch.float64)
+    rho, angle = radius * u.sqrt(), 2.0 * torch.pi * v
+    local = torch.stack([rho * angle.cos(), rho * angle.sin(), torch.zeros_like(rho)], -1)
+    if axes.rotation is None:
+        to, normal = local + torch.tensor([0.0, 0.0, float(axes.z)]), torch.tensor([0.0, 0.0, 1.0])
+    else:
+        rotation = axes.rotation.double()
+        to, normal = local @ rotation.T + axes.origin.double(), rotation[:, 2]
+    d = to - source
+    distance = d.norm(dim=-1)
+    density = (d @ normal.double()) / distance**3
+    chosen = keep * density.max() < density
+    d = d[chosen] / distance[chosen, None]
+    return Rays(source.expand(d.shape), d, wavelength)
+
+
+def read_measurement(
+    path: str | Path,
+    pixel_pitch: float,
+    dark_level: float = 0.0,
+    region: tuple[int, int, int, int] | None = None,
+    downsample: int = 1,
+    saturation: float | None = None,
+    electrons_per_count: float = 1.0,
+    read_noise: float = 1.0,
+) -> Measurement:
+    """A photograph of a source, 16 bits or 8, of one channel.
+
+    Args:
+        path: TIFF or PNG.
+        pixel_pitch: of the photograph, mm.
+        dark_level: counts that the sensor gives in the dark.
+        region: top, left, height and width that are used, pixels; None: all.  The optical axis is
+            taken to meet the middle of the photograph.
+        downsample: pixels along each side that are averaged to one; those that are left over at the
+            right and at the bottom are cut off.
+        saturation: counts from which a pixel is not trusted; None: the largest that the file's
+            integers can hold.
+        electrons_per_count: of the sensor.
+        read_noise: RMS of one pixel, electrons.
+
+    Raises:
+        InputError: the file cannot be read, is not grey integers, or a number is out of range.
+    """
+    try:
+        with Image.open(path) as image:
+            values = np.asarray(image)
+    except (OSError, SyntaxError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"data.measurement: {path} cannot be read ({reason})") from error
+    if values.ndim != 2 or values.dtype.kind not in "ui":
+        raise InputError(
+            f"data.measurement: {path} has {values.dtype} of shape {values.shape}; allowed: one "
+            "channel of integers"
+        )
+    if downsample < 1 or not pixel_pitch > 0.0:
+        raise InputError(
+            f"data: downsample {downsample} and pixel_pitch {pixel_pitch}; allowed: 1 or more, "
+            "and above 0 (mm)"
+        )
+    if saturation is None:
+        # Pillow gives 16 bits as int32.
+        saturation = 255.0 if values.dtype.itemsize == 1 else 65535.0
+    counts = torch.from_numpy(values.astype(np.float64))
+    whole = Sensor(*counts.shape, pixel_pitch)
+    top, left, height, width = region or (0, 0, whole.height, whole.width)
+    height, width = height - height % downsample, width - width % downsample
+    window = whole.window(top, left, height, width)
+    counts = counts[top : top + height, left : left + width]
+
+    def blocks(t: Tensor) -> Tensor:
+        return t.unflatten(1, (-1, downsample)).unflatten(0, (-1, downsample))
+
+    trusted = blocks(counts < saturation).all(-1).all(1)
+    electrons = blocks((counts - dark_level) * electrons_per_count).sum((1, 3))
+    sensor = Sensor(
+        height // downsample,
+        width // downsample,
+        pixel_pitch * downsample,
+        window.centre_row / downsample,
+        window.centre_column / downsample,
+    )
+    return Measurement(electrons[None], trusted[None], read_noise * downsample, sensor)

@@ -1,0 +1,147 @@
+"""A lens, its sources, and what of them is to be found."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dolens.errors import InputError
+from dolens.imaging.spot_image import SpotImage, SpotImager
+from dolens.optics.elements import TILTS
+from dolens.optics.lens import Lens
+
+_COORDINATES = ("x", "y", "z")
+_KEYS = ("scale", "initial")
+
+
+class Pose(nn.Module):
+    """Chosen numbers of a lens and its sources, θ, held as u = θ/scale.
+
+    Names are those of the lens's parameters (`elements.lens.tilt_x`, `elements.lens.decenter_x`,
+    `sensor_distance`) and `sources.<n>.x`, `.y`, `.z`.  Settings, and what is found, are in degrees
+    for tilts and in mm; θ is in the lens's own units, radians and mm.
+
+    Args:
+        lens: it is not changed.
+        sources: (S, 3), mm, in the lens's axes.
+        variables: name → settings: `scale` (default 1) and `initial` (default: as it is).
+
+    Attributes:
+        names: of θ, P of them.
+        scaled: u (P,).
+        scale: (P,), in θ's units.
+        units: (P,), θ's units in those of the settings: radians of a degree, or 1.
+
+    Raises:
+        InputError: an unknown name or setting, or a scale that is not positive.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        sources: Sequence[Sequence[float]],
+        variables: Mapping[str, Mapping[str, Any] | None],
+    ) -> None:
+        super().__init__()
+        self._of = (lens,)
+        options = {"dtype": torch.float64, "device": lens.device}
+        self.register_buffer("sources", torch.tensor(sources, **options).reshape(-1, 3))
+        self.names = tuple(variables)
+        scales, starts, units = [], [], []
+        for name, settings in variables.items():
+            settings = dict(settings or {})
+            for key in settings:
+                if key not in _KEYS:
+                    raise InputError(
+                        f"variable '{name}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
+                    )
+            scale = float(settings.get("scale", 1.0))
+            if not scale > 0.0:
+                raise InputError(f"variable '{name}': scale must be positive, not {scale:g}")
+            units.append(math.pi / 180.0 if name.rpartition(".")[2] in TILTS else 1.0)
+            scales.append(scale)
+            starts.append(float(settings.get("initial", self.value(name) / units[-1])) / scale)
+        self.register_buffer("units", torch.tensor(units, **options))
+        self.register_buffer("scale", self.units * torch.tensor(scales, **options))
+        self.scaled = nn.Parameter(torch.tensor(starts, **options))
+
+    @property
+    def lens(self) -> Lens:
+        """The lens as it was given."""
+        return self._of[0]
+
+    @property
+    def scale_in_units(self) -> Tensor:
+        """(P,), the scales as the settings have them."""
+        return self.scale / self.units
+
+    def found(self) -> dict[str, float]:
+        """θ by name, in degrees and mm."""
+        values = (self.scale_in_units * self.scaled.detach()).tolist()
+        return dict(zip(self.names, values, strict=True))
+
+    def value(self, name: str) -> float:
+        """A number as the lens, or the sources, have it, in θ's units.
+
+        Raises:
+            InputError: there is none of this name.
+        """
+        place = self._source(name)
+        if place is not None:
+            return float(self.sources[place])
+        found = self.lens.variables([name])
+        if list(found) != [name] or found[name].numel() != 1:
+            raise InputError(f"variable '{name}' is not one number of the lens")
+        return float(found[name])
+
+    def values(self, scaled: Tensor | None = None) -> dict[str, Tensor]:
+        """θ by name."""
+        theta = self.scale * (self.scaled if scaled is None else scaled)
+        return dict(zip(self.names, theta.unbind(), strict=True))
+
+    def images(self, imager: SpotImager, scaled: Tensor | None = None) -> list[SpotImage]:
+        """Of every source.
+
+        Args:
+            imager: how.
+            scaled: u, in place of the stored one.
+        """
+        values = self.values(scaled)
+        system = self.lens.system({n: v for n, v in values.items() if self._source(n) is None})
+        return [imager.image(system, source) for source in self._placed(values)]
+
+    def _placed(self, values: Mapping[str, Tensor]) -> list[Tensor]:
+        """The sources, (3,) each."""
+        return [
+            torch.stack(
+                [
+                    values.get(f"sources.{number + 1}.{axis}", self.sources[number, i])
+                    for i, axis in enumerate(_COORDINATES)
+                ]
+            )
+            for number in range(len(self.sources))
+        ]
+
+    def _source(self, name: str) -> tuple[int, int] | None:
+        """Number of the source, from 0, and of the coordinate; None for the lens's parameters."""
+        parts = name.split(".")
+        if parts[0] != "sources":
+            return None
+        known = len(parts) == 3 and parts[1].isdigit() and parts[2] in _COORDINATES
+        if not known or not 1 <= int(parts[1]) <= len(self.sources):
+            raise InputError(
+                f"variable '{name}': allowed are sources.<1 to {len(self.sources)}>.x, .y and .z"
+            )
+        return int(parts[1]) - 1, _COORDINATES.index(parts[2])
+
+    @torch.no_grad()
+    def store(self) -> None:
+        """Put θ into the lens and the sources."""
+        for name, value in self.values().items():
+            place = self._source(name)
+            if place is not None:
+                self.sources[place] = value
+            else:
+                self.lens.variables([name])[name].copy_(value)

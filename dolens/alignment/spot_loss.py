@@ -1,0 +1,121 @@
+"""S21: how far images are from those measured, and how far apart their centroids lie."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.func import jvp
+
+from dolens.alignment.measurement import Measurement
+from dolens.alignment.pose import Pose
+from dolens.errors import InputError
+from dolens.imaging.spot_image import SpotImager
+from dolens.optimize.linear_model import LinearModel
+
+# Of the light behind the lens; with less on the pixels, their shares mean nothing.
+_LEAST_SEEN = 0.01
+
+
+@dataclass(frozen=True)
+class SpotLoss:
+    """ε = mean (I - M)² + μ·|c - c_M|², over the trusted pixels of all sources (S21).
+
+    I and M are shares of the light that trusted pixels get, over the largest that was measured, so
+    that the first term is at most near 1; c are their centroids, mm.  Where less than a hundredth
+    of the light falls on them, I's are of all light behind the lens, so that the loss leads back
+    from anywhere.
+
+    Blurred, both of them, images of a caustic's sharp lines are comparable from farther away.
+
+    Attributes:
+        measurement: M.
+        imager: makes I.
+        centroid_weight: μ, 1/mm².
+        blur: standard deviation of a Gaussian that both are convolved with, pixels; 0 for none.
+
+    Raises:
+        InputError: a negative μ or blur.
+    """
+
+    measurement: Measurement
+    imager: SpotImager
+    centroid_weight: float
+    blur: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.blur >= 0.0:
+            raise InputError(f"loss.blur: {self.blur}; allowed: 0 pixels or more")
+        if not self.centroid_weight >= 0.0:
+            raise InputError(f"loss.centroid_weight: {self.centroid_weight}; allowed: 0 or more")
+
+    def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
+        """r with ε = |r|²: trusted pixels, source after source, and 2·S of the centroids."""
+        found = pose.images(self.imager, scaled)
+        measurement = self.measurement
+        shares, mask = self._blurred(measurement.shares), measurement.mask
+        per_pixel = 1.0 / (shares.max() * float(mask.sum()) ** 0.5)
+        wanted, root = measurement.centroids(), self.centroid_weight**0.5
+        parts, centroids = [], []
+        for own, share, trusted, place in zip(found, shares, mask, wanted, strict=True):
+            image, centroid = torch.where(trusted, own.image, 0.0), own.centroid
+            seen = image.sum()
+            if float(seen.detach()) > _LEAST_SEEN:
+                image = image / seen
+                centroid = measurement.centroid_of(image)
+            parts.append(per_pixel * (self._blurred(image) - share)[trusted])
+            centroids.append(root * (centroid - place))
+        return torch.cat([*parts, *centroids])
+
+    def _blurred(self, images: Tensor) -> Tensor:
+        """(..., height, width); what leaves at the edges is lost."""
+        if self.blur == 0.0:
+            return images
+        down, across = (_gaussian(n, self.blur, images) for n in images.shape[-2:])
+        return down @ images @ across
+
+    def terms(self, residuals: Tensor) -> dict[str, Tensor]:
+        """`image`, mean (I - M)², and `centroid`, μ·|c - c_M|²."""
+        count = 2 * len(self.measurement.images)
+        square = residuals.square()
+        return {"image": square[:-count].sum(), "centroid": square[-count:].sum()}
+
+    def jacobian(self, pose: Pose, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool.
+
+        By forward mode: memory for one column at a time.
+        """
+        point = pose.scaled.detach()
+        columns, value = [], None
+        for direction in torch.eye(len(point), dtype=point.dtype)[chosen]:
+            value, column = jvp(lambda u: self.residuals(pose, u), (point,), (direction,))
+            columns.append(column)
+        whole = value.new_zeros(len(value), len(point))
+        whole[:, chosen] = torch.stack(columns, -1)
+        return value, whole
+
+
+def _gaussian(length: int, deviation: float, like: Tensor) -> Tensor:
+    """(length, length), symmetric: the convolution with a Gaussian along one side."""
+    place = torch.arange(length, dtype=like.dtype, device=like.device)
+    far = (place[:, None] - place) / deviation
+    step = torch.arange(-4 * math.ceil(deviation), 4 * math.ceil(deviation) + 1).to(like)
+    return torch.exp(-0.5 * far.square()) / torch.exp(-0.5 * (step / deviation).square()).sum()
+
+
+class SpotResiduals:
+    """The residuals where the variables are, as `DampedLeastSquares` takes them."""
+
+    def __init__(self, loss: SpotLoss, pose: Pose, chosen: Tensor) -> None:
+        self._loss, self._pose, self._chosen = loss, pose, chosen
+        with torch.no_grad():
+            self.residuals = loss.residuals(pose)
+
+    def sum_of_squares(self) -> float:
+        """ε."""
+        return float(self.residuals.square().sum())
+
+    def linear_model(self) -> LinearModel:
+        """R and b of the chosen variables."""
+        with torch.no_grad():
+            return LinearModel.of_rows(*self._loss.jacobian(self._pose, self._chosen))

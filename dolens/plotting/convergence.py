@@ -1,0 +1,97 @@
+"""How a fit came to its end: parameters and loss by iteration."""
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from dolens.errors import InputError
+from dolens.plotting.style import PALETTE, SMALL, TITLE, colours, ruled_axes
+
+_DASHES = ("-", "--", ":")
+# Up to here each iteration is worth a dot.
+_FEW = 40
+
+
+def convergence_figure(
+    loss: Sequence[float],
+    values: Mapping[str, tuple[Sequence[float], str]],
+    stages: Sequence[tuple[str, int]],
+    truth: Mapping[str, float] | None = None,
+    title: str | None = None,
+    loss_label: str = "loss",
+) -> Figure:
+    """Loss on top, parameters below; lines part the stages, and above each is its optimizer.
+
+    Parameters whose truth is known are shown by the size of their errors on logarithmic axes, the
+    others by their values, those of one unit in the same axes.
+
+    Args:
+        loss: one value after each of n iterations; what is not positive leaves gaps.
+        values: name → (n values, their unit).
+        stages: optimizer and number of iterations of each, n in all.
+        truth: name → value in the parameter's unit, where it is known.
+        title: above.
+        loss_label: of the loss's axis.
+
+    Raises:
+        InputError: numbers of values and iterations that differ.
+    """
+    count = sum(length for _, length in stages)
+    for name, found in (("loss", loss), *((name, found) for name, (found, _) in values.items())):
+        if len(found) != count or not count:
+            raise InputError(f"{name}: {len(found)} values for {count} iterations of the stages")
+    truth = truth or {}
+    panels: dict[tuple[bool, str], dict[str, Sequence[float]]] = {}
+    for name, (found, unit) in values.items():
+        known = name in truth
+        shown = [abs(value - truth[name]) for value in found] if known else found
+        panels.setdefault((known, unit), {})[name] = shown
+    figure = Figure(figsize=(7.6, 2.3 + 1.9 * len(panels)), layout="constrained")
+    grid = figure.subplots(1 + len(panels), 1, squeeze=False, sharex=True)[:, 0]
+    numbers = range(1, count + 1)
+    style = {"linewidth": 1.4, "marker": "o" if count <= _FEW else None, "markersize": 3}
+    grid[0].plot(numbers, loss, color=PALETTE[0], **style)
+    grid[0].set_yscale("log", nonpositive="mask")
+    grid[0].set_ylabel(loss_label, fontsize=SMALL + 1)
+    for axes, ((known, unit), lines) in zip(grid[1:], panels.items(), strict=True):
+        for number, ((name, found), colour) in enumerate(
+            zip(lines.items(), colours(len(lines)), strict=True)
+        ):
+            dash = _DASHES[number // len(PALETTE) % len(_DASHES)]
+            axes.plot(numbers, found, linestyle=dash, color=colour, label=name, **style)
+        if known:
+            axes.set_yscale("log", nonpositive="mask")
+        axes.set_ylabel(f"|error|, {unit}" if known else f"value, {unit}", fontsize=SMALL + 1)
+        axes.legend(frameon=False, fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    for axes in grid:
+        ruled_axes(axes)
+    _part(grid, stages)
+    grid[-1].set_xlabel("iteration", fontsize=SMALL + 1)
+    grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10), min_n_ticks=1))
+    grid[-1].set_xlim(0.5, count + 0.5)
+    figure.align_ylabels()
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def _part(grid: Sequence[Axes], stages: Sequence[tuple[str, int]]) -> None:
+    """Lines between the stages, halfway from iteration to iteration, and the optimizers' names."""
+    start = 0
+    for number, (optimizer, length) in enumerate(stages):
+        if number:
+            for axes in grid:
+                axes.axvline(start + 0.5, color="0.4", linewidth=0.8, linestyle=(0, (4, 3)))
+        grid[0].text(
+            start + 0.5 + 0.5 * length,
+            1.02,
+            optimizer,
+            transform=grid[0].get_xaxis_transform(),
+            ha="center",
+            va="bottom",
+            color="0.3",
+            fontsize=SMALL,
+        )
+        start += length

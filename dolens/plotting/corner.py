@@ -1,0 +1,210 @@
+"""A covariance as ellipses, for every pair of parameters."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.plotting.style import PALETTE, SMALL, TITLE
+
+_SIGMAS = (1.0, 2.0)
+# Axes reach this far, in σ; further where points or the truth are, up to the second number.
+_REACH, _FURTHEST = 2.6, 6.0
+_CELL = 1.25
+# Units of σ below 0.1 of them are divided by 1000.
+_THOUSANDTHS = {"mm": "µm", "deg": "mdeg", "°": "mdeg"}
+
+
+@torch.no_grad()
+def corner_figure(
+    covariance: Tensor,
+    labels: Sequence[str],
+    units: Sequence[str],
+    centre: Tensor | None = None,
+    points: Tensor | None = None,
+    truth: Tensor | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Ellipses of 1σ and 2σ below the diagonal, correlations above it, each σ in it.
+
+    Axes count from the centre.  Mm and degrees become thousandths where σ is below 0.1 of them.
+
+    Args:
+        covariance: (P, P), in the products of the units.
+        labels: P names.
+        units: P of them, such as `mm` or `deg`.
+        centre: (P,), values in the middle of the ellipses, written in the diagonal; None: zero,
+            and nothing is written.
+        points: (M, P), estimates, drawn under the ellipses.
+        truth: (P,), a cross; what is not finite is not drawn.
+
+    Returns:
+        A figure.  In pairs whose truth is more than 6σ off there is no cross, and the title says
+        so.
+
+    Raises:
+        InputError: shapes that do not fit, or variances that are not positive and finite.
+    """
+    matrix = torch.as_tensor(covariance).detach().cpu().double()
+    count = len(labels)
+    middle = torch.zeros(count) if centre is None else torch.as_tensor(centre)
+    shapes = {"covariance": matrix.shape == (count, count), "units": len(units) == count}
+    shapes["centre"] = middle.shape == (count,)
+    shapes["truth"] = truth is None or truth.shape == (count,)
+    shapes["points"] = points is None or (points.ndim == 2 and points.shape[1] == count)
+    for name, fits in shapes.items():
+        if not fits or not count:
+            raise InputError(f"corner plot: {name} does not fit {count} labels")
+    sigma = matrix.diagonal().sqrt()
+    if not (bool(matrix.isfinite().all()) and bool((sigma > 0.0).all())):
+        raise InputError("corner plot: variances must be positive, and all numbers finite")
+    scaled = [_unit(float(s), unit) for s, unit in zip(sigma, units, strict=True)]
+    factor = torch.tensor([f for f, _ in scaled], dtype=torch.float64)
+    shift = middle.detach().cpu().double()
+    dots = np.empty((0, count))
+    if points is not None:
+        dots = ((points.detach().cpu().double() - shift) * factor).numpy()
+    cross = np.full(count, np.nan)
+    if truth is not None:
+        cross = ((truth.detach().cpu().double() - shift) * factor).numpy()
+    spread = (sigma * factor).numpy()
+    far = np.abs(cross) > _FURTHEST * spread
+    reach = _limits(dots, np.where(far, np.nan, cross), spread)
+
+    figure = Figure(figsize=(_CELL * count + 0.9, _CELL * count + 1.1), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
+    grid = figure.subplots(count, count, squeeze=False)
+    scaled_covariance = (matrix * torch.outer(factor, factor)).numpy()
+    correlations = (matrix / torch.outer(sigma, sigma)).numpy()
+    for row in range(count):
+        for column in range(count):
+            axes = grid[row, column]
+            pair = [column, row]
+            if column > row:
+                _correlation(axes, correlations[row, column])
+            elif column == row:
+                value = None if centre is None else float(shift[row])
+                _deviation(axes, labels[row], value, spread[row], scaled[row][1], units[row])
+            else:
+                shown = scaled_covariance[np.ix_(pair, pair)]
+                _pair(axes, shown, dots[:, pair], cross[pair], reach[pair])
+            _ticks(axes, row, column, count)
+            if row == count - 1 and column < row:
+                axes.set_xlabel(f"{labels[column]}\n{scaled[column][1]}", fontsize=SMALL)
+            if column == 0 and row > 0:
+                axes.set_ylabel(f"{labels[row]}\n{scaled[row][1]}", fontsize=SMALL)
+    figure.align_labels()
+    # A cross takes two.
+    crosses = int((np.isfinite(cross) & ~far).sum()) > 1
+    handles = _handles(len(dots), crosses)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=SMALL
+    )
+    if far.any():
+        beyond = ", ".join(label for label, out in zip(labels, far, strict=True) if out)
+        beyond = "all" if far.all() else beyond
+        note = f"truth more than {_FURTHEST:g}σ off, not drawn: {beyond}"
+        title = f"{title}\n{note}" if title else note
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def _unit(sigma: float, unit: str) -> tuple[float, str]:
+    """What numbers are multiplied by to be shown, and their unit then."""
+    if sigma < 0.1 and unit in _THOUSANDTHS:
+        return 1e3, _THOUSANDTHS[unit]
+    return 1.0, unit
+
+
+def _limits(dots: np.ndarray, cross: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(P,), half the length of each axis."""
+    reach = _REACH * spread
+    others = np.abs(np.concatenate([dots, cross[None]]))
+    found = 1.1 * np.nan_to_num(others, nan=0.0, posinf=0.0).max(0)
+    return np.maximum(reach, np.minimum(found, 1.1 * _FURTHEST * spread))
+
+
+def _pair(
+    axes: Axes, covariance: np.ndarray, dots: np.ndarray, cross: np.ndarray, reach: np.ndarray
+) -> None:
+    """Two parameters, the first along x."""
+    values, vectors = np.linalg.eigh(covariance)
+    lengths = np.sqrt(np.maximum(values, 0.0))
+    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    if len(dots):
+        axes.plot(*dots.T, ".", color="0.55", markersize=4, markeredgewidth=0, zorder=1)
+    for sigmas, width in zip(_SIGMAS, (1.4, 1.0), strict=True):
+        outline = Ellipse(
+            (0.0, 0.0),
+            2.0 * sigmas * lengths[1],
+            2.0 * sigmas * lengths[0],
+            angle=angle,
+            facecolor="none",
+            edgecolor=PALETTE[0],
+            linewidth=width,
+            zorder=2,
+        )
+        axes.add_patch(outline)
+    if np.isfinite(cross).all() and (np.abs(cross) <= reach).all():
+        axes.plot(*cross[:, None], "+", color=PALETTE[1], markersize=8, markeredgewidth=1.5)
+    axes.set_xlim(-reach[0], reach[0])
+    axes.set_ylim(-reach[1], reach[1])
+    for axis, length in ((axes.xaxis, reach[0]), (axes.yaxis, reach[1])):
+        # A round number either side, far enough from the ends that labels stay within the axes.
+        power = 10.0 ** np.floor(np.log10(0.8 * length))
+        step = power * max(factor for factor in (1, 2, 5) if factor * power <= 0.8 * length)
+        axis.set_ticks([-step, 0.0, step], [f"\N{MINUS SIGN}{step:g}", "0", f"{step:g}"])
+
+
+def _correlation(axes: Axes, correlation: float) -> None:
+    """A number on a field whose colour says it too."""
+    axes.set_facecolor(colormaps["RdBu_r"](0.5 + 0.35 * correlation))
+    # As many digits as tell it from ±1.
+    digits = 2 if abs(correlation) < 0.995 else 4
+    axes.text(
+        0.5,
+        0.5,
+        f"{correlation:+z.{digits}f}".replace("-", "\N{MINUS SIGN}"),
+        transform=axes.transAxes,
+        ha="center",
+        va="center",
+        fontsize=SMALL + 1,
+    )
+
+
+def _deviation(
+    axes: Axes, label: str, value: float | None, sigma: float, unit: str, value_unit: str
+) -> None:
+    lines = [label] if value is None else [label, f"{value:.6g} {value_unit}"]
+    text = "\n".join([*lines, f"σ = {sigma:.2g} {unit}"]).replace("-", "\N{MINUS SIGN}")
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=SMALL)
+
+
+def _ticks(axes: Axes, row: int, column: int, count: int) -> None:
+    """Numbers only at the left and at the bottom, none around what is not a plot."""
+    axes.tick_params(labelsize=SMALL - 1, length=2)
+    axes.spines[:].set_color("0.6")
+    if column >= row:
+        axes.set(xticks=[], yticks=[])
+        return
+    if column > 0:
+        axes.tick_params(labelleft=False)
+    if row < count - 1:
+        axes.tick_params(labelbottom=False)
+
+
+def _handles(points: int, crossed: bool) -> list[Line2D]:
+    handles = [Line2D([], [], color=PALETTE[0], linewidth=1.4, label="1σ and 2σ")]
+    if points:
+        handles.append(Line2D([], [], color="0.55", marker=".", ls="", label=f"{points} estimates"))
+    if crossed:
+        handles.append(Line2D([], [], color=PALETTE[1], marker="+", ls="", label="truth"))
+    return handles

@@ -1,0 +1,152 @@
+"""Images of point sources: as measured, and as a model has them before and after a fit."""
+
+from collections.abc import Sequence
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.plotting.style import SMALL, TITLE
+
+_COLUMNS = ("measured", "initial", "final", "final \N{MINUS SIGN} measured")
+# Light left out beyond each edge of the window, as a share, before the margin is added.
+_BEYOND = 0.002
+_MARGIN = 0.12
+_SMALLEST_WINDOW = 8
+_PANEL = 1.9
+# White letters stay readable on bright pixels.
+_OUTLINE = [withStroke(linewidth=1.5, foreground="black")]
+
+
+@torch.no_grad()
+def spot_fit_figure(
+    measured: Tensor,
+    initial: Tensor,
+    final: Tensor,
+    labels: Sequence[str],
+    pixel_pitch: float,
+    title: str | None = None,
+) -> Figure:
+    """A row for each image: measured, at the start of the fit, at its end, and what is left over.
+
+    Each row shows one square window where the light of its three images is, and is relative to the
+    largest pixel that was measured; an initial image may be brighter, its peak is written in it.
+    Differences are red where the model has too much light, blue where too little.
+
+    Args:
+        measured: (N, height, width), shares of light; sensor noise may be below zero.
+        initial: likewise.
+        final: likewise.
+        labels: N of them, of the rows.
+        pixel_pitch: mm, for the scale bars.
+        title: above all.
+
+    Raises:
+        InputError: shapes or labels that do not fit, no row, or a measured image without light.
+    """
+    images = [found.detach().cpu().double() for found in (measured, initial, final)]
+    count = len(labels)
+    if not count or any(i.ndim != 3 or i.shape != (count, *images[0].shape[1:]) for i in images):
+        shapes = ", ".join(str(tuple(i.shape)) for i in images)
+        raise InputError(f"{count} labels, and images of shapes {shapes}; all: (N, height, width)")
+    if not bool((images[0].sum((-2, -1)) > 0.0).all()):
+        raise InputError("a measured image has no light")
+    figure = Figure(
+        figsize=(4 * _PANEL + 1.9, (_PANEL + 0.05) * count + (0.55 if title else 0.3)),
+        layout="constrained",
+    )
+    grid = figure.subplots(count, 4, squeeze=False)
+    for number, (label, line) in enumerate(zip(labels, grid, strict=True)):
+        _row(figure, line, [found[number] for found in images], pixel_pitch)
+        line[0].set_ylabel(label, fontsize=SMALL + 1)
+    for axes, name in zip(grid[0], _COLUMNS, strict=True):
+        axes.set_title(name, fontsize=SMALL + 1)
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: float) -> None:
+    top, left, size = _window(images)
+    peak = images[0].max()
+    shown = [i[top : top + size, left : left + size] / peak for i in images]
+    for axes, picture in zip(line, shown, strict=False):
+        bright = axes.imshow(
+            picture.numpy(), cmap="inferno", vmin=0.0, vmax=1.0, interpolation="nearest"
+        )
+        axes.text(
+            0.04,
+            0.96,
+            f"peak {float(picture.max()):.2f}",
+            color="white",
+            va="top",
+            fontsize=SMALL - 1,
+            transform=axes.transAxes,
+            path_effects=_OUTLINE,
+        )
+    left_over = 100.0 * (shown[2] - shown[0])
+    reach = float(left_over.abs().max()) or 1.0
+    differing = line[3].imshow(
+        left_over.numpy(), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest"
+    )
+    for picture, owners, name in (
+        (bright, line[:3], "of measured peak"),
+        (differing, line[3], "% of measured peak"),
+    ):
+        bar = figure.colorbar(picture, ax=owners, fraction=0.05, pad=0.02)
+        bar.set_label(name, fontsize=SMALL - 1)
+        bar.ax.tick_params(labelsize=SMALL - 1)
+        bar.outline.set_visible(False)
+    for axes in line:
+        axes.set(xticks=[], yticks=[])
+    _scale_bar(line[0], shown[0].shape[-1], pitch)
+
+
+def _window(images: list[Tensor]) -> tuple[int, int, int]:
+    """Top, left and side, pixels, of a square that holds nearly all light of all the images."""
+    height, width = images[0].shape
+    ends = []
+    for direction in (1, 0):
+        lows, highs = [], []
+        for image in images:
+            cumulated = image.sum(direction).cumsum(0)
+            if float(cumulated[-1]) <= 0.0:
+                continue
+            inside = (cumulated > _BEYOND * cumulated[-1]) & (
+                cumulated < (1.0 - _BEYOND) * cumulated[-1]
+            )
+            places = inside.nonzero().flatten()
+            # All light in one pixel crosses both bounds at once.
+            lows.append(int(places.min()) if len(places) else int(image.sum(direction).argmax()))
+            highs.append(int(places.max()) + 1 if len(places) else lows[-1])
+        ends.append((min(lows), max(highs)))
+    longest = max(high - low + 1 for low, high in ends)
+    side = max(round((1.0 + 2.0 * _MARGIN) * longest), _SMALLEST_WINDOW)
+    side = min(side, height, width)
+    starts = [
+        min(max(round(0.5 * (low + high + 1 - side)), 0), length - side)
+        for (low, high), length in zip(ends, (height, width), strict=True)
+    ]
+    return starts[0], starts[1], side
+
+
+def _scale_bar(axes: Axes, size: int, pitch: float) -> None:
+    """A bar of a round length, at most 0.4 of the window, at the lower left."""
+    lengths = [factor * 10.0**power for power in range(-5, 4) for factor in (1, 2, 5)]
+    length = max((step for step in lengths if step <= 0.4 * size * pitch), default=size * pitch)
+    left, bottom = -0.5 + 0.05 * size, -0.5 + 0.94 * size
+    ends = [left, left + length / pitch]
+    axes.plot(ends, [bottom, bottom], color="white", linewidth=2, solid_capstyle="butt")
+    text = f"{length:g} mm" if length >= 0.1 else f"{1e3 * length:g} µm"
+    axes.text(
+        left,
+        bottom - 0.025 * size,
+        text,
+        color="white",
+        va="bottom",
+        fontsize=SMALL - 1,
+        path_effects=_OUTLINE,
+    )

@@ -1,0 +1,95 @@
+"""A picture of which elements were named, and how well their poses were found."""
+
+from pathlib import Path
+
+import lightning
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dolens.plotting import save_figure
+from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from experiments.callbacks.figures import log_figure
+from experiments.triplet_alignment import TripletAlignmentModule
+
+_PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
+
+
+class AlignmentPictures(lightning.Callback):
+    """`alignment.png`, and the same in TensorBoard.
+
+    Args:
+        folder: where it goes; made when needed.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Draw."""
+        figure = alignment_figure(pl_module)
+        save_figure(figure, self.folder / "alignment.png")
+        log_figure(trainer, "alignment", figure)
+
+
+def alignment_figure(module: TripletAlignmentModule) -> Figure:
+    """Elements off against elements named, and the spread of errors beside their bounds."""
+    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
+    left, *others = figure.subplots(1, 3, width_ratios=(0.8, 1.0, 1.0))
+    _confusion(left, module)
+    for axes, (name, columns, unit) in zip(others, _PANELS, strict=True):
+        _errors(axes, module, name, columns, unit)
+    figure.suptitle(
+        f"{module.lens.name}: {module.misalignments} misalignments from {len(module.fields)} fields"
+        f", {module.photons:.3g} photons a spot",
+        fontsize=TITLE,
+    )
+    return figure
+
+
+def _confusion(axes: Axes, module: TripletAlignmentModule) -> None:
+    found, names = module.alignment, module.elements
+    count = len(names)
+    # The demo is a case of its own, not of the batch.
+    pairs = (found.element * count + found.named)[1:]
+    table = torch.bincount(pairs, minlength=count * count).reshape(count, count)
+    share = table / table.sum(1, keepdim=True).clamp(min=1)
+    axes.imshow(share.numpy(), cmap="Blues", vmin=0.0, vmax=1.0)
+    for row in range(count):
+        for column in range(count):
+            pale = float(share[row, column]) > 0.5
+            text = str(int(table[row, column]))
+            colour = "white" if pale else "black"
+            axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=TITLE)
+    axes.set_xticks(range(count), names, fontsize=SMALL)
+    axes.set_yticks(range(count), names, fontsize=SMALL)
+    axes.set_xlabel("element named", fontsize=SMALL + 1)
+    axes.set_ylabel("element misaligned", fontsize=SMALL + 1)
+
+
+def _errors(
+    axes: Axes, module: TripletAlignmentModule, name: str, columns: slice, unit: str
+) -> None:
+    found = module.alignment
+    errors = found.errors(columns)
+    # The expected square of the error's length is the sum of the variances.
+    bound = found.bound[:, columns].norm(dim=1)
+    batch = torch.arange(len(errors)) > 0
+    for number, (element, colour) in enumerate(
+        zip(module.elements, colours(len(module.elements)), strict=True)
+    ):
+        mine = batch & (found.element == number)
+        if not bool(mine.any()):
+            continue
+        ordered = errors[mine].sort().values.clamp(min=1e-12)
+        share = 100.0 * torch.arange(1, len(ordered) + 1) / len(ordered)
+        axes.plot(ordered.numpy(), share.numpy(), color=colour, linewidth=1.5, label=element)
+        median = float(bound[mine].median())
+        axes.axvline(median, color=colour, linewidth=1.0, linestyle=":")
+    axes.plot([], [], color="0.4", linewidth=1.0, linestyle=":", label="bound on the RMS")
+    axes.set_xscale("log")
+    axes.set_ylim(0.0, 101.0)
+    axes.set_xlabel(f"error of the {name}, {unit}", fontsize=SMALL + 1)
+    axes.set_ylabel("share of misalignments, %", fontsize=SMALL + 1)
+    ruled_axes(axes)
+    axes.legend(frameon=False, fontsize=SMALL, loc="upper left")

@@ -1,0 +1,125 @@
+"""Pictures of fitted poses when they are found."""
+
+import itertools
+import math
+from pathlib import Path
+
+import lightning
+import torch
+from matplotlib.figure import Figure
+
+from dolens.plotting import save_figure
+from dolens.plotting.convergence import convergence_figure
+from dolens.plotting.corner import corner_figure
+from dolens.plotting.spot_fit import spot_fit_figure
+from experiments.callbacks.figures import log_figure
+from experiments.misalignment import MisalignmentModule
+
+
+class MisalignmentPictures(lightning.Callback):
+    """Images before and after, how fits converged, and how well poses are known, as PNG files.
+
+    Args:
+        folder: where they go; made when needed.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Write the files, and log them to TensorBoard."""
+        for name, figure in misalignment_figures(pl_module).items():
+            save_figure(figure, self.folder / f"{name}.png")
+            log_figure(trainer, name, figure)
+
+
+def misalignment_figures(module: MisalignmentModule) -> dict[str, Figure]:
+    """Figures of a run by name: `spots`, and `convergence_<fit>` and `corner_<fit>` of each fit.
+
+    A fit that made no iteration has no convergence.
+    """
+    figures = {"spots": _spots(module)}
+    for number, fit in enumerate(module.fits):
+        if any(row["fit"] == fit.name for row in module.history):
+            figures[f"convergence_{fit.name}"] = _convergence(module, number)
+        figures[f"corner_{fit.name}"] = _corner(module, number)
+    return figures
+
+
+def variable_label(name: str) -> str:
+    """`elements.lens.tilt_x` → `lens tilt x`, `sources.1.z` → `source 1 z`."""
+    short = name.removeprefix("elements.").replace("sources.", "source ")
+    return short.replace(".", " ").replace("_", " ")
+
+
+def _spots(module: MisalignmentModule) -> Figure:
+    measured, initial, final, labels = [], [], [], []
+    for number, fit in enumerate(module.fits):
+        shares = module.measurement(number).shares
+        measured.append(shares)
+        initial.append(
+            torch.stack([s.image for s in module.images(number, module.initial[number])])
+        )
+        final.append(torch.stack([s.image for s in module.images(number)]))
+        sources = [f", source {source + 1}" for source in range(len(shares))]
+        labels += [f"fit {fit.name}{source if len(shares) > 1 else ''}" for source in sources]
+    return spot_fit_figure(
+        torch.cat(measured),
+        torch.cat(initial),
+        torch.cat(final),
+        labels,
+        module.imager.sensor.pixel_pitch,
+        f"{module.lens.name}: measured and modelled images",
+    )
+
+
+def _convergence(module: MisalignmentModule, number: int) -> Figure:
+    fit, pose = module.fits[number], module.poses[number]
+    rows = [row for row in module.history if row["fit"] == fit.name]
+    stages = [
+        (optimizer, len(list(group)))
+        for (_, optimizer), group in itertools.groupby(
+            rows, key=lambda row: (row["stage"], row["optimizer"])
+        )
+    ]
+    values = {
+        variable_label(name): ([float(row[name]) for row in rows], unit)
+        for name, unit in zip(pose.names, _units(module, number), strict=True)
+    }
+    truth = _truth(module, number)
+    return convergence_figure(
+        [float(row["loss"]) for row in rows],
+        values,
+        stages,
+        {variable_label(name): truth[name] for name in pose.names if name in truth},
+        f"{module.lens.name}: convergence of fit {fit.name}",
+    )
+
+
+def _corner(module: MisalignmentModule, number: int) -> Figure:
+    fit, pose = module.fits[number], module.poses[number]
+    units = pose.units.cpu()
+    covariance = module.known[fit.name].covariance.cpu() / torch.outer(units, units)
+    found = torch.tensor([pose.found()[name] for name in pose.names], dtype=torch.float64)
+    truth = _truth(module, number)
+    true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
+    points = getattr(module, "estimates", {}).get(fit.name)
+    # Estimates scatter about the truth, where that is known; the truth lies about one estimate.
+    about_truth = points is not None and bool(true.isfinite().all())
+    return corner_figure(
+        covariance,
+        [variable_label(name) for name in pose.names],
+        _units(module, number),
+        true if about_truth else found,
+        points,
+        true if truth else None,
+        f"{module.lens.name}: how well fit {fit.name} knows its pose (Cramér–Rao)",
+    )
+
+
+def _truth(module: MisalignmentModule, number: int) -> dict[str, float]:
+    return {} if module.measured is not None else module.truth(number)
+
+
+def _units(module: MisalignmentModule, number: int) -> list[str]:
+    return ["mm" if unit == 1.0 else "deg" for unit in module.poses[number].units.tolist()]

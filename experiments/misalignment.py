@@ -1,0 +1,375 @@
+"""Section VI as a Lightning module: poses of a lens, fitted to images of point sources."""
+
+import copy
+import itertools
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from dolens.alignment.information import Knowledge, knowledge
+from dolens.alignment.measurement import Measurement, read_measurement, simulated
+from dolens.alignment.pose import Pose
+from dolens.alignment.spot_loss import SpotLoss, SpotResiduals
+from dolens.errors import InputError
+from dolens.imaging.sensor import Sensor
+from dolens.imaging.spot_image import SpotImage, SpotImager
+from dolens.optics.lens import Lens
+from dolens.optimize.damped_least_squares import DampedLeastSquares
+from experiments.pose_settings import Stage, fit_of, stage_of
+from experiments.tables import write_table
+
+logger = logging.getLogger(__name__)
+
+
+class MisalignmentModule(lightning.LightningModule):
+    """Finds poses one after another: an epoch is a fit, a step an iteration of one of its stages.
+
+    Args:
+        lens: as designed; its elements may have poses.
+        experiment: name of the experiment; a checkpoint of another one is refused.
+        sources: (S, 3), mm, in the lens's axes.
+        wavelength: nm.
+        sensor: the pixels; a measurement that is read brings its own.
+        fits: name → `variables`, `truth`, and `held: {from, variables}`.
+        stages: settings of `Stage`, in turn.
+        imager: settings of `SpotImager` besides sensor and wavelength.
+        centroid_weight: μ of S21, 1/mm².
+        photons: of each source, that pass the lens, in simulated measurements.
+        read_noise: RMS, electrons.
+        full_well: electrons; None: pixels do not saturate.
+        measurement: settings of `read_measurement`, for a photograph in the place of a simulation;
+            the fits then have no truth.
+        folder: of the run.
+        monte_carlo: measurements with other photons, for each fit, whose estimates (by one step of
+            weighted least squares) are compared with the bound and the truth; 0 for none.
+        seed: of simulations.
+
+    Raises:
+        InputError: a setting that is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        experiment: str,
+        sources: Sequence[Sequence[float]],
+        wavelength: float,
+        sensor: Sensor,
+        fits: Mapping[str, Mapping[str, Any]],
+        stages: Sequence[Mapping[str, Any]],
+        folder: str,
+        imager: Mapping[str, Any] | None = None,
+        centroid_weight: float = 1.0,
+        photons: int = 4_000_000,
+        read_noise: float = 2.0,
+        full_well: float | None = None,
+        measurement: Mapping[str, Any] | None = None,
+        monte_carlo: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        if lens.dtype != torch.float64:
+            raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
+        self.lens = lens.requires_grad_(False)
+        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.measured = None
+        if measurement is not None:
+            self.measured = read_measurement(**measurement)
+            sensor = self.measured.sensor
+        self.imager = SpotImager(sensor, float(wavelength), **(imager or {}))
+        self.centroid_weight = float(centroid_weight)
+        self.photons, self.read_noise, self.full_well = int(photons), float(read_noise), full_well
+        self.monte_carlo = int(monte_carlo)
+        self.stages = [stage_of(settings) for settings in stages]
+        self.fits = [fit_of(name, settings) for name, settings in fits.items()]
+        if not self.stages or not self.fits:
+            raise InputError("misalignment: give at least one fit and one stage")
+        # Each has a lens of its own, since what an earlier one found is held in it.
+        self.poses = nn.ModuleList(
+            Pose(copy.deepcopy(lens), sources, fit.variables) for fit in self.fits
+        )
+        for fit, pose in zip(self.fits, self.poses, strict=True):
+            for name in (*fit.truth, *fit.held):
+                pose.value(name)
+            for stage in self.stages:
+                unknown = set(stage.variables or ()) - set(pose.names)
+                if unknown:
+                    raise InputError(f"stages: variable '{unknown.pop()}' is not of fit {fit.name}")
+        self.initial = [pose.scaled.detach().clone() for pose in self.poses]
+        self.history: list[dict[str, float | str]] = []
+        self.results: list[dict[str, float | str]] = []
+        self.known: dict[str, Knowledge] = {}
+        self.estimates: dict[str, Tensor] = {}
+        self.seconds: dict[str, float] = {}
+        self._measurements: dict[int, Measurement] = {}
+
+    @property
+    def iterations(self) -> int:
+        """Of one fit."""
+        return sum(stage.iterations for stage in self.stages)
+
+    # ---------------------------------------------------------------- what is measured
+
+    def truth(self, number: int) -> dict[str, float]:
+        """All numbers that a fit's simulation has other than the lens: its own and those held."""
+        fit = self.fits[number]
+        found: dict[str, float] = {}
+        if fit.held_from is not None:
+            before = self.truth(self._number(fit.held_from))
+            found = {name: before[name] for name in fit.held if name in before}
+        return {**found, **fit.truth}
+
+    def true_pose(self, number: int) -> Pose:
+        """The lens and the sources as they are simulated, with the fit's variables."""
+        pose = self.poses[number]
+        truth = self.truth(number)
+        # All that the truth names is set; the variables that it does not name are as they are.
+        settings = {name: {"initial": value} for name, value in truth.items()}
+        placed = Pose(copy.deepcopy(self.lens), pose.sources.tolist(), settings)
+        placed.store()
+        scales = dict(zip(pose.names, pose.scale_in_units.tolist(), strict=True))
+        variables = {name: {"scale": scales[name]} for name in pose.names}
+        return Pose(placed.lens, placed.sources.tolist(), variables)
+
+    def measurement(self, number: int, seed: int = 0) -> Measurement:
+        """What a fit is to explain."""
+        if self.measured is not None:
+            return self.measured
+        if seed == 0 and number in self._measurements:
+            return self._measurements[number]
+        true = self.true_pose(number)
+        generator = torch.Generator().manual_seed(1000003 * (self.seed + 1) + 1009 * number + seed)
+        found = simulated(
+            true.lens,
+            true.sources,
+            self.imager.wavelength,
+            self.imager.sensor,
+            self.photons,
+            self.read_noise,
+            generator,
+            self.full_well,
+        )
+        if seed == 0:
+            self._measurements[number] = found
+        return found
+
+    def loss(self, number: int, stage: Stage) -> SpotLoss:
+        """Of a fit in a stage."""
+        weight = stage.centroid_weight
+        weight = self.centroid_weight if weight is None else weight
+        return SpotLoss(self.measurement(number), self.imager, weight, stage.blur)
+
+    # ---------------------------------------------------------------- iterations
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        """One for each stage of each fit, all of which a checkpoint holds."""
+        found: list[torch.optim.Optimizer] = []
+        for pose in self.poses:
+            for stage in self.stages:
+                if stage.optimizer == "adam":
+                    found.append(torch.optim.Adam([pose.scaled], lr=stage.learning_rate))
+                else:
+                    found.append(DampedLeastSquares([pose.scaled]))
+        return found
+
+    def on_train_epoch_start(self) -> None:
+        """Hold what earlier fits have found."""
+        self._hold(self.current_epoch)
+
+    def on_train_start(self) -> None:
+        """The same when a run is resumed within a fit."""
+        self._hold(min(self.current_epoch, len(self.fits) - 1))
+
+    @torch.no_grad()
+    def _hold(self, number: int) -> None:
+        fit, pose = self.fits[number], self.poses[number]
+        if fit.held_from is None:
+            return
+        before = self.poses[self._number(fit.held_from)]
+        found = before.found()
+        held = {name: {"initial": found[name]} for name in fit.held}
+        placed = Pose(pose.lens, pose.sources.tolist(), held)
+        placed.store()
+        pose.sources.copy_(placed.sources)
+
+    def _number(self, name: str) -> int:
+        return [fit.name for fit in self.fits].index(name)
+
+    def training_step(self, batch: Tensor, batch_idx: int) -> None:
+        """One iteration of the stage that is on."""
+        started = time.perf_counter()
+        number, place = self.current_epoch, self._stage_at(batch_idx)
+        stage = self.stages[place]
+        pose, loss = self.poses[number], self.loss(number, stage)
+        chosen = torch.tensor(
+            [stage.variables is None or name in stage.variables for name in pose.names]
+        )
+        optimizers = self.optimizers()
+        # Of a single one Lightning makes no list.
+        optimizers = optimizers if isinstance(optimizers, list) else [optimizers]
+        optimizer = optimizers[number * len(self.stages) + place]
+        bare = optimizer.optimizer
+        if stage.optimizer == "adam":
+            optimizer.zero_grad()
+            residuals = loss.residuals(pose)
+            residuals.square().sum().backward()
+            pose.scaled.grad.mul_(chosen)
+            optimizer.step()
+        else:
+            optimizer.step(lambda: SpotResiduals(loss, pose, chosen))
+            with torch.no_grad():
+                residuals = loss.residuals(pose)
+        self._record(number, place, stage, loss.terms(residuals.detach()), bare, started)
+
+    def _stage_at(self, iteration: int) -> int:
+        """Number of the stage that an iteration of a fit belongs to."""
+        ends = itertools.accumulate(stage.iterations for stage in self.stages)
+        return next((i for i, end in enumerate(ends) if iteration < end), len(self.stages) - 1)
+
+    def _record(
+        self,
+        number: int,
+        place: int,
+        stage: Stage,
+        terms: Mapping[str, Tensor],
+        optimizer: torch.optim.Optimizer,
+        started: float,
+    ) -> None:
+        seconds = time.perf_counter() - started
+        fit, pose = self.fits[number], self.poses[number]
+        row: dict[str, float | str] = {
+            "fit": fit.name,
+            "stage": place + 1,
+            "optimizer": stage.optimizer,
+            "loss": float(sum(terms.values())),
+            **{f"loss/{name}": float(value) for name, value in terms.items()},
+            **{name: value for name, value in pose.found().items()},
+            "seconds": seconds,
+        }
+        last = getattr(optimizer, "last", None)
+        if last is not None:
+            row["damping"] = last.damping
+        self.history.append(row)
+        self.seconds[fit.name] = self.seconds.get(fit.name, 0.0) + seconds
+        self.log("train/loss", row["loss"], prog_bar=True)
+        numbers = {k: v for k, v in row.items() if isinstance(v, float)}
+        for entry in self.loggers:
+            entry.log_metrics(
+                {f"{fit.name}/{name}": value for name, value in numbers.items()},
+                step=self.global_step,
+            )
+
+    # ---------------------------------------------------------------- what was found
+
+    @torch.no_grad()
+    def test_step(self, batch: Tensor, batch_idx: int) -> None:
+        """Errors, bounds, and what cannot be told apart; tables and metrics."""
+        for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
+            self._hold(number)
+            measurement = self.measurement(number)
+            known = knowledge(pose, self.imager, measurement)
+            self.known[fit.name] = known
+            truth = self.truth(number) if self.measured is None else {}
+            start = (self.initial[number] * pose.scale_in_units).tolist()
+            bounds = (known.bounds / pose.units).tolist()
+            for (name, value), first, bound in zip(
+                pose.found().items(), start, bounds, strict=True
+            ):
+                error = value - truth[name] if name in truth else math.nan
+                self.results.append(
+                    {
+                        "fit": fit.name,
+                        "variable": name,
+                        "true": truth.get(name, math.nan),
+                        "initial": first,
+                        "found": value,
+                        "error": error,
+                        "bound": bound,
+                    }
+                )
+                self.log(f"pose/{fit.name}/{name}", value)
+                self.log(f"pose_bound/{fit.name}/{name}", bound)
+                if math.isfinite(error):
+                    self.log(f"pose_error/{fit.name}/{name}", abs(error))
+            if self.monte_carlo and self.measured is None:
+                self._compare_with_bounds(number, known)
+        write_table(self.folder / "history.csv", self.history)
+        write_table(self.folder / "poses.csv", self.results)
+        for row in self.results:
+            logger.info(
+                "%s %s: true %.5g, initial %.5g, found %.5g, error %.2g, bound %.2g",
+                *(row[key] for key in row),
+            )
+
+    def _compare_with_bounds(self, number: int, known: Knowledge) -> None:
+        """Estimates of other measurements: their spread over the bound, and 95 % intervals."""
+        fit, pose = self.fits[number], self.poses[number]
+        theta = pose.scale * pose.scaled.detach()
+        found = [
+            theta + known.correction(self.measurement(number, seed))
+            for seed in range(1, self.monte_carlo + 1)
+        ]
+        self.estimates[fit.name] = torch.stack(found) / pose.units
+        truth = self.truth(number)
+        bounds = known.bounds / pose.units
+        spread = self.estimates[fit.name].std(0) / bounds
+        for place, name in enumerate(pose.names):
+            self.log(f"pose_spread_over_bound/{fit.name}/{name}", float(spread[place]))
+            if name in truth:
+                off = (self.estimates[fit.name][:, place] - truth[name]).abs()
+                within = (off < 1.96 * bounds[place]).double().mean()
+                self.log(f"pose_coverage/{fit.name}/{name}", float(within))
+
+    def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:
+        """Of a fit's pose, or of another point u."""
+        self._hold(number)
+        with torch.no_grad():
+            return self.poses[number].images(self.imager, scaled)
+
+    def summary(self) -> dict[str, float]:
+        """Numbers about the whole run, for metrics.json."""
+        numbers = {f"cost/{name}_s": value for name, value in self.seconds.items()}
+        numbers["cost/iterations"] = float(len(self.history))
+        numbers["cost/rays"] = float(self.imager.rays * len(self.poses[0].sources))
+        errors = [
+            abs(row["error"]) / row["bound"] for row in self.results if math.isfinite(row["error"])
+        ]
+        if errors:
+            numbers["pose_error/over_bound"] = math.sqrt(sum(e * e for e in errors) / len(errors))
+        return numbers
+
+    # ---------------------------------------------------------------- checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say which experiment it is, and what has been done."""
+        checkpoint["dolens"] = self._identity()
+        checkpoint["history"], checkpoint["seconds"] = self.history, self.seconds
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another experiment.
+
+        Raises:
+            InputError: it is one.
+        """
+        if checkpoint.get("dolens") != self._identity():
+            raise InputError(
+                "ckpt_path: the checkpoint is of another experiment, other fits or other stages"
+            )
+        self.history = list(checkpoint.get("history", []))
+        self.seconds = dict(checkpoint.get("seconds", {}))
+
+    def _identity(self) -> dict[str, Any]:
+        return {
+            "experiment": self.experiment,
+            "lens": self.lens.name,
+            "fits": {fit.name: list(fit.variables) for fit in self.fits},
+            "stages": [[stage.optimizer, stage.iterations] for stage in self.stages],
+        }

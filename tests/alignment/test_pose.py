@@ -1,0 +1,236 @@
+"""Poses from images: losses, what can be known, measurements."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+
+from dolens.alignment.information import Knowledge, covariance_of, knowledge
+from dolens.alignment.measurement import Measurement, read_measurement, simulated
+from dolens.alignment.pose import Pose
+from dolens.alignment.spot_loss import SpotLoss, SpotResiduals
+from dolens.errors import InputError
+from dolens.imaging.sensor import Sensor
+from dolens.imaging.spot_image import SpotImager
+from dolens.optimize.damped_least_squares import DampedLeastSquares
+from dolens.prescriptions import lens_from_prescription
+
+SENSOR = Sensor(48, 48, 0.1)
+SOURCE = [[0.0, 0.0, -864.0]]
+TILT, SHIFT = "elements.lens.tilt_x", "elements.lens.decenter_y"
+ALL = ("decenter_x", "decenter_y", "shift_z", "tilt_x", "tilt_y")
+IMAGER = SpotImager(SENSOR, 622.5, 40_000, subpixels=1)
+
+
+@pytest.fixture
+def singlet(root):
+    prescription = yaml.safe_load((root / "conf/lens/la1509.yaml").read_text())
+    prescription["elements"] = {"lens": {"surfaces": [1, 2]}}
+    return lens_from_prescription(prescription).double().requires_grad_(False)
+
+
+def pose(lens, **initial):
+    """All of a lens's pose, starting from these numbers (degrees, mm)."""
+    settings = {f"elements.lens.{n}": {"initial": initial.get(n, 0.0)} for n in ALL}
+    return Pose(copy.deepcopy(lens), SOURCE, settings)
+
+
+def seen(lens, photons=400_000, read_noise=2.0, seed=0, sensor=SENSOR, **truth):
+    """A simulated measurement of the lens in a pose."""
+    true = pose(lens, **truth)
+    true.store()
+    generator = torch.Generator().manual_seed(seed)
+    return simulated(true.lens, true.sources, 622.5, sensor, photons, read_noise, generator)
+
+
+def fitted(loss, fit, iterations=15):
+    """By least squares."""
+    chosen = torch.ones(len(fit.names), dtype=torch.bool)
+    optimizer = DampedLeastSquares([fit.scaled])
+    for _ in range(iterations):
+        optimizer.step(lambda: SpotResiduals(loss, fit, chosen))
+    return fit.found()
+
+
+def test_degrees_outside_and_radians_inside(singlet):
+    one = pose(singlet, tilt_x=3.0, shift_z=0.5)
+    assert float(one.values()[TILT]) == pytest.approx(math.radians(3.0))
+    assert one.found()[TILT] == pytest.approx(3.0)
+    one.store()
+    assert float(one.lens.elements["lens"].tilt_x) == pytest.approx(math.radians(3.0))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"sources.2.x": None}, "sources.<1 to 1>"),
+        ({"elements.lens.*": None}, "not one number"),
+        ({TILT: {"size": 1.0}}, "unknown key 'size'"),
+        ({TILT: {"scale": 0.0}}, "scale must be positive"),
+    ],
+)
+def test_bad_variables_are_errors(singlet, settings, message):
+    with pytest.raises(InputError, match=message):
+        Pose(singlet, SOURCE, settings)
+
+
+def test_simulation_and_model_agree_to_their_noise(singlet):
+    """Photons counted by other code, with sharp rims and square pixels: χ² of a pixel is near 1."""
+    truth = {"tilt_x": 8.0, "tilt_y": -3.0, "decenter_y": 0.4, "shift_z": -1.0}
+    measured = seen(singlet, 300_000, **truth)
+    with torch.no_grad():
+        (image,) = pose(singlet, **truth).images(SpotImager(SENSOR, 622.5, 400_000, subpixels=4))
+    expected = float(measured.totals[0]) * image.image
+    bright = expected > 20.0
+    chi = (measured.images[0] - expected).square() / (expected + 4.0)
+    assert float(chi[bright].mean()) == pytest.approx(1.0, abs=0.25)
+    assert torch.allclose(measured.centroids()[0], image.centroid, atol=2e-3)
+
+
+def test_least_squares_jacobian_is_that_of_differences(singlet):
+    loss = SpotLoss(seen(singlet, tilt_x=2.0), IMAGER, 1.0, blur=1.0)
+    one = pose(singlet, tilt_x=1.0, decenter_y=0.1)
+    chosen = torch.tensor([True, True, True, True, False])
+    residuals, jacobian = loss.jacobian(one, chosen)
+    point, h = one.scaled.detach(), 1e-6
+    assert torch.allclose(residuals, loss.residuals(one).detach())
+    assert not bool(jacobian[:, 4].any())
+    for number in range(4):
+        step = torch.zeros_like(point)
+        step[number] = h
+        with torch.no_grad():
+            difference = (loss.residuals(one, point + step) - loss.residuals(one, point - step)) / (
+                2.0 * h
+            )
+        assert float((jacobian[:, number] - difference).abs().max()) < 1e-4 * float(
+            difference.abs().max()
+        )
+
+
+def test_without_centroids_a_fit_of_spots_apart_stagnates_and_with_them_it_does_not(singlet):
+    """S21's reason: where spots do not overlap the squared error of images has no slope."""
+    sharp = copy.deepcopy(singlet)
+    with torch.no_grad():
+        sharp.sensor_distance.fill_(112.0)
+    measured = seen(sharp, read_noise=0.0, decenter_y=1.5)
+    errors = {}
+    for weight in (0.0, 1.0):
+        one = Pose(copy.deepcopy(sharp), SOURCE, {SHIFT: None})
+        loss = SpotLoss(measured, IMAGER, weight)
+        with torch.no_grad():
+            (image,) = one.images(IMAGER)
+        assert not bool(((image.image > 0.0) & (measured.images[0] > 0.0)).any())
+        errors[weight] = abs(fitted(loss, one)[SHIFT] - 1.5)
+    assert errors[0.0] > 1.4
+    assert errors[1.0] < 0.003
+
+
+def test_a_pose_is_found_within_a_few_of_its_bounds(singlet):
+    truth = {"tilt_x": 10.0, "tilt_y": 2.0, "decenter_x": 0.2, "decenter_y": 0.3, "shift_z": -0.5}
+    measured = seen(singlet, 1_000_000, **truth)
+    one = pose(singlet, tilt_x=9.0)
+    found = fitted(SpotLoss(measured, IMAGER, 1.0), one, 12)
+    bounds = knowledge(one, IMAGER, measured).bounds / one.units
+    for name, bound in zip(one.names, bounds.tolist(), strict=True):
+        assert abs(found[name] - truth[name.rpartition(".")[2]]) < 10.0 * bound
+
+
+def test_the_bound_is_that_of_many_simulated_estimates(singlet):
+    """Photons drawn anew 200 times: spread over bound is 1 to its standard error, 0.05, and 95 %
+    intervals about the estimates' mean hold 95 % of them.
+    """
+    truth = {"tilt_x": 10.0, "decenter_y": 0.3}
+    one = pose(singlet, **truth)
+    measured = seen(singlet, 100_000, **truth)
+    known = knowledge(one, SpotImager(SENSOR, 622.5, 200_000, subpixels=2), measured)
+    generator = torch.Generator().manual_seed(1)
+    images = torch.poisson(known.expected.clamp(min=0.0).expand(200, -1, -1, -1), generator)
+    images = images + 2.0 * torch.randn(images.shape, generator=generator, dtype=torch.float64)
+    found = torch.stack(
+        [known.correction(Measurement(image, measured.mask, 2.0, SENSOR)) for image in images]
+    )
+    ratio = found.std(0) / known.bounds
+    assert float((ratio - 1.0).abs().max()) < 4.0 / math.sqrt(2.0 * 200.0)
+    within = ((found - found.mean(0)).abs() < 1.96 * known.bounds).double().mean(0)
+    assert float((within - 0.95).abs().max()) < 0.06
+
+
+def test_information_grows_with_light_and_with_sources(singlet):
+    """Four times the photons halve a bound that shot noise sets; a second source adds its own."""
+    one = pose(singlet, tilt_x=10.0)
+    few = Measurement(*_flat(1, 1e5), 0.0, SENSOR)
+    many = Measurement(*_flat(1, 4e5), 0.0, SENSOR)
+    ratio = knowledge(one, IMAGER, few).bounds / knowledge(one, IMAGER, many).bounds
+    assert torch.allclose(ratio, torch.full_like(ratio, 2.0), rtol=1e-3)
+    names = {f"elements.lens.{n}": {"initial": 10.0 if n == "tilt_x" else 0.0} for n in ALL}
+    two = Pose(singlet, [*SOURCE, [150.0, 0.0, -864.0]], names)
+    wide = SpotImager(Sensor(96, 96, 0.5), 622.5, 20_000, subpixels=1)
+    alone = Pose(singlet, SOURCE, names)
+    sensor = wide.sensor
+    first = knowledge(alone, wide, Measurement(*_flat(1, 1e5, sensor), 0.0, sensor)).bounds
+    both = knowledge(two, wide, Measurement(*_flat(2, 1e5, sensor), 0.0, sensor)).bounds
+    assert bool((both < first).all())
+
+
+def test_what_cannot_be_seen_has_a_bound_beyond_all_measure():
+    """Two numbers of which images show only the sum, and a third that they do not show."""
+    weighted = torch.tensor([[3.0, 3.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]).double()
+    root = torch.linalg.qr(weighted, mode="r").R
+    fisher, covariance = weighted.T @ weighted, covariance_of(root)
+    known = Knowledge(("a", "b", "c"), fisher, covariance, weighted, weighted, weighted)
+    assert bool((known.bounds > 1e5).all())
+    assert float(known.correlations[0, 1]) == pytest.approx(-1.0)
+    spread, combinations = known.combinations(torch.ones(3, dtype=torch.float64))
+    assert spread.tolist()[2] == pytest.approx(1.0 / math.sqrt(20.0))
+    assert combinations[2].abs().tolist() == pytest.approx([0.5**0.5, 0.5**0.5, 0.0], abs=1e-9)
+    assert float(spread[1]) > 1e6
+
+
+def _flat(count, total, sensor=SENSOR):
+    """Images whose totals alone count, and a mask of ones."""
+    shape = (count, sensor.height, sensor.width)
+    images = torch.full(shape, total / (sensor.height * sensor.width), dtype=torch.float64)
+    return images, torch.ones(shape, dtype=torch.bool)
+
+
+def test_a_photograph_is_read_with_its_dark_level_region_and_saturation(tmp_path):
+    counts = np.full((40, 60), 100, np.uint16)
+    counts[10:14, 20:24] = 1100
+    counts[12, 30] = 65535
+    Image.fromarray(counts).save(tmp_path / "spot.tif")
+    found = read_measurement(
+        tmp_path / "spot.tif",
+        0.01,
+        dark_level=100.0,
+        region=(8, 16, 20, 24),
+        downsample=2,
+        electrons_per_count=0.5,
+        read_noise=3.0,
+    )
+    assert found.images.shape == (1, 10, 12)
+    assert found.read_noise == 6.0
+    assert found.sensor.pixel_pitch == 0.02
+    # 16 bright pixels of 1000 counts above the dark, half an electron each.
+    assert float(found.totals[0]) == pytest.approx(8000.0)
+    assert int((~found.mask).sum()) == 1
+    # The patch's middle is at row 11.5, column 21.5 of 40 × 60; images are upside down.
+    assert found.centroids()[0].tolist() == pytest.approx(
+        [(29.5 - 21.5) * 0.01, (11.5 - 19.5) * 0.01]
+    )
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda p: p.write_bytes(b"none"), "cannot be read"),
+        (lambda p: Image.new("RGB", (4, 4)).save(p), "one channel of integers"),
+    ],
+)
+def test_a_file_that_is_no_photograph_is_an_error(tmp_path, write, message):
+    write(tmp_path / "spot.png")
+    with pytest.raises(InputError, match=message):
+        read_measurement(tmp_path / "spot.png", 0.01)

@@ -1,0 +1,132 @@
+"""The five fits of Section VI, at a size that takes seconds."""
+
+import csv
+import json
+import math
+
+import pytest
+import torch
+from hydra.errors import InstantiationException
+
+from dolens.errors import InputError
+from experiments.training import run
+
+TINY = [
+    "experiment=misalignment",
+    "~fits.10",
+    "~fits.25",
+    "~fits.30",
+    "sensor.height=32",
+    "sensor.width=32",
+    "sensor.pixel_pitch=0.2208",
+    "photons=100000",
+    "imager.rays=10000",
+    "trainer.max_epochs=2",
+    "+trainer.enable_progress_bar=false",
+    "callbacks.pictures=null",
+]
+SHORT = [
+    "stages=[{optimizer: adam, iterations: 2},{optimizer: dls, iterations: 2}]",
+    "data.iterations=4",
+]
+
+
+def state(folder):
+    return torch.load(folder / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+
+
+def test_poses_are_found_and_what_was_found_first_is_held(composed, tmp_path):
+    """From Figure 8's initial values to its truth, then the lens's own pose."""
+    first, second = (
+        "{optimizer: adam, iterations: 40, learning_rate: 0.2}",
+        "{optimizer: dls, iterations: 12}",
+    )
+    run(composed(*TINY, f"stages=[{first},{second}]", "data.iterations=52"))
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    with (tmp_path / "run/poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 11
+    for row in rows:
+        initial = abs(float(row["initial"]) - float(row["true"]))
+        error = abs(float(row["error"]))
+        # Everything that began far off is found, or is as near as can be known.
+        assert error < max(0.25 * initial, 10.0 * float(row["bound"])), row
+        name = f"pose_error/{row['fit']}/{row['variable']}"
+        assert metrics[name] == pytest.approx(error, rel=1e-4)
+        assert metrics[f"pose_bound/{row['fit']}/{row['variable']}"] > 0.0
+    with (tmp_path / "run/history.csv").open() as file:
+        history = list(csv.DictReader(file))
+    assert len(history) == 104
+    for row in history:
+        terms = float(row["loss/image"]) + float(row["loss/centroid"])
+        assert float(row["loss"]) == pytest.approx(terms, rel=1e-9)
+    assert metrics["pose_error/over_bound"] < 30.0
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 6])
+def test_a_resumed_run_ends_with_the_same_poses_to_the_bit(composed, tmp_path, stop_after):
+    """Within a stage of Adam, within least squares, and within the second fit."""
+    steps = "callbacks.last.every_n_train_steps=1"
+    run(composed(*TINY, *SHORT, steps, folder="whole"))
+    part = f"+trainer.max_steps={stop_after}"
+    run(composed(*TINY, *SHORT, steps, part, "test=false", "objective=train/loss", folder="part"))
+    last = tmp_path / "part/checkpoints/last.ckpt"
+    run(composed(*TINY, *SHORT, steps, f"ckpt_path={last}", folder="resumed"))
+    whole, again = state(tmp_path / "whole"), state(tmp_path / "resumed")
+    assert whole.keys() == again.keys()
+    for name, value in whole.items():
+        assert torch.equal(value, again[name]), name
+
+
+def test_a_stage_may_move_some_variables_only(composed, tmp_path):
+    stages = "stages=[{optimizer: dls, iterations: 2, variables: [elements.lens.tilt_x]}]"
+    run(composed(*TINY, "~fits.5", stages, "data.iterations=2", "trainer.max_epochs=1"))
+    with (tmp_path / "run/poses.csv").open() as file:
+        found = {row["variable"]: row for row in csv.DictReader(file)}
+    moved = {n for n, row in found.items() if float(row["found"]) != float(row["initial"])}
+    assert moved == {"elements.lens.tilt_x"}
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("stages=[{optimizer: lbfgs, iterations: 2}]", "'lbfgs' is unknown; allowed: adam, dls"),
+        ("stages=[{optimizer: dls, iterations: 0}]", "0 iterations"),
+        ("stages=[{optimizer: dls, iterations: 1, variables: [focus]}]", "variable 'focus'"),
+        ("+fits.5.start=1", "fits.5: unknown key 'start'"),
+        ("+fits.5.truth.focus=1", "focus"),
+        ("lens_dtype=float32", "poses are fitted in float64"),
+    ],
+)
+def test_bad_settings_are_errors(composed, override, message):
+    with pytest.raises((InputError, InstantiationException)) as caught:
+        run(composed(*TINY, override))
+    assert message in str(caught.value)
+
+
+def test_a_photograph_is_fitted_without_a_truth(composed, tmp_path):
+    """Its pixels, its region and its dark level; errors cannot be told, bounds can."""
+    import numpy as np
+    from PIL import Image
+
+    rows, columns = np.mgrid[:256, :256]
+    spot = 20000.0 * (np.hypot(rows - 128.0, columns - 120.0) < 40.0)
+    Image.fromarray((spot + 500.0).astype(np.uint16)).save(tmp_path / "spot.tif")
+    photograph = (
+        f"measurement={{path: {tmp_path / 'spot.tif'}, pixel_pitch: 0.0276, dark_level: 500, "
+        "downsample: 8}"
+    )
+    run(
+        composed(
+            *TINY,
+            *SHORT,
+            "~fits.5",
+            "trainer.max_epochs=1",
+            photograph,
+            "objective=pose_bound/0/sensor_distance",
+        )
+    )
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert math.isfinite(metrics["pose/0/sensor_distance"])
+    assert metrics["pose_bound/0/sensor_distance"] > 0.0
+    assert not any(name.startswith("pose_error") for name in metrics)
