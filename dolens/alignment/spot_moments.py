@@ -90,9 +90,20 @@ class MomentModel:
     def _in_chunks(
         self, batch: Callable[..., tuple[Tensor, ...]], copies: int, *rows: Tensor
     ) -> list[Tensor]:
+        """A function of a batch, some rows at a time, on one thread.
+
+        Split among PyTorch's threads, the many short operations wait for one another, which takes
+        up to thirty times as long; and chunks cannot have threads of their own, since PyTorch
+        counts the levels of forward derivatives for the whole process.
+        """
         size = max(1, _RAYS_AT_A_TIME // (copies * len(self.shares)))
-        chunks = zip(*(part.split(size) for part in rows), strict=True)
-        parts = [batch(*chunk) for chunk in chunks]
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            chunks = zip(*(part.split(size) for part in rows), strict=True)
+            parts = [batch(*chunk) for chunk in chunks]
+        finally:
+            torch.set_num_threads(threads)
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
 
