@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from dolens.alignment.information import Knowledge, knowledge
 from dolens.alignment.measurement import Measurement, read_measurement, simulated
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotLoss, SpotResiduals
+from dolens.alignment.spot_loss import SpotLoss, SpotMerit
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImage, SpotImager
@@ -111,15 +111,14 @@ class MisalignmentModule(lightning.LightningModule):
         self.seconds: dict[str, float] = {}
         self._measurements: dict[int, Measurement] = {}
 
-    @property
-    def iterations(self) -> int:
-        """Of one fit."""
-        return sum(stage.iterations for stage in self.stages)
-
     # ---------------------------------------------------------------- what is measured
 
     def truth(self, number: int) -> dict[str, float]:
-        """All numbers that a fit's simulation has other than the lens: its own and those held."""
+        """All numbers that a fit's simulation has other than the lens: its own and those held; none
+        where a photograph is fitted.
+        """
+        if self.measured is not None:
+            return {}
         fit = self.fits[number]
         found: dict[str, float] = {}
         if fit.held_from is not None:
@@ -128,16 +127,10 @@ class MisalignmentModule(lightning.LightningModule):
         return {**found, **fit.truth}
 
     def true_pose(self, number: int) -> Pose:
-        """The lens and the sources as they are simulated, with the fit's variables."""
-        pose = self.poses[number]
-        truth = self.truth(number)
-        # All that the truth names is set; the variables that it does not name are as they are.
-        settings = {name: {"initial": value} for name, value in truth.items()}
-        placed = Pose(copy.deepcopy(self.lens), pose.sources.tolist(), settings)
-        placed.store()
-        scales = dict(zip(pose.names, pose.scale_in_units.tolist(), strict=True))
-        variables = {name: {"scale": scales[name]} for name in pose.names}
-        return Pose(placed.lens, placed.sources.tolist(), variables)
+        """The lens and the sources that are simulated; what the truth does not name is as given."""
+        true = Pose(copy.deepcopy(self.lens), self.poses[number].sources.tolist(), {})
+        true.put(self.truth(number))
+        return true
 
     def measurement(self, number: int, seed: int = 0) -> Measurement:
         """What a fit is to explain."""
@@ -188,17 +181,12 @@ class MisalignmentModule(lightning.LightningModule):
         """The same when a run is resumed within a fit."""
         self._hold(min(self.current_epoch, len(self.fits) - 1))
 
-    @torch.no_grad()
     def _hold(self, number: int) -> None:
         fit, pose = self.fits[number], self.poses[number]
         if fit.held_from is None:
             return
-        before = self.poses[self._number(fit.held_from)]
-        found = before.found()
-        held = {name: {"initial": found[name]} for name in fit.held}
-        placed = Pose(pose.lens, pose.sources.tolist(), held)
-        placed.store()
-        pose.sources.copy_(placed.sources)
+        found = self.poses[self._number(fit.held_from)].found()
+        pose.put({name: found[name] for name in fit.held})
 
     def _number(self, name: str) -> int:
         return [fit.name for fit in self.fits].index(name)
@@ -224,9 +212,9 @@ class MisalignmentModule(lightning.LightningModule):
             pose.scaled.grad.mul_(chosen)
             optimizer.step()
         else:
-            optimizer.step(lambda: SpotResiduals(loss, pose, chosen))
-            with torch.no_grad():
-                residuals = loss.residuals(pose)
+            merit = SpotMerit(loss, pose, chosen)
+            optimizer.step(merit)
+            residuals = merit().residuals
         self._record(number, place, stage, loss.terms(residuals.detach()), bare, started)
 
     def _stage_at(self, iteration: int) -> int:
@@ -251,7 +239,7 @@ class MisalignmentModule(lightning.LightningModule):
             "optimizer": stage.optimizer,
             "loss": float(sum(terms.values())),
             **{f"loss/{name}": float(value) for name, value in terms.items()},
-            **{name: value for name, value in pose.found().items()},
+            **pose.found(),
             "seconds": seconds,
         }
         last = getattr(optimizer, "last", None)
@@ -277,7 +265,7 @@ class MisalignmentModule(lightning.LightningModule):
             measurement = self.measurement(number)
             known = knowledge(pose, self.imager, measurement)
             self.known[fit.name] = known
-            truth = self.truth(number) if self.measured is None else {}
+            truth = self.truth(number)
             start = (self.initial[number] * pose.scale_in_units).tolist()
             bounds = (known.bounds / pose.units).tolist()
             for (name, value), first, bound in zip(

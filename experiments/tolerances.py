@@ -22,6 +22,7 @@ from dolens.tolerancing import (
     spot_weights,
     tolerances_from,
 )
+from experiments.settings import numbers_of
 from experiments.tables import write_table
 from experiments.tolerance_tables import (
     monte_carlo_rows,
@@ -83,8 +84,8 @@ class TolerancesModule(lightning.LightningModule):
                 raise InputError(f"{key}: {number!r}; allowed: an integer of 1 or more")
         self.lens = lens.requires_grad_(False)
         self.experiment = experiment
-        self.fields = [_numbers("fields", field, 2) for field in fields]
-        self.wavelengths = _numbers("wavelengths", wavelengths)
+        self.fields = [numbers_of("fields", field, 2) for field in fields]
+        self.wavelengths = numbers_of("wavelengths", wavelengths)
         for key, given in (("fields", self.fields), ("wavelengths", self.wavelengths)):
             if not given:
                 raise InputError(f"{key}: none is given")
@@ -93,7 +94,7 @@ class TolerancesModule(lightning.LightningModule):
         self.folder = Path(folder)
         self.lenses, self.chunk_size = lenses, chunk_size
         self.rings, self.arms = rings, arms
-        self.yield_at_um = _numbers("yield_at_um", yield_at_um)
+        self.yield_at_um = numbers_of("yield_at_um", yield_at_um)
         self.seed = seed
         self.analysis: ToleranceAnalysis | None = None
 
@@ -199,16 +200,6 @@ class TolerancesModule(lightning.LightningModule):
     def _weights(self, weights: Sequence[float] | None) -> Tensor:
         """(S,), from the fields': every wavelength of a field counts alike."""
         if weights is not None:
-            weights = torch.tensor(_numbers("weights", weights, len(self.fields)))
+            weights = torch.tensor(numbers_of("weights", weights, len(self.fields)))
             weights = weights.double().repeat_interleave(len(self.wavelengths))
         return spot_weights(weights, len(self.fields) * len(self.wavelengths))
-
-
-def _numbers(key: str, values: Any, count: int | None = None) -> list[float]:
-    try:
-        numbers = [float(value) for value in values]
-    except (TypeError, ValueError):
-        raise InputError(f"{key}: must be numbers, not {values!r}") from None
-    if count is not None and len(numbers) != count:
-        raise InputError(f"{key}: {count} numbers are needed, not {len(numbers)}")
-    return numbers

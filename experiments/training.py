@@ -24,6 +24,12 @@ logger = logging.getLogger(__name__)
 # Arithmetic that configurations need: the number of steps of a whole training.
 OmegaConf.register_new_resolver("total_steps", lambda epochs, steps: epochs * steps, replace=True)
 
+# And the iterations of stages together.
+OmegaConf.register_new_resolver(
+    "iterations", lambda stages: sum(stage["iterations"] for stage in stages), replace=True
+)
+OmegaConf.register_new_resolver("count", len, replace=True)
+
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 

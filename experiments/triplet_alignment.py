@@ -18,6 +18,7 @@ from dolens.alignment.spot_moments import MomentModel, moment_model, simulated_m
 from dolens.errors import InputError
 from dolens.imaging.spot_rays import gaussian_quadrature
 from dolens.optics.lens import Lens
+from experiments.settings import numbers_of
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
@@ -124,9 +125,9 @@ class TripletAlignmentModule(lightning.LightningModule):
             if not 0.0 < number < math.inf:
                 raise InputError(f"{key}: {number!r}; allowed: a positive number")
         self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
-        self.fields = [tuple(float(v) for v in field) for field in fields]
-        self.wavelengths = [float(wavelength) for wavelength in wavelengths]
-        if not self.fields or not self.wavelengths or any(len(f) != 2 for f in self.fields):
+        self.fields = [numbers_of("fields", field, 2) for field in fields]
+        self.wavelengths = numbers_of("wavelengths", wavelengths)
+        if not self.fields or not self.wavelengths:
             raise InputError("fields, wavelengths: give at least one (x, y) and one wavelength")
         self.misalignments, self.photons = misalignments, float(photons)
         tilt, shift = math.radians(tilt_range), float(decenter_range)

@@ -1,3 +1,4 @@
+import copy
 import json
 import os
 from pathlib import Path
@@ -36,3 +37,17 @@ def backend(request, monkeypatch):
 
     monkeypatch.setattr(backend, "choose_backend", chosen)
     return request.param
+
+
+@pytest.fixture
+def moved():
+    """A copy of a lens with numbers added to some of its parameters."""
+
+    def build(lens, errors):
+        other = copy.deepcopy(lens)
+        with torch.no_grad():
+            for name, error in errors.items():
+                other.variables([name])[name].add_(error)
+        return other
+
+    return build

@@ -1,14 +1,15 @@
 """How well a pose can be known: Fisher information, bounds, correlations, what cannot be seen."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
-from torch.func import jvp
 
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.imaging.spot_image import SpotImager
+from dolens.optics.row_jacobian import forward_columns
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,6 @@ class Knowledge:
 
     Attributes:
         names: of θ.
-        fisher: (P, P), the information in θ's own units, exposures taken as unknown.
-        covariance: its inverse, the least covariance of any unbiased estimate (Cramér and Rao).
         expected: (S, height, width), electrons.
         noise: (S, height, width), standard deviation of each pixel, electrons.
         weighted: (rows, P): ∂expected/∂θ over the noise of trusted pixels, source after source,
@@ -26,11 +25,24 @@ class Knowledge:
     """
 
     names: tuple[str, ...]
-    fisher: Tensor
-    covariance: Tensor
     expected: Tensor
     noise: Tensor
     weighted: Tensor
+
+    @cached_property
+    def root(self) -> Tensor:
+        """R (P, P), triangular, with RᵀR the information."""
+        return torch.linalg.qr(self.weighted, mode="r").R
+
+    @property
+    def fisher(self) -> Tensor:
+        """(P, P), the information in θ's own units, exposures taken as unknown."""
+        return self.root.T @ self.root
+
+    @cached_property
+    def covariance(self) -> Tensor:
+        """(P, P), its inverse: the least of any unbiased estimate (Cramér and Rao)."""
+        return covariance_of(self.root)
 
     def correction(self, measurement: Measurement) -> Tensor:
         """(P,), by which θ moves to another measurement of the same mask: one step of weighted
@@ -81,12 +93,8 @@ def knowledge(pose: Pose, imager: SpotImager, measurement: Measurement) -> Knowl
     def images(scaled: Tensor) -> Tensor:
         return torch.stack([found.image for found in pose.images(imager, scaled)])
 
-    columns, shares = [], None
-    for number in range(len(point)):
-        direction = torch.zeros_like(point)
-        direction[number] = 1.0
-        shares, column = jvp(images, (point,), (direction,))
-        columns.append(column / pose.scale[number])
+    shares, slopes = forward_columns(images, point)
+    slopes = slopes / pose.scale
     seen = torch.where(measurement.mask, shares, 0.0).sum((-2, -1))
     exposure = (measurement.totals / seen)[:, None, None]
     expected = exposure * shares
@@ -96,14 +104,11 @@ def knowledge(pose: Pose, imager: SpotImager, measurement: Measurement) -> Knowl
     rows = []
     for source, mask in enumerate(measurement.mask):
         noise = deviation[source][mask]
-        derivatives = torch.stack([c[source][mask] for c in columns], -1)
-        derivatives = exposure[source] * derivatives / noise[:, None]
+        derivatives = exposure[source] * slopes[source][mask] / noise[:, None]
         own = shares[source][mask] / noise
         own = own / own.norm()
         rows.append(derivatives - torch.outer(own, own @ derivatives))
-    weighted = torch.cat(rows)
-    r = torch.linalg.qr(weighted, mode="r").R
-    return Knowledge(pose.names, r.T @ r, covariance_of(r), expected, deviation, weighted)
+    return Knowledge(pose.names, expected, deviation, torch.cat(rows))
 
 
 def covariance_of(root: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """What a sensor saw of point sources: simulated photon by photon, or read from a file."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
+from dolens.optics.elements import from_lens_axes, to_lens_axes
 from dolens.optics.lens import Lens
-from dolens.optics.rays import Rays
+from dolens.optics.rays import Components, Rays
 
 _AT_A_TIME = 1 << 20
 # Light may pass the first rim of a tilted, curved surface that far out in its vertex plane.
@@ -34,12 +36,12 @@ class Measurement:
     read_noise: float
     sensor: Sensor
 
-    @property
+    @cached_property
     def totals(self) -> Tensor:
         """(S,), electrons in trusted pixels."""
         return torch.where(self.mask, self.images, 0.0).sum((-2, -1))
 
-    @property
+    @cached_property
     def shares(self) -> Tensor:
         """(S, height, width): images of sum 1 over the trusted pixels."""
         return torch.where(self.mask, self.images, 0.0) / self.totals[:, None, None]
@@ -97,9 +99,7 @@ def simulated(
                 raise InputError("no light from the source reaches the sensor plane")
             x, y = x[: photons - passed], y[: photons - passed]
             passed += len(x)
-            rows = 0.5 * (sensor.height - 1) - sensor.centre_row + y / sensor.pixel_pitch
-            columns = 0.5 * (sensor.width - 1) - sensor.centre_column - x / sensor.pixel_pitch
-            rows, columns = rows.round(), columns.round()
+            rows, columns = (p.round() for p in sensor.pixels(x, y))
             inside = (
                 (rows >= 0) & (rows < sensor.height) & (columns >= 0) & (columns < sensor.width)
             )
@@ -121,15 +121,11 @@ def _directions(lens: Lens, source: Tensor, wavelength: float, generator: torch.
     radius = _REACH * system.surfaces[0].semi_diameter
     u, v, keep = torch.rand(3, _AT_A_TIME, generator=generator, dtype=torch.float64)
     rho, angle = radius * u.sqrt(), 2.0 * torch.pi * v
-    local = torch.stack([rho * angle.cos(), rho * angle.sin(), torch.zeros_like(rho)], -1)
-    if axes.rotation is None:
-        to, normal = local + torch.tensor([0.0, 0.0, float(axes.z)]), torch.tensor([0.0, 0.0, 1.0])
-    else:
-        rotation = axes.rotation.double()
-        to, normal = local @ rotation.T + axes.origin.double(), rotation[:, 2]
-    d = to - source
+    local = Components(rho * angle.cos(), rho * angle.sin(), *4 * (torch.zeros_like(rho),))
+    d = torch.stack(to_lens_axes(local, axes)[:3], -1) - source
     distance = d.norm(dim=-1)
-    density = (d @ normal.double()) / distance**3
+    cosine = from_lens_axes(Components(*local[:3], *(d / distance[:, None]).unbind(-1)), axes).n
+    density = cosine / distance**2
     chosen = keep * density.max() < density
     d = d[chosen] / distance[chosen, None]
     return Rays(source.expand(d.shape), d, wavelength)

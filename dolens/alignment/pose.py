@@ -24,7 +24,7 @@ class Pose(nn.Module):
     for tilts and in mm; θ is in the lens's own units, radians and mm.
 
     Args:
-        lens: it is not changed.
+        lens: `put` and `store` change it, nothing else does.
         sources: (S, 3), mm, in the lens's axes.
         variables: name → settings: `scale` (default 1) and `initial` (default: as it is).
 
@@ -60,7 +60,7 @@ class Pose(nn.Module):
             scale = float(settings.get("scale", 1.0))
             if not scale > 0.0:
                 raise InputError(f"variable '{name}': scale must be positive, not {scale:g}")
-            units.append(math.pi / 180.0 if name.rpartition(".")[2] in TILTS else 1.0)
+            units.append(_unit(name))
             scales.append(scale)
             starts.append(float(settings.get("initial", self.value(name) / units[-1])) / scale)
         self.register_buffer("units", torch.tensor(units, **options))
@@ -137,11 +137,20 @@ class Pose(nn.Module):
         return int(parts[1]) - 1, _COORDINATES.index(parts[2])
 
     @torch.no_grad()
-    def store(self) -> None:
-        """Put θ into the lens and the sources."""
-        for name, value in self.values().items():
+    def put(self, values: Mapping[str, float]) -> None:
+        """Put numbers, in degrees and mm, into the lens and the sources; θ stays as it is."""
+        for name, value in values.items():
             place = self._source(name)
             if place is not None:
-                self.sources[place] = value
+                self.sources[place] = value * _unit(name)
             else:
-                self.lens.variables([name])[name].copy_(value)
+                self.lens.variables([name])[name].fill_(value * _unit(name))
+
+    def store(self) -> None:
+        """Put θ into the lens and the sources."""
+        self.put(self.found())
+
+
+def _unit(name: str) -> float:
+    """Of the settings, in the lens's: radians of a degree for tilts."""
+    return math.pi / 180.0 if name.rpartition(".")[2] in TILTS else 1.0

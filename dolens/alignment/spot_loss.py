@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.func import jvp
 
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
 from dolens.imaging.spot_image import SpotImager
+from dolens.optics.row_jacobian import forward_columns
 from dolens.optimize.linear_model import LinearModel
 
 # Of the light behind the lens; with less on the pixels, their shares mean nothing.
@@ -85,14 +85,7 @@ class SpotLoss:
 
         By forward mode: memory for one column at a time.
         """
-        point = pose.scaled.detach()
-        columns, value = [], None
-        for direction in torch.eye(len(point), dtype=point.dtype)[chosen]:
-            value, column = jvp(lambda u: self.residuals(pose, u), (point,), (direction,))
-            columns.append(column)
-        whole = value.new_zeros(len(value), len(point))
-        whole[:, chosen] = torch.stack(columns, -1)
-        return value, whole
+        return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
 
 
 def _gaussian(length: int, deviation: float, like: Tensor) -> Tensor:
@@ -108,6 +101,7 @@ class SpotResiduals:
 
     def __init__(self, loss: SpotLoss, pose: Pose, chosen: Tensor) -> None:
         self._loss, self._pose, self._chosen = loss, pose, chosen
+        self.point = pose.scaled.detach().clone()
         with torch.no_grad():
             self.residuals = loss.residuals(pose)
 
@@ -119,3 +113,24 @@ class SpotResiduals:
         """R and b of the chosen variables."""
         with torch.no_grad():
             return LinearModel.of_rows(*self._loss.jacobian(self._pose, self._chosen))
+
+
+class SpotMerit:
+    """The residuals wherever the variables are, as a closure; the last point's are kept.
+
+    Args:
+        loss: what is to be small.
+        pose: whose variables move.
+        chosen: (P,), bool: those that may.
+    """
+
+    def __init__(self, loss: SpotLoss, pose: Pose, chosen: Tensor) -> None:
+        self._of = (loss, pose, chosen)
+        self._last: SpotResiduals | None = None
+
+    def __call__(self) -> SpotResiduals:
+        """Where the variables are."""
+        point = self._of[1].scaled.detach()
+        if self._last is None or not torch.equal(self._last.point, point):
+            self._last = SpotResiduals(*self._of)
+        return self._last

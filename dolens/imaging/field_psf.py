@@ -174,13 +174,13 @@ def wave_cost(
     Arguments as there.
 
     Returns:
-        Samples of a pupil by Fourier transform, and why one of them needs direct integration, which
-        takes a thousand times as long; None where none does.
+        Samples along each side of a pupil by Fourier transform, and why one of them needs direct
+        integration, which takes a thousand times as long; None where none does.
     """
     places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
     found = propagation(system, *places, pitch, size, None, backend)
     direct = (reason for reason in found.reasons if reason.startswith("direct"))
-    return found.samples**2, next(direct, None)
+    return found.samples, next(direct, None)
 
 
 def _object_points(

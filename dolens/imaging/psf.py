@@ -108,9 +108,9 @@ def splat(
         (..., size, size).  Once continuously differentiable in rows and columns.  Points within a
         pixel and a half of the edge lose what falls outside.
     """
+    if backend != "cpu":
+        return bin_rays(rows, columns, weight, size, size)
     shape, points = rows.shape[:-1], rows.shape[-1]
     count = math.prod(shape)
     rows, columns, weight = (t.reshape(count, points) for t in (rows, columns, weight))
-    if backend == "cpu":
-        return splatting.splat(rows, columns, weight, size).reshape(*shape, size, size)
-    return bin_rays(rows, columns, weight, size, size).reshape(*shape, size, size)
+    return splatting.splat(rows, columns, weight, size).reshape(*shape, size, size)

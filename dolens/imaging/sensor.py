@@ -43,6 +43,12 @@ class Sensor:
         y = (rows - (0.5 * (self.height - 1) - self.centre_row)) * self.pixel_pitch
         return x, y
 
+    def pixels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Fractional rows and columns of points on the sensor plane, mm; undoes `positions`."""
+        rows = 0.5 * (self.height - 1) - self.centre_row + y / self.pixel_pitch
+        columns = 0.5 * (self.width - 1) - self.centre_column - x / self.pixel_pitch
+        return rows, columns
+
     def window(self, top: int, left: int, height: int, width: int) -> "Sensor":
         """The pixels from row `top` and column `left` on, as a sensor of their own.
 

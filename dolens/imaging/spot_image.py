@@ -121,8 +121,7 @@ class SpotImager:
         """Pixels, and Σ light·(1, x, y), of rays `first` to `last`."""
         landed = self.landed(system, source, first, last)
         sensor = self.sensor
-        columns = 0.5 * (sensor.width - 1) - sensor.centre_column - landed.x / sensor.pixel_pitch
-        rows = 0.5 * (sensor.height - 1) - sensor.centre_row + landed.y / sensor.pixel_pitch
+        rows, columns = sensor.pixels(landed.x, landed.y)
         grid = bin_rays(rows, columns, landed.light, sensor.height, sensor.width, self.subpixels)
         light = landed.light
         return grid, torch.stack([light.sum(), (light * landed.x).sum(), (light * landed.y).sum()])
@@ -144,9 +143,9 @@ class SpotImager:
         d = [t - s for t, s in zip(to, source.to(u).unbind(), strict=True)]
         distance = torch.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
         l, m, n = (c / distance for c in d)  # noqa: E741
-        normal = (0.0, 0.0, 1.0) if axes.rotation is None else axes.rotation[:, 2].unbind()
-        cosine = l * normal[0] + m * normal[1] + n * normal[2]
-        trace = trace_surfaces(system, Components(*to, l, m, n), self.wavelength, record=True)
+        ray = Components(*to, l, m, n)
+        cosine = from_lens_axes(ray, axes).n
+        trace = trace_surfaces(system, ray, self.wavelength, record=True)
         light = area * cosine / distance**2 * self._passed(system, trace, u * u + v * v)
         on_sensor = trace_to_plane(system, trace, system.vertices[-1], self.wavelength, 1.0)
         return LandedRays(on_sensor.ray.x, on_sensor.ray.y, light)

@@ -1,9 +1,10 @@
 """Derivatives of numbers by the tensors that they were computed from."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.func import jvp
 
 
 def jacobian_of(values: Tensor, variables: Sequence[Tensor]) -> Tensor:
@@ -66,3 +67,32 @@ def jacobian_by_columns(values: Tensor, variables: Sequence[Tensor]) -> Tensor:
     if columns is None:
         return values.new_zeros(len(values), len(flat))
     return columns.T
+
+
+def forward_columns(
+    function: Callable[[Tensor], Tensor], point: Tensor, chosen: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """A function's value and its derivatives, by one forward sweep for each variable.
+
+    Memory is that of the columns and of one sweep, however long the computation.
+
+    Args:
+        function: of (P,), of operations that have forward derivatives.
+        point: (P,), without a graph.
+        chosen: (P,), bool: where derivatives are asked for, those of the others are zero; None:
+            everywhere.
+
+    Returns:
+        The value (...) and the derivatives (..., P).
+    """
+    value, columns = None, []
+    for number, direction in enumerate(torch.eye(len(point)).to(point)):
+        if chosen is not None and not bool(chosen[number]):
+            columns.append(None)
+            continue
+        value, column = jvp(function, (point,), (direction,))
+        columns.append(column)
+    if value is None:
+        value = function(point)
+    zero = torch.zeros_like(value)
+    return value, torch.stack([zero if column is None else column for column in columns], -1)

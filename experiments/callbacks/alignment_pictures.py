@@ -7,9 +7,8 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dolens.plotting import save_figure
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-from experiments.callbacks.figures import log_figure
+from experiments.callbacks.figures import keep_figures
 from experiments.triplet_alignment import TripletAlignmentModule
 
 _PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
@@ -27,9 +26,7 @@ class AlignmentPictures(lightning.Callback):
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Draw."""
-        figure = alignment_figure(pl_module)
-        save_figure(figure, self.folder / "alignment.png")
-        log_figure(trainer, "alignment", figure)
+        keep_figures(trainer, self.folder, {"alignment": alignment_figure(pl_module)})
 
 
 def alignment_figure(module: TripletAlignmentModule) -> Figure:

@@ -8,11 +8,10 @@ import lightning
 import torch
 from matplotlib.figure import Figure
 
-from dolens.plotting import save_figure
 from dolens.plotting.convergence import convergence_figure
 from dolens.plotting.corner import corner_figure
 from dolens.plotting.spot_fit import spot_fit_figure
-from experiments.callbacks.figures import log_figure
+from experiments.callbacks.figures import keep_figures
 from experiments.misalignment import MisalignmentModule
 
 
@@ -28,9 +27,7 @@ class MisalignmentPictures(lightning.Callback):
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the files, and log them to TensorBoard."""
-        for name, figure in misalignment_figures(pl_module).items():
-            save_figure(figure, self.folder / f"{name}.png")
-            log_figure(trainer, name, figure)
+        keep_figures(trainer, self.folder, misalignment_figures(pl_module))
 
 
 def misalignment_figures(module: MisalignmentModule) -> dict[str, Figure]:
@@ -86,7 +83,7 @@ def _convergence(module: MisalignmentModule, number: int) -> Figure:
         variable_label(name): ([float(row[name]) for row in rows], unit)
         for name, unit in zip(pose.names, _units(module, number), strict=True)
     }
-    truth = _truth(module, number)
+    truth = module.truth(number)
     return convergence_figure(
         [float(row["loss"]) for row in rows],
         values,
@@ -101,9 +98,9 @@ def _corner(module: MisalignmentModule, number: int) -> Figure:
     units = pose.units.cpu()
     covariance = module.known[fit.name].covariance.cpu() / torch.outer(units, units)
     found = torch.tensor([pose.found()[name] for name in pose.names], dtype=torch.float64)
-    truth = _truth(module, number)
+    truth = module.truth(number)
     true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
-    points = getattr(module, "estimates", {}).get(fit.name)
+    points = module.estimates.get(fit.name)
     # Estimates scatter about the truth, where that is known; the truth lies about one estimate.
     about_truth = points is not None and bool(true.isfinite().all())
     return corner_figure(
@@ -115,10 +112,6 @@ def _corner(module: MisalignmentModule, number: int) -> Figure:
         true if truth else None,
         f"{module.lens.name}: how well fit {fit.name} knows its pose (Cramér–Rao)",
     )
-
-
-def _truth(module: MisalignmentModule, number: int) -> dict[str, float]:
-    return {} if module.measured is not None else module.truth(number)
 
 
 def _units(module: MisalignmentModule, number: int) -> list[str]:

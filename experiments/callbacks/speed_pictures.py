@@ -5,8 +5,8 @@ from pathlib import Path
 import lightning
 from matplotlib.figure import Figure
 
-from dolens.plotting import pareto_figure, save_figure
-from experiments.callbacks.figures import log_figure
+from dolens.plotting import pareto_figure
+from experiments.callbacks.figures import keep_figures
 from experiments.speed_vs_error import SpeedVsErrorModule
 
 # Part → cost's and error's columns, and their labels.
@@ -45,9 +45,7 @@ class SpeedPictures(lightning.Callback):
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Draw."""
-        for name, figure in speed_figures(pl_module).items():
-            save_figure(figure, self.folder / f"{name}.png")
-            log_figure(trainer, name, figure)
+        keep_figures(trainer, self.folder, speed_figures(pl_module))
 
 
 def speed_figures(module: SpeedVsErrorModule) -> dict[str, Figure]:

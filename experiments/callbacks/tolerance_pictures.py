@@ -7,14 +7,13 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.plotting import save_figure
 from dolens.plotting.tolerances import (
     matrix_figure,
     offenders_figure,
     parameter_label,
     yield_figure,
 )
-from experiments.callbacks.figures import log_figure
+from experiments.callbacks.figures import keep_figures
 from experiments.tolerance_tables import per_unit
 from experiments.tolerances import TolerancesModule
 
@@ -34,9 +33,7 @@ class TolerancePictures(lightning.Callback):
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the files, and log them to TensorBoard."""
-        for name, figure in tolerance_figures(pl_module).items():
-            save_figure(figure, self.folder / f"{name}.png")
-            log_figure(trainer, name, figure)
+        keep_figures(trainer, self.folder, tolerance_figures(pl_module))
 
 
 def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:

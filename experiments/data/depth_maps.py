@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from dolens.errors import InputError
+from experiments.data.photographs import DECODING_ERRORS, reason_of
 
 ENDINGS = (".npy", ".png", ".tif", ".tiff")
 """Endings of depth maps, in the order in which they are looked for."""
@@ -47,10 +48,10 @@ def read_depth_map(path: Path, unit: float) -> Tensor:
         else:
             with Image.open(path) as image:
                 values = np.asarray(image)
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+    except DECODING_ERRORS as error:
         raise InputError(
-            f"{path}: cannot be read as a depth map ({reason}); allowed: {', '.join(ENDINGS)}"
+            f"{path}: cannot be read as a depth map ({reason_of(error)}); "
+            f"allowed: {', '.join(ENDINGS)}"
         ) from error
     if values.ndim != 2 or values.dtype.kind not in "uif":
         raise InputError(

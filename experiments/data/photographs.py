@@ -27,7 +27,7 @@ EXTENSIONS: tuple[str, ...] = (
 )
 """The endings of files taken for photographs, in lower case; the case of a file is ignored."""
 
-_DECODING_ERRORS = (
+DECODING_ERRORS = (
     OSError,  # holds UnidentifiedImageError
     SyntaxError,  # a broken PNG chunk
     ValueError,
@@ -154,8 +154,8 @@ def probe_photograph(path: str | Path) -> str | None:
     try:
         with Image.open(path) as image:
             image.verify()
-    except _DECODING_ERRORS as error:
-        return _reason(error)
+    except DECODING_ERRORS as error:
+        return reason_of(error)
     return None
 
 
@@ -184,9 +184,9 @@ def read_photograph(path: str | Path, name: str | None = None) -> Photograph:
         raise
     except FileNotFoundError:
         raise InputError(f"{name}: no such file; allowed: an image Pillow can read") from None
-    except _DECODING_ERRORS as error:
+    except DECODING_ERRORS as error:
         raise InputError(
-            f"{name}: cannot be decoded ({_reason(error)}); allowed: an image Pillow can read"
+            f"{name}: cannot be decoded ({reason_of(error)}); allowed: an image Pillow can read"
         ) from error
     return Photograph(name, torch.from_numpy(pixels).permute(2, 0, 1).contiguous())
 
@@ -219,6 +219,7 @@ def _over_black(colour_and_alpha: np.ndarray) -> np.ndarray:
     return (covered * 255).round().to(torch.uint8).numpy()
 
 
-def _reason(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
+    """The kind of an error and the first line of what it says."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

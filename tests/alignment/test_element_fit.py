@@ -152,17 +152,3 @@ def test_bad_input_gives_one_clear_line(triplet, spots, models):
     mirrored = replace(few, centred=torch.ones_like(few.centred))
     with pytest.raises(InputError, match="whole pupil"):
         moment_model(triplet, mirrored, element_names(triplet, "front"))
-
-
-@pytest.fixture
-def moved():
-    import copy
-
-    def build(lens, errors):
-        other = copy.deepcopy(lens)
-        with torch.no_grad():
-            for name, error in errors.items():
-                other.variables([name])[name].add_(error)
-        return other
-
-    return build

@@ -1,5 +1,3 @@
-import copy
-
 import pytest
 import torch
 import yaml
@@ -46,20 +44,6 @@ TOLERANCES = {
 def settings():
     """Typical tolerances of every kind."""
     return dict(TOLERANCES)
-
-
-@pytest.fixture
-def moved():
-    """A copy of a lens with numbers added to some of its parameters."""
-
-    def build(lens, errors):
-        other = copy.deepcopy(lens)
-        with torch.no_grad():
-            for name, error in errors.items():
-                other.variables([name])[name].add_(error)
-        return other
-
-    return build
 
 
 @pytest.fixture

@@ -15,9 +15,10 @@ from dolens.errors import InputError
 from dolens.imaging.choice.chosen import Choice, settings_of
 from dolens.imaging.choice.cost import psf_cost, rays_cost
 from dolens.imaging.choice.finding import Finding
-from dolens.imaging.choice.plan import plan
-from dolens.imaging.choice.probe import probe_image
+from dolens.imaging.choice.plan import Plan, plan
+from dolens.imaging.choice.probe import probe_texture
 from dolens.imaging.choice.reference import Reference, rays_samples, reference
+from dolens.imaging.choice.tightening import tightened
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene, Scene
@@ -27,9 +28,8 @@ from dolens.optics.lens import Lens
 
 logger = logging.getLogger(__name__)
 
-# The reference's samples along each side of the pupil; rounds of tightening the plan.
-_REFERENCE_SAMPLES, _ROUNDS = 24, 3
-_MARGIN = 32
+# The reference's samples along each side of the pupil.
+REFERENCE_SAMPLES = 24
 
 
 class AutoRenderer:
@@ -105,9 +105,9 @@ class AutoRenderer:
             return
         started = time.perf_counter()
         current = with_values(lens, values)
-        single, double = (copy.deepcopy(current).to(d) for d in (torch.float32, torch.float64))
+        single, double = in_both_precisions(current)
         texture, whole = self._probe(scene)
-        judge = reference(single, whole, self.sensor, texture, _REFERENCE_SAMPLES, self.seed)
+        judge = reference(single, whole, self.sensor, texture, REFERENCE_SAMPLES, self.seed)
         choice = self.choice
         error = self._measured(choice.renderer, choice.dtype, single, double, texture, whole, judge)
         if error <= max(self.tolerance, choice.error):
@@ -160,32 +160,27 @@ class AutoRenderer:
         started = time.perf_counter()
         self.plans += 1
         current = with_values(lens, values)
-        single, double = (copy.deepcopy(current).to(d) for d in (torch.float32, torch.float64))
+        single, double = in_both_precisions(current)
         backend = choose_backend(double.system(), lens.backend)
         texture, whole = self._probe(scene)
         planes = replace(whole, texture_centre=scene.texture_centre)
-        judge = reference(single, whole, self.sensor, texture, _REFERENCE_SAMPLES, self.seed)
-        tightened, best = 1.0, None
-        for _ in range(_ROUNDS):
+        judge = reference(single, whole, self.sensor, texture, REFERENCE_SAMPLES, self.seed)
+
+        def attempt(tolerance: float) -> tuple[float, Plan]:
             found = plan(
                 single.system(),
                 double.system(),
                 planes,
                 self.sensor,
-                tightened * self.tolerance,
+                tolerance,
                 self.gradients,
                 self.diffraction,
                 backend,
             )
-            error = self._measured(
-                found.renderer, found.dtype, single, double, texture, whole, judge
-            )
-            if best is None or error < best[0]:
-                best = error, found
-            if error <= self.tolerance:
-                break
-            tightened *= max(0.25, 0.7 * self.tolerance / error)
-        error, found = best
+            measured = (single, double, texture, whole, judge)
+            return self._measured(found.renderer, found.dtype, *measured), found
+
+        error, found = tightened(attempt, self.tolerance)
         renderer, dtype, findings = found.renderer, found.dtype, list(found.findings)
         surfaces = len(lens.surfaces)
         samples, noise = rays_samples(single, whole, self.sensor, texture, self.tolerance)
@@ -234,8 +229,7 @@ class AutoRenderer:
     def _probe(self, scene: Scene) -> tuple[Tensor, PlanarScene]:
         """A texture that covers the sensor, and the scene with it in its place."""
         sensor = self.sensor
-        size = (sensor.height + 2 * _MARGIN, sensor.width + 2 * _MARGIN)
-        texture = probe_image(*size, self.seed)[:, [i % 3 for i in range(len(scene.wavelengths))]]
+        texture = probe_texture(sensor, len(scene.wavelengths), self.seed)
         centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
         return texture, PlanarScene(scene.depths, scene.wavelengths, centre)
 
@@ -263,3 +257,9 @@ def with_values(lens: Lens, values: Mapping[str, Tensor] | None) -> Lens:
     for name, value in (values or {}).items():
         parameters[name].copy_(value)
     return changed
+
+
+def in_both_precisions(lens: Lens) -> tuple[Lens, Lens]:
+    """Copies in single and in double precision."""
+    single, double = (copy.deepcopy(lens).to(d) for d in (torch.float32, torch.float64))
+    return single, double

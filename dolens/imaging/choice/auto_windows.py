@@ -1,6 +1,5 @@
 """A renderer for windows of a large sensor that is chosen by what the windows need."""
 
-import copy
 import logging
 import time
 from collections.abc import Mapping, Sequence
@@ -10,11 +9,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.imaging.choice.auto_renderer import AutoRenderer, with_values
+from dolens.imaging.choice.auto_renderer import (
+    REFERENCE_SAMPLES,
+    AutoRenderer,
+    in_both_precisions,
+    with_values,
+)
 from dolens.imaging.choice.chosen import settings_of
 from dolens.imaging.choice.plan import Plan, plan
-from dolens.imaging.choice.probe import probe_image
+from dolens.imaging.choice.probe import probe_texture
 from dolens.imaging.choice.reference import Reference, reference
+from dolens.imaging.choice.tightening import tightened
 from dolens.imaging.distortion import chief_ray_maps
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.pupil import paraxial_exit_pupil
@@ -25,10 +30,8 @@ from dolens.optics.lens import Lens
 
 logger = logging.getLogger(__name__)
 
-# The reference's samples along each side of the pupil, and the sides of its parts of a window,
-# pixels; rounds of tightening.
-_REFERENCE_SAMPLES, _SIDE, _ROUNDS = 24, 12, 3
-_MARGIN = 32
+# Sides of the reference's parts of a window, pixels.
+_SIDE = 12
 _DIFFRACTION = ("none", "limit", "wave")
 
 
@@ -103,18 +106,15 @@ class AutoWindows:
                 logger.info("renderer auto, windows: still serves, %s", self.choice)
                 return
         self.plans += 1
-        tightened, best = 1.0, None
-        for _ in range(_ROUNDS):
-            renderer = self._planned(trial, tightened * self.auto.tolerance)
-            renderer = renderer.with_pupil(lens, scene, values)
+
+        def attempt(tolerance: float) -> tuple[float, WindowChoice]:
+            renderer = self._planned(trial, tolerance).with_pupil(lens, scene, values)
             errors = trial.errors(renderer)
             seconds = time.perf_counter() - started + (before.seconds if before else 0.0)
             found = WindowChoice(renderer, errors, trial.uncertainty, seconds)
-            if best is None or found.worst < best.worst:
-                best = found
-            if found.worst <= self.auto.tolerance:
-                break
-            tightened *= max(0.25, 0.7 * self.auto.tolerance / found.worst)
+            return found.worst, found
+
+        _, best = tightened(attempt, self.auto.tolerance)
         self.choice = best
         logger.info("renderer auto, windows: %s", best)
         if best.worst > self.auto.tolerance:
@@ -184,19 +184,18 @@ class _Trial:
     def __init__(self, owner: AutoWindows, lens: Lens, scene: PlanarScene) -> None:
         self.lens, self.scene, self.auto = lens, scene, owner.auto
         self.names, self.windows = list(owner.windows), list(owner.windows.values())
-        self.single, self.double = (
-            copy.deepcopy(lens).to(d) for d in (torch.float32, torch.float64)
-        )
+        self.single, self.double = in_both_precisions(lens)
         self.backend = choose_backend(self.double.system(), lens.backend)
         self.centres = self._centres(owner.sensor)
-        self.textures = [self._texture(window) for window in self.windows]
+        channels = len(scene.wavelengths)
+        self.textures = [probe_texture(w, channels, self.auto.seed) for w in self.windows]
         self.judges: Sequence[Reference] = [
             reference(
                 self.single,
                 replace(scene, texture_centre=centre),
                 window,
                 texture,
-                _REFERENCE_SAMPLES,
+                REFERENCE_SAMPLES,
                 self.auto.seed,
                 _SIDE,
             )
@@ -248,8 +247,3 @@ class _Trial:
         pupil = paraxial_exit_pupil(system, wavelengths)
         looks = chief_ray_maps(system, middle, sensor, self.windows, pupil, self.backend)
         return [tuple(float(c.mean().round()) for c in look) for look in looks]
-
-    def _texture(self, window: Sensor) -> Tensor:
-        size = window.height + 2 * _MARGIN, window.width + 2 * _MARGIN
-        probe = probe_image(*size, self.auto.seed)
-        return probe[:, [i % 3 for i in range(len(self.scene.wavelengths))]]

@@ -186,8 +186,8 @@ def _diffraction(
     at = (system, scene, sensor, *places, size, distortion)
     samples, against = found.wave_cost(*at)
     pupils = math.prod(renderer.fields) * len(scene.depths) * len(scene.wavelengths)
-    if against is None and pupils * samples > _MOST_SAMPLES:
-        against = f"{pupils} pupils of {math.isqrt(samples)}² samples are too many"
+    if against is None and pupils * samples**2 > _MOST_SAMPLES:
+        against = f"{pupils} pupils of {samples}² samples are too many"
     if against is not None:
         # A perfect pupil's effect is then all that is known of it, and its size.
         because = f"{seen}; not by waves: {against}"

@@ -10,9 +10,13 @@ import math
 import torch
 from torch import Tensor
 
+from dolens.imaging.sensor import Sensor
+
 # Of photographs in linear light: the mean, and the standard deviation.
 MEAN, CONTRAST = 0.4, 0.2
 GREY_LEVEL = 1.0 / 255.0
+# Texels around the sensor, for blur to draw from.
+_MARGIN = 32
 # The longest wave that is taken into account, texels.
 _LONGEST = 256
 
@@ -29,6 +33,14 @@ def probe_image(height: int, width: int, seed: int = 0) -> Tensor:
     image = torch.fft.irfft2(spectrum, s=(height, width))
     image = MEAN + CONTRAST * image / image.std(dim=(-2, -1), keepdim=True)
     return image.clamp(0.0, 1.0)[None]
+
+
+def probe_texture(sensor: Sensor, channels: int, seed: int) -> Tensor:
+    """(1, channels, H, W), float64: a probe image wider than a sensor all around, its colours in
+    turn.
+    """
+    size = (sensor.height + 2 * _MARGIN, sensor.width + 2 * _MARGIN)
+    return probe_image(*size, seed)[:, [i % 3 for i in range(channels)]]
 
 
 def probe_power(side: int) -> Tensor:

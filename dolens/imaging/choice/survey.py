@@ -96,7 +96,7 @@ class Survey:
         size: int,
         distortion: bool,
     ) -> tuple[int, str | None]:
-        """Samples of a pupil of these points, and why Fourier transforms do not do; see there."""
+        """Samples along a pupil, and why Fourier transforms do not do, as `field_psf.wave_cost`."""
         return wave_cost(
             system,
             scene,

@@ -19,7 +19,7 @@ from dolens.imaging.wave.propagation import (
     fourier_samples,
     subsamples,
 )
-from dolens.imaging.wave.pupil_fit import PupilFit, fit_pupil, regular_pupil
+from dolens.imaging.wave.pupil_fit import PupilFit, RegularPupil, fit_pupil, regular_pupil
 from dolens.imaging.wave.wavefront import Wavefront, pupil_wavefront
 from dolens.optics.backend import say_once
 from dolens.optics.system import OpticalSystem
@@ -124,7 +124,9 @@ class _Prepared:
     points: ObjectPoints
     fit: PupilFit
     samples: int
-    chosen: Propagation | None
+    chosen: Propagation | None = None
+    # Of all pupils, where they are one piece of work.
+    pupil: RegularPupil | None = None
 
     def pieces(self, beside: int = 0) -> Sequence[Tensor]:
         """Numbers of the pupils, as many at a time as memory is meant for, beside a window."""
@@ -175,10 +177,15 @@ def _prepare(
     fit = _fitted(rays, settings)
     half_width = pitch * (0.5 * size + 1.0)
     points = points.to(rays.opd.dtype, rays.opd.device)
-    found = _Prepared(points, fit, fourier_samples(fit, half_width, settings), None)
-    with torch.no_grad():
-        flux = [regular_pupil(fit, found.samples, part).flux for part in found.pieces()]
-    chosen = choose_propagation(fit, torch.cat(flux), half_width, settings)
+    found = _Prepared(points, fit, fourier_samples(fit, half_width, settings))
+    parts = found.pieces()
+    if len(parts) == 1:
+        found = replace(found, pupil=regular_pupil(fit, found.samples))
+        flux = found.pupil.flux
+    else:
+        with torch.no_grad():
+            flux = torch.cat([regular_pupil(fit, found.samples, part).flux for part in parts])
+    chosen = choose_propagation(fit, flux, half_width, settings)
     return replace(found, chosen=replace(chosen, samples=found.samples))
 
 
@@ -195,13 +202,16 @@ def _by_fourier(found: _Prepared, window: _Window) -> Tensor:
     x, y = window.grid(found.fit.low)
     parts = found.pieces(len(x))
 
+    def kernels(pupil: RegularPupil) -> Tensor:
+        return window.integrated(fourier_field(pupil, x, y, window.dtype))
+
+    if found.pupil is not None and len(parts) == 1:
+        return kernels(found.pupil)
+
     def piece(i: int, coefficients: Tensor) -> Tensor:
         fit = replace(found.fit, coefficients=coefficients)
-        pupil = regular_pupil(fit, found.samples, parts[i])
-        return window.integrated(fourier_field(pupil, x, y, window.dtype)).movedim(0, -1)
+        return kernels(regular_pupil(fit, found.samples, parts[i])).movedim(0, -1)
 
-    if len(parts) == 1:
-        return piece(0, found.fit.coefficients).movedim(-1, 0)
     return replay(piece, [len(part) for part in parts], (found.fit.coefficients,)).movedim(-1, 0)
 
 
