@@ -11,11 +11,14 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.spot_image import SpotImage
 from dolens.optics.elements import from_lens_axes, to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays
 
 _AT_A_TIME = 1 << 20
+# Of the light behind the lens; with less on the pixels, their shares mean nothing.
+_LEAST_SEEN = 0.01
 # Light may pass the first rim of a tilted, curved surface that far out in its vertex plane.
 _REACH = 1.4
 
@@ -49,6 +52,20 @@ class Measurement:
     def centroids(self) -> Tensor:
         """(S, 2), x and y, mm, of trusted pixels."""
         return torch.stack([self.centroid_of(share) for share in self.shares])
+
+    def as_seen(self, found: SpotImage, source: int) -> tuple[Tensor, Tensor]:
+        """A model's image as the measured one is: shares (height, width) of the light on trusted
+        pixels, and their centroid (2,), mm.
+
+        Where less than a hundredth of the light falls on them, both are of all light behind the
+        lens, so that they lead back from anywhere.
+        """
+        image, centroid = torch.where(self.mask[source], found.image, 0.0), found.centroid
+        seen = image.sum()
+        if float(seen.detach()) > _LEAST_SEEN:
+            image = image / seen
+            centroid = self.centroid_of(image)
+        return image, centroid
 
     def centroid_of(self, share: Tensor) -> Tensor:
         """(2,), x and y, mm, of an image (height, width) of sum 1."""

@@ -13,9 +13,6 @@ from dolens.imaging.spot_image import SpotImager
 from dolens.optics.row_jacobian import forward_columns
 from dolens.optimize.linear_model import LinearModel
 
-# Of the light behind the lens; with less on the pixels, their shares mean nothing.
-_LEAST_SEEN = 0.01
-
 
 @dataclass(frozen=True)
 class SpotLoss:
@@ -57,14 +54,11 @@ class SpotLoss:
         per_pixel = 1.0 / (shares.max() * float(mask.sum()) ** 0.5)
         wanted, root = measurement.centroids(), self.centroid_weight**0.5
         parts, centroids = [], []
-        for own, share, trusted, place in zip(found, shares, mask, wanted, strict=True):
-            image, centroid = torch.where(trusted, own.image, 0.0), own.centroid
-            seen = image.sum()
-            if float(seen.detach()) > _LEAST_SEEN:
-                image = image / seen
-                centroid = measurement.centroid_of(image)
-            parts.append(per_pixel * (self._blurred(image) - share)[trusted])
-            centroids.append(root * (centroid - place))
+        for source, own in enumerate(found):
+            image, centroid = measurement.as_seen(own, source)
+            apart = self._blurred(image) - shares[source]
+            parts.append(per_pixel * apart[mask[source]])
+            centroids.append(root * (centroid - wanted[source]))
         return torch.cat([*parts, *centroids])
 
     def _blurred(self, images: Tensor) -> Tensor:

@@ -52,12 +52,12 @@ def variable_label(name: str) -> str:
 def _spots(module: MisalignmentModule) -> Figure:
     measured, initial, final, labels = [], [], [], []
     for number, fit in enumerate(module.fits):
-        shares = module.measurement(number).shares
+        measurement = module.measurement(number)
+        shares = measurement.shares
         measured.append(shares)
-        initial.append(
-            torch.stack([s.image for s in module.images(number, module.initial[number])])
-        )
-        final.append(torch.stack([s.image for s in module.images(number)]))
+        for kept, scaled in ((initial, module.initial[number]), (final, None)):
+            images = enumerate(module.images(number, scaled))
+            kept.append(torch.stack([measurement.as_seen(image, s)[0] for s, image in images]))
         sources = [f", source {source + 1}" for source in range(len(shares))]
         labels += [f"fit {fit.name}{source if len(shares) > 1 else ''}" for source in sources]
     return spot_fit_figure(

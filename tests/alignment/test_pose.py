@@ -232,3 +232,17 @@ def test_a_file_that_is_no_photograph_is_an_error(tmp_path, write, message):
     write(tmp_path / "spot.png")
     with pytest.raises(InputError, match=message):
         read_measurement(tmp_path / "spot.png", 0.01)
+
+
+def test_light_beyond_the_edge_is_missing_from_both(singlet):
+    """A spot that the sensor cuts is compared with the light that falls on it, not with all."""
+    small = Sensor(16, 16, 0.1)
+    measured = seen(singlet, 2_000_000, read_noise=0.0, sensor=small, tilt_x=10.0)
+    imager = SpotImager(small, 622.5, 200_000, subpixels=2)
+    with torch.no_grad():
+        (image,) = pose(singlet, tilt_x=10.0).images(imager)
+    shares, centroid = measured.as_seen(image, 0)
+    assert float(image.image.sum()) < 0.9
+    assert float(shares.sum()) == pytest.approx(1.0, rel=1e-12)
+    assert float((shares - measured.shares[0]).abs().max() / shares.max()) < 0.05
+    assert torch.allclose(centroid, measured.centroids()[0], atol=2e-3)
