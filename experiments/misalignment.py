@@ -3,7 +3,6 @@
 import copy
 import itertools
 import logging
-import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,16 +13,24 @@ import torch
 from torch import Tensor, nn
 
 from dolens.alignment.information import Knowledge, knowledge
-from dolens.alignment.measurement import Measurement, read_measurement, simulated
+from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.noise_weighted import NoiseWeightedLoss
+from dolens.alignment.photograph import read_measurements
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotLoss, SpotMerit
+from dolens.alignment.spot_loss import ImageLoss, SpotLoss, SpotMerit
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImage, SpotImager
 from dolens.optics.lens import Lens
 from dolens.optimize.damped_least_squares import DampedLeastSquares
-from experiments.pose_settings import Stage, fit_of, stage_of
-from experiments.tables import write_table
+from experiments.pose_results import (
+    error_over_bound,
+    pose_metrics,
+    pose_rows,
+    spread_metrics,
+)
+from experiments.pose_settings import Stage, fit_of, stage_of, with_settings
+from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +42,7 @@ class MisalignmentModule(lightning.LightningModule):
         lens: as designed; its elements may have poses.
         experiment: name of the experiment; a checkpoint of another one is refused.
         sources: (S, 3), mm, in the lens's axes.
+        planes: where the sensor stands for a source's images, mm from `sensor_distance`.
         wavelength: nm.
         sensor: the pixels; a measurement that is read brings its own.
         fits: name → `variables`, `truth`, and `held: {from, variables}`.
@@ -44,11 +52,12 @@ class MisalignmentModule(lightning.LightningModule):
         photons: of each source, that pass the lens, in simulated measurements.
         read_noise: RMS, electrons.
         full_well: electrons; None: pixels do not saturate.
-        measurement: settings of `read_measurement`, for a photograph in the place of a simulation;
-            the fits then have no truth.
+        measurement: settings of `read_measurement`, for a photograph in the place of a simulation,
+            or a list of them, one for each source on each plane; the fits then have no truth.
         folder: of the run.
         monte_carlo: measurements with other photons, for each fit, whose estimates (by one step of
-            weighted least squares) are compared with the bound and the truth; 0 for none.
+            weighted least squares, from what the fits that they hold would have found) are compared
+            with the bound and the truth; 0 for none.
         seed: of simulations.
 
     Raises:
@@ -70,9 +79,10 @@ class MisalignmentModule(lightning.LightningModule):
         photons: int = 4_000_000,
         read_noise: float = 2.0,
         full_well: float | None = None,
-        measurement: Mapping[str, Any] | None = None,
+        measurement: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
         monte_carlo: int = 0,
         seed: int = 0,
+        planes: Sequence[float] = (0.0,),
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -82,19 +92,33 @@ class MisalignmentModule(lightning.LightningModule):
         self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
         self.measured = None
         if measurement is not None:
-            self.measured = read_measurement(**measurement)
+            self.measured = read_measurements(measurement, len(sources) * len(planes))
             sensor = self.measured.sensor
         self.imager = SpotImager(sensor, float(wavelength), **(imager or {}))
         self.centroid_weight = float(centroid_weight)
         self.photons, self.read_noise, self.full_well = int(photons), float(read_noise), full_well
         self.monte_carlo = int(monte_carlo)
+        if self.monte_carlo < 0 or self.monte_carlo == 1:
+            raise InputError(f"monte_carlo: {monte_carlo}; allowed: 0 for none, or 2 or more")
         self.stages = [stage_of(settings) for settings in stages]
         self.fits = [fit_of(name, settings) for name, settings in fits.items()]
         if not self.stages or not self.fits:
             raise InputError("misalignment: give at least one fit and one stage")
+        self._imagers = [with_settings(self.imager, stage.imager) for stage in self.stages]
+        self._slopes = [
+            with_settings(imager, stage.slopes)
+            for imager, stage in zip(self._imagers, self.stages, strict=True)
+        ]
+        for number, fit in enumerate(self.fits):
+            earlier = [before.name for before in self.fits[:number]]
+            if fit.held_from is not None and fit.held_from not in earlier:
+                raise InputError(
+                    f"fits.{fit.name}.held.from: '{fit.held_from}' is no earlier fit; allowed: "
+                    f"{', '.join(earlier) or 'none'}"
+                )
         # Each has a lens of its own, since what an earlier one found is held in it.
         self.poses = nn.ModuleList(
-            Pose(copy.deepcopy(lens), sources, fit.variables) for fit in self.fits
+            Pose(copy.deepcopy(lens), sources, fit.variables, planes) for fit in self.fits
         )
         for fit, pose in zip(self.fits, self.poses, strict=True):
             for name in (*fit.truth, *fit.held):
@@ -105,7 +129,7 @@ class MisalignmentModule(lightning.LightningModule):
                     raise InputError(f"stages: variable '{unknown.pop()}' is not of fit {fit.name}")
         self.initial = [pose.scaled.detach().clone() for pose in self.poses]
         self.history: list[dict[str, float | str]] = []
-        self.results: list[dict[str, float | str]] = []
+        self.results: list[Row] = []
         self.known: dict[str, Knowledge] = {}
         self.estimates: dict[str, Tensor] = {}
         self.seconds: dict[str, float] = {}
@@ -128,7 +152,8 @@ class MisalignmentModule(lightning.LightningModule):
 
     def true_pose(self, number: int) -> Pose:
         """The lens and the sources that are simulated; what the truth does not name is as given."""
-        true = Pose(copy.deepcopy(self.lens), self.poses[number].sources.tolist(), {})
+        pose = self.poses[number]
+        true = Pose(copy.deepcopy(self.lens), pose.sources.tolist(), {}, pose.planes)
         true.put(self.truth(number))
         return true
 
@@ -149,16 +174,29 @@ class MisalignmentModule(lightning.LightningModule):
             self.read_noise,
             generator,
             self.full_well,
+            true.planes,
         )
         if seed == 0:
             self._measurements[number] = found
         return found
 
-    def loss(self, number: int, stage: Stage) -> SpotLoss:
+    def loss(self, number: int, place: int) -> ImageLoss:
         """Of a fit in a stage."""
+        stage, measurement, imager = (
+            self.stages[place],
+            self.measurement(number),
+            self._imagers[place],
+        )
+        if stage.loss == "noise_weighted":
+            return NoiseWeightedLoss(measurement, imager, self._slopes[place])
         weight = stage.centroid_weight
         weight = self.centroid_weight if weight is None else weight
-        return SpotLoss(self.measurement(number), self.imager, weight, stage.blur)
+        return SpotLoss(measurement, imager, weight, stage.blur)
+
+    @property
+    def finest(self) -> SpotImager:
+        """The imager of the last stage, by which results are judged."""
+        return self._imagers[-1]
 
     # ---------------------------------------------------------------- iterations
 
@@ -170,7 +208,7 @@ class MisalignmentModule(lightning.LightningModule):
                 if stage.optimizer == "adam":
                     found.append(torch.optim.Adam([pose.scaled], lr=stage.learning_rate))
                 else:
-                    found.append(DampedLeastSquares([pose.scaled]))
+                    found.append(DampedLeastSquares([pose.scaled], initial_damping=stage.damping))
         return found
 
     def on_train_epoch_start(self) -> None:
@@ -196,7 +234,8 @@ class MisalignmentModule(lightning.LightningModule):
         started = time.perf_counter()
         number, place = self.current_epoch, self._stage_at(batch_idx)
         stage = self.stages[place]
-        pose, loss = self.poses[number], self.loss(number, stage)
+        pose = self.poses[number]
+        loss = self.loss(number, place).weighted_at(pose)
         chosen = torch.tensor(
             [stage.variables is None or name in stage.variables for name in pose.names]
         )
@@ -213,6 +252,9 @@ class MisalignmentModule(lightning.LightningModule):
             optimizer.step()
         else:
             merit = SpotMerit(loss, pose, chosen)
+            if stage.loss != "s21":
+                # Its weights are new, so what had nothing to gain may have.
+                bare.restart()
             optimizer.step(merit)
             residuals = merit().residuals
         self._record(number, place, stage, loss.terms(residuals.detach()), bare, started)
@@ -262,76 +304,73 @@ class MisalignmentModule(lightning.LightningModule):
         """Errors, bounds, and what cannot be told apart; tables and metrics."""
         for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
             self._hold(number)
-            measurement = self.measurement(number)
-            known = knowledge(pose, self.imager, measurement)
+            known = self._knowledge(number)
             self.known[fit.name] = known
             truth = self.truth(number)
-            start = (self.initial[number] * pose.scale_in_units).tolist()
-            bounds = (known.bounds / pose.units).tolist()
-            for (name, value), first, bound in zip(
-                pose.found().items(), start, bounds, strict=True
-            ):
-                error = value - truth[name] if name in truth else math.nan
-                self.results.append(
-                    {
-                        "fit": fit.name,
-                        "variable": name,
-                        "true": truth.get(name, math.nan),
-                        "initial": first,
-                        "found": value,
-                        "error": error,
-                        "bound": bound,
-                    }
-                )
-                self.log(f"pose/{fit.name}/{name}", value)
-                self.log(f"pose_bound/{fit.name}/{name}", bound)
-                if math.isfinite(error):
-                    self.log(f"pose_error/{fit.name}/{name}", abs(error))
+            rows = pose_rows(fit.name, pose, self.initial[number], known, truth)
+            self.results += rows
+            self.log_dict(pose_metrics(rows))
             if self.monte_carlo and self.measured is None:
-                self._compare_with_bounds(number, known)
+                self.estimates[fit.name] = self._estimates(number, known)
+                bounds = known.bounds / pose.units
+                self.log_dict(
+                    spread_metrics(fit.name, pose.names, self.estimates[fit.name], bounds, truth)
+                )
         write_table(self.folder / "history.csv", self.history)
         write_table(self.folder / "poses.csv", self.results)
         for row in self.results:
             logger.info(
-                "%s %s: true %.5g, initial %.5g, found %.5g, error %.2g, bound %.2g",
+                "%s %s: true %.5g, initial %.5g, found %.5g, error %.2g, bound %.2g (%.2g if all "
+                "that it holds were exact)",
                 *(row[key] for key in row),
             )
 
-    def _compare_with_bounds(self, number: int, known: Knowledge) -> None:
-        """Estimates of other measurements: their spread over the bound, and 95 % intervals."""
+    def _knowledge(self, number: int) -> Knowledge:
+        """Of a fit's pose, with the uncertainty of what it holds from an earlier one."""
+        fit, pose, measurement = self.fits[number], self.poses[number], self.measurement(number)
+        if fit.held_from is None:
+            return knowledge(pose, self.finest, measurement, self._slopes[-1])
+        found = pose.found()
+        variables = {
+            name: {"scale": float(scale), "initial": found[name]}
+            for name, scale in zip(pose.names, pose.scale_in_units, strict=True)
+        }
+        both = Pose(
+            pose.lens, pose.sources.tolist(), {**variables, **dict.fromkeys(fit.held)}, pose.planes
+        )
+        before = self.known[fit.held_from]
+        places = [before.names.index(name) for name in fit.held]
+        covariance = before.covariance[places][:, places]
+        known = knowledge(both, self.finest, measurement, self._slopes[-1])
+        return known.holding(len(pose.names), covariance)
+
+    def _estimates(self, number: int, known: Knowledge) -> Tensor:
+        """(M, P), degrees and mm: what other measurements lead to, those of an earlier fit too."""
         fit, pose = self.fits[number], self.poses[number]
         theta = pose.scale * pose.scaled.detach()
-        found = [
-            theta + known.correction(self.measurement(number, seed))
-            for seed in range(1, self.monte_carlo + 1)
-        ]
-        self.estimates[fit.name] = torch.stack(found) / pose.units
-        truth = self.truth(number)
-        bounds = known.bounds / pose.units
-        spread = self.estimates[fit.name].std(0) / bounds
-        for place, name in enumerate(pose.names):
-            self.log(f"pose_spread_over_bound/{fit.name}/{name}", float(spread[place]))
-            if name in truth:
-                off = (self.estimates[fit.name][:, place] - truth[name]).abs()
-                within = (off < 1.96 * bounds[place]).double().mean()
-                self.log(f"pose_coverage/{fit.name}/{name}", float(within))
+        seeds = range(1, self.monte_carlo + 1)
+        moved = torch.stack([known.correction(self.measurement(number, seed)) for seed in seeds])
+        if fit.held_from is not None:
+            before = self.poses[self._number(fit.held_from)]
+            places = [before.names.index(name) for name in fit.held]
+            off = self.estimates[fit.held_from] * before.units - before.scale * before.scaled
+            moved = moved + off[:, places] @ known.inheritance.T
+        return (theta + moved) / pose.units
 
     def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:
         """Of a fit's pose, or of another point u."""
         self._hold(number)
         with torch.no_grad():
-            return self.poses[number].images(self.imager, scaled)
+            return self.poses[number].images(self.finest, scaled)
 
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
         numbers = {f"cost/{name}_s": value for name, value in self.seconds.items()}
         numbers["cost/iterations"] = float(len(self.history))
-        numbers["cost/rays"] = float(self.imager.rays * len(self.poses[0].sources))
-        errors = [
-            abs(row["error"]) / row["bound"] for row in self.results if math.isfinite(row["error"])
-        ]
-        if errors:
-            numbers["pose_error/over_bound"] = math.sqrt(sum(e * e for e in errors) / len(errors))
+        numbers["cost/rays"] = float(self.imager.rays * len(self.measurement(0).images))
+        ratio = error_over_bound(self.results)
+        if ratio is not None:
+            numbers["pose_error/over_bound"] = ratio
         return numbers
 
     # ---------------------------------------------------------------- checkpoints

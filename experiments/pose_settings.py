@@ -1,12 +1,14 @@
 """What a pose fit is made of: what is to be found, and by which stages."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.imaging.spot_image import SpotImager
 
 OPTIMIZERS = ("adam", "dls")
+LOSSES = ("s21", "noise_weighted")
 
 
 @dataclass(frozen=True)
@@ -17,23 +19,37 @@ class Stage:
         optimizer: `adam` or `dls`.
         iterations: how many.
         learning_rate: of Adam, in u.
+        damping: of least squares' first step.
+        loss: `s21`, or `noise_weighted`, which reaches the bound but wants a start near the pose.
+        imager: settings of `SpotImager` that differ from the experiment's.
+        slopes: those that differ from this stage's for derivatives, of `noise_weighted`.
         variables: names that move; None: all of the fit's.
         centroid_weight: μ (1/mm²) of this stage; None: the experiment's.
         blur: of both images, pixels; see `SpotLoss`.
+
+    Both `centroid_weight` and `blur` are S21's.
     """
 
     optimizer: str
     iterations: int
     learning_rate: float = 0.1
+    damping: float = 1e-3
+    loss: str = "s21"
+    imager: Mapping[str, Any] = field(default_factory=dict)
+    slopes: Mapping[str, Any] = field(default_factory=dict)
     variables: tuple[str, ...] | None = None
     centroid_weight: float | None = None
     blur: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.optimizer not in OPTIMIZERS:
-            raise InputError(
-                f"stages: optimizer '{self.optimizer}' is unknown; allowed: {', '.join(OPTIMIZERS)}"
-            )
+        for key, allowed in (("optimizer", OPTIMIZERS), ("loss", LOSSES)):
+            if getattr(self, key) not in allowed:
+                raise InputError(
+                    f"stages: {key} '{getattr(self, key)}' is unknown; allowed: "
+                    f"{', '.join(allowed)}"
+                )
+        if self.loss != "s21" and (self.blur or self.centroid_weight is not None):
+            raise InputError(f"stages: blur and centroid_weight are of loss s21, not {self.loss}")
         if self.iterations < 1:
             raise InputError(f"stages: {self.iterations} iterations; allowed: 1 or more")
 
@@ -69,6 +85,18 @@ def stage_of(settings: Mapping[str, Any]) -> Stage:
     if stage.variables is None:
         return stage
     return replace(stage, variables=tuple(stage.variables))
+
+
+def with_settings(imager: SpotImager, settings: Mapping[str, Any]) -> SpotImager:
+    """An imager with other settings.
+
+    Raises:
+        InputError: an unknown key, or a number out of range.
+    """
+    try:
+        return replace(imager, **settings)
+    except TypeError as error:
+        raise InputError(f"stages.imager: {error}") from None
 
 
 def fit_of(name: str, settings: Mapping[str, Any]) -> Fit:

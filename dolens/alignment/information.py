@@ -1,12 +1,13 @@
 """How well a pose can be known: Fisher information, bounds, correlations, what cannot be seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from dolens.alignment.measurement import Measurement
+from dolens.alignment.noise_weighted import deviation
 from dolens.alignment.pose import Pose
 from dolens.imaging.spot_image import SpotImager
 from dolens.optics.row_jacobian import forward_columns
@@ -20,14 +21,19 @@ class Knowledge:
         names: of θ.
         expected: (S, height, width), electrons.
         noise: (S, height, width), standard deviation of each pixel, electrons.
-        weighted: (rows, P): ∂expected/∂θ over the noise of trusted pixels, source after source,
+        weighted: (rows, P): ∂expected/∂θ over the noise of trusted pixels, image after image,
             exposures projected out.
+        inherited: (P, P), covariance that θ has from numbers which were not fitted but held as
+            another measurement found them; None: all others are exact.
+        inheritance: (P, H), ∂θ/∂held: by how much the best θ moves with each of H held numbers.
     """
 
     names: tuple[str, ...]
     expected: Tensor
     noise: Tensor
     weighted: Tensor
+    inherited: Tensor | None = None
+    inheritance: Tensor | None = None
 
     @cached_property
     def root(self) -> Tensor:
@@ -36,13 +42,39 @@ class Knowledge:
 
     @property
     def fisher(self) -> Tensor:
-        """(P, P), the information in θ's own units, exposures taken as unknown."""
+        """(P, P), the images' information in θ's own units, exposures taken as unknown."""
         return self.root.T @ self.root
 
     @cached_property
-    def covariance(self) -> Tensor:
-        """(P, P), its inverse: the least of any unbiased estimate (Cramér and Rao)."""
+    def own_covariance(self) -> Tensor:
+        """(P, P), its inverse: the least of any unbiased estimate (Cramér and Rao) from these
+        images, all other numbers being exact.
+        """
         return covariance_of(self.root)
+
+    @property
+    def covariance(self) -> Tensor:
+        """(P, P), the same with what is inherited."""
+        own = self.own_covariance
+        return own if self.inherited is None else own + self.inherited
+
+    def holding(self, count: int, covariance: Tensor) -> "Knowledge":
+        """Of the first numbers alone, the last ones being held as they were found elsewhere.
+
+        With A and B the columns of both, θ is off by -(AᵀA)⁻¹AᵀB times what those held are off.
+
+        Args:
+            count: P - H numbers that are fitted.
+            covariance: (H, H), of those held, independent of these images.
+        """
+        slope = -torch.linalg.pinv(self.weighted[:, :count]) @ self.weighted[:, count:]
+        return replace(
+            self,
+            names=self.names[:count],
+            weighted=self.weighted[:, :count],
+            inherited=slope @ covariance @ slope.T,
+            inheritance=slope,
+        )
 
     def correction(self, measurement: Measurement) -> Tensor:
         """(P,), by which θ moves to another measurement of the same mask: one step of weighted
@@ -56,7 +88,7 @@ class Knowledge:
 
     @property
     def bounds(self) -> Tensor:
-        """(P,), standard deviations in θ's units."""
+        """(P,), standard deviations in θ's units, with what is inherited."""
         return self.covariance.diagonal().sqrt()
 
     @property
@@ -76,7 +108,9 @@ class Knowledge:
 
 
 @torch.no_grad()
-def knowledge(pose: Pose, imager: SpotImager, measurement: Measurement) -> Knowledge:
+def knowledge(
+    pose: Pose, imager: SpotImager, measurement: Measurement, slopes: SpotImager | None = None
+) -> Knowledge:
     """What a measurement can tell of a pose's variables, at the pose.
 
     A pixel of λ expected electrons has the variance λ + σ², σ the read noise; a share of light i
@@ -87,28 +121,28 @@ def knowledge(pose: Pose, imager: SpotImager, measurement: Measurement) -> Knowl
         pose: the lens where it is.
         imager: makes the expected images.
         measurement: of these sources; its totals and its mask count, its pixels do not.
+        slopes: makes their derivatives; None: `imager` does.  Few rays in narrow patches of light
+            make derivatives rough, and a rough image would seem to tell more than it can: patches
+            should be wide enough that some ten rays cross each edge of a pixel.
     """
     point = pose.scaled.detach()
 
-    def images(scaled: Tensor) -> Tensor:
-        return torch.stack([found.image for found in pose.images(imager, scaled)])
+    def images(scaled: Tensor, by: SpotImager = slopes or imager) -> Tensor:
+        return torch.stack([found.image for found in pose.images(by, scaled)])
 
-    shares, slopes = forward_columns(images, point)
-    slopes = slopes / pose.scale
-    seen = torch.where(measurement.mask, shares, 0.0).sum((-2, -1))
-    exposure = (measurement.totals / seen)[:, None, None]
-    expected = exposure * shares
-    # Without read noise a dark pixel would know everything.
-    variance = expected.clamp(min=1e-9 * float(expected.max())) + measurement.read_noise**2
-    deviation = variance.sqrt()
+    shares, columns = forward_columns(images, point)
+    if slopes is not None:
+        shares = images(point, imager)
+    columns = columns / pose.scale
+    exposure, noise = deviation(shares, measurement)
     rows = []
     for source, mask in enumerate(measurement.mask):
-        noise = deviation[source][mask]
-        derivatives = exposure[source] * slopes[source][mask] / noise[:, None]
-        own = shares[source][mask] / noise
+        sigma = noise[source][mask]
+        derivatives = exposure[source] * columns[source][mask] / sigma[:, None]
+        own = shares[source][mask] / sigma
         own = own / own.norm()
         rows.append(derivatives - torch.outer(own, own @ derivatives))
-    return Knowledge(pose.names, expected, deviation, torch.cat(rows))
+    return Knowledge(pose.names, exposure * shares, noise, torch.cat(rows))
 
 
 def covariance_of(root: Tensor) -> Tensor:

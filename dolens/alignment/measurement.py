@@ -1,12 +1,12 @@
-"""What a sensor saw of point sources: simulated photon by photon, or read from a file."""
+"""What a sensor saw of point sources, and how it is simulated photon by photon."""
 
+import copy
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
-import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from dolens.errors import InputError
@@ -25,7 +25,7 @@ _REACH = 1.4
 
 @dataclass(frozen=True)
 class Measurement:
-    """Images of S sources.
+    """S images, of a source each, or of some on several planes.
 
     Attributes:
         images: (S, height, width), electrons, the dark level taken off.
@@ -86,6 +86,7 @@ def simulated(
     read_noise: float,
     generator: torch.Generator,
     full_well: float | None = None,
+    planes: Sequence[float] = (0.0,),
 ) -> Measurement:
     """Photons that leave each source in random directions and are counted where they land.
 
@@ -100,17 +101,22 @@ def simulated(
         read_noise: RMS, electrons.
         generator: of directions and noise.
         full_well: electrons at which a pixel saturates, and is not trusted; None: never.
+        planes: where the sensor stands, mm from where the lens has it; an exposure of each source
+            on each.
 
     Raises:
         InputError: no light passes.
     """
     images = []
-    for source in sources.double():
+    moved = [copy.deepcopy(lens) for _ in planes]
+    for one, plane in zip(moved, planes, strict=True):
+        one.sensor_distance.add_(plane)
+    for source, one in itertools.product(sources.double(), moved):
         image = torch.zeros(sensor.height * sensor.width, dtype=torch.float64)
         passed = 0
         while passed < photons:
-            rays = _directions(lens, source, wavelength, generator)
-            hit = lens.trace(rays)
+            rays = _directions(one, source, wavelength, generator)
+            hit = one.trace(rays)
             x, y = (c[hit.valid].double() for c in hit.position[:, :2].unbind(-1))
             if not len(x):
                 raise InputError("no light from the source reaches the sensor plane")
@@ -146,72 +152,3 @@ def _directions(lens: Lens, source: Tensor, wavelength: float, generator: torch.
     chosen = keep * density.max() < density
     d = d[chosen] / distance[chosen, None]
     return Rays(source.expand(d.shape), d, wavelength)
-
-
-def read_measurement(
-    path: str | Path,
-    pixel_pitch: float,
-    dark_level: float = 0.0,
-    region: tuple[int, int, int, int] | None = None,
-    downsample: int = 1,
-    saturation: float | None = None,
-    electrons_per_count: float = 1.0,
-    read_noise: float = 1.0,
-) -> Measurement:
-    """A photograph of a source, 16 bits or 8, of one channel.
-
-    Args:
-        path: TIFF or PNG.
-        pixel_pitch: of the photograph, mm.
-        dark_level: counts that the sensor gives in the dark.
-        region: top, left, height and width that are used, pixels; None: all.  The optical axis is
-            taken to meet the middle of the photograph.
-        downsample: pixels along each side that are averaged to one; those that are left over at the
-            right and at the bottom are cut off.
-        saturation: counts from which a pixel is not trusted; None: the largest that the file's
-            integers can hold.
-        electrons_per_count: of the sensor.
-        read_noise: RMS of one pixel, electrons.
-
-    Raises:
-        InputError: the file cannot be read, is not grey integers, or a number is out of range.
-    """
-    try:
-        with Image.open(path) as image:
-            values = np.asarray(image)
-    except (OSError, SyntaxError, ValueError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"data.measurement: {path} cannot be read ({reason})") from error
-    if values.ndim != 2 or values.dtype.kind not in "ui":
-        raise InputError(
-            f"data.measurement: {path} has {values.dtype} of shape {values.shape}; allowed: one "
-            "channel of integers"
-        )
-    if downsample < 1 or not pixel_pitch > 0.0:
-        raise InputError(
-            f"data: downsample {downsample} and pixel_pitch {pixel_pitch}; allowed: 1 or more, "
-            "and above 0 (mm)"
-        )
-    if saturation is None:
-        # Pillow gives 16 bits as int32.
-        saturation = 255.0 if values.dtype.itemsize == 1 else 65535.0
-    counts = torch.from_numpy(values.astype(np.float64))
-    whole = Sensor(*counts.shape, pixel_pitch)
-    top, left, height, width = region or (0, 0, whole.height, whole.width)
-    height, width = height - height % downsample, width - width % downsample
-    window = whole.window(top, left, height, width)
-    counts = counts[top : top + height, left : left + width]
-
-    def blocks(t: Tensor) -> Tensor:
-        return t.unflatten(1, (-1, downsample)).unflatten(0, (-1, downsample))
-
-    trusted = blocks(counts < saturation).all(-1).all(1)
-    electrons = blocks((counts - dark_level) * electrons_per_count).sum((1, 3))
-    sensor = Sensor(
-        height // downsample,
-        width // downsample,
-        pixel_pitch * downsample,
-        window.centre_row / downsample,
-        window.centre_column / downsample,
-    )
-    return Measurement(electrons[None], trusted[None], read_noise * downsample, sensor)

@@ -27,6 +27,8 @@ class Pose(nn.Module):
         lens: `put` and `store` change it, nothing else does.
         sources: (S, 3), mm, in the lens's axes.
         variables: name → settings: `scale` (default 1) and `initial` (default: as it is).
+        planes: where the sensor stands for each of a source's images, mm from `sensor_distance`,
+            as on a stage whose travel is known.
 
     Attributes:
         names: of θ, P of them.
@@ -43,12 +45,15 @@ class Pose(nn.Module):
         lens: Lens,
         sources: Sequence[Sequence[float]],
         variables: Mapping[str, Mapping[str, Any] | None],
+        planes: Sequence[float] = (0.0,),
     ) -> None:
         super().__init__()
         self._of = (lens,)
         options = {"dtype": torch.float64, "device": lens.device}
         self.register_buffer("sources", torch.tensor(sources, **options).reshape(-1, 3))
-        self.names = tuple(variables)
+        self.names, self.planes = tuple(variables), tuple(float(z) for z in planes)
+        if not self.planes:
+            raise InputError("planes: none is given; allowed: one or more places of the sensor, mm")
         scales, starts, units = [], [], []
         for name, settings in variables.items():
             settings = dict(settings or {})
@@ -102,15 +107,19 @@ class Pose(nn.Module):
         return dict(zip(self.names, theta.unbind(), strict=True))
 
     def images(self, imager: SpotImager, scaled: Tensor | None = None) -> list[SpotImage]:
-        """Of every source.
+        """Of every source on every plane of the sensor, a source's images together.
 
         Args:
             imager: how.
             scaled: u, in place of the stored one.
         """
         values = self.values(scaled)
-        system = self.lens.system({n: v for n, v in values.items() if self._source(n) is None})
-        return [imager.image(system, source) for source in self._placed(values)]
+        own = {n: v for n, v in values.items() if self._source(n) is None}
+        distance = own.get("sensor_distance", self.lens.sensor_distance)
+        systems = [
+            self.lens.system({**own, "sensor_distance": distance + plane}) for plane in self.planes
+        ]
+        return [imager.image(s, source) for source in self._placed(values) for s in systems]
 
     def _placed(self, values: Mapping[str, Tensor]) -> list[Tensor]:
         """The sources, (3,) each."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -12,6 +13,26 @@ from dolens.errors import InputError
 from dolens.imaging.spot_image import SpotImager
 from dolens.optics.row_jacobian import forward_columns
 from dolens.optimize.linear_model import LinearModel
+
+
+class ImageLoss(Protocol):
+    """A sum of squares that is small where a pose explains what a sensor saw."""
+
+    def weighted_at(self, pose: Pose) -> "ImageLoss":
+        """The same with the weights of an iteration that begins at the pose."""
+        ...
+
+    def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
+        """r (rows,), at the pose or at another point u (P,)."""
+        ...
+
+    def terms(self, residuals: Tensor) -> dict[str, Tensor]:
+        """Parts of |r|² by name."""
+        ...
+
+    def jacobian(self, pose: Pose, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -45,6 +66,10 @@ class SpotLoss:
             raise InputError(f"loss.blur: {self.blur}; allowed: 0 pixels or more")
         if not self.centroid_weight >= 0.0:
             raise InputError(f"loss.centroid_weight: {self.centroid_weight}; allowed: 0 or more")
+
+    def weighted_at(self, pose: Pose) -> "SpotLoss":
+        """Itself: all pixels weigh the same, wherever the pose is."""
+        return self
 
     def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
         """r with ε = |r|²: trusted pixels, source after source, and 2·S of the centroids."""
@@ -93,7 +118,7 @@ def _gaussian(length: int, deviation: float, like: Tensor) -> Tensor:
 class SpotResiduals:
     """The residuals where the variables are, as `DampedLeastSquares` takes them."""
 
-    def __init__(self, loss: SpotLoss, pose: Pose, chosen: Tensor) -> None:
+    def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
         self._loss, self._pose, self._chosen = loss, pose, chosen
         self.point = pose.scaled.detach().clone()
         with torch.no_grad():
@@ -118,7 +143,7 @@ class SpotMerit:
         chosen: (P,), bool: those that may.
     """
 
-    def __init__(self, loss: SpotLoss, pose: Pose, chosen: Tensor) -> None:
+    def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
         self._of = (loss, pose, chosen)
         self._last: SpotResiduals | None = None
 

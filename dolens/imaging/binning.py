@@ -11,9 +11,29 @@ def spline_taps(position: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     centre = torch.round(position.detach())
     d = position - centre
     weights = [0.5 * (0.5 - d) ** 2, 0.75 - d * d, 0.5 * (0.5 + d) ** 2]
-    # Far rays (only invalid ones are) must not overflow the integer index.
-    index = centre.clamp(-(2.0**30), 2.0**30).long()
+    index = _index(centre)
     return [index - 1, index, index + 1], weights
+
+
+def patch_taps(position: Tensor, subpixels: int) -> tuple[list[Tensor], list[Tensor]]:
+    """The pixels that a tent at each position covers, and what each integrates of it.
+
+    A tent of half-width w = 1/subpixels, whose middle is e inside the nearest edge of its pixel,
+    has (1 - e/w)²/2 beyond that edge while e < w; with w = 1 this is the quadratic B-spline.
+    """
+    if subpixels == 1:
+        return spline_taps(position)
+    centre = torch.round(position.detach())
+    d = position - centre
+    beyond = 0.5 * (1.0 - subpixels * (0.5 - d.abs())).clamp(min=0.0).square()
+    index = _index(centre)
+    side = torch.where(d.detach() < 0.0, -1, 1)
+    return [index, index + side], [1.0 - beyond, beyond]
+
+
+def _index(centre: Tensor) -> Tensor:
+    """Far rays (only invalid ones are) must not overflow the integer."""
+    return centre.clamp(-(2.0**30), 2.0**30).long()
 
 
 def bin_rays(
@@ -33,21 +53,16 @@ def bin_rays(
         weight: (..., N); zero leaves a ray out, wherever it lands.
         height: pixels.
         width: pixels.
-        subpixels: along each side of a pixel.
+        subpixels: of which a tent is as wide at half its height, along each side of a pixel.
 
     Returns:
         (..., height, width).
     """
-    if subpixels > 1:
-        fine = (subpixels * (p + 0.5) - 0.5 for p in (rows, columns))
-        found = bin_rays(*fine, weight, subpixels * height, subpixels * width)
-        blocks = found.unflatten(-1, (width, subpixels)).unflatten(-3, (height, subpixels))
-        return blocks.sum((-3, -1))
     shape, points = rows.shape[:-1], rows.shape[-1]
     count = math.prod(shape)
     rows, columns, weight = (t.reshape(count, points) for t in (rows, columns, weight))
-    row_taps, row_weights = spline_taps(rows)
-    column_taps, column_weights = spline_taps(columns)
+    row_taps, row_weights = patch_taps(rows, subpixels)
+    column_taps, column_weights = patch_taps(columns, subpixels)
     first = torch.arange(count, device=weight.device)[:, None] * (height * width)
     flat = torch.zeros(count * height * width, dtype=weight.dtype, device=weight.device)
     for row, row_weight in zip(row_taps, row_weights, strict=True):

@@ -10,9 +10,11 @@ import yaml
 from PIL import Image
 
 from dolens.alignment.information import Knowledge, knowledge
-from dolens.alignment.measurement import Measurement, read_measurement, simulated
+from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.noise_weighted import NoiseWeightedLoss
+from dolens.alignment.photograph import read_measurement
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotLoss, SpotResiduals
+from dolens.alignment.spot_loss import SpotLoss, SpotMerit, SpotResiduals
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImager
@@ -58,7 +60,7 @@ def fitted(loss, fit, iterations=15):
 
 def test_degrees_outside_and_radians_inside(singlet):
     one = pose(singlet, tilt_x=3.0, shift_z=0.5)
-    assert float(one.values()[TILT]) == pytest.approx(math.radians(3.0))
+    assert float(one.values()[TILT].detach()) == pytest.approx(math.radians(3.0))
     assert one.found()[TILT] == pytest.approx(3.0)
     one.store()
     assert float(one.lens.elements["lens"].tilt_x) == pytest.approx(math.radians(3.0))
@@ -246,3 +248,108 @@ def test_light_beyond_the_edge_is_missing_from_both(singlet):
     assert float(shares.sum()) == pytest.approx(1.0, rel=1e-12)
     assert float((shares - measured.shares[0]).abs().max() / shares.max()) < 0.05
     assert torch.allclose(centroid, measured.centroids()[0], atol=2e-3)
+
+
+# ---------------------------------------------------------------- weighted by noise
+
+
+def test_weighted_by_noise_a_fit_has_errors_of_its_bounds(singlet):
+    """Of 12 measurements with other photons: the RMS of error over bound is 1 to its standard
+    error, 1/√(2·12·5) = 0.09, times three; χ² of a pixel is 1.
+    """
+    truth = {"tilt_x": 10.0, "tilt_y": 2.0, "decenter_x": 0.2, "decenter_y": 0.3, "shift_z": -0.5}
+    fine = SpotImager(SENSOR, 622.5, 100_000, rim=0.002, subpixels=8)
+    ratios = []
+    for seed in range(12):
+        measured = seen(singlet, 200_000, seed=seed, **truth)
+        one = pose(singlet, **truth)
+        found = weighted_fit(one, fine, measured)
+        loss = NoiseWeightedLoss(measured, fine)
+        assert float(loss.residuals(one).square().sum()) == pytest.approx(1.0, abs=0.12)
+        bounds = knowledge(one, fine, measured).bounds / one.units
+        ratios += [
+            (found[name] - truth[name.rpartition(".")[2]]) / float(bound)
+            for name, bound in zip(one.names, bounds, strict=True)
+        ]
+    assert float(torch.tensor(ratios).square().mean().sqrt()) == pytest.approx(1.0, abs=0.27)
+
+
+def weighted_fit(one, imager, measured, iterations=3):
+    """By least squares with weights that follow the pose."""
+    chosen = torch.ones(len(one.names), dtype=torch.bool)
+    optimizer = DampedLeastSquares([one.scaled], initial_damping=1e-6)
+    for _ in range(iterations):
+        loss = NoiseWeightedLoss(measured, imager).weighted_at(one)
+        optimizer.restart()
+        optimizer.step(SpotMerit(loss, one, chosen))
+    return one.found()
+
+
+def test_noise_weighted_jacobian_is_that_of_differences(singlet):
+    one = pose(singlet, tilt_x=1.0, decenter_y=0.1)
+    loss = NoiseWeightedLoss(seen(singlet, tilt_x=2.0), IMAGER).weighted_at(one)
+    chosen = torch.ones(5, dtype=torch.bool)
+    _, jacobian = loss.jacobian(one, chosen)
+    point, h = one.scaled.detach(), 1e-6
+    for number in range(5):
+        step = torch.zeros_like(point)
+        step[number] = h
+        with torch.no_grad():
+            ahead, behind = (loss.residuals(one, point + s) for s in (step, -step))
+        difference = (ahead - behind) / (2.0 * h)
+        apart = (jacobian[:, number] - difference).abs().max()
+        assert float(apart) < 1e-4 * float(difference.abs().max())
+
+
+def test_a_held_number_that_is_off_moves_the_fit_by_what_was_foretold(singlet):
+    """And its variance goes into the bound: the sensor's distance held 0.05 mm too far."""
+    truth = {"tilt_x": 10.0, "decenter_y": 0.3}
+    fine = SpotImager(SENSOR, 622.5, 100_000, rim=0.002, subpixels=8)
+    measured = seen(singlet, 400_000, **truth)
+    right, wrong = pose(singlet, **truth), pose(singlet, **truth)
+    wrong.lens.sensor_distance.add_(0.05)
+    moved = [weighted_fit(one, fine, measured, 5) for one in (right, wrong)]
+    names = {n: {"initial": v} for n, v in moved[0].items()}
+    both = Pose(right.lens, SOURCE, {**names, "sensor_distance": None})
+    variance = torch.tensor([[0.05**2]], dtype=torch.float64)
+    known = knowledge(both, fine, measured).holding(5, variance)
+    foretold = (0.05 * known.inheritance[:, 0] / right.units).tolist()
+    for name, expected in zip(known.names, foretold, strict=True):
+        slack = 0.1 * max(abs(expected), float(known.bounds.min()))
+        assert moved[1][name] - moved[0][name] == pytest.approx(expected, abs=slack)
+    added = known.covariance - known.own_covariance
+    wanted = known.inheritance @ variance @ known.inheritance.T
+    apart = (added - wanted) / torch.outer(known.bounds, known.bounds)
+    assert float(apart.abs().max()) < 1e-9
+    assert bool((known.bounds > known.own_covariance.diagonal().sqrt()).all())
+
+
+def test_a_second_plane_is_the_sensor_moved(singlet):
+    """Its images are those of a sensor there, and tell source from sensor distance."""
+    names = {"sensor_distance": None, "sources.1.z": {"scale": 50.0}}
+    two = Pose(singlet, SOURCE, names, planes=[0.0, -2.0])
+    near = copy.deepcopy(singlet)
+    near.sensor_distance.add_(-2.0)
+    with torch.no_grad():
+        images = two.images(IMAGER)
+        (alone,) = Pose(near, SOURCE, {}).images(IMAGER)
+    assert torch.equal(images[1].image, alone.image)
+    measured = simulated(
+        singlet,
+        two.sources,
+        622.5,
+        SENSOR,
+        400_000,
+        2.0,
+        torch.Generator().manual_seed(0),
+        planes=two.planes,
+    )
+    assert measured.images.shape == (2, 48, 48)
+    assert torch.allclose(measured.centroids()[1], images[1].centroid, atol=5e-3)
+    both = knowledge(two, IMAGER, measured)
+    first = Measurement(measured.images[:1], measured.mask[:1], 2.0, SENSOR)
+    one = knowledge(Pose(singlet, SOURCE, names), IMAGER, first)
+    # Twice the light alone would make it 0.7 of the bound.
+    assert bool((both.bounds < 0.55 * one.bounds).all())
+    with pytest.raises(InputError, match="planes: none is given"):
+        Pose(singlet, SOURCE, names, planes=[])

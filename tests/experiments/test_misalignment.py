@@ -91,6 +91,16 @@ def test_a_stage_may_move_some_variables_only(composed, tmp_path):
         ("stages=[{optimizer: lbfgs, iterations: 2}]", "'lbfgs' is unknown; allowed: adam, dls"),
         ("stages=[{optimizer: dls, iterations: 0}]", "0 iterations"),
         ("stages=[{optimizer: dls, iterations: 1, variables: [focus]}]", "variable 'focus'"),
+        (
+            "stages=[{optimizer: dls, iterations: 1, loss: l1}]",
+            "loss 'l1' is unknown; allowed: s21",
+        ),
+        ("stages=[{optimizer: dls, iterations: 1, imager: {ray: 2}}]", "stages.imager"),
+        (
+            "stages=[{optimizer: dls, iterations: 1, loss: noise_weighted, blur: 1.0}]",
+            "blur and centroid_weight are of loss s21",
+        ),
+        ("fits.5.held.from='30'", "fits.5.held.from: '30' is no earlier fit; allowed: 0"),
         ("+fits.5.start=1", "fits.5: unknown key 'start'"),
         ("+fits.5.truth.focus=1", "focus"),
         ("lens_dtype=float32", "poses are fitted in float64"),
