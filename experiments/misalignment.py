@@ -14,22 +14,20 @@ from torch import Tensor, nn
 
 from dolens.alignment.information import Knowledge, knowledge
 from dolens.alignment.measurement import Measurement, simulated
-from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.photograph import read_measurements
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import ImageLoss, SpotLoss, SpotMerit
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImage, SpotImager
 from dolens.optics.lens import Lens
-from dolens.optimize.damped_least_squares import DampedLeastSquares
+from experiments.pose_iteration import iterate, loss_of, optimizer_of, slopes_of
 from experiments.pose_results import (
     error_over_bound,
     pose_metrics,
     pose_rows,
     spread_metrics,
 )
-from experiments.pose_settings import Stage, fit_of, stage_of, with_settings
+from experiments.pose_settings import Stage, fit_of, plain_imager, spot_imager, stage_of
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
@@ -47,7 +45,7 @@ class MisalignmentModule(lightning.LightningModule):
         sensor: the pixels; a measurement that is read brings its own.
         fits: name → `variables`, `truth`, and `held: {from, variables}`.
         stages: settings of `Stage`, in turn.
-        imager: settings of `SpotImager` besides sensor and wavelength.
+        imager: settings of `SpotImager` besides sensor and wavelength; see `spot_imager`.
         centroid_weight: μ of S21, 1/mm².
         photons: of each source, that pass the lens, in simulated measurements.
         read_noise: RMS, electrons.
@@ -94,7 +92,8 @@ class MisalignmentModule(lightning.LightningModule):
         if measurement is not None:
             self.measured = read_measurements(measurement, len(sources) * len(planes))
             sensor = self.measured.sensor
-        self.imager = SpotImager(sensor, float(wavelength), **(imager or {}))
+        self.sensor, self.wavelength = sensor, float(wavelength)
+        self.imager = dict(imager or {})
         self.centroid_weight = float(centroid_weight)
         self.photons, self.read_noise, self.full_well = int(photons), float(read_noise), full_well
         self.monte_carlo = int(monte_carlo)
@@ -104,11 +103,9 @@ class MisalignmentModule(lightning.LightningModule):
         self.fits = [fit_of(name, settings) for name, settings in fits.items()]
         if not self.stages or not self.fits:
             raise InputError("misalignment: give at least one fit and one stage")
-        self._imagers = [with_settings(self.imager, stage.imager) for stage in self.stages]
-        self._slopes = [
-            with_settings(imager, stage.slopes)
-            for imager, stage in zip(self._imagers, self.stages, strict=True)
-        ]
+        for stage in self.stages:
+            # A mistake in the last stage is found before the first one.
+            plain_imager(sensor, self.wavelength, self.imager, stage.imager, stage.slopes)
         for number, fit in enumerate(self.fits):
             earlier = [before.name for before in self.fits[:number]]
             if fit.held_from is not None and fit.held_from not in earlier:
@@ -167,9 +164,9 @@ class MisalignmentModule(lightning.LightningModule):
         generator = torch.Generator().manual_seed(1000003 * (self.seed + 1) + 1009 * number + seed)
         found = simulated(
             true.lens,
-            true.sources,
-            self.imager.wavelength,
-            self.imager.sensor,
+            true.places,
+            self.wavelength,
+            self.sensor,
             self.photons,
             self.read_noise,
             generator,
@@ -180,36 +177,16 @@ class MisalignmentModule(lightning.LightningModule):
             self._measurements[number] = found
         return found
 
-    def loss(self, number: int, place: int) -> ImageLoss:
-        """Of a fit in a stage."""
-        stage, measurement, imager = (
-            self.stages[place],
-            self.measurement(number),
-            self._imagers[place],
-        )
-        if stage.loss == "noise_weighted":
-            return NoiseWeightedLoss(measurement, imager, self._slopes[place])
-        weight = stage.centroid_weight
-        weight = self.centroid_weight if weight is None else weight
-        return SpotLoss(measurement, imager, weight, stage.blur)
-
-    @property
-    def finest(self) -> SpotImager:
-        """The imager of the last stage, by which results are judged."""
-        return self._imagers[-1]
+    def finest(self, number: int) -> SpotImager:
+        """The imager of a fit's last stage, by which its result is judged."""
+        settings = (self.imager, self.stages[-1].imager)
+        return spot_imager(self.measurement(number), self.wavelength, *settings)
 
     # ---------------------------------------------------------------- iterations
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         """One for each stage of each fit, all of which a checkpoint holds."""
-        found: list[torch.optim.Optimizer] = []
-        for pose in self.poses:
-            for stage in self.stages:
-                if stage.optimizer == "adam":
-                    found.append(torch.optim.Adam([pose.scaled], lr=stage.learning_rate))
-                else:
-                    found.append(DampedLeastSquares([pose.scaled], initial_damping=stage.damping))
-        return found
+        return [optimizer_of(stage, pose) for pose in self.poses for stage in self.stages]
 
     def on_train_epoch_start(self) -> None:
         """Hold what earlier fits have found."""
@@ -234,30 +211,16 @@ class MisalignmentModule(lightning.LightningModule):
         started = time.perf_counter()
         number, place = self.current_epoch, self._stage_at(batch_idx)
         stage = self.stages[place]
-        pose = self.poses[number]
-        loss = self.loss(number, place).weighted_at(pose)
-        chosen = torch.tensor(
-            [stage.variables is None or name in stage.variables for name in pose.names]
-        )
         optimizers = self.optimizers()
         # Of a single one Lightning makes no list.
         optimizers = optimizers if isinstance(optimizers, list) else [optimizers]
         optimizer = optimizers[number * len(self.stages) + place]
+        measurement = self.measurement(number)
+        loss = loss_of(stage, measurement, self.wavelength, self.imager, self.centroid_weight)
         bare = optimizer.optimizer
-        if stage.optimizer == "adam":
-            optimizer.zero_grad()
-            residuals = loss.residuals(pose)
-            residuals.square().sum().backward()
-            pose.scaled.grad.mul_(chosen)
-            optimizer.step()
-        else:
-            merit = SpotMerit(loss, pose, chosen)
-            if stage.loss != "s21":
-                # Its weights are new, so what had nothing to gain may have.
-                bare.restart()
-            optimizer.step(merit)
-            residuals = merit().residuals
-        self._record(number, place, stage, loss.terms(residuals.detach()), bare, started)
+        # Lightning counts the steps of its own wrapping.
+        terms = iterate(self.poses[number], stage, loss, bare, optimizer.step)
+        self._record(number, place, stage, terms, bare, started)
 
     def _stage_at(self, iteration: int) -> int:
         """Number of the stage that an iteration of a fit belongs to."""
@@ -328,20 +291,20 @@ class MisalignmentModule(lightning.LightningModule):
     def _knowledge(self, number: int) -> Knowledge:
         """Of a fit's pose, with the uncertainty of what it holds from an earlier one."""
         fit, pose, measurement = self.fits[number], self.poses[number], self.measurement(number)
+        slopes = slopes_of(self.stages[-1], measurement, self.wavelength, self.imager)
+        finest = self.finest(number)
         if fit.held_from is None:
-            return knowledge(pose, self.finest, measurement, self._slopes[-1])
+            return knowledge(pose, finest, measurement, slopes)
         found = pose.found()
         variables = {
             name: {"scale": float(scale), "initial": found[name]}
             for name, scale in zip(pose.names, pose.scale_in_units, strict=True)
         }
-        both = Pose(
-            pose.lens, pose.sources.tolist(), {**variables, **dict.fromkeys(fit.held)}, pose.planes
-        )
+        both = pose.varying({**variables, **dict.fromkeys(fit.held)})
         before = self.known[fit.held_from]
         places = [before.names.index(name) for name in fit.held]
         covariance = before.covariance[places][:, places]
-        known = knowledge(both, self.finest, measurement, self._slopes[-1])
+        known = knowledge(both, finest, measurement, slopes)
         return known.holding(len(pose.names), covariance)
 
     def _estimates(self, number: int, known: Knowledge) -> Tensor:
@@ -361,13 +324,14 @@ class MisalignmentModule(lightning.LightningModule):
         """Of a fit's pose, or of another point u."""
         self._hold(number)
         with torch.no_grad():
-            return self.poses[number].images(self.finest, scaled)
+            return self.poses[number].images(self.finest(number), scaled)
 
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
         numbers = {f"cost/{name}_s": value for name, value in self.seconds.items()}
         numbers["cost/iterations"] = float(len(self.history))
-        numbers["cost/rays"] = float(self.imager.rays * len(self.measurement(0).images))
+        images = len(self.measurement(0).images)
+        numbers["cost/rays"] = float(self.finest(0).rays * images)
         ratio = error_over_bound(self.results)
         if ratio is not None:
             numbers["pose_error/over_bound"] = ratio

@@ -4,11 +4,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
+from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImager
 
 OPTIMIZERS = ("adam", "dls")
 LOSSES = ("s21", "noise_weighted")
+AUTO = "auto"
+_SPACINGS, _FINEST = 1.2, 16
+# Derivatives are differences of what crosses a pixel's edges: by so much wider are their patches.
+SLOPES_WIDENED = 2.0
 
 
 @dataclass(frozen=True)
@@ -87,16 +93,50 @@ def stage_of(settings: Mapping[str, Any]) -> Stage:
     return replace(stage, variables=tuple(stage.variables))
 
 
-def with_settings(imager: SpotImager, settings: Mapping[str, Any]) -> SpotImager:
-    """An imager with other settings.
+def plain_imager(
+    sensor: Sensor, wavelength: float, *settings: Mapping[str, Any]
+) -> tuple[SpotImager, bool]:
+    """What settings make before there is a measurement, and whether its patches are `auto`.
 
     Raises:
         InputError: an unknown key, or a number out of range.
     """
+    merged = {key: value for part in settings for key, value in part.items()}
+    auto = merged.get("subpixels") == AUTO
+    if auto:
+        merged.pop("subpixels")
     try:
-        return replace(imager, **settings)
+        return SpotImager(sensor, wavelength, **merged), auto
     except TypeError as error:
-        raise InputError(f"stages.imager: {error}") from None
+        raise InputError(f"imager: {error}") from None
+
+
+def spot_imager(
+    measurement: Measurement,
+    wavelength: float,
+    *settings: Mapping[str, Any],
+    widened: float = 1.0,
+) -> SpotImager:
+    """What models a measurement's images.
+
+    `subpixels: auto` makes a ray's patch of light 1.2 times as wide as rays are apart where the
+    measured light is: narrower ones let the rays' pattern show as moiré, wider ones blur rims.
+
+    Args:
+        measurement: its sensor, and how many pixels its light covers.
+        wavelength: nm.
+        settings: of `SpotImager`; later ones override earlier ones.
+        widened: by how much `auto` is wider.
+
+    Raises:
+        InputError: an unknown key, or a number out of range.
+    """
+    imager, auto = plain_imager(measurement.sensor, wavelength, *settings)
+    if not auto:
+        return imager
+    # Of the disc that rays aim at, the lens lets this part through.
+    rays = imager.rays / imager.reach**2 / float(measurement.lit_pixels.max())
+    return replace(imager, subpixels=min(max(int(rays**0.5 / (_SPACINGS * widened)), 1), _FINEST))
 
 
 def fit_of(name: str, settings: Mapping[str, Any]) -> Fit:

@@ -17,6 +17,8 @@ from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays
 
 _AT_A_TIME = 1 << 20
+# Of directions that are drawn, about a third pass.
+_DRAWN = 4
 # Of the light behind the lens; with less on the pixels, their shares mean nothing.
 _LEAST_SEEN = 0.01
 # Light may pass the first rim of a tilted, curved surface that far out in its vertex plane.
@@ -48,6 +50,11 @@ class Measurement:
     def shares(self) -> Tensor:
         """(S, height, width): images of sum 1 over the trusted pixels."""
         return torch.where(self.mask, self.images, 0.0) / self.totals[:, None, None]
+
+    @cached_property
+    def lit_pixels(self) -> Tensor:
+        """(S,), how many pixels each image covers: 1/Σ share², their number if all were alike."""
+        return 1.0 / self.shares.square().sum((-2, -1))
 
     def centroids(self) -> Tensor:
         """(S, 2), x and y, mm, of trusted pixels."""
@@ -115,7 +122,8 @@ def simulated(
         image = torch.zeros(sensor.height * sensor.width, dtype=torch.float64)
         passed = 0
         while passed < photons:
-            rays = _directions(one, source, wavelength, generator)
+            count = min(_AT_A_TIME, _DRAWN * (photons - passed) + 1024)
+            rays = _directions(one, source, wavelength, count, generator)
             hit = one.trace(rays)
             x, y = (c[hit.valid].double() for c in hit.position[:, :2].unbind(-1))
             if not len(x):
@@ -137,12 +145,14 @@ def simulated(
     return Measurement(stacked, mask, read_noise, sensor)
 
 
-def _directions(lens: Lens, source: Tensor, wavelength: float, generator: torch.Generator) -> Rays:
-    """Rays of even density in solid angle, towards the first surface where it stands."""
+def _directions(
+    lens: Lens, source: Tensor, wavelength: float, count: int, generator: torch.Generator
+) -> Rays:
+    """At most so many rays of even density in solid angle, towards the first surface as it is."""
     system = lens.system()
     axes = system.axes[0]
     radius = _REACH * system.surfaces[0].semi_diameter
-    u, v, keep = torch.rand(3, _AT_A_TIME, generator=generator, dtype=torch.float64)
+    u, v, keep = torch.rand(3, count, generator=generator, dtype=torch.float64)
     rho, angle = radius * u.sqrt(), 2.0 * torch.pi * v
     local = Components(rho * angle.cos(), rho * angle.sin(), *4 * (torch.zeros_like(rho),))
     d = torch.stack(to_lens_axes(local, axes)[:3], -1) - source

@@ -20,8 +20,9 @@ class Pose(nn.Module):
     """Chosen numbers of a lens and its sources, θ, held as u = θ/scale.
 
     Names are those of the lens's parameters (`elements.lens.tilt_x`, `elements.lens.decenter_x`,
-    `sensor_distance`) and `sources.<n>.x`, `.y`, `.z`.  Settings, and what is found, are in degrees
-    for tilts and in mm; θ is in the lens's own units, radians and mm.
+    `sensor_distance`), `sources.<n>.x`, `.y`, `.z`, and `sources.*.x`, `.y`, `.z`, by which all
+    sources are shifted from where they are given, as one target.  Settings, and what is found, are
+    in degrees for tilts and in mm; θ is in the lens's own units, radians and mm.
 
     Args:
         lens: `put` and `store` change it, nothing else does.
@@ -29,6 +30,7 @@ class Pose(nn.Module):
         variables: name → settings: `scale` (default 1) and `initial` (default: as it is).
         planes: where the sensor stands for each of a source's images, mm from `sensor_distance`,
             as on a stage whose travel is known.
+        shift: (3,), mm, of all sources from there.
 
     Attributes:
         names: of θ, P of them.
@@ -46,11 +48,13 @@ class Pose(nn.Module):
         sources: Sequence[Sequence[float]],
         variables: Mapping[str, Mapping[str, Any] | None],
         planes: Sequence[float] = (0.0,),
+        shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         super().__init__()
         self._of = (lens,)
         options = {"dtype": torch.float64, "device": lens.device}
         self.register_buffer("sources", torch.tensor(sources, **options).reshape(-1, 3))
+        self.register_buffer("shift", torch.tensor(shift, **options), persistent=False)
         self.names, self.planes = tuple(variables), tuple(float(z) for z in planes)
         if not self.planes:
             raise InputError("planes: none is given; allowed: one or more places of the sensor, mm")
@@ -78,6 +82,16 @@ class Pose(nn.Module):
         return self._of[0]
 
     @property
+    def places(self) -> Tensor:
+        """(S, 3), mm, the sources where they stand, but for θ."""
+        return self.sources + self.shift
+
+    def varying(self, variables: Mapping[str, Mapping[str, Any] | None]) -> "Pose":
+        """The same lens, sources and planes, with other variables."""
+        sources, shift = self.sources.tolist(), self.shift.tolist()
+        return Pose(self.lens, sources, variables, self.planes, shift)
+
+    @property
     def scale_in_units(self) -> Tensor:
         """(P,), the scales as the settings have them."""
         return self.scale / self.units
@@ -95,7 +109,7 @@ class Pose(nn.Module):
         """
         place = self._source(name)
         if place is not None:
-            return float(self.sources[place])
+            return float(self._at(place))
         found = self.lens.variables([name])
         if list(found) != [name] or found[name].numel() != 1:
             raise InputError(f"variable '{name}' is not one number of the lens")
@@ -123,25 +137,36 @@ class Pose(nn.Module):
 
     def _placed(self, values: Mapping[str, Tensor]) -> list[Tensor]:
         """The sources, (3,) each."""
+
+        def along(place: tuple[int | None, int]) -> Tensor:
+            number, axis = place
+            name = f"sources.{'*' if number is None else number + 1}.{_COORDINATES[axis]}"
+            return values.get(name, self._at(place))
+
         return [
-            torch.stack(
-                [
-                    values.get(f"sources.{number + 1}.{axis}", self.sources[number, i])
-                    for i, axis in enumerate(_COORDINATES)
-                ]
-            )
+            torch.stack([along((number, axis)) + along((None, axis)) for axis in range(3)])
             for number in range(len(self.sources))
         ]
 
-    def _source(self, name: str) -> tuple[int, int] | None:
-        """Number of the source, from 0, and of the coordinate; None for the lens's parameters."""
+    def _at(self, place: tuple[int | None, int]) -> Tensor:
+        """A stored number of a source, or of their shift."""
+        number, axis = place
+        return self.shift[axis] if number is None else self.sources[number, axis]
+
+    def _source(self, name: str) -> tuple[int | None, int] | None:
+        """Number of the source, from 0, or None for all, and of the coordinate; None for the lens's
+        parameters.
+        """
         parts = name.split(".")
         if parts[0] != "sources":
             return None
-        known = len(parts) == 3 and parts[1].isdigit() and parts[2] in _COORDINATES
-        if not known or not 1 <= int(parts[1]) <= len(self.sources):
+        known = len(parts) == 3 and parts[2] in _COORDINATES
+        if known and parts[1] == "*":
+            return None, _COORDINATES.index(parts[2])
+        if not (known and parts[1].isdigit() and 1 <= int(parts[1]) <= len(self.sources)):
             raise InputError(
-                f"variable '{name}': allowed are sources.<1 to {len(self.sources)}>.x, .y and .z"
+                f"variable '{name}': allowed are sources.<1 to {len(self.sources)}>.x, .y and .z, "
+                "and sources.*.x, .y and .z"
             )
         return int(parts[1]) - 1, _COORDINATES.index(parts[2])
 
@@ -151,7 +176,7 @@ class Pose(nn.Module):
         for name, value in values.items():
             place = self._source(name)
             if place is not None:
-                self.sources[place] = value * _unit(name)
+                self._at(place).fill_(value * _unit(name))
             else:
                 self.lens.variables([name])[name].fill_(value * _unit(name))
 

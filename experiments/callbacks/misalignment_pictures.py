@@ -44,8 +44,11 @@ def misalignment_figures(module: MisalignmentModule) -> dict[str, Figure]:
 
 
 def variable_label(name: str) -> str:
-    """`elements.lens.tilt_x` → `lens tilt x`, `sources.1.z` → `source 1 z`."""
-    short = name.removeprefix("elements.").replace("sources.", "source ")
+    """`elements.lens.tilt_x` → `lens tilt x`, `sources.1.z` → `source 1 z`, `sources.*.z` →
+    `sources z`.
+    """
+    short = name.removeprefix("elements.").replace("sources.*", "sources")
+    short = short.replace("sources.", "source ") if "*" not in name else short
     return short.replace(".", " ").replace("_", " ")
 
 
@@ -65,7 +68,7 @@ def _spots(module: MisalignmentModule) -> Figure:
         torch.cat(initial),
         torch.cat(final),
         labels,
-        module.imager.sensor.pixel_pitch,
+        module.sensor.pixel_pitch,
         f"{module.lens.name}: measured and modelled images",
     )
 

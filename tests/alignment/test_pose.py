@@ -353,3 +353,20 @@ def test_a_second_plane_is_the_sensor_moved(singlet):
     assert bool((both.bounds < 0.55 * one.bounds).all())
     with pytest.raises(InputError, match="planes: none is given"):
         Pose(singlet, SOURCE, names, planes=[])
+
+
+def test_sources_shift_as_one_target(singlet):
+    """By a variable of their own, once however often it is put."""
+    names = {"sources.*.x": {"initial": 0.5}, "sources.2.z": None}
+    two = Pose(singlet, [[0.0, 0.0, -864.0], [3.0, 1.0, -700.0]], names)
+    assert two.found() == {"sources.*.x": 0.5, "sources.2.z": -700.0}
+    for _ in range(2):
+        two.put({"sources.*.x": 0.5, "sources.2.z": -710.0})
+    assert two.places.tolist() == [[0.5, 0.0, -864.0], [3.5, 1.0, -710.0]]
+    other = two.varying({"sources.*.x": None})
+    assert other.found() == {"sources.*.x": 0.5}
+    given = Pose(singlet, [[0.5, 0.0, -864.0], [3.5, 1.0, -710.0]], {})
+    with torch.no_grad():
+        pairs = zip(other.images(IMAGER), given.images(IMAGER), strict=True)
+        for shifted, image in pairs:
+            assert torch.equal(shifted.image, image.image)

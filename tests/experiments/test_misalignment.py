@@ -95,7 +95,7 @@ def test_a_stage_may_move_some_variables_only(composed, tmp_path):
             "stages=[{optimizer: dls, iterations: 1, loss: l1}]",
             "loss 'l1' is unknown; allowed: s21",
         ),
-        ("stages=[{optimizer: dls, iterations: 1, imager: {ray: 2}}]", "stages.imager"),
+        ("stages=[{optimizer: dls, iterations: 1, imager: {ray: 2}}]", "imager: "),
         (
             "stages=[{optimizer: dls, iterations: 1, loss: noise_weighted, blur: 1.0}]",
             "blur and centroid_weight are of loss s21",

@@ -1,0 +1,160 @@
+"""Pictures of what limits a pose fit."""
+
+from pathlib import Path
+
+import lightning
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from experiments.callbacks.figures import keep_figures
+from experiments.callbacks.misalignment_pictures import variable_label
+from experiments.pose_accuracy import ESTIMATORS, PoseAccuracyModule
+
+_LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}
+_MARKERS = {"noise_weighted": "o", "s21": "s"}
+
+
+class PoseAccuracyPictures(lightning.Callback):
+    """`photons.png`, `rays.png` and `basin.png`, and the same in TensorBoard.
+
+    Args:
+        folder: where they go; made when needed.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Draw what was measured."""
+        keep_figures(trainer, self.folder, pose_accuracy_figures(pl_module))
+
+
+def pose_accuracy_figures(module: PoseAccuracyModule) -> dict[str, Figure]:
+    """Figures by name, of the parts that were measured."""
+    drawn = {"photons": _photons, "rays": _rays, "basin": _basin}
+    return {part: drawn[part](module) for part in module.parts}
+
+
+def _photons(module: PoseAccuracyModule) -> Figure:
+    """A panel for each variable: errors of both estimates, and the bound."""
+    names = module.true.names
+    figure = Figure(figsize=(2.6 * len(names), 3.3), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(names)))
+    for axes, name, unit in zip(panels, names, module.true.units.tolist(), strict=True):
+        rows = [r for r in module.rows if r["part"] == "photons" and r["variable"] == name]
+        for estimator, colour in zip(ESTIMATORS, colours(2), strict=True):
+            mine = [r for r in rows if r["estimator"] == estimator]
+            counts = [r["count"] for r in mine]
+            axes.plot(
+                counts,
+                [r["rms_error"] for r in mine],
+                _MARKERS[estimator],
+                color=colour,
+                label=f"RMS error, {_LABELS[estimator]}",
+                markersize=5,
+            )
+        axes.plot(counts, [r["bound"] for r in mine], color="0.3", linewidth=1.0, label="bound")
+        axes.set(xscale="log", yscale="log")
+        axes.set_title(variable_label(name), fontsize=SMALL + 1)
+        axes.set_xlabel("photons", fontsize=SMALL + 1)
+        axes.set_ylabel("mm" if unit == 1.0 else "deg", fontsize=SMALL + 1)
+        ruled_axes(axes)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL
+    )
+    figure.suptitle(
+        f"{module.lens.name}: error and light, {module.measurements} measurements each",
+        fontsize=TITLE,
+    )
+    return figure
+
+
+def _rays(module: PoseAccuracyModule) -> Figure:
+    """Errors that rays make, over the bound of the light that is quoted."""
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    axes = figure.subplots(1, 1)
+    for imager, colour in zip(module.imagers, colours(len(module.imagers)), strict=True):
+        settings = module.imagers[imager]
+        for estimator in ESTIMATORS:
+            found = [
+                module.summary()[f"pose_error/over_bound/rays/{imager}_{count:g}/{estimator}"]
+                for count in module.ray_counts
+            ]
+            axes.plot(
+                module.ray_counts,
+                found,
+                marker=_MARKERS[estimator],
+                linestyle="-" if estimator == ESTIMATORS[0] else "--",
+                color=colour,
+                markersize=5,
+                linewidth=1.2,
+                label=f"{_LABELS[estimator]}, rim {settings.rim:g}, {settings.subpixels} subpixels",
+            )
+    axes.axhline(1.0, color="0.3", linewidth=1.0)
+    axes.text(
+        module.ray_counts[0],
+        1.08,
+        f"bound of {module.photons:.3g} photons",
+        fontsize=SMALL,
+        color="0.3",
+        va="bottom",
+    )
+    floor = module.summary()["pose_error/reference_over_bound"]
+    axes.axhspan(0.0, floor, color="0.92", label="noise of the reference", zorder=0)
+    axes.set(xscale="log", yscale="log")
+    axes.set_xlabel("rays of a source", fontsize=SMALL + 1)
+    axes.set_ylabel("RMS error over bound", fontsize=SMALL + 1)
+    ruled_axes(axes)
+    axes.legend(frameon=False, fontsize=SMALL)
+    figure.suptitle(f"{module.lens.name}: error that the model's rays make", fontsize=TITLE)
+    return figure
+
+
+def _basin(module: PoseAccuracyModule) -> Figure:
+    """A map of final errors for each centroid weight."""
+    basin = module.basin
+    weights = basin.centroid_weights
+    figure = Figure(figsize=(1.2 + 4.2 * len(weights), 4.0), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(weights), sharey=True))
+    units = dict(zip(module.true.names, module.true.units.tolist(), strict=True))
+    across, up = basin.along
+    for axes, weight in zip(panels, weights, strict=True):
+        table = basin.table(weight).numpy()
+        shown = axes.imshow(
+            np.clip(table, 1.0, None),
+            norm=LogNorm(1.0, 1e4),
+            cmap="viridis_r",
+            origin="lower",
+            aspect="auto",
+        )
+        _write(axes, table)
+        errors = list(basin.along.values())
+        axes.set_xticks(range(len(errors[0])), [f"{e:g}" for e in errors[0]], fontsize=SMALL)
+        axes.set_yticks(range(len(errors[1])), [f"{e:g}" for e in errors[1]], fontsize=SMALL)
+        axes.set_xlabel(_start(across, units), fontsize=SMALL + 1)
+        share = module.summary()[f"basin/converged/centroid_weight_{weight:g}"]
+        axes.set_title(f"μ = {weight:g} /mm²: {100.0 * share:.0f} % converge", fontsize=SMALL + 1)
+    panels[0].set_ylabel(_start(up, units), fontsize=SMALL + 1)
+    bar = figure.colorbar(shown, ax=list(panels), pad=0.01, extend="both")
+    bar.set_label("RMS error of the fit over bound", fontsize=SMALL)
+    bar.ax.tick_params(labelsize=SMALL)
+    figure.suptitle(f"{module.lens.name}: from where a fit converges", fontsize=TITLE)
+    return figure
+
+
+def _start(name: str, units: dict[str, float]) -> str:
+    unit = "mm" if units[name] == 1.0 else "deg"
+    return f"error of the start, {variable_label(name)}, {unit}"
+
+
+def _write(axes: Axes, table: np.ndarray) -> None:
+    """The number in each cell."""
+    for row, column in np.ndindex(*table.shape):
+        value = table[row, column]
+        text = f"{value:.2g}" if value < 100.0 else f"{value:.0e}".replace("e+0", "e")
+        pale = "white" if value > 100.0 else "black"
+        axes.text(column, row, text, ha="center", va="center", fontsize=SMALL - 2, color=pale)

@@ -1,0 +1,174 @@
+"""Pictures of how well arrangements of sources and planes tell a lens's pose."""
+
+from pathlib import Path
+
+import lightning
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dolens.plotting.corner import corner_figure
+from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from experiments.callbacks.figures import keep_figures
+from experiments.callbacks.misalignment_pictures import variable_label
+from experiments.pose_knowledge import UNSEEN, Arrangement, PoseKnowledgeModule
+
+_MARKERS = "osD^vP*X"
+
+
+class PoseKnowledgePictures(lightning.Callback):
+    """`knowledge.png` and a corner plot of each arrangement, and the same in TensorBoard.
+
+    Args:
+        folder: where they go; made when needed.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Draw."""
+        keep_figures(trainer, self.folder, pose_knowledge_figures(pl_module))
+
+
+def pose_knowledge_figures(module: PoseKnowledgeModule) -> dict[str, Figure]:
+    """Figures by name: `knowledge`, and `corner_<arrangement>` where all can be seen."""
+    figures = {"knowledge": _overview(module)}
+    for found in module.arrangements:
+        if float(found.spread[0]) < UNSEEN:
+            figures[f"corner_{found.name}"] = _corner(module, found)
+    return figures
+
+
+def _overview(module: PoseKnowledgeModule) -> Figure:
+    figure = Figure(figsize=(11.5, 7.4), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.8))
+    left, right = above.subplots(1, 2, width_ratios=(1.5, 1.0))
+    _bounds(left, module)
+    _spectrum(right, module)
+    axes = below.subplots(1, 1)
+    _worst(axes, module, below)
+    figure.suptitle(
+        f"{module.lens.name}: what images of {module.photons:.3g} photons in all tell of its pose",
+        fontsize=TITLE,
+    )
+    return figure
+
+
+def _bounds(axes: Axes, module: PoseKnowledgeModule) -> None:
+    """Bounds of each variable over its scale, a mark for each arrangement."""
+    names = list(dict.fromkeys(name for f in module.arrangements for name in f.pose.names))
+    units = {
+        n: u for f in module.arrangements for n, u in zip(f.pose.names, _units(f), strict=True)
+    }
+    scales = {
+        n: float(s)
+        for f in module.arrangements
+        for n, s in zip(f.pose.names, f.pose.scale_in_units, strict=True)
+    }
+    far = 0.0
+    for found in module.arrangements:
+        for name, bound in zip(found.pose.names, found.bounds.tolist(), strict=True):
+            share = bound / scales[name]
+            far = max(far, share if share < UNSEEN else 0.0)
+    for number, (found, colour) in enumerate(_coloured(module)):
+        for row, name in enumerate(names):
+            if name not in found.pose.names:
+                continue
+            share = float(found.bounds[found.pose.names.index(name)]) / scales[name]
+            seen = share < UNSEEN
+            offset = 0.13 * (number - 0.5 * (len(module.arrangements) - 1))
+            axes.plot(
+                share if seen else 8.0 * far,
+                row + offset,
+                _MARKERS[number % len(_MARKERS)] if seen else ">",
+                color=colour,
+                markersize=5 if seen else 7,
+                markerfacecolor=colour if seen else "none",
+            )
+    labels = [f"{variable_label(name)}\n(1 = {scales[name]:g} {units[name]})" for name in names]
+    axes.set_yticks(range(len(names)), labels, fontsize=SMALL)
+    axes.set_xscale("log")
+    axes.invert_yaxis()
+    axes.set_xlabel("bound over scale (▷: cannot be seen)", fontsize=SMALL + 1)
+    ruled_axes(axes)
+
+
+def _spectrum(axes: Axes, module: PoseKnowledgeModule) -> None:
+    """Standard deviations of combinations, from the worst known to the best."""
+    for number, (found, colour) in enumerate(_coloured(module)):
+        spread = found.spread.clone()
+        unseen = int((spread > UNSEEN).sum())
+        spread[:unseen] = torch.nan
+        label = _label(found) if not unseen else f"{_label(found)} ({unseen} cannot be seen)"
+        axes.plot(
+            np.arange(1, len(spread) + 1),
+            spread.numpy(),
+            marker=_MARKERS[number % len(_MARKERS)],
+            color=colour,
+            linewidth=1.0,
+            markersize=5,
+            label=label,
+        )
+    axes.set_yscale("log")
+    axes.set_xlabel("combination, from the worst known to the best", fontsize=SMALL + 1)
+    axes.set_ylabel("standard deviation, of scales", fontsize=SMALL + 1)
+    ruled_axes(axes)
+    axes.legend(frameon=False, fontsize=SMALL)
+
+
+def _worst(axes: Axes, module: PoseKnowledgeModule, figure: Figure) -> None:
+    """What the worst known combination of each arrangement is made of."""
+    names = list(dict.fromkeys(name for f in module.arrangements for name in f.pose.names))
+    table = np.full((len(module.arrangements), len(names)), np.nan)
+    for row, found in enumerate(module.arrangements):
+        worst = found.combinations[0]
+        # Of one sign: its largest part is positive.
+        worst = worst * torch.sign(worst[worst.abs().argmax()])
+        for name, part in zip(found.pose.names, worst.tolist(), strict=True):
+            table[row, names.index(name)] = part
+    shown = axes.imshow(table, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto")
+    for row, column in np.argwhere(np.isfinite(table)):
+        value = table[row, column]
+        if abs(value) >= 0.005:
+            text = f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
+            pale = "white" if abs(value) > 0.6 else "black"
+            axes.text(column, row, text, ha="center", va="center", fontsize=SMALL, color=pale)
+    axes.set_facecolor("0.93")
+    labels = []
+    for found in module.arrangements:
+        spread = float(found.spread[0])
+        labels.append(
+            f"{_label(found)}\nσ = {spread:.2g}" if spread < UNSEEN else f"{_label(found)}\n∞"
+        )
+    axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
+    axes.set_xticks(range(len(names)), [variable_label(n) for n in names], fontsize=SMALL)
+    axes.set_title("the combination that each knows worst", fontsize=SMALL + 1)
+    figure.colorbar(shown, ax=axes, pad=0.01).ax.tick_params(labelsize=SMALL)
+
+
+def _corner(module: PoseKnowledgeModule, found: Arrangement) -> Figure:
+    units = found.pose.units
+    values = torch.tensor(list(found.pose.found().values()), dtype=torch.float64)
+    return corner_figure(
+        found.known.covariance / torch.outer(units, units),
+        [variable_label(name) for name in found.pose.names],
+        _units(found),
+        values,
+        found.estimates,
+        values if found.estimates is not None else None,
+        f"{module.lens.name}, {_label(found)}: Cramér–Rao",
+    )
+
+
+def _label(found: Arrangement) -> str:
+    return found.name.replace("_", " ")
+
+
+def _units(found: Arrangement) -> list[str]:
+    return ["mm" if unit == 1.0 else "deg" for unit in found.pose.units.tolist()]
+
+
+def _coloured(module: PoseKnowledgeModule) -> zip:
+    return zip(module.arrangements, colours(len(module.arrangements)), strict=True)

@@ -1,0 +1,98 @@
+"""What limits a pose fit, as a run."""
+
+import csv
+import json
+import math
+
+import pytest
+
+from dolens import InputError
+from experiments.training import run
+
+TINY = [
+    "experiment=pose_accuracy",
+    "sensor.height=48",
+    "sensor.width=48",
+    "sensor.pixel_pitch=0.1472",
+    "photons=100000",
+    "imagers.narrow.rays=50000",
+    "imagers.wide.rays=50000",
+    "photon_levels=[20000,80000]",
+    "measurements=8",
+    "ray_counts=[1000,50000]",
+    "patterns=2",
+    "reference_photons=5e6",
+    "objective=pose_error/over_bound/photons_80000/noise_weighted",
+    "basin.along={elements.lens.tilt_x: [0.0, 3.0], elements.lens.decenter_y: [0.5]}",
+    "basin.centroid_weights=[1.0]",
+    "basin.photons=1e5",
+    "basin.imager.rays=4000",
+    "basin.stages=[{optimizer: dls, iterations: 12}]",
+    "+trainer.enable_progress_bar=false",
+]
+
+
+def rows_of(path):
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_errors_fall_with_light_and_rays_and_near_starts_converge(composed, tmp_path):
+    run(composed(*TINY))
+    folder = tmp_path / "run"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    rows = rows_of(folder / "accuracy.csv")
+    # Bounds of four times the light are half as large where shot noise rules.
+    bounds = {
+        (r["count"], r["variable"]): float(r["bound"]) for r in rows if r["part"] == "photons"
+    }
+    for name in {name for _, name in bounds}:
+        ratio = bounds[("80000", name)] / bounds[("20000", name)]
+        assert 0.4 < ratio < 0.52
+    for level in (20000, 80000):
+        # RMS of 8 estimates of 5 numbers: a standard error of 1/√80, times three.
+        found = metrics[f"pose_error/over_bound/photons_{level}/noise_weighted"]
+        assert found == pytest.approx(1.0, abs=0.35)
+        assert found < metrics[f"pose_error/over_bound/photons_{level}/s21"]
+    few, many = (
+        metrics[f"pose_error/over_bound/rays/narrow_{count}/noise_weighted"]
+        for count in (1000, 50000)
+    )
+    assert many < 0.3 * few
+    basin = rows_of(folder / "basin.csv")
+    assert [float(row["converged"]) for row in basin] == [1.0, 1.0]
+    assert all(
+        float(r["error_over_bound"]) < 0.1 * float(r["initial_error_over_bound"]) for r in basin
+    )
+    assert metrics["basin/converged/centroid_weight_1"] == 1.0
+    for name in ("photons", "rays", "basin"):
+        assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000
+
+
+def test_a_start_without_light_is_a_lost_fit_and_not_the_end_of_the_run(composed, tmp_path):
+    """Turned by 110° the lens shows its back, and no ray enters by its first surface."""
+    far = "basin.along={elements.lens.tilt_x: [0.0, 120.0], elements.lens.decenter_y: [0.0]}"
+    run(composed(*TINY, "parts=[basin]", far, "objective=basin/converged/centroid_weight_1"))
+    first, second = rows_of(tmp_path / "run" / "basin.csv")
+    assert float(first["converged"]) == 1.0 and float(second["converged"]) == 0.0
+    assert float(second["iterations"]) == 0.0
+    assert math.isfinite(float(second["error_over_bound"]))
+
+
+BAD_INPUT = {
+    "part": (["parts=[light]"], "parts: 'light' is unknown (allowed: photons, rays, basin)"),
+    "along": (["+basin.along.focus=[0]"], "focus; allowed: two of"),
+    "count": (["measurements=1"], "measurements, patterns"),
+    "imager": (["imagers.narrow.rim=0"], "imager.rim: 0; allowed"),
+    "precision": (["lens_dtype=float32"], "poses are fitted in float64"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_input_gives_one_clear_line(composed, case):
+    overrides, expected = BAD_INPUT[case]
+    with pytest.raises(Exception) as caught:
+        run(composed(*TINY, *overrides))
+    error = caught.value.__cause__ or caught.value
+    assert isinstance(error, InputError), error
+    assert expected in str(error) and "\n" not in str(error)

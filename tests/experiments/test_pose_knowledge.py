@@ -1,0 +1,83 @@
+"""How well poses can be known, by arrangement, as a run."""
+
+import csv
+import json
+
+import pytest
+
+from dolens import InputError
+from experiments.training import run
+
+TINY = [
+    "experiment=pose_knowledge",
+    "sensor.height=32",
+    "sensor.width=32",
+    "sensor.pixel_pitch=0.2208",
+    "photons=100000",
+    "imager.rays=20000",
+    "imager.rim=0.01",
+    "+trainer.enable_progress_bar=false",
+]
+
+
+def rows_of(path):
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_planes_part_what_one_image_cannot_and_a_common_shift_is_never_seen(composed, tmp_path):
+    run(composed(*TINY, "monte_carlo=25"))
+    folder = tmp_path / "run"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    bounds = {(r["arrangement"], r["variable"]): r for r in rows_of(folder / "bounds.csv")}
+    one, planes = "one_source", "three_planes"
+    for name in ("sensor_distance", "sources.*.z", "elements.lens.tilt_x"):
+        near, far = (float(bounds[(a, name)]["bound"]) for a in (planes, one))
+        # The same light, shared among three images.
+        assert near < 0.3 * far
+    # One spot cannot tell a sensor that is farther from a source that is nearer.
+    row = bounds[(one, "sensor_distance")]
+    assert abs(float(row["correlation"])) > 0.99
+    # Source, lens and sensor moving together along the axis change no image: the combination that
+    # is not seen is (1, 1, 1) in mm.
+    everything = "one_source_and_lens_shift"
+    assert metrics[f"knowledge/{everything}/unseen"] == 1.0
+    assert metrics[f"knowledge/{one}/unseen"] == 0.0
+    first = next(r for r in rows_of(folder / "combinations.csv") if r["arrangement"] == everything)
+    moved = {
+        "sensor_distance": 1.0 * float(first["sensor_distance"]),
+        "sources.*.z": 10.0 * float(first["sources.*.z"]),
+        "elements.lens.shift_z": 0.1 * float(first["elements.lens.shift_z"]),
+    }
+    size = moved["elements.lens.shift_z"]
+    assert moved["sources.*.z"] == pytest.approx(size, rel=1e-3)
+    # The lens goes towards the sensor as the sensor goes away with it.
+    assert abs(moved["sensor_distance"]) == pytest.approx(abs(size), rel=1e-3)
+    spreads = [v for k, v in metrics.items() if k.startswith(f"pose_spread_over_bound/{planes}")]
+    assert len(spreads) == 8
+    # Of 25 estimates each: a standard error of 0.14, and they go together.
+    assert sum(spreads) / 8 == pytest.approx(1.0, abs=0.3)
+    assert (folder / "figures" / "knowledge.png").stat().st_size > 10_000
+    assert (folder / "figures" / "corner_three_planes.png").exists()
+
+
+BAD_INPUT = {
+    "key": (["+arrangements.one_source.plane=[0]"], "unknown key 'plane' (allowed: sources"),
+    "sources": (
+        ["arrangements.one_source.sources=[]"],
+        "arrangements.one_source: sources are missing; give one",
+    ),
+    "estimates": (["monte_carlo=1"], "monte_carlo: 1; allowed: 0 for none, or 2 or more"),
+    "precision": (["lens_dtype=float32"], "poses are known in float64"),
+    "variable": (["+variables.focus={}"], "focus"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUT)
+def test_bad_input_gives_one_clear_line(composed, case):
+    overrides, expected = BAD_INPUT[case]
+    with pytest.raises(Exception) as caught:
+        run(composed(*TINY, *overrides))
+    error = caught.value.__cause__ or caught.value
+    assert isinstance(error, InputError), error
+    assert expected in str(error) and "\n" not in str(error)
