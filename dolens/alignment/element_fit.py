@@ -1,6 +1,7 @@
 """Which element of a lens is misaligned, and by how much: a fit of each, for many lenses at once.
 
-Every hypothesis is that one element has a pose of its own and all others are as designed.
+Every hypothesis is that one element has a pose of its own and all others are as designed; where
+the sensor is may be unknown besides.
 """
 
 from collections.abc import Sequence
@@ -9,7 +10,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.alignment.spot_moments import LINEAR, MOMENTS, MeasuredMoments, MomentModel
+from dolens.alignment.moment_noise import MeasuredMoments
+from dolens.alignment.moments import LINEAR, MOMENTS
+from dolens.alignment.spot_moments import MomentModel
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
@@ -28,10 +31,10 @@ _ENOUGH, _WRONG, _SHARE = 1e-8, 10.0, 0.05
 
 @dataclass(frozen=True)
 class ElementFit:
-    """The best pose of one element for each of K measurements.
+    """The best pose of one element, and place of the sensor, for each of K measurements.
 
     Attributes:
-        errors: (K, P), in the lens's units (radians, mm).
+        errors: (K, P), in the lens's units (radians, mm), in the order of the model's names.
         chi_squared: (K,), Σ (L⁻¹·(m - measured))².
         converged: (K,), bool: no step would gain anything that matters.
         iterations: most that any measurement took.
@@ -78,8 +81,10 @@ def fit_element(model: MomentModel, measured: MeasuredMoments, iterations: int =
 
 
 @torch.no_grad()
-def bounds(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Tensor:
-    """Least covariance (Cramér and Rao) of unbiased estimates from these moments: (JᵀJ)⁻¹.
+def information_root(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Tensor:
+    """R, upper triangular, with RᵀR = JᵀJ the information that these moments hold.
+
+    The first rows and columns of R are the R of the first parameters alone, the others known.
 
     Args:
         model: of P parameters.
@@ -87,13 +92,27 @@ def bounds(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Ten
         errors: (K, P), where the lenses truly are.
 
     Returns:
-        (K, P, P), in the lens's units squared.
+        (K, P, P), in the inverse of the lens's units.
     """
     _, jacobian = _whitened(model, measured, errors, MOMENTS)
-    # Radians and mm side by side: columns of one length keep the inverse accurate.
+    # Radians and mm side by side: columns of one length keep digits.
     length = jacobian.norm(dim=1, keepdim=True)
-    r = torch.linalg.qr(jacobian / length, mode="r").R
-    inverse = torch.linalg.inv(r) / length.mT
+    return torch.linalg.qr(jacobian / length, mode="r").R * length
+
+
+def least_covariance(root: Tensor) -> Tensor:
+    """Of unbiased estimates (Cramér and Rao): (RᵀR)⁻¹.
+
+    A block of it is the covariance of some parameters with all others unknown.
+
+    Args:
+        root: (K, P, P), upper triangular.
+
+    Returns:
+        (K, P, P), in the lens's units squared.
+    """
+    length = root.norm(dim=1, keepdim=True)
+    inverse = torch.linalg.inv(root / length) / length.mT
     return inverse @ inverse.mT
 
 

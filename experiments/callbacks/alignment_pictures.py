@@ -38,10 +38,23 @@ def alignment_figure(module: TripletAlignmentModule) -> Figure:
         _errors(axes, module, name, columns, unit)
     figure.suptitle(
         f"{module.lens.name}: {module.misalignments} misalignments from {len(module.fields)} fields"
-        f", {module.photons:.3g} photons a spot",
+        f", {module.photons:.3g} photons a spot{_sensor(module)}",
         fontsize=TITLE,
     )
     return figure
+
+
+def _sensor(module: TripletAlignmentModule) -> str:
+    """What counts the photons, and what of its place is unknown, for the title."""
+    pixels, unknown = module.pixels, module.sensor
+    text = ""
+    if pixels is not None:
+        text = f"; {1e3 * pixels.pitch:.3g} µm pixels, {pixels.read_noise:.3g} e⁻ read noise"
+    if unknown:
+        shift, focus = "sensor_x" in unknown, "sensor_distance" in unknown
+        what = " and ".join(["shift"] * shift + ["focus"] * focus)
+        text += f"; sensor's {what} unknown"
+    return text
 
 
 def _confusion(axes: Axes, module: TripletAlignmentModule) -> None:

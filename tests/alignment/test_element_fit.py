@@ -9,7 +9,7 @@ import yaml
 
 from dolens import InputError
 from dolens.alignment.element_fit import bounds, element_names, fit_element, named_element
-from dolens.alignment.spot_moments import (
+from dolens.alignment.moment_noise import (
     POWERS,
     moment_covariance,
     moment_model,
