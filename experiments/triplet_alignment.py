@@ -22,7 +22,7 @@ from dolens.alignment.element_fit import (
 )
 from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
 from dolens.alignment.pixel_moments import Pixels, grid_error
-from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model
+from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one_thread
 from dolens.errors import InputError
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.optics.lens import Lens
@@ -36,7 +36,7 @@ _DIGITS = 9
 # Radians and mm as tables have them: degrees and µm.
 _DEGREES, _MICROMETRES = math.degrees(1.0), 1e3
 # Rings and arms with many rays in every pixel, and how many places of the grid are tried.
-_DENSE, _PLACES = (60, 180), 16
+_DENSE, _PLACES = (40, 120), 16
 
 
 class TripletAlignmentModule(lightning.LightningModule):
@@ -140,7 +140,7 @@ class TripletAlignmentModule(lightning.LightningModule):
     def test_step(self, batch: Any, batch_idx: int) -> None:
         """Simulate, fit, log, and write the table."""
         # Lightning tests in inference mode, which forward derivatives do not work in.
-        with torch.inference_mode(False), torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad(), one_thread():
             self.alignment = self._align()
         self.log_dict(self.summary(), batch_size=1)
         write_table(self.folder / "alignment.csv", self.alignment.rows(), _DIGITS)

@@ -1,6 +1,7 @@
 """Spots of a lens in a few numbers each: moments of where light lands, and their derivatives."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -17,8 +18,9 @@ from dolens.optics.trace import trace_surfaces, trace_to_plane
 
 # Where the sensor is, mm: across, where it is from where it should be, and along the axis.
 SENSOR = ("sensor_x", "sensor_y", "sensor_distance")
-# Rays traced at a time, a derivative counting like a ray: bounds intermediate results to 0.2 GB.
-_RAYS_AT_A_TIME = 1 << 17
+# Rays traced at a time, a derivative counting like a ray: bounds intermediate results to 0.4 GB,
+# and makes operations long beside what calling them takes.
+_RAYS_AT_A_TIME = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class MomentModel:
     @torch.no_grad()
     def moments_and_jacobian(self, errors: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
         """The moments (K, S, 9) and their derivatives by the parameters (K, S, 9, P)."""
-        copies = 1 + len(self.names)
+        copies = 1 + len(self.start)
         sums, jacobian = self._in_chunks(
             vmap(self._derivatives), copies, *self._split(errors), origin
         )
@@ -135,19 +137,27 @@ class MomentModel:
     ) -> list[Tensor]:
         """A function of a batch, some rows at a time, on one thread.
 
-        Split among PyTorch's threads, the many short operations wait for one another, which takes
-        up to thirty times as long; and chunks cannot have threads of their own, since PyTorch
-        counts the levels of forward derivatives for the whole process.
+        Chunks cannot have threads of their own: PyTorch counts the levels of forward derivatives
+        for the whole process.
         """
         size = max(1, _RAYS_AT_A_TIME // (copies * len(self.shares)))
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with one_thread():
             chunks = zip(*(part.split(size) for part in rows), strict=True)
             parts = [batch(*chunk) for chunk in chunks]
-        finally:
-            torch.set_num_threads(threads)
         return [torch.cat(part) for part in zip(*parts, strict=True)]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """For many short operations: split among PyTorch's threads they wait for one another, which
+    takes up to thirty times as long.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def moment_model(
