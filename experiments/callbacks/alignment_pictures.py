@@ -44,10 +44,10 @@ def alignment_figure(module: TripletAlignmentModule) -> Figure:
         _errors(axes, module, name, columns, unit)
     if unknown:
         _sensor_errors(others[-1], module)
+    photons = f"{module.photons:_.0f}".replace("_", " ")
     figure.suptitle(
         f"{module.lens.name}: {module.misalignments} misalignments from {len(module.fields)} fields"
-        f", {module.photons:_.0f} photons a spot".replace("_", " ")
-        + _sensor(module),
+        f", {photons} photons a spot{_sensor(module)}",
         fontsize=TITLE,
     )
     return figure
