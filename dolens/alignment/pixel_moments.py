@@ -4,8 +4,8 @@ Counts are divided by their own sum over a window about the spot.  A photon coun
 its pixel, x + u for one that lands at x.  Averaged over the places of the grid under the spot, u
 is uniform over a pixel and independent of x: the spot is convolved with a pixel.  That is exact
 for exposures that are summed with the spot dithered over a pixel; for one exposure it leaves out
-what depends on where the grid happens to lie, which `grid_error` gives.  Rays make that larger
-than it is: the structure of a spot as fine as a pixel, which causes it, is blurred by diffraction.
+what depends on where the grid happens to lie, which `grid_error` gives, of rays without
+diffraction.
 """
 
 import math

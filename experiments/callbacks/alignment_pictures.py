@@ -138,4 +138,5 @@ def _finish(axes: Axes, label: str, known: bool) -> None:
     axes.set_xlabel(label, fontsize=SMALL + 1)
     axes.set_ylabel("share of misalignments, %", fontsize=SMALL + 1)
     ruled_axes(axes)
-    axes.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    # Lines of bounds pass behind it.
+    axes.legend(framealpha=0.9, edgecolor="none", fontsize=SMALL, loc="upper left")
