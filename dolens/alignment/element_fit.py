@@ -1,6 +1,7 @@
 """Which element of a lens is misaligned, and by how much: a fit of each, for many lenses at once.
 
-Every hypothesis is that one element has a pose of its own and all others are as designed.
+Every hypothesis is that one element has a pose of its own and all others are as designed; where
+the sensor is may be unknown besides.
 """
 
 from collections.abc import Sequence
@@ -9,17 +10,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.alignment.spot_moments import LINEAR, MOMENTS, MeasuredMoments, MomentModel
+from dolens.alignment.moment_noise import MeasuredMoments
+from dolens.alignment.moments import LINEAR
+from dolens.alignment.spot_moments import MomentModel
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
-# Centroids are all but linear in a pose: so few steps on them bring a true hypothesis near.
-_CENTROID_STEPS = 3
+# Centroids are all but linear in a pose: so few steps on them bring a true hypothesis near.  They
+# cannot tell a decentre from a place of the sensor: damped so much, no step goes astray.
+_CENTROID_STEPS, _CENTROID_DAMPING = 3, 1e-3
 # What a hypothesis moves, of one element.
 POSE = ("tilt_x", "tilt_y", "decenter_x", "decenter_y")
 # Damping of the first step, its factors after a step that helps and one that does not, and where
 # no step can help any more.
-_DAMPING, _EASE, _BRAKE, _STUCK = 1e-3, 0.1, 10.0, 1e10
+_DAMPING, _EASE, _BRAKE, _STUCK = 1e-6, 0.1, 10.0, 1e10
 # A fit is done when a step would gain less than this of χ², far below the noise; or, once χ² is
 # more than so many times the count of moments, less than a share of the excess: such a hypothesis
 # is wrong, and its digits are worth no iterations.
@@ -28,10 +32,10 @@ _ENOUGH, _WRONG, _SHARE = 1e-8, 10.0, 0.05
 
 @dataclass(frozen=True)
 class ElementFit:
-    """The best pose of one element for each of K measurements.
+    """The best pose of one element, and place of the sensor, for each of K measurements.
 
     Attributes:
-        errors: (K, P), in the lens's units (radians, mm).
+        errors: (K, P), in the lens's units (radians, mm), in the order of the model's names.
         chi_squared: (K,), Σ (L⁻¹·(m - measured))².
         converged: (K,), bool: no step would gain anything that matters.
         iterations: most that any measurement took.
@@ -59,8 +63,8 @@ def fit_element(model: MomentModel, measured: MeasuredMoments, iterations: int =
     """Fit a model's parameters to each measurement by damped Gauss-Newton steps.
 
     Marquardt's step solves (JᵀJ + λ·diag JᵀJ)·δ = -Jᵀr, with r and J the residuals and their
-    derivatives after whitening, and a λ of its own for each measurement.  It starts from the
-    design, where a displaced spot makes cubes of its distance; so centroids are fitted alone first.
+    derivatives after whitening, and a λ of its own for each measurement.  At the design a
+    displaced spot makes cubes of its distance; so centroids are fitted alone first.
 
     Args:
         model: of the parameters that may be off.
@@ -69,17 +73,14 @@ def fit_element(model: MomentModel, measured: MeasuredMoments, iterations: int =
     """
     if iterations < 1:
         raise InputError(f"iterations: {iterations}; allowed: 1 or more")
-    start = measured.moments.new_zeros(len(measured.moments), len(model.names))
-    near = _descend(model, measured, start, LINEAR, min(iterations, _CENTROID_STEPS))
-    found = _descend(model, measured, near.errors, MOMENTS, iterations)
-    return ElementFit(
-        found.errors, found.chi_squared, found.converged, near.iterations + found.iterations
-    )
+    return _descend(model, measured, _from_centroids(model, measured), iterations)
 
 
 @torch.no_grad()
-def bounds(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Tensor:
-    """Least covariance (Cramér and Rao) of unbiased estimates from these moments: (JᵀJ)⁻¹.
+def information_root(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Tensor:
+    """R, upper triangular, with RᵀR = JᵀJ the information that these moments hold.
+
+    The first rows and columns of R are the R of the first parameters alone, the others known.
 
     Args:
         model: of P parameters.
@@ -87,13 +88,27 @@ def bounds(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Ten
         errors: (K, P), where the lenses truly are.
 
     Returns:
+        (K, P, P), in the inverse of the lens's units.
+    """
+    _, jacobian = _whitened(model, measured, errors)
+    # Radians and mm side by side: columns of one length keep digits.
+    length = jacobian.norm(dim=1, keepdim=True)
+    return torch.linalg.qr(jacobian / length, mode="r").R * length
+
+
+def least_covariance(root: Tensor) -> Tensor:
+    """Of unbiased estimates (Cramér and Rao): (RᵀR)⁻¹.
+
+    A block of it is the covariance of some parameters with all others unknown.
+
+    Args:
+        root: (K, P, P), upper triangular.
+
+    Returns:
         (K, P, P), in the lens's units squared.
     """
-    _, jacobian = _whitened(model, measured, errors, MOMENTS)
-    # Radians and mm side by side: columns of one length keep the inverse accurate.
-    length = jacobian.norm(dim=1, keepdim=True)
-    r = torch.linalg.qr(jacobian / length, mode="r").R
-    inverse = torch.linalg.inv(r) / length.mT
+    length = root.norm(dim=1, keepdim=True)
+    inverse = torch.linalg.inv(root / length) / length.mT
     return inverse @ inverse.mT
 
 
@@ -113,12 +128,32 @@ def named_element(chi_squared: Sequence[Tensor] | Tensor) -> tuple[Tensor, Tenso
     return table.argmin(0), torch.softmax(-0.5 * table, 0)
 
 
+def _from_centroids(model: MomentModel, measured: MeasuredMoments) -> Tensor:
+    """Parameters (K, P) that all but explain the centroids.
+
+    Damped steps with the derivatives of the design throughout, which are the same for all.
+    """
+    design = measured.moments.new_zeros(1, len(model.names))
+    _, jacobian = model.moments_and_jacobian(design, model.centroids[None])
+    # The first rows of a triangular factor are that of the first moments alone.
+    factor = measured.factor[..., :LINEAR, :LINEAR]
+    slopes = torch.linalg.solve_triangular(factor, jacobian[:, :, :LINEAR], upper=False)
+    slopes = slopes.flatten(1, 2)
+    damping = torch.full_like(measured.moments[:, 0, 0], _CENTROID_DAMPING)
+    errors = design.expand(len(damping), -1)
+    for _ in range(_CENTROID_STEPS):
+        apart = (model.moments(errors, measured.origin) - measured.moments)[..., :LINEAR, None]
+        white = torch.linalg.solve_triangular(factor, apart, upper=False)
+        errors = errors + _damped_step(white.flatten(1), slopes, damping)
+    return errors
+
+
 def _descend(
-    model: MomentModel, measured: MeasuredMoments, start: Tensor, count: int, iterations: int
+    model: MomentModel, measured: MeasuredMoments, start: Tensor, iterations: int
 ) -> ElementFit:
-    """With the first `count` moments of each spot only."""
+    """Marquardt's steps with all moments."""
     errors = start.clone()
-    residual, jacobian = _whitened(model, measured, errors, count)
+    residual, jacobian = _whitened(model, measured, errors)
     cost = residual.square().sum(-1)
     damping = torch.full_like(cost, _DAMPING)
     converged = torch.zeros_like(cost, dtype=torch.bool)
@@ -133,7 +168,7 @@ def _descend(
         step = _damped_step(r, j, damping[at])
         gain = r.square().sum(-1) - (r + (j @ step[..., None])[..., 0]).square().sum(-1)
         tried = errors[at] + step
-        new_residual, new_jacobian = _whitened(model, measured[at], tried, count)
+        new_residual, new_jacobian = _whitened(model, measured[at], tried)
         new_cost = new_residual.square().sum(-1)
         better = new_cost < cost[at]
         excess = (cost[at] - _WRONG * residual.shape[1]).clamp(min=0.0)
@@ -155,13 +190,10 @@ def _damped_step(residual: Tensor, jacobian: Tensor, damping: Tensor) -> Tensor:
 
 
 def _whitened(
-    model: MomentModel, measured: MeasuredMoments, errors: Tensor, count: int
+    model: MomentModel, measured: MeasuredMoments, errors: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Residuals (K, S·count) of unit variance, and their derivatives (K, S·count, P).
-
-    The first entries of L⁻¹·v are those that the first entries of v alone would give.
-    """
+    """Residuals (K, S·9) of unit variance, and their derivatives (K, S·9, P)."""
     moments, jacobian = model.moments_and_jacobian(errors, measured.origin)
     both = torch.cat([(moments - measured.moments)[..., None], jacobian], -1)
-    white = torch.linalg.solve_triangular(measured.factor, both, upper=False)[:, :, :count]
+    white = torch.linalg.solve_triangular(measured.factor, both, upper=False)
     return white[..., 0].flatten(1), white[..., 1:].flatten(1, 2)

@@ -1,50 +1,58 @@
-"""Spots in a few numbers each: moments of where light lands, their derivatives, their noise."""
+"""Spots of a lens in a few numbers each: moments of where light lands, and their derivatives."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.func import jacfwd, vmap
+from torch.func import jacfwd, jvp, vmap
 
+from dolens.alignment.moments import POWERS, shift_derivatives, weighted_sums
+from dolens.alignment.pixel_moments import Pixels, convolved, pixel_convolution
 from dolens.errors import InputError
 from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
 from dolens.optics.trace import trace_surfaces, trace_to_plane
 
-# Powers of x and y in the moments of a spot: the centroid, the second and the third moments.
-POWERS = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
-MOMENTS = len(POWERS)
-# Moments that are linear in the ray points, the first of all.
-LINEAR = 2
-# Rays traced at a time, a derivative counting like a ray: bounds intermediate results to 0.2 GB.
-_RAYS_AT_A_TIME = 1 << 17
+# Where the sensor is, mm: across, where it is from where it should be, and along the axis.
+SENSOR = ("sensor_x", "sensor_y", "sensor_distance")
+# Rays traced at a time, a derivative counting like a ray: bounds intermediate results to 0.4 GB,
+# and makes operations long beside what calling them takes.
+_RAYS_AT_A_TIME = 1 << 18
 
 
 @dataclass(frozen=True)
 class MomentModel:
-    """Moments of S spots as functions of P numbers of a lens.
+    """Moments of S spots as functions of P numbers: T of a lens, and then some of its sensor's.
 
     Spots are lit by fixed rays of the lens as designed: they do not move in object space, as if
-    the entrance pupil stayed where it is, and no aperture clips them.
+    the entrance pupil stayed where it is, and no aperture clips them.  Points are on the sensor,
+    wherever that is: as it moves by +Δ, light moves by -Δ.
 
     Attributes:
         names: of the P parameters.
-        start: (P,), their values as designed, in the lens's units (radians for tilts).
+        start: (T,), values as designed of those that are traced, in the lens's units (radians for
+            tilts); numbers of the sensor start from zero.
+        sensor: (P - T, 3), which of `SENSOR` the others are, one in each row.
         shares: (N, S), the weight of ray i in spot s; columns sum to one.
-        size: (S,), mm, RMS radius of each spot as designed: the unit of lengths in moments.
+        size: (S,), mm, the unit of lengths in moments of each spot.
         centroids: (S, 2), mm, of the spots as designed.
-        land: (P,) → points (2, N), mm, on the sensor, and the least of what ends a ray, which is
-            positive where all rays arrive; to be called in `vmap` and under forward derivatives.
+        land: (T,) → points (2, N), mm, on the sensor as designed, slopes (2, N) there, dx/dz and
+            dy/dz, and the least of what ends a ray, which is positive where all rays arrive; to be
+            called in `vmap` and under forward derivatives.
+        pixels: what counts the light; None: every photon is located exactly.
     """
 
     names: tuple[str, ...]
     start: Tensor
+    sensor: Tensor
     shares: Tensor
     size: Tensor
     centroids: Tensor
-    land: Callable[[Tensor], tuple[Tensor, Tensor]]
+    land: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
+    pixels: Pixels | None = None
 
     @torch.no_grad()
     def points(self, errors: Tensor) -> Tensor:
@@ -53,7 +61,7 @@ class MomentModel:
         Raises:
             InputError: a ray of such a lens misses a surface or is reflected totally.
         """
-        points, margin = self._in_chunks(vmap(self.land), 1, self.start + errors.to(self.start))
+        points, _, margin = self._in_chunks(vmap(self._arrive), 1, *self._split(errors))
         lost = ~(margin > 0.0)
         if bool(lost.any()):
             raise InputError(f"misalignments: {int(lost.sum())} of {len(lost)} lenses lose rays")
@@ -63,6 +71,8 @@ class MomentModel:
     def moments(self, errors: Tensor, origin: Tensor) -> Tensor:
         """m = Σ w·((x - x₀)/a)ⁱ·((y - y₀)/a)ʲ of each spot, a its size; (i, j) from `POWERS`.
 
+        With pixels, x and y are their centres, averaged over the places of the grid.
+
         Args:
             errors: (K, P), added to the parameters.
             origin: (K, S, 2), mm, (x₀, y₀).
@@ -70,194 +80,145 @@ class MomentModel:
         Returns:
             (K, S, 9).
         """
-        return self._in_chunks(vmap(self._moments), 1, self.start + errors, origin)[0]
+        sums = vmap(lambda *row: self._sums(*row)[1][:1])
+        return self.convolved(self._in_chunks(sums, 1, *self._split(errors), origin)[0])
 
     @torch.no_grad()
     def moments_and_jacobian(self, errors: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
         """The moments (K, S, 9) and their derivatives by the parameters (K, S, 9, P)."""
-        derivative = vmap(jacfwd(self._moments, has_aux=True))
-        jacobian, moments = self._in_chunks(
-            derivative, 1 + len(self.names), self.start + errors, origin
+        copies = 1 + len(self.start)
+        sums, jacobian = self._in_chunks(
+            vmap(self._derivatives), copies, *self._split(errors), origin
         )
-        return moments, jacobian
+        if self.pixels is not None:
+            matrix = pixel_convolution(POWERS, self.pixels.pitch / self.size)
+            jacobian = matrix[..., :-1] @ jacobian
+        return self.convolved(sums), jacobian
 
-    def _moments(self, values: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-        """Twice the same (S, 9): to be differentiated, and to be kept."""
-        points, _ = self.land(values)
+    def convolved(self, sums: Tensor) -> Tensor:
+        """Moments (..., S, 9) of what pixels count, from those of where light lands."""
+        if self.pixels is None:
+            return sums
+        return convolved(sums, POWERS, self.pixels.pitch / self.size)
+
+    def _split(self, errors: Tensor) -> tuple[Tensor, Tensor]:
+        """Values that are traced (K, T), and the sensor's place (K, 3)."""
+        traced, other = errors.to(self.start).split([len(self.start), len(self.sensor)], 1)
+        return self.start + traced, other @ self.sensor
+
+    def _arrive(self, values: Tensor, sensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `land`, on the sensor at its place (3,)."""
+        points, slopes, margin = self.land(values)
+        return points + sensor[2] * slopes - sensor[:2, None], slopes, margin
+
+    def _sums(
+        self, values: Tensor, sensor: Tensor, origin: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """Moments (S, 9), to be differentiated; and the same, points, and slopes, to be kept."""
+        points, slopes, _ = self._arrive(values, sensor)
         found = weighted_sums(points, self.shares, origin, self.size, POWERS)
-        return found, found
+        return found, (found, points.detach(), slopes.detach())
+
+    def _derivatives(self, values: Tensor, sensor: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
+        """Moments (S, 9), and derivatives (S, 9, P): only those of the lens need its rays."""
+        traced, (found, points, slopes) = jacfwd(self._sums, has_aux=True)(values, sensor, origin)
+        if not len(self.sensor):
+            return found, traced
+
+        def on_sensor(at: Tensor) -> Tensor:
+            return weighted_sums(at, self.shares, origin, self.size, POWERS)
+
+        _, along = jvp(on_sensor, (points,), (slopes,))
+        other = torch.cat([shift_derivatives(found, self.size), along[..., None]], -1)
+        return found, torch.cat([traced, other @ self.sensor.mT], -1)
 
     def _in_chunks(
         self, batch: Callable[..., tuple[Tensor, ...]], copies: int, *rows: Tensor
     ) -> list[Tensor]:
         """A function of a batch, some rows at a time, on one thread.
 
-        Split among PyTorch's threads, the many short operations wait for one another, which takes
-        up to thirty times as long; and chunks cannot have threads of their own, since PyTorch
-        counts the levels of forward derivatives for the whole process.
+        Chunks cannot have threads of their own: PyTorch counts the levels of forward derivatives
+        for the whole process.
         """
         size = max(1, _RAYS_AT_A_TIME // (copies * len(self.shares)))
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with one_thread():
             chunks = zip(*(part.split(size) for part in rows), strict=True)
             parts = [batch(*chunk) for chunk in chunks]
-        finally:
-            torch.set_num_threads(threads)
         return [torch.cat(part) for part in zip(*parts, strict=True)]
 
 
-def moment_model(lens: Lens, spots: SpotRays, names: Sequence[str]) -> MomentModel:
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """For many short operations: split among PyTorch's threads they wait for one another, which
+    takes up to thirty times as long.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def moment_model(
+    lens: Lens,
+    spots: SpotRays,
+    names: Sequence[str],
+    sensor: Sequence[str] = (),
+    pixels: Pixels | None = None,
+    size: Tensor | None = None,
+) -> MomentModel:
     """A lens's spots as functions of some of its parameters, by the reference tracer.
 
     Args:
         lens: as designed.
         spots: of the whole pupil, `gaussian_quadrature(..., symmetry=False)`.
         names: parameters, each a single number.
+        sensor: which of the sensor's numbers, from `SENSOR`, are parameters as well.
+        pixels: what counts the light; None: every photon is located exactly.
+        size: (S,), mm, the unit of lengths in moments; None: each spot's RMS radius as designed.
 
     Raises:
-        InputError: a lens in single precision, rays that stand for mirror images, or a parameter
-            that the lens lacks.
+        InputError: a lens in single precision, rays that stand for mirror images, a parameter
+            that the lens lacks, or a number that the sensor lacks.
     """
     if lens.dtype != torch.float64:
         raise InputError(f"lens_dtype: moments of spots need float64, not {lens.dtype}")
     if bool(spots.centred.any()):
         raise InputError("spots: rays of the whole pupil are needed (symmetry=False)")
+    unknown = set(sensor) - set(SENSOR)
+    if unknown:
+        raise InputError(f"sensor: '{unknown.pop()}' is unknown; allowed: {', '.join(SENSOR)}")
     nominal = {name: value.detach() for name, value in lens.variables(names).items()}
     names = tuple(names)
     start = torch.stack([nominal[name] for name in names])
     ray = Components(*(c.double() for c in spots.rays.components()))
     wavelength = spots.rays.wavelength
 
-    def land(values: Tensor) -> tuple[Tensor, Tensor]:
+    def land(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         system = lens.system(dict(zip(names, values.unbind(), strict=True)))
         last = trace_surfaces(system, ray, wavelength)
         traced = trace_to_plane(system, last, system.vertices[-1], wavelength, 1.0)
         ends = [m for row in traced.margins for m in (row.met, row.transmitted) if m is not None]
         margin = torch.stack([end.detach().amin() for end in ends]).amin()
-        return torch.stack([traced.ray.x, traced.ray.y]), margin
+        at = traced.ray
+        return torch.stack([at.x, at.y]), torch.stack([at.l / at.n, at.m / at.n]), margin
 
     shares = spots.weight.new_zeros(len(spots.weight), spots.count)
     shares[torch.arange(len(spots.weight)), spots.spot] = spots.weight
     with torch.no_grad():
-        points, _ = land(start)
+        points, _, _ = land(start)
         centroids = (points @ shares).T
         apart = points - centroids.T[:, spots.spot]
-        size = (apart.square().sum(0) @ shares).sqrt()
-    return MomentModel(names, start, shares, size, centroids, land)
-
-
-def weighted_sums(
-    points: Tensor,
-    shares: Tensor,
-    origin: Tensor,
-    size: Tensor,
-    powers: Sequence[tuple[int, int]],
-) -> Tensor:
-    """Σ w·xⁱ·yʲ of each spot, about an origin and in units of a size.
-
-    Args:
-        points: (..., 2, N), mm.
-        shares: (N, S), weights w of rays in spots.
-        origin: (..., S, 2), mm.
-        size: (S,), mm.
-        powers: Q pairs (i, j).
-
-    Returns:
-        (..., S, Q).
-    """
-    # Every ray counts in one spot: its origin and its size are picked by that spot.
-    own = (shares > 0.0).to(shares)
-    unit = (points - origin.mT @ own.mT) / (own @ size)
-    highest = max(max(pair) for pair in powers)
-    x, y = ([torch.ones_like(unit[..., axis, :])] for axis in (0, 1))
-    for _ in range(highest):
-        x.append(x[-1] * unit[..., 0, :])
-        y.append(y[-1] * unit[..., 1, :])
-    return (torch.stack([x[i] * y[j] for i, j in powers], -2) @ shares).mT
-
-
-@torch.no_grad()
-def moment_covariance(
-    points: Tensor, shares: Tensor, origin: Tensor, size: Tensor, photons: float
-) -> Tensor:
-    """Covariance of the moments of spots of so many photons each, exactly.
-
-    A moment about a fixed origin is the mean over photons of f = xⁱ·yʲ, and the photons land
-    independently: cov = (E[f·fᵀ] - E[f]·E[f]ᵀ)/photons, from moments up to the sixth.
-
-    Args:
-        points: (..., 2, N), mm.
-        shares: (N, S).
-        origin: (..., S, 2), mm.
-        size: (S,), mm.
-        photons: of a spot.
-
-    Returns:
-        (..., S, 9, 9), in the units of the moments.
-    """
-    products = [(i + k, j + m) for i, j in POWERS for k, m in POWERS]
-    distinct = list(dict.fromkeys((*POWERS, *products)))
-    sums = weighted_sums(points, shares, origin, size, distinct)
-    places = torch.tensor([distinct.index(pair) for pair in products])
-    second = sums[..., places].unflatten(-1, (MOMENTS, MOMENTS))
-    mean = sums[..., :MOMENTS]
-    return (second - mean[..., :, None] * mean[..., None, :]) / photons
-
-
-@dataclass(frozen=True)
-class MeasuredMoments:
-    """Moments of S spots of K lenses as a sensor gave them.
-
-    With (x, y) about another origin every moment is a linear combination of those up to its own
-    order, so χ² is the same about any origin; near the spot, rounding is least.
-
-    Attributes:
-        origin: (K, S, 2), mm, what moments are about.
-        moments: (K, S, 9), in units of the sizes of the spots as designed.
-        factor: (K, S, 9, 9), lower triangular L with covariance L·Lᵀ.
-    """
-
-    origin: Tensor
-    moments: Tensor
-    factor: Tensor
-
-    def __getitem__(self, rows: Tensor) -> "MeasuredMoments":
-        return MeasuredMoments(self.origin[rows], self.moments[rows], self.factor[rows])
-
-
-@torch.no_grad()
-def simulated_moments(
-    model: MomentModel, errors: Tensor, photons: float, generator: torch.Generator | None
-) -> MeasuredMoments:
-    """What a sensor would measure of lenses with these errors.
-
-    The sums over so many photons are normally distributed about the true moments, by the central
-    limit theorem, with all their correlations.  Nothing but photon noise is in them.
-
-    Args:
-        model: of all the parameters that are off.
-        errors: (K, P), in the lens's units.
-        photons: of each spot.
-        generator: on the CPU; None: no noise, though the covariance is that of the photons.
-
-    Raises:
-        InputError: photons out of range, a lens that loses rays, or so few rays a spot that its
-            moments are not independent.
-    """
-    if not photons >= 1.0:
-        raise InputError(f"photons: {photons!r}; allowed: 1 or more")
-    points = model.points(errors)
-    origin = (points @ model.shares).mT
-    covariance = moment_covariance(points, model.shares, origin, model.size, photons)
-    factor, failed = torch.linalg.cholesky_ex(covariance)
-    spread = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    # A pivot of rounding's size is no independent moment.
-    pivots = factor.diagonal(dim1=-2, dim2=-1) / spread.clamp(min=torch.finfo(spread.dtype).tiny)
-    if bool((failed > 0).any()) or not bool((pivots > 1e-6).all()):
-        raise InputError("rings, arms: too few rays for the moments of a spot to be independent")
-    moments = weighted_sums(points, model.shares, origin, model.size, POWERS)
-    if generator is not None:
-        normal = torch.randn(moments.shape, generator=generator, dtype=moments.dtype)
-        moments = moments + (factor @ normal[..., None])[..., 0]
-    return MeasuredMoments(origin, moments, factor)
+        own_size = (apart.square().sum(0) @ shares).sqrt()
+    chosen = torch.eye(len(SENSOR), dtype=start.dtype)[[SENSOR.index(name) for name in sensor]]
+    return MomentModel(
+        (*names, *sensor),
+        start,
+        chosen,
+        shares,
+        own_size if size is None else size,
+        centroids,
+        land,
+        pixels,
+    )

@@ -6,8 +6,10 @@ import lightning
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from experiments.alignment_result import COLUMNS
 from experiments.callbacks.figures import keep_figures
 from experiments.triplet_alignment import TripletAlignmentModule
 
@@ -30,18 +32,38 @@ class AlignmentPictures(lightning.Callback):
 
 
 def alignment_figure(module: TripletAlignmentModule) -> Figure:
-    """Elements off against elements named, and the spread of errors beside their bounds."""
-    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    left, *others = figure.subplots(1, 3, width_ratios=(0.8, 1.0, 1.0))
+    """Elements off against elements named, and the spread of errors beside their bounds.
+
+    Where the sensor is unknown, its own errors are beside them.
+    """
+    unknown = bool(module.sensor)
+    figure = Figure(figsize=(14.0 if unknown else 11.0, 3.6), layout="constrained")
+    left, *others = figure.subplots(1, 3 + unknown, width_ratios=(0.8, *[1.0] * (2 + unknown)))
     _confusion(left, module)
-    for axes, (name, columns, unit) in zip(others, _PANELS, strict=True):
+    for axes, (name, columns, unit) in zip(others, _PANELS, strict=False):
         _errors(axes, module, name, columns, unit)
+    if unknown:
+        _sensor_errors(others[-1], module)
+    photons = f"{module.photons:_.0f}".replace("_", " ")
     figure.suptitle(
         f"{module.lens.name}: {module.misalignments} misalignments from {len(module.fields)} fields"
-        f", {module.photons:.3g} photons a spot",
+        f", {photons} photons a spot{_sensor(module)}",
         fontsize=TITLE,
     )
     return figure
+
+
+def _sensor(module: TripletAlignmentModule) -> str:
+    """What counts the photons, and what of its place is unknown, for the title."""
+    pixels, unknown = module.pixels, module.sensor
+    text = ""
+    if pixels is not None:
+        text = f"; {1e3 * pixels.pitch:.3g} µm pixels, {pixels.read_noise:.3g} e⁻ read noise"
+    if unknown:
+        shift, focus = "sensor_x" in unknown, "sensor_distance" in unknown
+        what = " and ".join(["shift"] * shift + ["focus"] * focus)
+        text += f"; sensor's {what} unknown"
+    return text
 
 
 def _confusion(axes: Axes, module: TripletAlignmentModule) -> None:
@@ -71,6 +93,7 @@ def _errors(
     errors = found.errors(columns)
     # The expected square of the error's length is the sum of the variances.
     bound = found.bound[:, columns].norm(dim=1)
+    known = (found.bound[:, :4] / found.bound_ratio)[:, columns].norm(dim=1)
     batch = torch.arange(len(errors)) > 0
     for number, (element, colour) in enumerate(
         zip(module.elements, colours(len(module.elements)), strict=True)
@@ -78,15 +101,42 @@ def _errors(
         mine = batch & (found.element == number)
         if not bool(mine.any()):
             continue
-        ordered = errors[mine].sort().values.clamp(min=1e-12)
-        share = 100.0 * torch.arange(1, len(ordered) + 1) / len(ordered)
-        axes.plot(ordered.numpy(), share.numpy(), color=colour, linewidth=1.5, label=element)
-        median = float(bound[mine].median())
-        axes.axvline(median, color=colour, linewidth=1.0, linestyle=":")
+        _spread(axes, errors[mine], bound[mine], colour, element)
+        if module.sensor:
+            median = float(known[mine].median())
+            axes.axvline(median, color=colour, linewidth=1.0, linestyle="--")
+    _finish(axes, f"error of the {name}, {unit}", bool(module.sensor))
+
+
+def _sensor_errors(axes: Axes, module: TripletAlignmentModule) -> None:
+    """All elements together: across by its length, and along the axis."""
+    found, pose = module.alignment, len(COLUMNS)
+    difference = (found.found - found.true)[1:, pose:]
+    bound = found.bound[1:, pose:]
+    along = torch.tensor([name == "sensor_distance" for name in module.sensor])
+    for chosen, colour, name in ((~along, "0.2", "shift"), (along, "0.6", "focus")):
+        if bool(chosen.any()):
+            errors = difference[:, chosen].norm(dim=1)
+            _spread(axes, errors, bound[:, chosen].norm(dim=1), colour, name)
+    _finish(axes, "error of the sensor's place, µm", False)
+
+
+def _spread(axes: Axes, errors: Tensor, bound: Tensor, colour: str, label: str) -> None:
+    """How many of (K,) errors are below each, and the median of their bounds."""
+    ordered = errors.sort().values.clamp(min=1e-12)
+    share = 100.0 * torch.arange(1, len(ordered) + 1) / len(ordered)
+    axes.plot(ordered.numpy(), share.numpy(), color=colour, linewidth=1.5, label=label)
+    axes.axvline(float(bound.median()), color=colour, linewidth=1.0, linestyle=":")
+
+
+def _finish(axes: Axes, label: str, known: bool) -> None:
     axes.plot([], [], color="0.4", linewidth=1.0, linestyle=":", label="bound on the RMS")
+    if known:
+        axes.plot([], [], color="0.4", linewidth=1.0, linestyle="--", label="with the sensor known")
     axes.set_xscale("log")
     axes.set_ylim(0.0, 101.0)
-    axes.set_xlabel(f"error of the {name}, {unit}", fontsize=SMALL + 1)
+    axes.set_xlabel(label, fontsize=SMALL + 1)
     axes.set_ylabel("share of misalignments, %", fontsize=SMALL + 1)
     ruled_axes(axes)
-    axes.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    # Lines of bounds pass behind it.
+    axes.legend(framealpha=0.9, edgecolor="none", fontsize=SMALL, loc="upper left")

@@ -13,12 +13,19 @@ SMALL = [
     "experiment=triplet_alignment",
     "fields=[[0,0],[0,14],[-14,0],[14,-6]]",
     "misalignments=12",
-    "module.rings=3",
-    "module.arms=8",
-    "+module.iterations=8",
+    "module.arms=16",
+    "module.simulation_rings=5",
+    "module.simulation_arms=20",
+    "+module.iterations=12",
     "+trainer.enable_progress_bar=false",
 ]
 COLUMNS = ("tilt_x_deg", "tilt_y_deg", "decenter_x_um", "decenter_y_um")
+SENSOR = ("sensor_x_um", "sensor_y_um", "focus_um")
+
+
+def table(folder):
+    with (folder / "alignment.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def test_a_run_names_the_elements_and_its_table_agrees_with_its_metrics(composed, tmp_path):
@@ -29,8 +36,7 @@ def test_a_run_names_the_elements_and_its_table_agrees_with_its_metrics(composed
     assert metrics["alignment/converged"] == 1.0
     assert metrics["cost/batch_s"] > 0.0
     assert (folder / "figures" / "alignment.png").stat().st_size > 10_000
-    with (folder / "alignment.csv").open(encoding="utf-8") as file:
-        demo, *rows = csv.DictReader(file)
+    demo, *rows = table(folder)
     assert len(rows) == 12 and {row["case"] for row in rows} == {str(k) for k in range(1, 13)}
     assert demo["true_element"] == demo["named_element"] == "middle"
     assert [float(demo[f"true_{c}"]) for c in COLUMNS] == pytest.approx([0.12, -0.05, 20.0, -30.0])
@@ -41,13 +47,45 @@ def test_a_run_names_the_elements_and_its_table_agrees_with_its_metrics(composed
         assert min(chi2, key=chi2.get) == row["named_element"]
         assert max(abs(float(row[f"true_{c}"])) for c in COLUMNS[:2]) <= 0.2
         assert max(abs(float(row[f"true_{c}"])) for c in COLUMNS[2:]) <= 50.0
-        for c in COLUMNS:
+        assert max(abs(float(row[f"true_{c}"])) for c in SENSOR) <= 20.0
+        for c in (*COLUMNS, *SENSOR):
             difference = float(row[f"found_{c}"]) - float(row[f"true_{c}"])
             assert abs(difference) < 6.0 * float(row[f"bound_{c}"])
         errors.append(math.dist(*([float(row[f"{w}_{c}"]) for c in COLUMNS[:2]] for w in PAIR)))
     middle = sorted(errors)[5:7]
     assert metrics["pose_error/tilt_deg/median"] == pytest.approx(sum(middle) / 2, rel=1e-4)
     assert metrics["pose_error/tilt_deg/median"] == metrics["pose_error/tilt_deg/median_all"]
+    for c in SENSOR:
+        apart = sorted(abs(float(row[f"found_{c}"]) - float(row[f"true_{c}"])) for row in rows)
+        assert metrics[f"sensor_error/{c}/median_all"] == pytest.approx(
+            sum(apart[5:7]) / 2, rel=1e-4
+        )
+    # Other rays, far below the noise but not the same; and a sensor that hides decentres.
+    assert 1e-4 < metrics["alignment/sampling_error_over_noise"] < 0.2
+    assert metrics["alignment/pixel_grid_over_noise"] > 0.0
+    for element in {row["true_element"] for row in rows}:
+        assert metrics[f"alignment/bound_ratio/{element}/decenter_x_um"] > 3.0
+        assert metrics[f"alignment/bound_ratio/{element}/tilt_x_deg"] > 1.0
+
+
+def test_an_ideal_sensor_in_a_known_place_with_the_fits_own_rays(composed, tmp_path):
+    ideal = ["pixel_pitch=0", "read_noise=0", "sensor_shift_range=0", "focus_range=0"]
+    same = ["module.simulation_rings=4", "module.simulation_arms=16"]
+    run(composed(*SMALL, *ideal, *same))
+    folder = tmp_path / "run"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["alignment/named_right"] == 1.0
+    assert metrics["alignment/sampling_error_over_noise"] < 1e-9
+    assert not any("sensor" in key or "focus" in key for row in table(folder) for key in row)
+    assert not any(key.startswith("sensor") or "pixel_grid" in key for key in metrics)
+    ratios = [value for key, value in metrics.items() if "bound_ratio" in key]
+    assert ratios and ratios == pytest.approx([1.0] * len(ratios), rel=1e-9)
+
+
+def test_focus_alone_may_be_unknown(composed, tmp_path):
+    run(composed(*SMALL, "sensor_shift_range=0", "misalignments=4"))
+    row = table(tmp_path / "run")[0]
+    assert "bound_focus_um" in row and "bound_sensor_x_um" not in row
 
 
 PAIR = ("found", "true")
@@ -57,6 +95,16 @@ BAD_INPUT = {
     "count": (["misalignments=0"], "misalignments: 0; allowed: an integer of 1 or more"),
     "range": (["tilt_range=0"], "tilt_range: 0; allowed: a positive number"),
     "photons": (["photons=0"], "photons: 0.0; allowed: 1 or more"),
+    "shift": (
+        ["sensor_shift_range=-1"],
+        "sensor_shift_range: -1; allowed: a positive number, or 0",
+    ),
+    "focus": (["focus_range=inf"], "focus_range: inf; allowed: a positive number, or 0"),
+    "pitch": (["pixel_pitch=-1"], "pixel_pitch: -1; allowed: a positive number"),
+    "noise": (["read_noise=-1"], "read_noise: -1; allowed: 0 or more"),
+    "no pixels": (["pixel_pitch=0"], "read_noise: 2.0; allowed: 0 where pixel_pitch is 0"),
+    "window": (["window=1"], "window: 1; light lands up to"),
+    "rays": (["module.simulation_arms=7"], "rings must be at least 1 and arms even, not 5 and 7"),
     "fields": (["fields=[]"], "fields, wavelengths: give at least one"),
 }
 

@@ -1,0 +1,156 @@
+"""What was found of misaligned lenses: numbers for metrics, and the table of cases."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.alignment.element_fit import POSE
+from experiments.tables import Row
+
+# Numbers of a case as tables have them, of the element's pose and of the sensor's place.
+COLUMNS = ("tilt_x_deg", "tilt_y_deg", "decenter_x_um", "decenter_y_um")
+SENSOR_COLUMNS = {
+    "sensor_x": "sensor_x_um",
+    "sensor_y": "sensor_y_um",
+    "sensor_distance": "focus_um",
+}
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """K misaligned lenses and what was found of them, in degrees and µm; the demo is the first.
+
+    P numbers describe a case: tilts and decentres of its element, and what of the sensor's place
+    is unknown.
+
+    Attributes:
+        elements: E names.
+        columns: P names, `COLUMNS` and those of the sensor.
+        element: (K,), number of the element that is off.
+        true: (K, P).
+        named: (K,), number of the element that fits best.
+        found: (K, P), in the fit of that element.
+        chi_squared: (E, K), of each element's fit.
+        share: (E, K), of each hypothesis in the posterior.
+        bound: (K, P), least standard deviations, were the element known.
+        bound_ratio: (K, 4), the pose's bounds over those with the sensor's place known.
+        correlation: (K, P, P), of the bound's covariance.
+        converged: share of the fits of named elements that came to rest.
+        seconds: of the fits of all hypotheses.
+        checks: other numbers, by name, of what the model leaves out.
+    """
+
+    elements: Sequence[str]
+    columns: Sequence[str]
+    element: Tensor
+    true: Tensor
+    named: Tensor
+    found: Tensor
+    chi_squared: Tensor
+    share: Tensor
+    bound: Tensor
+    bound_ratio: Tensor
+    correlation: Tensor
+    converged: float
+    seconds: float
+    checks: dict[str, float]
+
+    @property
+    def right(self) -> Tensor:
+        """(K,), bool: the element that is off is the one named."""
+        return self.named == self.element
+
+    def errors(self, columns: slice) -> Tensor:
+        """(K,), length of the difference of the whole lens's pose, over these columns of all
+        elements: a wrong name counts with what it invents and with what it misses.
+        """
+        difference = self.true.new_zeros(len(self.true), len(self.elements), len(POSE))
+        rows = torch.arange(len(self.true))
+        difference[rows, self.named] += self.found[:, : len(POSE)]
+        difference[rows, self.element] -= self.true[:, : len(POSE)]
+        return difference[..., columns].flatten(1).norm(dim=1)
+
+    def summary(self) -> dict[str, float]:
+        """Numbers for metrics.json, of the batch without the demo."""
+        right = self.right[1:]
+        numbers = {"alignment/named_right": float(right.double().mean())}
+        for name, columns in (("tilt_deg", slice(0, 2)), ("decenter_um", slice(2, 4))):
+            errors = self.errors(columns)
+            numbers[f"pose_error/demo/{name}"] = float(errors[0])
+            bound = self.bound[1:, columns].norm(dim=1)
+            numbers[f"pose_bound/{name}/median"] = float(bound.median())
+            for kind, chosen in (("", right), ("_all", torch.ones_like(right))):
+                # Where no element is named right there is nothing to tell; NaN says so.
+                some = errors[1:][chosen] if bool(chosen.any()) else errors.new_full((1,), math.nan)
+                numbers[f"pose_error/{name}/median{kind}"] = float(some.quantile(0.5))
+                numbers[f"pose_error/{name}/p95{kind}"] = float(some.quantile(0.95))
+        for at, column in enumerate(self.columns[len(POSE) :], len(POSE)):
+            errors = (self.found - self.true)[1:, at].abs()
+            numbers[f"sensor_error/{column}/median_all"] = float(errors.quantile(0.5))
+            numbers[f"sensor_error/{column}/p95_all"] = float(errors.quantile(0.95))
+            numbers[f"sensor_bound/{column}/median"] = float(self.bound[1:, at].median())
+        own = self.chi_squared[self.element, torch.arange(len(self.true))][1:]
+        numbers["alignment/chi_squared/mean"] = float(own.mean())
+        numbers["alignment/converged"] = self.converged
+        for number in range(len(self.elements)):
+            numbers |= self._of_element(number)
+        return numbers | self.checks | {"cost/batch_s": self.seconds}
+
+    def _of_element(self, number: int) -> dict[str, float]:
+        """Of the cases where this element is off and is named."""
+        element = self.elements[number]
+        mine = (self.element == number) & self.right
+        mine[0] = False
+        numbers: dict[str, float] = {}
+        if not bool(mine.any()):
+            return numbers
+        ratio = (self.found - self.true)[mine] / self.bound[mine]
+        for at, column in enumerate(self.columns):
+            kind = "pose_bound" if at < len(POSE) else "sensor_bound"
+            numbers[f"{kind}/{element}/{column}"] = float(self.bound[mine, at].median())
+            rms = float(ratio[:, at].square().mean().sqrt())
+            numbers[f"alignment/error_over_bound/{element}/{column}"] = rms
+        for at, column in enumerate(COLUMNS):
+            lost = float(self.bound_ratio[mine, at].median())
+            numbers[f"alignment/bound_ratio/{element}/{column}"] = lost
+        # A tilt about x and a decentre along y move light in the same plane.
+        for first, second in ((0, 3), (1, 2)):
+            name = f"alignment/correlation/{element}/{POSE[first]}_{POSE[second]}"
+            numbers[name] = float(self.correlation[mine, first, second].median())
+        return numbers
+
+    def rows(self) -> list[Row]:
+        """Of alignment.csv: the demo, and the batch."""
+        rows: list[Row] = []
+        for k in range(len(self.true)):
+            element, named = int(self.element[k]), int(self.named[k])
+            row: dict[str, float | str] = {
+                "case": "demo" if k == 0 else str(k),
+                "true_element": self.elements[element],
+                "named_element": self.elements[named],
+                "share": float(self.share[named, k]),
+            }
+            for what in ("true", "found", "bound"):
+                values = getattr(self, what)[k].tolist()
+                row |= {f"{what}_{c}": v for c, v in zip(self.columns, values, strict=True)}
+            chi_squared = self.chi_squared[:, k].tolist()
+            row |= {f"chi2_{e}": v for e, v in zip(self.elements, chi_squared, strict=True)}
+            rows.append(row)
+        return rows
+
+    def verdict(self) -> str:
+        """One line of a log."""
+        n = self.summary()
+        true, named = (self.elements[int(which[0])] for which in (self.element, self.named))
+        return (
+            f"demo: {true} is off, {named} is named, errors {n['pose_error/demo/tilt_deg']:.2g}° "
+            f"and {n['pose_error/demo/decenter_um']:.2g} µm; of {len(self.true) - 1} others "
+            f"{100.0 * n['alignment/named_right']:.1f} % are named right, median errors "
+            f"{n['pose_error/tilt_deg/median_all']:.2g}° and "
+            f"{n['pose_error/decenter_um/median_all']:.2g} µm, 95 % within "
+            f"{n['pose_error/tilt_deg/p95_all']:.2g}° and "
+            f"{n['pose_error/decenter_um/p95_all']:.2g} µm ({self.seconds:.1f} s)"
+        )
