@@ -12,7 +12,7 @@ from PIL import Image
 from dolens.alignment.information import Knowledge, knowledge
 from dolens.alignment.measurement import Measurement, simulated
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
-from dolens.alignment.photograph import read_measurement
+from dolens.alignment.photograph import read_measurement, read_measurements
 from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import SpotLoss, SpotMerit, SpotResiduals
 from dolens.errors import InputError
@@ -370,3 +370,17 @@ def test_sources_shift_as_one_target(singlet):
         pairs = zip(other.images(IMAGER), given.images(IMAGER), strict=True)
         for shifted, image in pairs:
             assert torch.equal(shifted.image, image.image)
+
+
+def test_photographs_of_several_sources_are_one_of_each_and_alike(tmp_path):
+    rows = np.arange(16, dtype=np.uint16)
+    for number in range(2):
+        Image.fromarray(np.add.outer(rows, (number + 1) * rows)).save(tmp_path / f"{number}.png")
+    entries = [{"path": tmp_path / f"{number}.png", "pixel_pitch": 0.01} for number in range(2)]
+    both = read_measurements(entries, 2)
+    assert both.images.shape == (2, 16, 16)
+    assert torch.equal(both.images[1], read_measurement(**entries[1]).images[0])
+    with pytest.raises(InputError, match="1 photographs; allowed: 2"):
+        read_measurements(entries[0], 2)
+    with pytest.raises(InputError, match="differ in their pixels"):
+        read_measurements([entries[0], {**entries[1], "pixel_pitch": 0.02}], 2)

@@ -8,7 +8,10 @@ import pytest
 import torch
 from hydra.errors import InstantiationException
 
+from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
+from dolens.imaging.sensor import Sensor
+from experiments.pose_settings import spot_imager
 from experiments.training import run
 
 TINY = [
@@ -25,7 +28,8 @@ TINY = [
     "callbacks.pictures=null",
 ]
 SHORT = [
-    "stages=[{optimizer: adam, iterations: 2},{optimizer: dls, iterations: 2}]",
+    "stages=[{optimizer: adam, iterations: 2},{optimizer: dls, iterations: 2},"
+    "{optimizer: dls, iterations: 2, loss: noise_weighted, imager: {rim: 0.005}}]",
 ]
 
 
@@ -61,9 +65,9 @@ def test_poses_are_found_and_what_was_found_first_is_held(composed, tmp_path):
     assert metrics["pose_error/over_bound"] < 30.0
 
 
-@pytest.mark.parametrize("stop_after", [1, 3, 6])
+@pytest.mark.parametrize("stop_after", [1, 3, 5, 8])
 def test_a_resumed_run_ends_with_the_same_poses_to_the_bit(composed, tmp_path, stop_after):
-    """Within a stage of Adam, within least squares, and within the second fit."""
+    """Within a stage of Adam, within least squares of either kind, and within the second fit."""
     steps = "callbacks.last.every_n_train_steps=1"
     run(composed(*TINY, *SHORT, steps, folder="whole"))
     part = f"+trainer.max_steps={stop_after}"
@@ -137,3 +141,46 @@ def test_a_photograph_is_fitted_without_a_truth(composed, tmp_path):
     assert math.isfinite(metrics["pose/0/sensor_distance"])
     assert metrics["pose_bound/0/sensor_distance"] > 0.0
     assert not any(name.startswith("pose_error") for name in metrics)
+
+
+def test_three_planes_tell_bench_and_lens_at_once(composed, tmp_path):
+    """Eight numbers of which one image knows a combination ten times worse."""
+    run(
+        composed(
+            "experiment=misalignment_planes",
+            "sensor.height=32",
+            "sensor.width=32",
+            "sensor.pixel_pitch=0.2208",
+            "photons=100000",
+            "imager.rays=20000",
+            "stages=[{optimizer: adam, iterations: 40, learning_rate: 0.2},"
+            "{optimizer: dls, iterations: 12},"
+            "{optimizer: dls, iterations: 3, loss: noise_weighted, damping: 1.0e-6}]",
+            "+trainer.enable_progress_bar=false",
+        )
+    )
+    with (tmp_path / "run/poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 8
+    for row in rows:
+        assert abs(float(row["error"])) < 6.0 * float(row["bound"]), row
+        assert float(row["bound"]) == float(row["own_bound"])
+    assert (tmp_path / "run/figures/spots.png").stat().st_size > 10_000
+
+
+def test_patches_of_light_are_as_narrow_as_rays_are_dense():
+    """Of a measured disc of 100 pixels: rays that pass, over them, are 1.2 patches apart."""
+    image = torch.zeros(1, 32, 32, dtype=torch.float64)
+    image[0, 10:20, 10:20] = 7.0
+    measured = Measurement(
+        image, torch.ones_like(image, dtype=torch.bool), 0.0, Sensor(32, 32, 0.1)
+    )
+    assert float(measured.lit_pixels) == pytest.approx(100.0)
+    for rays, widened, expected in ((100_000, 1.0, 16), (10_000, 1.0, 6), (10_000, 2.0, 3)):
+        imager = spot_imager(
+            measured, 622.5, {"rays": rays, "subpixels": "auto", "reach": 1.25}, widened=widened
+        )
+        # √(rays/1.5625/100)/1.2: 21.1, 6.7 and 3.3.
+        assert imager.subpixels == expected
+    assert spot_imager(measured, 622.5, {"subpixels": "auto"}, {"subpixels": 3}).subpixels == 3
+    assert spot_imager(measured, 622.5, {"rays": 10, "subpixels": "auto"}).subpixels == 1

@@ -60,6 +60,21 @@ def test_the_patch_widens_by_what_is_said():
         assert variance == pytest.approx(1.0 / 12.0 + 1.0 / (6.0 * subpixels**2), rel=1e-3)
 
 
+@pytest.mark.parametrize("subpixels", [1, 2, 3, 16])
+def test_a_pixel_integrates_the_tent_over_its_square(subpixels):
+    """Against sums of the tent, 1 - |t|·s of half-width 1/s, on a fine grid."""
+    width = 1.0 / subpixels
+    t = (torch.arange(20000, dtype=torch.float64) + 0.5) / 10000 - 1.0
+    weight = (1.0 - t.abs()) / 10000
+    for place in (3.0, 3.2, 3.47, 3.5, 2.61):
+        at = torch.tensor([place], dtype=torch.float64)
+        found = bin_rays(at, at.new_zeros(1), torch.ones_like(at), 7, 1, subpixels)[:, 0]
+        pixel = (place + width * t).round().long()
+        wanted = torch.zeros(7, dtype=torch.float64).index_add(0, pixel, weight)
+        # Half of the patch is in one row of pixels for each of the columns that it covers.
+        assert torch.allclose(found / found.sum(), wanted, atol=2e-4)
+
+
 def test_light_behind_an_untilted_lens_is_its_solid_angle(singlet):
     """Of a rim of radius a at the sag s, seen from z: 2π(1 - cos), to the rim's soft edge."""
     rim, sag = 12.7, 51.5 - math.sqrt(51.5**2 - 12.7**2)
