@@ -291,10 +291,10 @@ class MisalignmentModule(lightning.LightningModule):
     def _knowledge(self, number: int) -> Knowledge:
         """Of a fit's pose, with the uncertainty of what it holds from an earlier one."""
         fit, pose, measurement = self.fits[number], self.poses[number], self.measurement(number)
-        slopes = slopes_of(self.stages[-1], measurement, self.wavelength, self.imager)
+        own = slopes_of(self.stages[-1], measurement, self.wavelength, self.imager)
         finest = self.finest(number)
         if fit.held_from is None:
-            return knowledge(pose, finest, measurement, slopes)
+            return knowledge(pose, finest, measurement, *own)
         found = pose.found()
         variables = {
             name: {"scale": float(scale), "initial": found[name]}
@@ -304,7 +304,7 @@ class MisalignmentModule(lightning.LightningModule):
         before = self.known[fit.held_from]
         places = [before.names.index(name) for name in fit.held]
         covariance = before.covariance[places][:, places]
-        known = knowledge(both, finest, measurement, slopes)
+        known = knowledge(both, finest, measurement, *own)
         return known.holding(len(pose.names), covariance)
 
     def _estimates(self, number: int, known: Knowledge) -> Tensor:

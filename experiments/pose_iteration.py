@@ -12,7 +12,7 @@ from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import ImageLoss, SpotLoss, SpotMerit
 from dolens.imaging.spot_image import SpotImager
 from dolens.optimize.damped_least_squares import DampedLeastSquares
-from experiments.pose_settings import SLOPES_WIDENED, Stage, spot_imager
+from experiments.pose_settings import SLOPES_WIDENED, Stage, blur_for, spot_imager
 
 
 def loss_of(
@@ -33,18 +33,19 @@ def loss_of(
     """
     own = spot_imager(measurement, wavelength, imager, stage.imager)
     if stage.loss == "noise_weighted":
-        slopes = slopes_of(stage, measurement, wavelength, imager)
-        return NoiseWeightedLoss(measurement, own, slopes)
+        slopes, blur = slopes_of(stage, measurement, wavelength, imager)
+        return NoiseWeightedLoss(measurement, own, slopes, blur)
     weight = centroid_weight if stage.centroid_weight is None else stage.centroid_weight
-    return SpotLoss(measurement, own, weight, stage.blur)
+    return SpotLoss(measurement, own, weight, stage.blur or 0.0)
 
 
 def slopes_of(
     stage: Stage, measurement: Measurement, wavelength: float, imager: Mapping[str, Any]
-) -> SpotImager:
-    """What makes a stage's derivatives when images are weighted by noise."""
+) -> tuple[SpotImager, float]:
+    """What makes a stage's derivatives when images are weighted by noise, and their blur (px)."""
     settings = (imager, stage.imager, stage.slopes)
-    return spot_imager(measurement, wavelength, *settings, widened=SLOPES_WIDENED)
+    slopes = spot_imager(measurement, wavelength, *settings, widened=SLOPES_WIDENED)
+    return slopes, blur_for(measurement, slopes) if stage.blur is None else stage.blur
 
 
 def optimizer_of(stage: Stage, pose: Pose) -> torch.optim.Optimizer:

@@ -18,7 +18,7 @@ from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.optics.lens import Lens
 from experiments.pose_results import spread_metrics
-from experiments.pose_settings import SLOPES_WIDENED, spot_imager
+from experiments.pose_settings import SLOPES_WIDENED, blur_for, spot_imager
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
@@ -195,7 +195,7 @@ class PoseKnowledgeModule(lightning.LightningModule):
         own = spot_imager(measured, self.wavelength, self.imager)
         settings = (self.imager, self.slopes)
         slopes = spot_imager(measured, self.wavelength, *settings, widened=SLOPES_WIDENED)
-        known = knowledge(pose, own, measured, slopes)
+        known = knowledge(pose, own, measured, slopes, blur_for(measured, slopes))
         spread, combinations = known.combinations(pose.scale)
         estimates = None
         if self.monte_carlo:

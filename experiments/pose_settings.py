@@ -1,5 +1,6 @@
 """What a pose fit is made of: what is to be found, and by which stages."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,6 +16,7 @@ AUTO = "auto"
 _SPACINGS, _FINEST = 1.2, 16
 # Derivatives are differences of what crosses a pixel's edges: by so much wider are their patches.
 SLOPES_WIDENED = 2.0
+_RAYS_OF_A_SLOPE, _LEAST_BLUR = 450.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,9 @@ class Stage:
         imager: settings of `SpotImager` that differ from the experiment's.
         slopes: those that differ from this stage's for derivatives, of `noise_weighted`.
         variables: names that move; None: all of the fit's.
-        centroid_weight: μ (1/mm²) of this stage; None: the experiment's.
-        blur: of both images, pixels; see `SpotLoss`.
-
-    Both `centroid_weight` and `blur` are S21's.
+        centroid_weight: μ (1/mm²) of this stage, of S21; None: the experiment's.
+        blur: of what is compared, pixels; see `SpotLoss` and `NoiseWeightedLoss`; None, of the
+            second: as much as the rays' number asks for.
     """
 
     optimizer: str
@@ -45,7 +46,7 @@ class Stage:
     slopes: Mapping[str, Any] = field(default_factory=dict)
     variables: tuple[str, ...] | None = None
     centroid_weight: float | None = None
-    blur: float = 0.0
+    blur: float | None = None
 
     def __post_init__(self) -> None:
         for key, allowed in (("optimizer", OPTIMIZERS), ("loss", LOSSES)):
@@ -54,8 +55,8 @@ class Stage:
                     f"stages: {key} '{getattr(self, key)}' is unknown; allowed: "
                     f"{', '.join(allowed)}"
                 )
-        if self.loss != "s21" and (self.blur or self.centroid_weight is not None):
-            raise InputError(f"stages: blur and centroid_weight are of loss s21, not {self.loss}")
+        if self.loss != "s21" and self.centroid_weight is not None:
+            raise InputError(f"stages: centroid_weight is of loss s21, not {self.loss}")
         if self.iterations < 1:
             raise InputError(f"stages: {self.iterations} iterations; allowed: 1 or more")
 
@@ -137,6 +138,18 @@ def spot_imager(
     # Of the disc that rays aim at, the lens lets this part through.
     rays = imager.rays / imager.reach**2 / float(measurement.lit_pixels.max())
     return replace(imager, subpixels=min(max(int(rays**0.5 / (_SPACINGS * widened)), 1), _FINEST))
+
+
+def blur_for(measurement: Measurement, imager: SpotImager) -> float:
+    """Pixels by which derivatives are averaged so that 450 rays make each, 0 where less than half a
+    pixel would do: a Gaussian of the deviation b averages 4π·b² pixels and one more.
+
+    With 37 rays a pixel (the fit at 30° with 800 000) derivatives by two patterns of rays agree so
+    to some per cent, where without it they seem to tell three times as much as they do.
+    """
+    rays = imager.rays / imager.reach**2 / float(measurement.lit_pixels.max())
+    needed = math.sqrt(max(_RAYS_OF_A_SLOPE / rays - 1.0, 0.0) / (4.0 * math.pi))
+    return needed if needed >= _LEAST_BLUR else 0.0
 
 
 def fit_of(name: str, settings: Mapping[str, Any]) -> Fit:

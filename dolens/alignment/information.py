@@ -6,6 +6,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dolens.alignment.blur import blurred
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import deviation
 from dolens.alignment.pose import Pose
@@ -21,8 +22,10 @@ class Knowledge:
         names: of θ.
         expected: (S, height, width), electrons.
         noise: (S, height, width), standard deviation of each pixel, electrons.
-        weighted: (rows, P): ∂expected/∂θ over the noise of trusted pixels, image after image,
-            exposures projected out.
+        weighted: (S·height·width, P): G ∂expected/∂θ over the noise, image after image, exposures
+            projected out; zero where pixels are not trusted.
+        blur: standard deviation of the Gaussian G that noise and derivatives are convolved with,
+            pixels; 0: none.
         inherited: (P, P), covariance that θ has from numbers which were not fitted but held as
             another measurement found them; None: all others are exact.
         inheritance: (P, H), ∂θ/∂held: by how much the best θ moves with each of H held numbers.
@@ -32,6 +35,7 @@ class Knowledge:
     expected: Tensor
     noise: Tensor
     weighted: Tensor
+    blur: float = 0.0
     inherited: Tensor | None = None
     inheritance: Tensor | None = None
 
@@ -49,8 +53,18 @@ class Knowledge:
     def own_covariance(self) -> Tensor:
         """(P, P), its inverse: the least of any unbiased estimate (Cramér and Rao) from these
         images, all other numbers being exact.
+
+        With G it is the covariance of the estimate that `correction` makes, (A⁺G)(A⁺G)ᵀ for noise
+        of unit variance, which is a little more than the least.
         """
-        return covariance_of(self.root)
+        if self.blur == 0.0:
+            return covariance_of(self.root)
+        estimate = self._blurred(torch.linalg.pinv(self.weighted))
+        return estimate @ estimate.T
+
+    def _blurred(self, rows: Tensor) -> Tensor:
+        """(..., S·height·width), convolved."""
+        return blurred(rows.unflatten(-1, self.noise.shape), self.blur).flatten(-3)
 
     @property
     def covariance(self) -> Tensor:
@@ -84,7 +98,8 @@ class Knowledge:
         seen = torch.where(mask, self.expected, 0.0).sum((-2, -1))
         exposure = (measurement.totals / seen)[:, None, None]
         missing = (measurement.images - exposure * self.expected) / self.noise
-        return torch.linalg.pinv(self.weighted) @ missing[mask]
+        rows = torch.where(mask, missing, 0.0).flatten()
+        return torch.linalg.pinv(self.weighted) @ self._blurred(rows)
 
     @property
     def bounds(self) -> Tensor:
@@ -109,7 +124,11 @@ class Knowledge:
 
 @torch.no_grad()
 def knowledge(
-    pose: Pose, imager: SpotImager, measurement: Measurement, slopes: SpotImager | None = None
+    pose: Pose,
+    imager: SpotImager,
+    measurement: Measurement,
+    slopes: SpotImager | None = None,
+    blur: float = 0.0,
 ) -> Knowledge:
     """What a measurement can tell of a pose's variables, at the pose.
 
@@ -124,6 +143,7 @@ def knowledge(
         slopes: makes their derivatives; None: `imager` does.  Few rays in narrow patches of light
             make derivatives rough, and a rough image would seem to tell more than it can: patches
             should be wide enough that some ten rays cross each edge of a pixel.
+        blur: of noise and derivatives, pixels, where rays are too few for that; see `Knowledge`.
     """
     point = pose.scaled.detach()
 
@@ -137,12 +157,14 @@ def knowledge(
     exposure, noise = deviation(shares, measurement)
     rows = []
     for source, mask in enumerate(measurement.mask):
-        sigma = noise[source][mask]
-        derivatives = exposure[source] * columns[source][mask] / sigma[:, None]
-        own = shares[source][mask] / sigma
+        sigma = noise[source]
+        trusted = mask.to(sigma) / sigma
+        derivatives = (exposure[source] * columns[source]).movedim(-1, 0) * trusted
+        own = shares[source] * trusted
         own = own / own.norm()
-        rows.append(derivatives - torch.outer(own, own @ derivatives))
-    return Knowledge(pose.names, exposure * shares, noise, torch.cat(rows))
+        along = (derivatives * own).sum((-2, -1), keepdim=True)
+        rows.append(blurred(derivatives - along * own, blur).flatten(1))
+    return Knowledge(pose.names, exposure * shares, noise, torch.cat(rows, 1).T, blur)
 
 
 def covariance_of(root: Tensor) -> Tensor:

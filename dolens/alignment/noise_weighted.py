@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.alignment.blur import blurred, noise_left
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.imaging.spot_image import SpotImager
@@ -13,7 +14,7 @@ from dolens.optics.row_jacobian import forward_columns
 
 @dataclass(frozen=True)
 class NoiseWeightedLoss:
-    """ε = mean ((N·I - M)/σ)², over the trusted pixels of all sources and planes.
+    """ε = mean (G (N·I - M)/σ)²/g, over the trusted pixels of all sources and planes.
 
     I are shares of light, M electrons; each image's exposure N is the one that fits best, so that
     nothing is assumed of it.  σ² = N·I + σ_r² is that of the model, not of the measurement, whose
@@ -23,87 +24,65 @@ class NoiseWeightedLoss:
     Models, 2.5), near 1 where the model holds.
 
     A narrow patch of light about each ray makes true images, and rough derivatives of them: of the
-    few rays near a pixel's edge.  So these may come from another imager, whose patches are wider.
+    few rays near a pixel's edge.  So within an iteration I moves as images of wider patches do, and
+    is right where that begins: I(u) = I_wide(u) + I_narrow(u₀) - I_wide(u₀).  What an iteration
+    makes small is smooth then, and iterations rest where I_wide'ᵀ·(N·I_narrow - M)/σ² = 0.
+
+    Where light is spread over so many pixels that few rays are left for each, derivatives are rough
+    still, and tell more than there is.  G convolves what is compared, so that they are averaged; g
+    is what it leaves of noise's variance.
 
     Attributes:
         measurement: M.
         imager: makes I.
-        slopes: makes ∂I/∂u; None: `imager` does.
+        blur: standard deviation of G, a Gaussian, pixels; 0 for none.
+        slopes: makes I_wide; None: `imager` does.
         deviation: σ (S, height, width), electrons; None: to be had from `weighted_at`.
+        defect: (S, height, width), I_narrow(u₀) - I_wide(u₀), likewise.
     """
 
     measurement: Measurement
     imager: SpotImager
     slopes: SpotImager | None = None
+    blur: float = 0.0
     deviation: Tensor | None = None
+    defect: Tensor | None = None
 
     @torch.no_grad()
     def weighted_at(self, pose: Pose) -> "NoiseWeightedLoss":
-        """The same with σ of the images at the pose."""
+        """The same with σ and I of an iteration that begins at the pose."""
         shares = torch.stack([found.image for found in pose.images(self.imager)])
-        return replace(self, deviation=deviation(shares, self.measurement)[1])
+        defect = torch.zeros_like(shares)
+        if self.slopes is not None:
+            defect = shares - torch.stack([found.image for found in pose.images(self.slopes)])
+        sigma = deviation(shares, self.measurement)[1]
+        return replace(self, deviation=sigma, defect=defect)
 
     def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
-        """r with ε = |r|²: trusted pixels, image after image."""
-        if self.deviation is None:
+        """r with ε = |r|²: all pixels, image after image; zero where they are not trusted."""
+        if self.deviation is None or self.defect is None:
             return self.weighted_at(pose).residuals(pose, scaled)
-        parts = []
-        for own, measured in zip(self._over_noise(pose, scaled), self._measured(), strict=True):
-            parts.append(_exposure(own, measured) * own - measured)
-        return self._scale * torch.cat(parts)
-
-    @property
-    def _scale(self) -> float:
-        return float(self.measurement.mask.sum()) ** -0.5
-
-    def _measured(self) -> list[Tensor]:
-        """M/σ of the trusted pixels of each image."""
-        seen = zip(self.measurement.images, self.deviation, self.measurement.mask, strict=True)
-        return [(image / sigma)[mask] for image, sigma, mask in seen]
-
-    def _over_noise(
-        self, pose: Pose, scaled: Tensor | None, imager: SpotImager | None = None
-    ) -> list[Tensor]:
-        """I/σ of the same."""
-        found = pose.images(imager or self.imager, scaled)
-        seen = zip(found, self.deviation, self.measurement.mask, strict=True)
-        return [(own.image / sigma)[mask] for own, sigma, mask in seen]
+        mask, parts = self.measurement.mask, []
+        for number, found in enumerate(pose.images(self.slopes or self.imager, scaled)):
+            sigma = self.deviation[number][mask[number]]
+            own = (found.image + self.defect[number])[mask[number]] / sigma
+            measured = self.measurement.images[number][mask[number]] / sigma
+            # Where no light falls on the pixels, no exposure explains what they saw.
+            power = (own @ own).clamp(min=torch.finfo(own.dtype).tiny)
+            apart = torch.zeros_like(self.deviation[number])
+            apart[mask[number]] = (own @ measured) / power * own - measured
+            parts.append(blurred(apart, self.blur).flatten())
+        return torch.cat(parts) / (float(mask.sum()) * noise_left(self.blur)) ** 0.5
 
     def terms(self, residuals: Tensor) -> dict[str, Tensor]:
         """`chi_squared`, of a pixel."""
         return {"chi_squared": residuals.square().sum()}
 
     def jacobian(self, pose: Pose, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool.
-
-        With i = I/σ, m = M/σ and N = i·m/i·i the derivative of N·i is N·i' + (m - 2N·i)·i'/(i·i) i.
-        """
+        """r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool."""
         if self.deviation is None:
             return self.weighted_at(pose).jacobian(pose, chosen)
-        point = pose.scaled.detach()
-        _, columns = forward_columns(
-            lambda u: torch.cat(self._over_noise(pose, u, self.slopes)), point, chosen
-        )
-        images, measured = self._over_noise(pose, None), self._measured()
-        residuals, rows = [], []
-        for own, seen, slope in zip(
-            images, measured, columns.split([len(m) for m in measured]), strict=True
-        ):
-            exposure = _exposure(own, seen)
-            residuals.append(exposure * own - seen)
-            change = (seen - 2.0 * exposure * own) @ slope / _power(own)
-            rows.append(exposure * slope + torch.outer(own, change))
-        return self._scale * torch.cat(residuals), self._scale * torch.cat(rows)
-
-
-def _exposure(own: Tensor, measured: Tensor) -> Tensor:
-    """The multiple of one vector that is nearest to another."""
-    return (own @ measured) / _power(own)
-
-
-def _power(own: Tensor) -> Tensor:
-    """i·i; where no light falls on the pixels, no exposure explains what they saw."""
-    return (own @ own).clamp(min=torch.finfo(own.dtype).tiny)
+        return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
 
 
 def deviation(shares: Tensor, measurement: Measurement) -> tuple[Tensor, Tensor]:

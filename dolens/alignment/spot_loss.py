@@ -1,12 +1,12 @@
 """S21: how far images are from those measured, and how far apart their centroids lie."""
 
-import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from dolens.alignment.blur import blurred
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
@@ -75,23 +75,16 @@ class SpotLoss:
         """r with ε = |r|²: trusted pixels, source after source, and 2·S of the centroids."""
         found = pose.images(self.imager, scaled)
         measurement = self.measurement
-        shares, mask = self._blurred(measurement.shares), measurement.mask
+        shares, mask = blurred(measurement.shares, self.blur), measurement.mask
         per_pixel = 1.0 / (shares.max() * float(mask.sum()) ** 0.5)
         wanted, root = measurement.centroids(), self.centroid_weight**0.5
         parts, centroids = [], []
         for source, own in enumerate(found):
             image, centroid = measurement.as_seen(own, source)
-            apart = self._blurred(image) - shares[source]
+            apart = blurred(image, self.blur) - shares[source]
             parts.append(per_pixel * apart[mask[source]])
             centroids.append(root * (centroid - wanted[source]))
         return torch.cat([*parts, *centroids])
-
-    def _blurred(self, images: Tensor) -> Tensor:
-        """(..., height, width); what leaves at the edges is lost."""
-        if self.blur == 0.0:
-            return images
-        down, across = (_gaussian(n, self.blur, images) for n in images.shape[-2:])
-        return down @ images @ across
 
     def terms(self, residuals: Tensor) -> dict[str, Tensor]:
         """`image`, mean (I - M)², and `centroid`, μ·|c - c_M|²."""
@@ -105,14 +98,6 @@ class SpotLoss:
         By forward mode: memory for one column at a time.
         """
         return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
-
-
-def _gaussian(length: int, deviation: float, like: Tensor) -> Tensor:
-    """(length, length), symmetric: the convolution with a Gaussian along one side."""
-    place = torch.arange(length, dtype=like.dtype, device=like.device)
-    far = (place[:, None] - place) / deviation
-    step = torch.arange(-4 * math.ceil(deviation), 4 * math.ceil(deviation) + 1).to(like)
-    return torch.exp(-0.5 * far.square()) / torch.exp(-0.5 * (step / deviation).square()).sum()
 
 
 class SpotResiduals:

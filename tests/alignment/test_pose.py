@@ -384,3 +384,25 @@ def test_photographs_of_several_sources_are_one_of_each_and_alike(tmp_path):
         read_measurements(entries[0], 2)
     with pytest.raises(InputError, match="differ in their pixels"):
         read_measurements([entries[0], {**entries[1], "pixel_pitch": 0.02}], 2)
+
+
+def test_blurred_residuals_have_the_covariance_that_is_said_and_a_chi_squared_near_one(singlet):
+    """Noise drawn 400 times through `correction`: its spread is that of `own_covariance`, to four
+    standard errors, and no less than the bound without a blur.
+    """
+    truth = {"tilt_x": 10.0, "decenter_y": 0.3}
+    one = pose(singlet, **truth)
+    measured = seen(singlet, 100_000, **truth)
+    known = knowledge(one, IMAGER, measured, blur=1.0)
+    generator = torch.Generator().manual_seed(1)
+    found = []
+    for _ in range(400):
+        noise = torch.randn(known.noise.shape, generator=generator, dtype=torch.float64)
+        image = known.expected + known.noise * noise
+        found.append(known.correction(Measurement(image, measured.mask, 2.0, SENSOR)))
+    ratio = torch.stack(found).std(0) / known.bounds
+    assert float((ratio - 1.0).abs().max()) < 4.0 / math.sqrt(800.0)
+    assert bool((known.bounds > 0.99 * knowledge(one, IMAGER, measured).bounds).all())
+    fine = SpotImager(SENSOR, 622.5, 100_000, rim=0.002, subpixels=8)
+    loss = NoiseWeightedLoss(measured, fine, blur=1.0)
+    assert float(loss.residuals(one).square().sum()) == pytest.approx(1.0, abs=0.2)

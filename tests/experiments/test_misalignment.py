@@ -101,8 +101,8 @@ def test_a_stage_may_move_some_variables_only(composed, tmp_path):
         ),
         ("stages=[{optimizer: dls, iterations: 1, imager: {ray: 2}}]", "imager: "),
         (
-            "stages=[{optimizer: dls, iterations: 1, loss: noise_weighted, blur: 1.0}]",
-            "blur and centroid_weight are of loss s21",
+            "stages=[{optimizer: dls, iterations: 1, loss: noise_weighted, centroid_weight: 1.0}]",
+            "centroid_weight is of loss s21",
         ),
         ("fits.5.held.from='30'", "fits.5.held.from: '30' is no earlier fit; allowed: 0"),
         ("+fits.5.start=1", "fits.5: unknown key 'start'"),

@@ -1,0 +1,33 @@
+"""Images convolved with a Gaussian."""
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def blurred(images: Tensor, deviation: float) -> Tensor:
+    """(..., height, width), of the Gaussian's standard deviation in pixels; 0 leaves them as they
+    are.  What leaves at the edges is lost.  The operation is its own transpose.
+    """
+    if deviation == 0.0:
+        return images
+    down, across = (_gaussian(n, deviation, images) for n in images.shape[-2:])
+    return down @ images @ across
+
+
+def noise_left(deviation: float) -> float:
+    """The variance that independent noise of variance 1 keeps when it is blurred, Σ kernel²."""
+    if deviation == 0.0:
+        return 1.0
+    length = 2 * 4 * math.ceil(deviation) + 1
+    kernel = _gaussian(length, deviation, torch.zeros((), dtype=torch.float64))[length // 2]
+    return float(kernel.square().sum()) ** 2
+
+
+def _gaussian(length: int, deviation: float, like: Tensor) -> Tensor:
+    """(length, length), symmetric: the convolution with a Gaussian along one side."""
+    place = torch.arange(length, dtype=like.dtype, device=like.device)
+    far = (place[:, None] - place) / deviation
+    step = torch.arange(-4 * math.ceil(deviation), 4 * math.ceil(deviation) + 1).to(like)
+    return torch.exp(-0.5 * far.square()) / torch.exp(-0.5 * (step / deviation).square()).sum()
