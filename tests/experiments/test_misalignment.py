@@ -11,7 +11,7 @@ from hydra.errors import InstantiationException
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
-from experiments.pose_settings import spot_imager
+from experiments.pose_settings import blur_for, spot_imager
 from experiments.training import run
 
 TINY = [
@@ -184,3 +184,7 @@ def test_patches_of_light_are_as_narrow_as_rays_are_dense():
         assert imager.subpixels == expected
     assert spot_imager(measured, 622.5, {"subpixels": "auto"}, {"subpixels": 3}).subpixels == 3
     assert spot_imager(measured, 622.5, {"rays": 10, "subpixels": "auto"}).subpixels == 1
+    # 64 and 640 rays a pixel: √((450/64 - 1)/4π) pixels, and none.
+    for rays, expected in ((10_000, 0.6928), (100_000, 0.0)):
+        imager = spot_imager(measured, 622.5, {"rays": rays, "reach": 1.25})
+        assert blur_for(measured, imager) == pytest.approx(expected, abs=1e-4)
