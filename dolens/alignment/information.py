@@ -57,10 +57,13 @@ class Knowledge:
         With G it is the covariance of the estimate that `correction` makes, (A⁺G)(A⁺G)ᵀ for noise
         of unit variance, which is a little more than the least.
         """
+        plain = covariance_of(self.root)
         if self.blur == 0.0:
-            return covariance_of(self.root)
-        estimate = self._blurred(torch.linalg.pinv(self.weighted))
-        return estimate @ estimate.T
+            return plain
+        inverse = torch.linalg.pinv(self.weighted)
+        estimate = self._blurred(inverse)
+        # What cannot be seen has no part in the pseudo-inverse, and all of its variance still.
+        return estimate @ estimate.T + (plain - inverse @ inverse.T)
 
     def _blurred(self, rows: Tensor) -> Tensor:
         """(..., S·height·width), convolved."""

@@ -254,16 +254,16 @@ def test_light_beyond_the_edge_is_missing_from_both(singlet):
 
 
 def test_weighted_by_noise_a_fit_has_errors_of_its_bounds(singlet):
-    """Of 12 measurements with other photons: the RMS of error over bound is 1 to its standard
-    error, 1/√(2·12·5) = 0.09, times three; χ² of a pixel is 1.
+    """Of 8 measurements with other photons: the RMS of error over bound is 1 to its standard
+    error, 1/√(2·8·5) = 0.11, times three; χ² of a pixel is 1.
     """
     truth = {"tilt_x": 10.0, "tilt_y": 2.0, "decenter_x": 0.2, "decenter_y": 0.3, "shift_z": -0.5}
-    fine = SpotImager(SENSOR, 622.5, 100_000, rim=0.002, subpixels=8)
+    fine = SpotImager(SENSOR, 622.5, 30_000, rim=0.004, subpixels=5)
     ratios = []
-    for seed in range(12):
-        measured = seen(singlet, 200_000, seed=seed, **truth)
+    for seed in range(8):
+        measured = seen(singlet, 60_000, seed=seed, **truth)
         one = pose(singlet, **truth)
-        found = weighted_fit(one, fine, measured)
+        found = weighted_fit(one, fine, measured, 2)
         loss = NoiseWeightedLoss(measured, fine)
         assert float(loss.residuals(one).square().sum()) == pytest.approx(1.0, abs=0.12)
         bounds = knowledge(one, fine, measured).bounds / one.units
@@ -271,7 +271,7 @@ def test_weighted_by_noise_a_fit_has_errors_of_its_bounds(singlet):
             (found[name] - truth[name.rpartition(".")[2]]) / float(bound)
             for name, bound in zip(one.names, bounds, strict=True)
         ]
-    assert float(torch.tensor(ratios).square().mean().sqrt()) == pytest.approx(1.0, abs=0.27)
+    assert float(torch.tensor(ratios).square().mean().sqrt()) == pytest.approx(1.0, abs=0.33)
 
 
 def weighted_fit(one, imager, measured, iterations=3):
@@ -403,6 +403,10 @@ def test_blurred_residuals_have_the_covariance_that_is_said_and_a_chi_squared_ne
     ratio = torch.stack(found).std(0) / known.bounds
     assert float((ratio - 1.0).abs().max()) < 4.0 / math.sqrt(800.0)
     assert bool((known.bounds > 0.99 * knowledge(one, IMAGER, measured).bounds).all())
+    # Source, lens and sensor that move along the axis together cannot be seen, blurred or not.
+    along = {"sensor_distance": None, "sources.1.z": None, "elements.lens.shift_z": None}
+    unseen = knowledge(one.varying(along), IMAGER, measured, blur=1.0)
+    assert bool((unseen.bounds > 1e3).all())
     fine = SpotImager(SENSOR, 622.5, 100_000, rim=0.002, subpixels=8)
     loss = NoiseWeightedLoss(measured, fine, blur=1.0)
     assert float(loss.residuals(one).square().sum()) == pytest.approx(1.0, abs=0.2)

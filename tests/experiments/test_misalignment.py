@@ -151,11 +151,11 @@ def test_three_planes_tell_bench_and_lens_at_once(composed, tmp_path):
             "sensor.height=32",
             "sensor.width=32",
             "sensor.pixel_pitch=0.2208",
-            "photons=100000",
-            "imager.rays=20000",
-            "stages=[{optimizer: adam, iterations: 40, learning_rate: 0.2},"
-            "{optimizer: dls, iterations: 12},"
-            "{optimizer: dls, iterations: 3, loss: noise_weighted, damping: 1.0e-6}]",
+            "photons=30000",
+            "imager.rays=6000",
+            "stages=[{optimizer: adam, iterations: 25, learning_rate: 0.2},"
+            "{optimizer: dls, iterations: 10},"
+            "{optimizer: dls, iterations: 2, loss: noise_weighted, damping: 1.0e-6}]",
             "+trainer.enable_progress_bar=false",
         )
     )
