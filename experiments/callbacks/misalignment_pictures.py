@@ -87,12 +87,14 @@ def _convergence(module: MisalignmentModule, number: int) -> Figure:
         for name, unit in zip(pose.names, _units(module, number), strict=True)
     }
     truth = module.truth(number)
+    losses = {stage.loss for stage in module.stages}
     return convergence_figure(
         [float(row["loss"]) for row in rows],
         values,
         stages,
         {variable_label(name): truth[name] for name in pose.names if name in truth},
         f"{module.lens.name}: convergence of fit {fit.name}",
+        "loss: S21, then χ² of a pixel" if len(losses) > 1 else "loss",
     )
 
 
