@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.alignment.information import Knowledge, knowledge
-from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.measurement import Measurement
 from dolens.alignment.photograph import read_measurements
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
@@ -21,6 +21,7 @@ from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImage, SpotImager
 from dolens.optics.lens import Lens
 from experiments.pose_iteration import iterate, loss_of, optimizer_of, slopes_of
+from experiments.pose_measurements import draw, repetitions, simulated_at
 from experiments.pose_results import (
     error_over_bound,
     pose_metrics,
@@ -96,9 +97,7 @@ class MisalignmentModule(lightning.LightningModule):
         self.imager = dict(imager or {})
         self.centroid_weight = float(centroid_weight)
         self.photons, self.read_noise, self.full_well = int(photons), float(read_noise), full_well
-        self.monte_carlo = int(monte_carlo)
-        if self.monte_carlo < 0 or self.monte_carlo == 1:
-            raise InputError(f"monte_carlo: {monte_carlo}; allowed: 0 for none, or 2 or more")
+        self.monte_carlo = repetitions(monte_carlo)
         self.stages = [stage_of(settings) for settings in stages]
         self.fits = [fit_of(name, settings) for name, settings in fits.items()]
         if not self.stages or not self.fits:
@@ -160,18 +159,14 @@ class MisalignmentModule(lightning.LightningModule):
             return self.measured
         if seed == 0 and number in self._measurements:
             return self._measurements[number]
-        true = self.true_pose(number)
-        generator = torch.Generator().manual_seed(1000003 * (self.seed + 1) + 1009 * number + seed)
-        found = simulated(
-            true.lens,
-            true.places,
+        found = simulated_at(
+            self.true_pose(number),
             self.wavelength,
             self.sensor,
             self.photons,
             self.read_noise,
-            generator,
+            draw(self.seed, number, seed),
             self.full_well,
-            true.planes,
         )
         if seed == 0:
             self._measurements[number] = found
@@ -295,12 +290,7 @@ class MisalignmentModule(lightning.LightningModule):
         finest = self.finest(number)
         if fit.held_from is None:
             return knowledge(pose, finest, measurement, *own)
-        found = pose.found()
-        variables = {
-            name: {"scale": float(scale), "initial": found[name]}
-            for name, scale in zip(pose.names, pose.scale_in_units, strict=True)
-        }
-        both = pose.varying({**variables, **dict.fromkeys(fit.held)})
+        both = pose.varying({**pose.settings, **dict.fromkeys(fit.held)})
         before = self.known[fit.held_from]
         places = [before.names.index(name) for name in fit.held]
         covariance = before.covariance[places][:, places]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.information import knowledge
-from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import SpotLoss
 from dolens.errors import InputError
@@ -22,6 +22,7 @@ from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImager
 from dolens.optics.lens import Lens
 from experiments.pose_basin import Basin
+from experiments.pose_measurements import draw, simulated_at
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
@@ -164,16 +165,9 @@ class PoseAccuracyModule(lightning.LightningModule):
         write_table(self.folder / "accuracy.csv", self.rows, _DIGITS)
 
     def _measurement(self, photons: int, seed: int) -> Measurement:
-        generator = torch.Generator().manual_seed(1000003 * (self.seed + 1) + seed)
-        imager, true = self.imager, self.true
-        return simulated(
-            true.lens,
-            true.places,
-            imager.wavelength,
-            imager.sensor,
-            photons,
-            self.read_noise,
-            generator,
+        imager, generator = self.imager, draw(self.seed, 0, seed)
+        return simulated_at(
+            self.true, imager.wavelength, imager.sensor, photons, self.read_noise, generator
         )
 
     # ---------------------------------------------------------------- rays

@@ -1,5 +1,6 @@
 """From how far off a pose fit converges: fits from a grid of starts."""
 
+import itertools
 import logging
 import math
 import time
@@ -10,11 +11,12 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.information import knowledge
-from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from experiments.pose_iteration import iterate, loss_of, optimizer_of
+from experiments.pose_measurements import simulated_at
 from experiments.pose_settings import Stage, spot_imager, stage_of
 from experiments.tables import Row
 
@@ -79,9 +81,8 @@ class Basin:
         A fit whose light is lost ends where it was, and says so in the log.
         """
         true, generator = self.true, torch.Generator().manual_seed(self.seed)
-        measured = simulated(
-            true.lens,
-            true.places,
+        measured = simulated_at(
+            true,
             self.wavelength,
             self.sensor,
             self.photons,
@@ -90,37 +91,11 @@ class Basin:
         )
         imager = spot_imager(measured, self.wavelength, self.imager)
         bounds = knowledge(true, imager, measured).bounds
-        truth = true.scale * true.scaled.detach()
-        scales = {
-            name: {"scale": float(scale)}
-            for name, scale in zip(true.names, true.scale_in_units, strict=True)
-        }
-        first, second = (true.names.index(name) for name in self.along)
-        errors = list(self.along.values())
+        across, up = self.along.values()
         for weight in self.centroid_weights:
-            for up in errors[1]:
-                for across in errors[0]:
-                    started = time.perf_counter()
-                    start = truth.clone()
-                    start[first] += across * true.units[first]
-                    start[second] += up * true.units[second]
-                    pose = true.varying(scales)
-                    with torch.no_grad():
-                        pose.scaled.copy_(start / pose.scale)
-                    count = self._fit(pose, measured, weight)
-                    off = pose.scale * pose.scaled.detach() - truth
-                    error = _rms(off / bounds)
-                    self.rows.append(
-                        {
-                            "centroid_weight": weight,
-                            **dict(zip(self.along, (across, up), strict=True)),
-                            "initial_error_over_bound": _rms((start - truth) / bounds),
-                            "error_over_bound": error,
-                            "converged": float(error < _CONVERGED),
-                            "iterations": float(count),
-                            "seconds": time.perf_counter() - started,
-                        }
-                    )
+            # The grid's rows from below, as `table` takes them.
+            for second, first in itertools.product(up, across):
+                self.rows.append(self._row(measured, bounds, weight, (first, second)))
             mine = [row for row in self.rows if row["centroid_weight"] == weight]
             logger.info(
                 "basin, centroid weight %g: %d of %d starts converge, %.2g s each",
@@ -129,6 +104,31 @@ class Basin:
                 len(mine),
                 sum(row["seconds"] for row in mine) / len(mine),
             )
+
+    def _row(
+        self, measured: Measurement, bounds: Tensor, weight: float, errors: tuple[float, float]
+    ) -> Row:
+        """Of a fit whose start is off by two errors, degrees or mm."""
+        started, true = time.perf_counter(), self.true
+        truth = true.scale * true.scaled.detach()
+        start = truth.clone()
+        for name, error in zip(self.along, errors, strict=True):
+            place = true.names.index(name)
+            start[place] += error * true.units[place]
+        pose = true.varying(true.settings)
+        with torch.no_grad():
+            pose.scaled.copy_(start / pose.scale)
+        count = self._fit(pose, measured, weight)
+        left = _rms((pose.scale * pose.scaled.detach() - truth) / bounds)
+        return {
+            "centroid_weight": weight,
+            **dict(zip(self.along, errors, strict=True)),
+            "initial_error_over_bound": _rms((start - truth) / bounds),
+            "error_over_bound": left,
+            "converged": float(left < _CONVERGED),
+            "iterations": float(count),
+            "seconds": time.perf_counter() - started,
+        }
 
     def _fit(self, pose: Pose, measured: Measurement, weight: float) -> int:
         """Iterations that were made."""

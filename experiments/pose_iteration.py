@@ -12,7 +12,7 @@ from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import ImageLoss, SpotLoss, SpotMerit
 from dolens.imaging.spot_image import SpotImager
 from dolens.optimize.damped_least_squares import DampedLeastSquares
-from experiments.pose_settings import SLOPES_WIDENED, Stage, blur_for, spot_imager
+from experiments.pose_settings import Stage, blur_for, slopes_imager, spot_imager
 
 
 def loss_of(
@@ -43,8 +43,7 @@ def slopes_of(
     stage: Stage, measurement: Measurement, wavelength: float, imager: Mapping[str, Any]
 ) -> tuple[SpotImager, float]:
     """What makes a stage's derivatives when images are weighted by noise, and their blur (px)."""
-    settings = (imager, stage.imager, stage.slopes)
-    slopes = spot_imager(measurement, wavelength, *settings, widened=SLOPES_WIDENED)
+    slopes = slopes_imager(measurement, wavelength, imager, stage.imager, stage.slopes)
     return slopes, blur_for(measurement, slopes) if stage.blur is None else stage.blur
 
 

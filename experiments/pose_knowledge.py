@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.information import Knowledge, knowledge
-from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.optics.lens import Lens
+from experiments.pose_measurements import draw, repetitions, simulated_at
 from experiments.pose_results import spread_metrics
-from experiments.pose_settings import SLOPES_WIDENED, blur_for, spot_imager
+from experiments.pose_settings import blur_for, slopes_imager, spot_imager
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
@@ -102,12 +103,10 @@ class PoseKnowledgeModule(lightning.LightningModule):
             raise InputError(f"lens_dtype: poses are known in float64, not {lens.dtype}")
         if not variables or not arrangements:
             raise InputError("variables, arrangements: give at least one of each")
-        if monte_carlo < 0 or monte_carlo == 1:
-            raise InputError(f"monte_carlo: {monte_carlo}; allowed: 0 for none, or 2 or more")
         self.lens = lens.requires_grad_(False)
         self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
         self.photons, self.read_noise = int(photons), float(read_noise)
-        self.monte_carlo = int(monte_carlo)
+        self.monte_carlo = repetitions(monte_carlo)
         self.sensor, self.wavelength = sensor, float(wavelength)
         self.imager, self.slopes = dict(imager or {}), dict(slopes or {})
         self.poses = {
@@ -193,8 +192,7 @@ class PoseKnowledgeModule(lightning.LightningModule):
     def _evaluate(self, number: int, name: str, pose: Pose) -> Arrangement:
         measured = self._measurement(number, pose, 0)
         own = spot_imager(measured, self.wavelength, self.imager)
-        settings = (self.imager, self.slopes)
-        slopes = spot_imager(measured, self.wavelength, *settings, widened=SLOPES_WIDENED)
+        slopes = slopes_imager(measured, self.wavelength, self.imager, self.slopes)
         known = knowledge(pose, own, measured, slopes, blur_for(measured, slopes))
         spread, combinations = known.combinations(pose.scale)
         estimates = None
@@ -209,16 +207,13 @@ class PoseKnowledgeModule(lightning.LightningModule):
 
     def _measurement(self, number: int, pose: Pose, seed: int) -> Measurement:
         count = len(pose.sources) * len(pose.planes)
-        generator = torch.Generator().manual_seed(1000003 * (self.seed + 1) + 1009 * number + seed)
-        return simulated(
-            pose.lens,
-            pose.places,
+        return simulated_at(
+            pose,
             self.wavelength,
             self.sensor,
             max(1, self.photons // count),
             self.read_noise,
-            generator,
-            planes=pose.planes,
+            draw(self.seed, number, seed),
         )
 
     def _metrics(self, found: Arrangement) -> dict[str, float]:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dolens.alignment.blur import blurred
 from dolens.alignment.measurement import Measurement
-from dolens.alignment.noise_weighted import deviation
+from dolens.alignment.noise_weighted import deviation, exposure_of
 from dolens.alignment.pose import Pose
 from dolens.imaging.spot_image import SpotImager
 from dolens.optics.row_jacobian import forward_columns
@@ -60,10 +60,14 @@ class Knowledge:
         plain = covariance_of(self.root)
         if self.blur == 0.0:
             return plain
-        inverse = torch.linalg.pinv(self.weighted)
-        estimate = self._blurred(inverse)
+        estimate = self._blurred(self._inverse)
         # What cannot be seen has no part in the pseudo-inverse, and all of its variance still.
-        return estimate @ estimate.T + (plain - inverse @ inverse.T)
+        return estimate @ estimate.T + (plain - self._inverse @ self._inverse.T)
+
+    @cached_property
+    def _inverse(self) -> Tensor:
+        """A⁺ (P, S·height·width)."""
+        return torch.linalg.pinv(self.weighted)
 
     def _blurred(self, rows: Tensor) -> Tensor:
         """(..., S·height·width), convolved."""
@@ -98,11 +102,10 @@ class Knowledge:
         least squares, efficient where the pose is right to a few bounds.
         """
         mask = measurement.mask
-        seen = torch.where(mask, self.expected, 0.0).sum((-2, -1))
-        exposure = (measurement.totals / seen)[:, None, None]
+        exposure = exposure_of(self.expected, measurement)
         missing = (measurement.images - exposure * self.expected) / self.noise
         rows = torch.where(mask, missing, 0.0).flatten()
-        return torch.linalg.pinv(self.weighted) @ self._blurred(rows)
+        return self._inverse @ self._blurred(rows)
 
     @property
     def bounds(self) -> Tensor:

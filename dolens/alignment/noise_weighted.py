@@ -95,10 +95,14 @@ def deviation(shares: Tensor, measurement: Measurement) -> tuple[Tensor, Tensor]
     Returns:
         N (S, 1, 1), electrons behind the lens, and √(N·shares + σ_r²) (S, height, width).
     """
-    seen = torch.where(measurement.mask, shares, 0.0).sum((-2, -1), keepdim=True)
-    tiny = torch.finfo(seen.dtype).tiny
-    exposure = measurement.totals[:, None, None] / seen.clamp(min=tiny)
+    exposure = exposure_of(shares, measurement)
     expected = exposure * shares
     # Without read noise a dark pixel would know everything.
     least = 1e-9 * float(expected.max())
     return exposure, (expected.clamp(min=least) + measurement.read_noise**2).sqrt()
+
+
+def exposure_of(images: Tensor, measurement: Measurement) -> Tensor:
+    """(S, 1, 1), what images (S, height, width) are multiplied by to have the measured totals."""
+    seen = torch.where(measurement.mask, images, 0.0).sum((-2, -1), keepdim=True)
+    return measurement.totals[:, None, None] / seen.clamp(min=torch.finfo(seen.dtype).tiny)

@@ -82,6 +82,17 @@ class Pose(nn.Module):
         return self._of[0]
 
     @property
+    def unit_names(self) -> list[str]:
+        """Of the settings, `deg` or `mm`."""
+        return ["mm" if unit == 1.0 else "deg" for unit in self.units.tolist()]
+
+    @property
+    def settings(self) -> dict[str, dict[str, float]]:
+        """Of its variables, starting where they are."""
+        scales = dict(zip(self.names, self.scale_in_units.tolist(), strict=True))
+        return {n: {"scale": scales[n], "initial": at} for n, at in self.found().items()}
+
+    @property
     def places(self) -> Tensor:
         """(S, 3), mm, the sources where they stand, but for θ."""
         return self.sources + self.shift

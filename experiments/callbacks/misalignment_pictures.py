@@ -47,8 +47,8 @@ def variable_label(name: str) -> str:
     """`elements.lens.tilt_x` → `lens tilt x`, `sources.1.z` → `source 1 z`, `sources.*.z` →
     `sources z`.
     """
-    short = name.removeprefix("elements.").replace("sources.*", "sources")
-    short = short.replace("sources.", "source ") if "*" not in name else short
+    short = name.removeprefix("elements.").replace("sources.*.", "sources ")
+    short = short.replace("sources.", "source ")
     return short.replace(".", " ").replace("_", " ")
 
 
@@ -84,7 +84,7 @@ def _convergence(module: MisalignmentModule, number: int) -> Figure:
     ]
     values = {
         variable_label(name): ([float(row[name]) for row in rows], unit)
-        for name, unit in zip(pose.names, _units(module, number), strict=True)
+        for name, unit in zip(pose.names, pose.unit_names, strict=True)
     }
     truth = module.truth(number)
     losses = {stage.loss for stage in module.stages}
@@ -111,13 +111,9 @@ def _corner(module: MisalignmentModule, number: int) -> Figure:
     return corner_figure(
         covariance,
         [variable_label(name) for name in pose.names],
-        _units(module, number),
+        pose.unit_names,
         true if about_truth else found,
         points,
         true if truth else None,
         f"{module.lens.name}: how well fit {fit.name} knows its pose (Cramér–Rao)",
     )
-
-
-def _units(module: MisalignmentModule, number: int) -> list[str]:
-    return ["mm" if unit == 1.0 else "deg" for unit in module.poses[number].units.tolist()]

@@ -43,7 +43,7 @@ def _photons(module: PoseAccuracyModule) -> Figure:
     names = module.true.names
     figure = Figure(figsize=(2.6 * len(names), 3.3), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(names)))
-    for axes, name, unit in zip(panels, names, module.true.units.tolist(), strict=True):
+    for axes, name, unit in zip(panels, names, module.true.unit_names, strict=True):
         rows = [r for r in module.rows if r["part"] == "photons" and r["variable"] == name]
         for estimator, colour in zip(ESTIMATORS, colours(2), strict=True):
             mine = [r for r in rows if r["estimator"] == estimator]
@@ -60,7 +60,7 @@ def _photons(module: PoseAccuracyModule) -> Figure:
         axes.set(xscale="log", yscale="log")
         axes.set_title(variable_label(name), fontsize=SMALL + 1)
         axes.set_xlabel("photons", fontsize=SMALL + 1)
-        axes.set_ylabel("mm" if unit == 1.0 else "deg", fontsize=SMALL + 1)
+        axes.set_ylabel(unit, fontsize=SMALL + 1)
         ruled_axes(axes)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
@@ -120,7 +120,7 @@ def _basin(module: PoseAccuracyModule) -> Figure:
     weights = basin.centroid_weights
     figure = Figure(figsize=(1.2 + 4.2 * len(weights), 4.0), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(weights), sharey=True))
-    units = dict(zip(module.true.names, module.true.units.tolist(), strict=True))
+    units = dict(zip(module.true.names, module.true.unit_names, strict=True))
     across, up = basin.along
     for axes, weight in zip(panels, weights, strict=True):
         table = basin.table(weight).numpy()
@@ -146,9 +146,8 @@ def _basin(module: PoseAccuracyModule) -> Figure:
     return figure
 
 
-def _start(name: str, units: dict[str, float]) -> str:
-    unit = "mm" if units[name] == 1.0 else "deg"
-    return f"error of the start, {variable_label(name)}, {unit}"
+def _start(name: str, units: dict[str, str]) -> str:
+    return f"error of the start, {variable_label(name)}, {units[name]}"
 
 
 def _write(axes: Axes, table: np.ndarray) -> None:

@@ -58,9 +58,11 @@ def _overview(module: PoseKnowledgeModule) -> Figure:
 
 def _bounds(axes: Axes, module: PoseKnowledgeModule) -> None:
     """Bounds of each variable over its scale, a mark for each arrangement."""
-    names = list(dict.fromkeys(name for f in module.arrangements for name in f.pose.names))
+    names = _names(module)
     units = {
-        n: u for f in module.arrangements for n, u in zip(f.pose.names, _units(f), strict=True)
+        n: u
+        for f in module.arrangements
+        for n, u in zip(f.pose.names, f.pose.unit_names, strict=True)
     }
     scales = {
         n: float(s)
@@ -120,7 +122,7 @@ def _spectrum(axes: Axes, module: PoseKnowledgeModule) -> None:
 
 def _worst(axes: Axes, module: PoseKnowledgeModule, figure: Figure) -> None:
     """What the worst known combination of each arrangement is made of."""
-    names = list(dict.fromkeys(name for f in module.arrangements for name in f.pose.names))
+    names = _names(module)
     table = np.full((len(module.arrangements), len(names)), np.nan)
     for row, found in enumerate(module.arrangements):
         worst = found.combinations[0]
@@ -154,7 +156,7 @@ def _corner(module: PoseKnowledgeModule, found: Arrangement) -> Figure:
     return corner_figure(
         found.known.covariance / torch.outer(units, units),
         [variable_label(name) for name in found.pose.names],
-        _units(found),
+        found.pose.unit_names,
         values,
         found.estimates,
         values if found.estimates is not None else None,
@@ -166,8 +168,9 @@ def _label(found: Arrangement) -> str:
     return found.name.replace("_", " ")
 
 
-def _units(found: Arrangement) -> list[str]:
-    return ["mm" if unit == 1.0 else "deg" for unit in found.pose.units.tolist()]
+def _names(module: PoseKnowledgeModule) -> list[str]:
+    """Of all variables of all arrangements."""
+    return list(dict.fromkeys(name for f in module.arrangements for name in f.pose.names))
 
 
 def _coloured(module: PoseKnowledgeModule) -> zip:

@@ -7,6 +7,9 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, open_dict
 
+from dolens.errors import InputError
+from experiments.training import run
+
 
 @pytest.fixture
 def composed(root: Path, tmp_path: Path) -> Iterator[Callable[..., DictConfig]]:
@@ -26,3 +29,17 @@ def composed(root: Path, tmp_path: Path) -> Iterator[Callable[..., DictConfig]]:
         yield build
     GlobalHydra.instance().clear()
     HydraConfig.instance().cfg = None
+
+
+@pytest.fixture
+def refused(composed: Callable[..., DictConfig]) -> Callable[..., None]:
+    """Run with overrides, and see that it ends by one clear line that says what is expected."""
+
+    def check(expected: str, *overrides: str) -> None:
+        with pytest.raises(Exception) as caught:
+            run(composed(*overrides))
+        error = caught.value.__cause__ or caught.value
+        assert isinstance(error, InputError), error
+        assert expected in str(error) and "\n" not in str(error)
+
+    return check
