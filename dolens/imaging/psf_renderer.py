@@ -316,7 +316,7 @@ class PsfRenderer(Unprepared):
         """The scene of the depths and wavelengths that have functions of their own."""
         depths = (scene.middle_depth,) if self.depths == "one" else scene.depths
         wavelengths = (scene.middle_wavelength,) if self.colours == "one" else scene.wavelengths
-        return PlanarScene(depths, wavelengths, scene.texture_centre)
+        return scene.as_planes(depths, wavelengths)
 
     def _illuminated(
         self,

@@ -28,19 +28,37 @@ _LARGEST, _FINE_RADII = 2.0, 256
 class ExitPupil(NamedTuple):
     """A disc through which light reaches the sensor: z from the first vertex and radii, mm.
 
+    Numbers, or tensors whose gradients follow the lens (`moving_pupil.moving_exit_pupil`).
+
     Attributes:
         z: of the paraxial exit pupil.
         radius: of the disc that holds the light of every pixel.
         axial_radius: of the disc that pixels on the axis see filled.
     """
 
-    z: float
-    radius: float
-    axial_radius: float
+    z: float | Tensor
+    radius: float | Tensor
+    axial_radius: float | Tensor
+
+    def numbers(self) -> "ExitPupil":
+        """The same without gradients."""
+        return ExitPupil(*(float(torch.as_tensor(v).detach()) for v in self))
+
+    def axial_mean(self, sensor_z: float | Tensor) -> float | Tensor:
+        """The mean of cos⁴ over the axial disc of radius a at distance L from a sensor plane, as
+        an axial pixel sees it: L²/(L² + a²).
+        """
+        squared = (sensor_z - self.z) ** 2
+        return squared / (squared + self.axial_radius**2)
 
 
 def aim(
-    x: Tensor, y: Tensor, sensor_z: Tensor, pupil_x: Tensor, pupil_y: Tensor, pupil_z: float
+    x: Tensor,
+    y: Tensor,
+    sensor_z: Tensor,
+    pupil_x: Tensor,
+    pupil_y: Tensor,
+    pupil_z: float | Tensor,
 ) -> Components:
     """Rays from points of the sensor towards points of the pupil plane, travelling towards -z.
 

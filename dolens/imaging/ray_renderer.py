@@ -4,14 +4,19 @@ Two implementations of one computation, with the same samples: fused kernels, fo
 images of their own, and PyTorch's operations, the reference that they must equal.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.pupil import aim, sampled_exit_pupil
+from dolens.imaging.edge_rays import EdgeRays, edge_rays
+from dolens.imaging.light_edges import EdgeMap, edge_map
+from dolens.imaging.moving_pupil import depends_on_parameters, moving_exit_pupil
+from dolens.imaging.pupil import ExitPupil, aim, sampled_exit_pupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.replay import replay
@@ -28,6 +33,8 @@ from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane, trace_surfaces
 
 _SEED_RANGE = 2**63 - 1
+# Rays along the edges of apertures, a pixel and wavelength, where these cut light: for gradients.
+_EDGE_RAYS = 2
 
 
 @dataclass(frozen=True)
@@ -131,20 +138,31 @@ class RayRenderer(Unprepared):
         now = lens.system({n: p.detach() for n, p in parameters.items()})
         scene.check(now)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, backend)
+        moving = _moving(system, scene, view, backend)
+        edges = None
+        if depends_on_parameters(system):
+            still = moving.pupil.numbers()
+            edges = edge_map(now, scene.wavelengths, self.sensor, still, backend)
         if backend == "cpu" and scene.separate_planes:
-            return self._fused(system, scene, textures, view)
+            image = self._fused(system, scene, textures, view, moving)
+            if edges is None:
+                return image
+            return image + self._edge_light(lens, parameters, scene, shown, view, moving, edges)
         if backend != "reference":
             what = "cuda" if scene.separate_planes else "layers"
             say_once(f"render: no fused renderer for {what}; the reference, with fused traces")
         names, planes = list(parameters), len(shown)
 
         def piece(i: int, *tensors: Tensor) -> Tensor:
-            system = lens.system(dict(zip(names, tensors[planes:], strict=True)))
+            system = lens.system(dict(zip(names, tensors[planes:-1], strict=True)))
             start, end = self._chunk(i)
-            ray, weight = self._samples(system, view, start, end)
-            return self._shade(system, scene, view, tensors[:planes], ray, weight, backend)
+            now = moving.of(tensors[-1])
+            ray, weight = self._samples(system, view, now.pupil, start, end)
+            rim = self._edge_rays(system, scene, view, now.pupil, edges, start, end, backend)
+            shown = tensors[:planes]
+            return self._shade(system, scene, view, now, shown, ray, weight, rim, backend)
 
-        tensors = [*shown, *parameters.values()]
+        tensors = [*shown, *parameters.values(), moving.joined(system)]
         sizes = [end - start for start, end in map(self._chunk, range(self._chunks))]
         if self.replay:
             flat = replay(piece, sizes, tensors, self._replayed(seed))
@@ -198,8 +216,15 @@ class RayRenderer(Unprepared):
         generator = torch.Generator().manual_seed(seed % _SEED_RANGE)
         return torch.randperm(self._chunks, generator=generator)[:count].tolist()
 
-    def _fused(self, system: OpticalSystem, scene: Scene, textures: Tensor, view: View) -> Tensor:
-        """The render in one kernel."""
+    def _fused(
+        self,
+        system: OpticalSystem,
+        scene: Scene,
+        textures: Tensor,
+        view: View,
+        moving: "_Moving",
+    ) -> Tensor:
+        """The render in one kernel, and outside of it how a sample's share moves."""
         wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64)
         table = pack(system, wavelengths, -1.0, 1, len(system.surfaces), False)
         pieces, scale = [(0, view.height * view.width)], 1.0
@@ -207,11 +232,12 @@ class RayRenderer(Unprepared):
             replayed = self._replayed(view.seed)
             pieces = [self._chunk(i) for i in sorted(replayed)]
             scale = self._chunks / len(replayed)
-        return rendering.render(
+        image = rendering.render(
             table.values,
             table.indices,
             textures,
             system.vertices[-1],
+            moving.joined(system),
             table.codes,
             table.extras,
             view.integers(),
@@ -219,9 +245,13 @@ class RayRenderer(Unprepared):
             torch.tensor(pieces),
             scale,
         )
+        share = _share(system, view, moving.pupil)
+        if share.requires_grad:
+            image = image * (share / share.detach())
+        return image
 
     def _samples(
-        self, system: OpticalSystem, view: View, start: int, end: int
+        self, system: OpticalSystem, view: View, pupil: ExitPupil, start: int, end: int
     ) -> tuple[Components, Tensor]:
         """Rays (pixels, samples) from the sensor, and their weights, which sum to one on axis."""
         side = view.pupil_samples
@@ -235,34 +265,161 @@ class RayRenderer(Unprepared):
             rows, columns = rows + (jitters[2] - 0.5), columns + (jitters[3] - 0.5)
         x, y = self.sensor.positions(rows, columns)
         sensor_z = system.vertices[-1]
-        radius = view.pupil_radius
-        ray = aim(x, y, sensor_z, disc_x * radius, disc_y * radius, view.pupil_z)
-        return ray, (ray.n * ray.n) ** 2 * view.weight(float(sensor_z.detach()))
+        radius = pupil.radius
+        ray = aim(x, y, sensor_z, disc_x * radius, disc_y * radius, pupil.z)
+        return ray, (ray.n * ray.n) ** 2 * _share(system, view, pupil)
+
+    def _edge_rays(
+        self,
+        system: OpticalSystem,
+        scene: Scene,
+        view: View,
+        pupil: ExitPupil,
+        edges: EdgeMap | None,
+        start: int,
+        end: int,
+        backend: str,
+    ) -> EdgeRays | None:
+        """Rays of pixels at the edges of apertures; None where no gradient asks for them."""
+        if edges is None or not depends_on_parameters(system):
+            return None
+        pixel = torch.arange(start, end, device=system.device)[:, None]
+        # Beyond the numbers of the pupil's samples.
+        number = torch.arange(_EDGE_RAYS, device=system.device) + view.pupil_samples**2
+        words = random_words(view.seed, pixel, number)
+        jitter, _, *area = (uniform(word, system.dtype) for word in words)
+        stratum = torch.arange(_EDGE_RAYS, device=system.device)
+        angle = (stratum + jitter) * (2.0 * math.pi / _EDGE_RAYS)
+        rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)[:, 0]
+        columns = (pixel % view.width).to(system.dtype)[:, 0]
+        if view.pixel_area:
+            # One place serves all azimuths of a pixel.
+            rows, columns = rows + (area[0][:, 0] - 0.5), columns + (area[1][:, 0] - 0.5)
+        points = self.sensor.positions(rows, columns)
+        edge = edges.at(*points, angle)
+        return edge_rays(system, scene.wavelengths, points, pupil, edge, backend)
+
+    def _edge_light(
+        self,
+        lens: Lens,
+        parameters: Mapping[str, Tensor],
+        scene: Scene,
+        shown: tuple[Tensor, ...],
+        view: View,
+        moving: "_Moving",
+        edges: EdgeMap,
+    ) -> Tensor:
+        """A black image, whose gradient is that of the light at the edges of apertures."""
+        names, planes = list(parameters), len(shown)
+        images = shown[0].shape[0]
+        per_piece = max(1, self.chunk_rays // _EDGE_RAYS)
+        pixels = view.height * view.width
+        starts = range(0, pixels, per_piece)
+        sizes = [min(per_piece, pixels - start) for start in starts]
+
+        def piece(i: int, *tensors: Tensor) -> Tensor:
+            shape = (images, len(scene.depths), len(scene.wavelengths), sizes[i])
+            system = lens.system(dict(zip(names, tensors[planes:-1], strict=True)))
+            now, start = moving.of(tensors[-1]), starts[i]
+            rim = self._edge_rays(
+                system, scene, view, now.pupil, edges, start, start + sizes[i], "cpu"
+            )
+            if rim is None:
+                return shown[0].new_zeros(shape)
+            channels = [
+                scene.gather(
+                    tensors[:planes],
+                    channel,
+                    _texture_places(view, moving.still, _channel(rim.ray, channel)),
+                    rim.weight[channel],
+                )
+                for channel in range(len(scene.wavelengths))
+            ]
+            return torch.stack(channels, dim=2)
+
+        still = [t.detach() for t in shown]
+        tensors = [*still, *parameters.values(), moving.joined(lens.system(parameters))]
+        return replay(piece, sizes, tensors).unflatten(-1, (view.height, view.width))
 
     def _shade(
         self,
         system: OpticalSystem,
         scene: Scene,
         view: View,
+        moving: "_Moving",
         shown: tuple[Tensor, ...],
         ray: Components,
         weight: Tensor,
+        rim: EdgeRays | None,
         backend: str,
     ) -> Tensor:
-        """(B, images, C, count): trace, meet the planes, gather what they show."""
+        """(B, images, C, count): trace, meet the planes, gather what they show.
+
+        Rays of `rim` stand beside the samples.
+        """
         channels = []
         for channel, wavelength in enumerate(scene.wavelengths):
             there, valid = _trace(system, ray, wavelength, backend)
             arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
-            places = _texture_places(view, there)
+            if rim is not None:
+                beside = _channel(rim.ray, channel)
+                there = Components(
+                    *(torch.cat(pair, -1) for pair in zip(there, beside, strict=True))
+                )
+                arriving = torch.cat((arriving, rim.weight[channel]), -1)
+            places = _texture_places(view, moving.magnifications, there)
             channels.append(scene.gather(shown, channel, places, arriving))
         return torch.stack(channels, dim=2)
 
 
-def _texture_places(view: View, there: Components) -> Iterator[tuple[Tensor, Tensor]]:
+class _Moving(NamedTuple):
+    """What of a view moves with the lens: numbers, or tensors with gradients."""
+
+    pupil: ExitPupil
+    magnifications: Sequence[float | Tensor]
+
+    @property
+    def still(self) -> list[float]:
+        """The magnifications without gradients."""
+        return [float(torch.as_tensor(m).detach()) for m in self.magnifications]
+
+    def joined(self, system: OpticalSystem) -> Tensor:
+        """All of it in one tensor, (3 + planes,), in the lens's precision."""
+        options = {"dtype": system.dtype, "device": system.device}
+        values = [*self.pupil, *self.magnifications]
+        return torch.stack([torch.as_tensor(v, **options) for v in values])
+
+    def of(self, joined: Tensor) -> "_Moving":
+        """The inverse of `joined`; the numbers themselves where nothing moves."""
+        if not joined.requires_grad:
+            return self
+        values = joined.unbind()
+        return _Moving(ExitPupil(*values[:3]), values[3:])
+
+
+def _channel(ray: Components, channel: int) -> Components:
+    """Rays of one wavelength."""
+    return Components(*(component[channel] for component in ray))
+
+
+def _moving(system: OpticalSystem, scene: Scene, view: View, backend: str) -> _Moving:
+    pupil = ExitPupil(view.pupil_z, view.pupil_radius, view.axial_radius)
+    pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
+    return _Moving(pupil, scene.moving_magnifications(system))
+
+
+def _share(system: OpticalSystem, view: View, pupil: ExitPupil) -> Tensor:
+    """Weight of a sample over cos⁴ of its ray's angle, so that they sum to one on the axis."""
+    larger = (pupil.radius / pupil.axial_radius) ** 2
+    return larger / (pupil.axial_mean(system.vertices[-1]) * view.pupil_samples**2)
+
+
+def _texture_places(
+    view: View, magnifications: Sequence[float | Tensor], there: Components
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows and columns of the texture where rays meet one plane after the other."""
     origin = (view.texture_row, view.texture_column)
-    for depth, magnification in zip(view.depths, view.magnifications, strict=True):
+    for depth, magnification in zip(view.depths, magnifications, strict=True):
         t, _ = distance_to_plane(there, -depth, -1.0)
         x = torch.addcmul(there.x, t, there.l)
         y = torch.addcmul(there.y, t, there.m)

@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -35,6 +35,13 @@ class Scene(ABC):
     lens's own magnification sees it: a plane is scaled with its depth, and the pinhole image
     of a texture is the texture's central part.  Texel and pixel centres coincide.
 
+    What happens to this scale when the lens changes is part of the model, and derivatives are those
+    of the model.  With `follows` "magnification" the texels change with the lens: the scene is as
+    large as the lens sees it, and the truth stays the texture's central part, whatever the focal
+    length.  Magnification then costs nothing, as for a camera whose pictures are compared at equal
+    framing.  With "world" the texels are fixed at the scale of one lens (`fixed_for`): a lens that
+    magnifies more sees less of the scene, and its image departs from the truth.
+
     Renderers know the light's way from a pixel to the planes; what is met there, and how the planes
     share a pixel, the scene knows: `on_planes` once an image, then `gather` for rays or `blend` for
     blurred planes.
@@ -44,16 +51,25 @@ class Scene(ABC):
         wavelengths: nm, one for each of the texture's colours.
         texture_centre: rows below and columns right of the axis, in the pinhole's image, where the
             texture's centre lies; (0, 0) but for windows of a larger sensor.
+        follows: what the texels' size follows when the lens changes, "magnification" or "world".
+        fixed_scales: pairs of a depth and its magnification, where the scale is fixed; `fixed_for`
+            fills it in.
         separate_planes: whether each plane makes an image of its own, as the fused kernels have it.
     """
 
     depths: tuple[float, ...]
     wavelengths: tuple[float, ...]
     texture_centre: tuple[float, float] = (0.0, 0.0)
+    follows: Literal["magnification", "world"] = field(default="magnification", kw_only=True)
+    fixed_scales: tuple[tuple[float, float], ...] = field(default=(), kw_only=True)
 
     separate_planes: ClassVar[bool]
 
     def __post_init__(self) -> None:
+        if self.follows not in ("magnification", "world"):
+            raise InputError(
+                f"scene.follows: '{self.follows}' is unknown; allowed: magnification, world"
+            )
         for name in ("depths", "wavelengths", "texture_centre"):
             object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
         if not self.depths or not self.wavelengths:
@@ -137,17 +153,65 @@ class Scene(ABC):
         """The middle wavelength in order, or the longer one of two."""
         return sorted(self.wavelengths)[len(self.wavelengths) // 2]
 
+    def as_planes(
+        self,
+        depths: tuple[float, ...] | None = None,
+        wavelengths: tuple[float, ...] | None = None,
+        texture_centre: tuple[float, float] | None = None,
+    ) -> "PlanarScene":
+        """Planes that make images of their own, of the same scale: all of them, or others."""
+        return PlanarScene(
+            self.depths if depths is None else depths,
+            self.wavelengths if wavelengths is None else wavelengths,
+            self.texture_centre if texture_centre is None else texture_centre,
+            follows=self.follows,
+            fixed_scales=self.fixed_scales,
+        )
+
     def plane_labels(self) -> list[str]:
         """Depths of the planes, in metres: `8m`, `4.5m`."""
         return [f"{depth / 1000.0:g}m" for depth in self.depths]
 
-    @torch.no_grad()
+    def fixed_for(self, system: OpticalSystem) -> Self:
+        """The scene as it is used from now on: with `follows` "world" its texels keep the scale
+        that they have for this lens, with "magnification" the scene itself.
+        """
+        if self.follows == "magnification" or self.fixed_scales:
+            return self
+        scales = _paraxial_magnifications(ParaxialNumbers.of(system), self.depths)
+        return replace(self, fixed_scales=tuple(zip(self.depths, scales, strict=True)))
+
     def magnifications(self, system: OpticalSystem) -> list[float]:
-        """|image height / object height| of the paraxial chief ray, at each depth."""
-        first_order = ParaxialNumbers.of(system)
+        """Pixels over texels, times pitch: how large each plane's texels are drawn.
+
+        |image height / object height| of the paraxial chief ray at each depth, of this lens or of
+        the one that the scale is fixed for.
+        """
+        if self.follows == "world":
+            fixed = dict(self.fixed_scales)
+            if not set(self.depths) <= set(fixed):
+                raise InputError(
+                    "scene.follows: 'world' needs the lens that the scale is fixed for; call "
+                    "scene.fixed_for(lens.system()) once, with the lens as it begins"
+                )
+            return [fixed[depth] for depth in self.depths]
+        with torch.no_grad():
+            return _paraxial_magnifications(ParaxialNumbers.of(system), self.depths)
+
+    def moving_magnifications(self, system: OpticalSystem) -> list[float | Tensor]:
+        """The same, with gradients with respect to the lens's parameters where there are any."""
+        numbers = self.magnifications(system)
+        moving = None
+        if self.follows == "magnification" and torch.is_grad_enabled():
+            moving = ParaxialNumbers.differentiable(system)
+        if moving is None:
+            return list(numbers)
+        options = {"dtype": system.dtype, "device": system.device}
         return [
-            abs(first_order.chief_ray_magnification(REFERENCE_WAVELENGTH, depth))
-            for depth in self.depths
+            torch.tensor(number, **options) + (tensor - tensor.detach()).to(**options)
+            for number, tensor in zip(
+                numbers, _paraxial_magnifications(moving, self.depths), strict=True
+            )
         ]
 
 
@@ -198,6 +262,14 @@ class PlanarScene(Scene):
         return blur(textures).expand(-1, len(self.depths), -1, -1, -1)
 
 
+def _paraxial_magnifications(
+    first_order: ParaxialNumbers, depths: Iterable[float]
+) -> list[float | Tensor]:
+    return [
+        abs(first_order.chief_ray_magnification(REFERENCE_WAVELENGTH, depth)) for depth in depths
+    ]
+
+
 def texture_origin(size: tuple[int, int], centre: tuple[float, float]) -> tuple[float, float]:
     """Row and column of the axis in a texture of `size` texels; see `Scene`."""
     (height, width), (row, column) = size, centre
@@ -205,7 +277,11 @@ def texture_origin(size: tuple[int, int], centre: tuple[float, float]) -> tuple[
 
 
 def texture_coordinates(
-    x: Tensor, y: Tensor, magnification: float, pitch: float, origin: tuple[float, float]
+    x: Tensor,
+    y: Tensor,
+    magnification: float | Tensor,
+    pitch: float,
+    origin: tuple[float, float],
 ) -> tuple[Tensor, Tensor]:
     """Rows and columns of the texture at points (x, y) mm of the plane.
 

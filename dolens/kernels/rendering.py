@@ -35,6 +35,7 @@ def render(
     indices: Tensor,
     textures: Tensor,
     sensor_z: Tensor,
+    moving: Tensor,
     codes: Tensor,
     extras: Tensor,
     integers: list[int],
@@ -49,6 +50,8 @@ def render(
         indices: (media, C), float64, a column a channel.
         textures: (B, C, H, W), linear light.
         sensor_z: (), mm from the first vertex.
+        moving: (3 + depths,): of the view the pupil's z, radius and axial radius and the planes'
+            magnifications, for their cotangents alone; values are the view's.
         codes: (steps, Code.ROW), int64, on the CPU.
         extras: int64, on the CPU.
         integers: of a `View`.
@@ -65,7 +68,7 @@ def render(
     return _backend(textures).render(table, textures, sensor_z, view)
 
 
-def _render_shapes(values, indices, textures, sensor_z, codes, extras, *others):  # noqa: ANN001, ANN002, ANN202
+def _render_shapes(values, indices, textures, sensor_z, moving, codes, extras, *others):  # noqa: ANN001, ANN002, ANN202
     integers, numbers, *_ = others
     view = View.from_lists(integers, numbers)
     images, channels = textures.shape[:2]
@@ -78,6 +81,7 @@ def render_adjoint(
     indices: Tensor,
     textures: Tensor,
     sensor_z: Tensor,
+    moving: Tensor,
     codes: Tensor,
     extras: Tensor,
     integers: list[int],
@@ -86,8 +90,10 @@ def render_adjoint(
     scale: float,
     of_image: Tensor,
     wanted: list[bool],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cotangents of values, indices, textures and sensor_z from that of the image.
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Cotangents of values, indices, textures, sensor_z and moving from that of the image.
+
+    Weights hold constant what they are divided by, so that of the axial radius is zero.
 
     Args beyond those of `render`:
         of_image: (B, depths, C, height, width).
@@ -96,13 +102,14 @@ def render_adjoint(
     """
     table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
     view = View.from_lists(integers, numbers)
-    return _backend(textures).render_adjoint(
+    *found, of_moving = _backend(textures).render_adjoint(
         table, textures, sensor_z, view, of_image, replayed, scale, wanted
     )
+    return (*found, of_moving.to(moving))
 
 
-def _render_adjoint_shapes(values, indices, textures, sensor_z, *others):  # noqa: ANN001, ANN002, ANN202
-    return tuple(torch.empty_like(t) for t in (values, indices, textures, sensor_z))
+def _render_adjoint_shapes(values, indices, textures, sensor_z, moving, *others):  # noqa: ANN001, ANN002, ANN202
+    return tuple(torch.empty_like(t) for t in (values, indices, textures, sensor_z, moving))
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -114,9 +121,9 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 def _backward(ctx: Any, of_image: Tensor) -> tuple[Tensor | None, ...]:
     *tensors, replayed = ctx.saved_tensors
     needed = ctx.needs_input_grad
-    wanted = [needed[0] or needed[1] or needed[3], needed[1], needed[2]]
+    wanted = [needed[0] or needed[1] or needed[3] or needed[4], needed[1], needed[2]]
     found = render_adjoint(*tensors, *ctx.view, replayed, ctx.scale, of_image, wanted)
-    gradients = [g if needs else None for g, needs in zip(found, needed[:4], strict=True)]
+    gradients = [g if needs else None for g, needs in zip(found, needed[:5], strict=True)]
     return (*gradients, None, None, None, None, None, None)
 
 

@@ -142,7 +142,9 @@ class Lens(nn.Module):
         """The lens as pure functions see it, with the stored values or others in their place.
 
         Args:
-            values: parameter name → tensor used instead of the stored one.
+            values: parameter name → tensor used instead of the stored one; besides them
+                `surfaces.<n>.semi_diameter` of a circular aperture, mm, which no lens stores as a
+                parameter.
         """
         values = dict(values or {})
         surfaces = []
@@ -154,7 +156,11 @@ class Lens(nn.Module):
                     name: values.pop(f"surfaces.{number}.{name}", value)
                     for name, value in parameters.items()
                 }
-            surfaces.append(SurfaceState(type(surface), parameters, surface.aperture))
+            edge = values.pop(f"surfaces.{number}.semi_diameter", None) if values else None
+            aperture = surface.aperture
+            if edge is not None:
+                aperture = aperture.resized(float(edge.detach()))
+            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge))
         thicknesses = [
             values.pop(f"thicknesses.{number}", gap) for number, gap in self.thicknesses.items()
         ]

@@ -1,8 +1,9 @@
-"""First-order optics in plain numbers, for what needs no gradient and is asked at every step."""
+"""First-order optics in scalar arithmetic: plain numbers, or tensors where gradients are wanted."""
 
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from dolens.optics.materials import Medium
 from dolens.optics.system import OpticalSystem
@@ -13,7 +14,7 @@ class ParaxialNumbers:
     """A centred lens as first-order optics sees it; the equations are those of `paraxial`.
 
     Python's own arithmetic takes a hundredth of the time that tensors of one number take, and on a
-    GPU one transfer in place of many.
+    GPU one transfer in place of many.  `differentiable` holds tensors in the same places.
 
     Attributes:
         curvatures: paraxial, of each surface, 1/mm.
@@ -24,12 +25,12 @@ class ParaxialNumbers:
         stop_radius: mm.
     """
 
-    curvatures: tuple[float, ...]
-    thicknesses: tuple[float, ...]
-    sensor_distance: float
+    curvatures: tuple[float | Tensor, ...]
+    thicknesses: tuple[float | Tensor, ...]
+    sensor_distance: float | Tensor
     materials: tuple[Medium, ...]
     stop: int
-    stop_radius: float
+    stop_radius: float | Tensor
 
     @classmethod
     @torch.no_grad()
@@ -50,12 +51,33 @@ class ParaxialNumbers:
             float(system.surfaces[system.stop - 1].semi_diameter),
         )
 
+    @classmethod
+    def differentiable(cls, system: OpticalSystem) -> "ParaxialNumbers | None":
+        """The same numbers as tensors, in double precision on the CPU; None where no gradient
+        would come of them.
+        """
+        curvatures = [s.shape.paraxial_curvature(s.parameters) for s in system.surfaces]
+        radius = system.surfaces[system.stop - 1].edge_radius
+        scalars = [*curvatures, *system.thicknesses, system.sensor_distance, radius]
+        if not any(isinstance(s, Tensor) and s.requires_grad for s in scalars):
+            return None
+        numbers = [torch.as_tensor(s, dtype=torch.float64).cpu() for s in scalars]
+        count = len(curvatures)
+        return cls(
+            tuple(numbers[:count]),
+            tuple(numbers[count:-2]),
+            numbers[-2],
+            tuple(system.materials),
+            system.stop,
+            numbers[-1],
+        )
+
     @property
-    def length(self) -> float:
+    def length(self) -> float | Tensor:
         """From the first vertex to the last, mm."""
         return sum(self.thicknesses)
 
-    def exit_pupil(self, wavelength: float) -> tuple[float, float]:
+    def exit_pupil(self, wavelength: float) -> tuple[float | Tensor, float | Tensor]:
         """z from the first vertex and diameter, mm; both infinite where it lies at infinity."""
         _, b, _, d = self._matrix(wavelength, self.stop, len(self.curvatures))
         if d == 0.0:
@@ -63,7 +85,7 @@ class ParaxialNumbers:
         image_index = float(self.materials[-1].index(wavelength))
         return self.length - b * image_index / d, 2.0 * self.stop_radius / abs(d)
 
-    def chief_ray_magnification(self, wavelength: float, depth: float) -> float:
+    def chief_ray_magnification(self, wavelength: float, depth: float) -> float | Tensor:
         """Height on the sensor over height on an object at a depth in mm, by the chief ray."""
         before = float(self.materials[0].index(wavelength))
         behind = float(self.materials[-1].index(wavelength))
@@ -75,7 +97,7 @@ class ParaxialNumbers:
         reduced = before * slope
         return a * height + b * reduced + (c * height + d * reduced) / behind * self.sensor_distance
 
-    def _to_stop(self, wavelength: float) -> tuple[float, float]:
+    def _to_stop(self, wavelength: float) -> tuple[float | Tensor, float | Tensor]:
         """A and B from just before the first vertex to just before the stop."""
         a, b, c, d = self._matrix(wavelength, 1, self.stop - 1)
         if self.stop == 1:
@@ -86,7 +108,7 @@ class ParaxialNumbers:
 
     def _matrix(
         self, wavelength: float, first: int, last: int
-    ) -> tuple[float, float, float, float]:
+    ) -> tuple[float | Tensor, float | Tensor, float | Tensor, float | Tensor]:
         """[[A, B], [C, D]] on (y, n·u) from just before surface `first` to just after `last`."""
         a, b, c, d = 1.0, 0.0, 0.0, 1.0
         index = float(self.materials[first - 1].index(wavelength))

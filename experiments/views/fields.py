@@ -194,7 +194,7 @@ class FieldViews:
         system = lens.system(values)
         backend = choose_backend(system, lens.backend)
         wavelengths = (lens.primary_wavelength,)
-        scene = PlanarScene(self.scene.depths, wavelengths)
+        scene = self.scene.as_planes(wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
         looks = chief_ray_maps(system, scene, self.whole, windows, pupil, backend)
         truth, centres = [], []

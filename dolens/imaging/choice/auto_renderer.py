@@ -231,7 +231,7 @@ class AutoRenderer:
         sensor = self.sensor
         texture = probe_texture(sensor, len(scene.wavelengths), self.seed)
         centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
-        return texture, PlanarScene(scene.depths, scene.wavelengths, centre)
+        return texture, scene.as_planes(texture_centre=centre)
 
     def _measured(
         self,

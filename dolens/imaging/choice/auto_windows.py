@@ -243,7 +243,7 @@ class _Trial:
     def _centres(self, sensor: Sensor) -> list[tuple[float, float]]:
         """Where windows look, to a whole texel."""
         system, wavelengths = self.double.system(), (self.scene.middle_wavelength,)
-        middle = PlanarScene(self.scene.depths, wavelengths)
+        middle = self.scene.as_planes(wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
         looks = chief_ray_maps(system, middle, sensor, self.windows, pupil, self.backend)
         return [tuple(float(c.mean().round()) for c in look) for look in looks]

@@ -333,11 +333,13 @@ class SurfaceState:
         shape: the `Surface` subclass, used as a namespace of pure functions.
         parameters: name → tensor.
         aperture: what light passes.
+        edge: the semi-diameter as a tensor, where a gradient with respect to it is wanted.
     """
 
     shape: type[Surface]
     parameters: Parameters
     aperture: ClearAperture
+    edge: Tensor | None = None
 
     def rim_sag(self, like: Tensor) -> Tensor:
         """Sag (mm) at the aperture's reach along x, in the precision of another tensor."""
@@ -348,3 +350,19 @@ class SurfaceState:
     def semi_diameter(self) -> float:
         """Distance of the clear aperture's farthest point from the vertex, mm."""
         return self.aperture.edge.reach
+
+    @property
+    def edge_radius(self) -> float | Tensor:
+        """The semi-diameter, mm, with its gradient where there is one."""
+        return self.semi_diameter if self.edge is None else self.edge
+
+    def edge_distance(self, x: Tensor, y: Tensor) -> Tensor:
+        """How far points (mm, in the surface's axes) lie inside the aperture's edge; negative
+        outside.  Differentiable in the points and in `edge`.
+        """
+        depth = self.aperture.depth(x, y)
+        if self.edge is None:
+            return depth
+        # Of an obscuration the distance does not move with the outer edge.
+        outer = self.aperture.edge.depth(x, y) <= depth
+        return depth + torch.where(outer, (self.edge - self.edge.detach()).to(depth), 0.0)

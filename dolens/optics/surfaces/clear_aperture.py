@@ -137,6 +137,16 @@ class ClearAperture:
         """The same size with no edge and no obscuration: it clips nothing."""
         return ClearAperture(Unlimited(self.edge.reach))
 
+    def resized(self, semi_diameter: float) -> "ClearAperture":
+        """The same with another radius of its circular edge.
+
+        Raises:
+            InputError: the edge is no circle.
+        """
+        if not isinstance(self.edge, Circle):
+            raise InputError("semi_diameter: only a circular aperture has one that can be varied")
+        return ClearAperture(Circle(semi_diameter), self.obscuration)
+
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
         """How far a point is from what stops light, mm, negative where it does; differentiable."""
         inside = self.edge.depth(x, y)

@@ -138,8 +138,12 @@ def lookup(real: types.Type) -> Lookup:
 
         With p = Q + t·d, t = (depth + z)/(-n): Q̄ = (x̄, ȳ, t̄/(-n)), d̄ = (t·x̄, t·ȳ, t·t̄/(-n)),
         where t̄ = x̄·l + ȳ·m.
+
+        Returns:
+            x̄·p_x + ȳ·p_y, summed: the cotangent of the logarithm of the plane's magnification.
         """
         src, rows, cot = carray(state, 1280), carray(scratch, 1664), carray(cotangents, 768)
+        total = zero
         for i in range(128):
             shine = rows[256 + i] * rows[384 + i]
             y = shine * rows[1280 + i] * rows[1024 + i]
@@ -152,7 +156,9 @@ def lookup(real: types.Type) -> Lookup:
             cot[384 + i] += t * x
             cot[512 + i] += t * y
             cot[640 + i] += t * along
+            total += x * (src[i] + t * src[384 + i]) + y * (src[128 + i] + t * src[512 + i])
             rows[1280 + i], rows[1408 + i] = zero, zero
+        return total
 
     return Lookup(arrive, meet, see, of_texels, of_rays)
 

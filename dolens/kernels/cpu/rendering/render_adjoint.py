@@ -76,7 +76,7 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
     sweep = sweeps(real)
     back, add_sums = sweep.back, sweep.add_sums
     reusable, refract_again = first_surface(real)
-    place_pixels, sample, of_sensor_z = sampler(real)
+    place_pixels, sample, of_aim = sampler(real)
     arrive, meet, _, of_texels, of_rays = lookup(real)
     add_texels = texel_sums(real)
     load, replace, clear, copy = _preparation(real)
@@ -142,7 +142,10 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                                 to = shifted(at(view[16]), group * all_texels + place)
                                 add_texels(to, width, job[38], scratch, pixels)
                         if of_lens:
-                            of_rays(state, scratch, cotangents)
+                            # Behind the cotangents of the aim, one of each plane's magnification.
+                            sums[job[35] - 4 - d] += types.float64(
+                                of_rays(state, scratch, cotangents)
+                            )
                     if not of_lens:
                         continue
                     total = zero
@@ -152,8 +155,9 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                     for k in range(job[8] - 1, -1, -1):
                         back(job, k, lanes)
                         add_sums(job, k, lanes, sums)
-                    sums[job[35] - 1] += types.float64(
-                        of_sensor_z(lengths, stack, cotangents, scratch)
-                    )
+                    of_z, of_pupil_z, of_radius = of_aim(lengths, stack, cotangents, scratch)
+                    sums[job[35] - 1] += types.float64(of_z)
+                    sums[job[35] - 2] += types.float64(of_pupil_z)
+                    sums[job[35] - 3] += types.float64(of_radius)
 
     return kernel

@@ -19,7 +19,7 @@ class Sampler(NamedTuple):
 
     place_pixels: Any
     sample: Any
-    of_sensor_z: Any
+    of_aim: Any
 
 
 def _disc(real: types.Type) -> Callable[..., Any]:
@@ -100,21 +100,28 @@ def sampler(real: types.Type) -> Sampler:
             rows[256 + i] = (n * n) * (n * n) * weight
 
     @njit(**OPTIONS)
-    def of_sensor_z(lengths, state, cotangents, scratch):  # noqa: ANN001, ANN202
-        """Cotangent of the sensor's z from those of a block's rays and weights, summed.
+    def of_aim(lengths, state, cotangents, scratch):  # noqa: ANN001, ANN202
+        """Cotangents of the sensor's z, the pupil's z and its radius from those of a block's rays
+        and weights, summed.
 
-        With d = D/|D| and D_z = z_pupil - z: ∂l/∂z = l·n²/D_z, ∂m/∂z = m·n²/D_z and
-        ∂n/∂z = -n·(1 - n²)/D_z.
+        Rays start at P, aim at the pupil's point A, and with A - P = Q·d
+        of_A = (of_d - (of_d·d) d)/Q, of_P = of_position - of_A, and of_radius = of_A·A/radius.
         """
         src, cot, rows = carray(state, 1280), carray(cotangents, 768), carray(scratch, 1664)
-        inverse = one / (lengths[3] - lengths[5])
-        total = zero
+        distance, per_radius = lengths[3] - lengths[5], one / lengths[4]
+        of_z, of_pupil_z, of_radius = zero, zero, zero
         for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
             of_weight = rows[384 + i] * rows[1536 + i]
             of_n = cot[640 + i] + four * of_weight * rows[256 + i] / n
-            across = (cot[384 + i] * l + cot[512 + i] * m) * n * n - of_n * n * (one - n * n)
-            total += cot[256 + i] + across * inverse
-        return total
+            along = cot[384 + i] * l + cot[512 + i] * m + of_n * n
+            q = distance / n
+            inverse = one / q
+            x, y = (cot[384 + i] - along * l) * inverse, (cot[512 + i] - along * m) * inverse
+            z = (of_n - along * n) * inverse
+            of_z += cot[256 + i] - z
+            of_pupil_z += z
+            of_radius += x * (src[i] + q * l) + y * (src[128 + i] + q * m)
+        return of_z, of_pupil_z, of_radius * per_radius
 
-    return Sampler(place_pixels, sample, of_sensor_z)
+    return Sampler(place_pixels, sample, of_aim)

@@ -1,0 +1,165 @@
+"""Rays along the edges of apertures, which carry the derivative that a clipped integral has.
+
+A pixel's irradiance is an integral over the part of the exit pupil's disc that passes the lens.
+When the lens changes, the edge of that part moves, and with it light comes or goes at the edge
+itself.  With the edge at R(φ; θ) in polar coordinates about the middle of the light,
+
+    ∂/∂θ ∫dφ ∫_0^R f r dr  =  ∫dφ ∫_0^R ∂f/∂θ r dr  +  ∫dφ f(R) R ∂R/∂θ.
+
+Sampled rays have the first term.  Rays at the edge have the second: their weight is zero, and its
+gradient is f's factor R ∂R/∂θ.  What collects rays by their weights needs to know nothing of it.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.imaging.moving_pupil import edge_distances
+from dolens.imaging.pupil import ExitPupil, aim
+from dolens.optics.backend import trace_rays
+from dolens.optics.rays import Components, Rays
+from dolens.optics.system import OpticalSystem
+
+# Newton's iterations towards the edge, and the share of the radius that differences are taken over.
+_ITERATIONS, _STEP = 2, 5e-3
+# Rays so far inside and outside tell whether this is the edge of the light.
+_BESIDE = 1e-3
+
+
+class EdgeRays(NamedTuple):
+    """Rays (C, P, J) in object space at the edge of the light of P points.
+
+    Attributes:
+        ray: no gradient.
+        weight: zeros whose gradients are the edge's; in units in which a sample of the disc that
+            stands for a share s of its area has the weight s · cos⁴ · (radius/axial radius)² over
+            the axial mean of cos⁴.
+    """
+
+    ray: Components
+    weight: Tensor
+
+
+def edge_rays(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    edge: tuple[Tensor, Tensor, Tensor, Tensor],
+    backend: str,
+) -> EdgeRays | None:
+    """Rays at the edge of the light, from where it roughly is.
+
+    Args:
+        system: the lens, differentiable.
+        wavelengths: nm, C of them.
+        points: x and y on the sensor, mm, each (P,).
+        pupil: the disc, of `moving_exit_pupil`.
+        edge: middles (P, 1, 2), arms (P, J, 2), radii (P, J) and surfaces (P, J) in units of the
+            disc's radius, as `EdgeMap.at` gives them; J azimuths that are spread evenly.
+        backend: what traces.
+
+    Returns:
+        None where no edge cuts the disc.
+    """
+    middle, arms, radius, surface = edge
+    cut = surface > 0
+    if not bool(cut.any()):
+        return None
+    options = {"dtype": system.dtype, "device": system.device}
+    every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)[:, None]
+    shape = (len(wavelengths), *surface.shape)
+    weight = torch.zeros(shape, **options)
+    parts = [torch.zeros(shape, **options) for _ in range(6)]
+    parts[5].fill_(-1.0)
+    for number in torch.unique(surface[cut]).tolist():
+        where = surface == number
+        beam = _Beam(
+            system,
+            every,
+            tuple(p.to(**options)[:, None].expand(where.shape)[where] for p in points),
+            pupil,
+            middle.to(**options).expand(*where.shape, 2)[where],
+            arms.to(**options)[where],
+            int(number),
+            backend,
+        )
+        ray, found = beam.at_edge(radius.to(**options)[where])
+        weight = _filled(weight, where, found / surface.shape[-1])
+        parts = [_filled(part, where, c) for part, c in zip(parts, ray, strict=True)]
+    return EdgeRays(Components(*parts), weight)
+
+
+def _filled(whole: Tensor, where: Tensor, values: Tensor) -> Tensor:
+    """(C, P, J) with values (C, n) where a mask (P, J) says so."""
+    return whole.masked_scatter(where.expand(whole.shape), values)
+
+
+class _Beam:
+    """Rays of n points of the sensor to places on arms from middles, towards one surface's edge."""
+
+    def __init__(
+        self,
+        system: OpticalSystem,
+        wavelength: Tensor,
+        points: tuple[Tensor, ...],
+        pupil: ExitPupil,
+        middle: Tensor,
+        arms: Tensor,
+        surface: int,
+        backend: str,
+    ) -> None:
+        self.system, self.wavelength, self.points = system, wavelength, points
+        self.pupil, self.middle, self.arms = pupil, middle, arms
+        self.surface, self.backend = surface, backend
+
+    def rays(self, radius: Tensor, pupil: ExitPupil) -> Components:
+        """Towards radii (C, n) on the arms."""
+        across, up = (self.middle + radius[..., None] * self.arms).unbind(-1)
+        x, y = self.points
+        sensor_z = self.system.vertices[-1]
+        return aim(x, y, sensor_z, across * pupil.radius, up * pupil.radius, pupil.z)
+
+    def distance(self, radius: Tensor, pupil: ExitPupil) -> Tensor:
+        """How far inside the edge, mm."""
+        ray = self.rays(radius, pupil)
+        return edge_distances(self.system, ray, self.surface, self.wavelength, self.backend)
+
+    @torch.no_grad()
+    def refined(self, radius: Tensor, pupil: ExitPupil) -> tuple[Tensor, Tensor]:
+        """The radius where the edge is, and how the distance from it falls with the radius."""
+        slope = torch.ones_like(radius)
+        for _ in range(_ITERATIONS):
+            step = _STEP * radius
+            near, far = self.distance(radius - step, pupil), self.distance(radius + step, pupil)
+            slope = (far - near) / (2.0 * step)
+            change = -0.5 * (near + far) / torch.where(slope < 0.0, slope, 1.0)
+            radius = radius + torch.where(slope < 0.0, change, 0.0).clamp(-0.1, 0.1)
+        return radius, slope
+
+    def at_edge(self, radius: Tensor) -> tuple[Components, Tensor]:
+        """Rays (C, n) in object space at the edge, and J times their weights."""
+        still = self.pupil.numbers()
+        radius = radius.expand(len(self.wavelength), -1)
+        radius, slope = self.refined(radius, still)
+        with torch.no_grad():
+            inside, passes = self._through(radius * (1.0 - _BESIDE), still)
+            _, beyond = self._through(radius * (1.0 + _BESIDE), still)
+            place = (self.middle + radius[..., None] * self.arms).norm(dim=-1)
+            counts = passes & ~beyond & (place < 1.0) & (slope < 0.0) & (radius > 0.0)
+            safe = torch.where(slope < 0.0, slope, -1.0)
+            share = (still.radius / still.axial_radius) ** 2
+            share = share / still.axial_mean(float(self.system.vertices[-1].detach()))
+            factor = torch.where(counts, -2.0 * radius * inside.n**4 * share / safe, 0.0)
+        distance = self.distance(radius, self.pupil)
+        moved = distance - distance.detach()
+        return inside, factor * moved
+
+    def _through(self, radius: Tensor, pupil: ExitPupil) -> tuple[Components, Tensor]:
+        """Rays before the lens, and which got there."""
+        rays = Rays.from_components(self.rays(radius, pupil), self.wavelength)
+        hit = trace_rays(self.system, rays, self.backend, -1.0, record=False, first=1, last=None)
+        there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
+        return there, hit.valid & (there.n < 0.0)
