@@ -43,7 +43,6 @@ class Distortion(NamedTuple):
         return (sides[0] @ self.coefficients @ sides[1].mT).unbind(0)
 
 
-@torch.no_grad()
 def distortion(
     system: OpticalSystem, scene: Scene, sensor: Sensor, pupil: ExitPupil, backend: str
 ) -> Distortion | None:
@@ -61,7 +60,7 @@ def distortion(
         backend: what traces.
 
     Returns:
-        The polynomials, no gradient; None where none of the orders that are tried is enough.
+        The polynomials; None where none of the orders that are tried is enough.
 
     Raises:
         InputError: such a ray misses a surface or is totally reflected.
@@ -79,12 +78,11 @@ def distortion(
         last = torch.maximum(
             coefficients[..., -2:, :].abs().amax(), coefficients[..., -2:].abs().amax()
         )
-        if float(last) <= _SMALL:
+        if float(last.detach()) <= _SMALL:
             return Distortion(coefficients, sensor)
     return None
 
 
-@torch.no_grad()
 def chief_ray_maps(
     system: OpticalSystem,
     scene: Scene,
@@ -103,7 +101,7 @@ def chief_ray_maps(
 
     Returns:
         Of each window rows and columns from the axis in the image of a pinhole, each
-        (D, C, height, width), double precision, no gradient.
+        (D, C, height, width), double precision; differentiable in the lens.
     """
     found = distortion(system, scene, sensor, pupil, backend)
     if found is not None:

@@ -31,7 +31,7 @@ class FieldFunctions(NamedTuple):
     Attributes:
         functions: (N, D, C, K, K), upright, of the points' light about the central pixel; their
             sums are relative illuminations, less what falls beyond the window.
-        light: (N, C), relative illumination by the same rays, no gradient.
+        light: (N, C), relative illumination by the same rays.
         lost: (), the largest share of a function's light that falls beyond its window.
     """
 
@@ -52,7 +52,6 @@ def field_point_spread_functions(
     distortion: bool,
     symmetric: bool,
     backend: str,
-    followed: float | None = None,
 ) -> FieldFunctions:
     """Geometric point spread functions at points of the sensor.
 
@@ -73,9 +72,9 @@ def field_point_spread_functions(
             a pinhole sees it.
         symmetric: whether the lens has rotational symmetry.
         backend: what traces and splats.
-        followed: wavelength, nm, whose chief rays the scene is taken to move with as the lens
-            changes: gradients then are of functions about that chief ray, and leave out what
-            distortion moves the image as a whole by.  None: gradients are those of the image.
+
+    Centres move with the lens, and so do the functions about them: gradients are of both, and where
+    pixels look has to carry its own (`convolve_patches`).
     """
     count = distinct_radii(points) if symmetric else len(points[0])
     disc = sampled_disc(count, pupil_samples, seed, system)
@@ -86,31 +85,9 @@ def field_point_spread_functions(
     else:
         centre = pinhole_points(points, pitch, planes, channels)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
-    if followed is not None and torch.is_grad_enabled():
-        down, across = _moved(system, scene, points, pupil, pitch, symmetric, backend, followed)
-        rows, columns = rows + down, columns + across
     return splatted(
         PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight), size, backend
     )
-
-
-def _moved(
-    system: OpticalSystem,
-    scene: Scene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
-    symmetric: bool,
-    backend: str,
-    wavelength: float,
-) -> tuple[Tensor, Tensor]:
-    """Zeros (N, D, 1, 1) whose gradients are those of a wavelength's chief rays."""
-    one = PlanarScene(scene.depths, (wavelength,), scene.texture_centre)
-    middle = torch.zeros(1, 1, dtype=system.dtype, device=system.device)
-    count = distinct_radii(points) if symmetric else len(points[0])
-    disc = (middle.expand(count, 1), middle.expand(count, 1))
-    seen = plane_points(system, one, points, pupil, disc, pitch, symmetric, backend)
-    return seen.rows - seen.rows.detach(), seen.columns - seen.columns.detach()
 
 
 def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
@@ -120,8 +97,8 @@ def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
     rows, columns = middle - seen.rows, middle - seen.columns
     weight = seen.weight.expand(rows.shape)
     functions = splat(rows, columns, weight, size, backend)
+    total = weight.sum(-1)
     with torch.no_grad():
-        total = weight.sum(-1)
         kept = functions.sum((-2, -1)) / total.clamp(min=torch.finfo(total.dtype).tiny)
         lost = torch.where(total > 0.0, 1.0 - kept, 0.0).max()
     return FieldFunctions(functions, total[:, 0], lost)
@@ -149,10 +126,9 @@ def wave_point_spread_functions(
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
     kernels = wave_kernels(system, *places, pitch, size, settings, backend)
     kernels = kernels.reshape(*shape, size, size)
-    with torch.no_grad():
-        disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
-        seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
-        light = seen.weight.sum(-1)
+    disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
+    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    light = seen.weight.sum(-1)
     total = kernels.sum((-2, -1))
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
     lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
@@ -200,7 +176,8 @@ def _object_points(
         rows, columns = pinhole_points(points, pitch, planes, channels)
     options = {"dtype": torch.float64, "device": system.device}
     depth = torch.tensor(scene.depths, **options)[:, None]
-    scale = pitch / torch.tensor(scene.magnifications(system), **options)[:, None]
+    magnifications = scene.moving_magnifications(system)
+    scale = pitch / torch.stack([torch.as_tensor(m, **options) for m in magnifications])[:, None]
     shape = (len(points[0]), planes, channels)
     positions = torch.stack(
         [

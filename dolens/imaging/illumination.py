@@ -18,7 +18,6 @@ RADII, _SIDE = 65, 13
 RAYS = 2048
 
 
-@torch.no_grad()
 def relative_illumination(
     system: OpticalSystem,
     wavelengths: Sequence[float],
@@ -44,7 +43,7 @@ def relative_illumination(
         rays: through the pupil, for each point and wavelength; a multiple of four.
 
     Returns:
-        (wavelengths, height, width), no gradient.
+        (wavelengths, height, width); differentiable in the lens.
     """
     options = {"dtype": torch.float64, "device": system.device}
     height, width = sensor.height, sensor.width

@@ -12,6 +12,8 @@ from dolens.imaging.spline_lookup import spline_lookup
 
 # Pixels after which the inverse of the quadratic spline's filter has faded: (3 - √8)^10 = 2e-8.
 _FADED = 10
+# Pixels over which a lookup's derivative is taken.
+_NUDGE = 2.0**-6
 
 
 class Patch(NamedTuple):
@@ -34,7 +36,7 @@ class Coordinates(NamedTuple):
     """Where in the texture each pixel of the image looks, fractional rows and columns.
 
     Attributes:
-        rows: (D, C, height, width), no gradient.
+        rows: (D, C, height, width).
         columns: (D, C, height, width).
     """
 
@@ -102,6 +104,8 @@ def convolve_patches(
     A texture's edge goes on beyond it.  Memory is that of one patch at a time: the backward pass
     transforms again what several patches see.
 
+    Differentiable in the textures, the kernels and the coordinates.
+
     Args:
         textures: (B, D or 1, C or 1, H, W).
         kernels: (N, D or 1, C or 1, K, K), K odd, sums of quadratic B-splines.
@@ -119,44 +123,66 @@ def convolve_patches(
     if coordinates is not None:
         sizes.append(coordinates.rows.shape[:2])
     shape = (*torch.broadcast_shapes(*sizes), *image_size)
-    settings = (tuple(layout), origin, shape, coordinates, backend)
-    return _Convolution.apply(textures, kernels, settings)
+    settings = (tuple(layout), origin, shape, backend)
+    return _Convolution.apply(textures, kernels, *(coordinates or (None, None)), settings)
 
 
 class _Convolution(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, textures: Tensor, kernels: Tensor, settings: tuple[Any, ...]):  # noqa: ANN205
+    def forward(  # noqa: ANN205
+        ctx: Any,
+        textures: Tensor,
+        kernels: Tensor,
+        rows: Tensor | None,
+        columns: Tensor | None,
+        settings: tuple[Any, ...],
+    ):
         ctx.settings = settings
-        layout, _, shape, _, _ = settings
+        layout, _, shape, _ = settings
+        looks = None if rows is None else Coordinates(rows, columns)
         image = textures.new_zeros((textures.shape[0], *shape))
         tile = None
         for node, patch in enumerate(layout):
-            tile = _tile(tile, textures, kernels.shape[-1], patch, settings)
+            tile = _tile(tile, textures, kernels.shape[-1], patch, settings, looks)
             seen = tile.see(tile.texture_spectrum() * tile.kernel_spectrum(kernels[node]))
             image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
         # Where all patches see the same texels, their spectrum is kept for the way back.
         spectrum = tile.texture_spectrum() if len({p[:4] for p in layout}) == 1 else None
-        ctx.save_for_backward(textures, kernels, spectrum)
+        ctx.save_for_backward(textures, kernels, rows, columns, spectrum)
         return image
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        textures, kernels, spectrum = ctx.saved_tensors
-        of_textures = torch.zeros_like(textures) if ctx.needs_input_grad[0] else None
-        of_kernels = torch.zeros_like(kernels) if ctx.needs_input_grad[1] else None
+        textures, kernels, rows, columns, spectrum = ctx.saved_tensors
+        looks = None if rows is None else Coordinates(rows, columns)
+        of_textures, of_kernels, of_rows, of_columns = (
+            torch.zeros_like(t) if needed else None
+            for t, needed in zip(
+                (textures, kernels, rows, columns), ctx.needs_input_grad[:4], strict=True
+            )
+        )
         tile = None
         for node, patch in enumerate(ctx.settings[0]):
-            tile = _tile(tile, textures, kernels.shape[-1], patch, ctx.settings, spectrum)
-            part = gradient[..., patch.top : patch.bottom, patch.left : patch.right]
-            seen = tile.of_seen(patch.weight * part)
+            tile = _tile(tile, textures, kernels.shape[-1], patch, ctx.settings, looks, spectrum)
+            area = (..., slice(patch.top, patch.bottom), slice(patch.left, patch.right))
+            part = patch.weight * gradient[area]
+            if of_kernels is not None or of_textures is not None:
+                seen = tile.of_seen(part)
             if of_kernels is not None:
                 product = (tile.texture_spectrum().conj() * seen).sum(0)
                 of_kernels[node] = tile.of_kernel(product, kernels[node].shape)
             if of_textures is not None:
                 product = tile.kernel_spectrum(kernels[node]).conj() * seen
                 tile.add_to_texture(product, of_textures)
-        return of_textures, of_kernels, None
+            if of_rows is not None or of_columns is not None:
+                product = tile.texture_spectrum() * tile.kernel_spectrum(kernels[node])
+                for of, found in zip(
+                    (of_rows, of_columns), tile.of_coordinates(product, part), strict=True
+                ):
+                    if of is not None:
+                        of[area] += found.sum_to_size(of[area].shape)
+        return of_textures, of_kernels, of_rows, of_columns, None
 
 
 def _tile(
@@ -165,12 +191,13 @@ def _tile(
     size: int,
     patch: Patch,
     settings: tuple[Any, ...],
+    coordinates: Coordinates | None,
     spectrum: Tensor | None = None,
 ) -> "_Tile":
     """The tile of a patch: the last one where that has the same area, as two nodes a side do."""
     if last is not None and last.area == patch[:4]:
         return last
-    return _Tile(textures, size, patch, settings, spectrum)
+    return _Tile(textures, size, patch, settings, coordinates, spectrum)
 
 
 class _Tile:
@@ -182,9 +209,10 @@ class _Tile:
         size: int,
         patch: Patch,
         settings: tuple[Any, ...],
+        coordinates: Coordinates | None,
         spectrum: Tensor | None,
     ) -> None:
-        _, origin, self.shape, coordinates, self.backend = settings
+        _, origin, self.shape, self.backend = settings
         self.textures, self.size, self.area = textures, size, patch[:4]
         self._spectrum = spectrum
         self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
@@ -241,11 +269,15 @@ class _Tile:
         )
         return spectrum / (down[:, None] * across)
 
-    def see(self, spectrum: Tensor) -> Tensor:
-        """(B, D, C, height, width) of the patch from the product of the spectra."""
+    def _blurred(self, spectrum: Tensor) -> Tensor:
+        """The blurred texels that are seen, from the product of the spectra."""
         first, (height, width) = self.size - 1, self.seen_size
         rows = torch.fft.ifft(spectrum, dim=-2)[..., first : first + height, :]
-        image = torch.fft.irfft(rows, n=self.transform[1])[..., first : first + width]
+        return torch.fft.irfft(rows, n=self.transform[1])[..., first : first + width]
+
+    def see(self, spectrum: Tensor) -> Tensor:
+        """(B, D, C, height, width) of the patch from the product of the spectra."""
+        image = self._blurred(spectrum)
         if self.coordinates is None:
             return image
         image = image.expand(-1, *self.shape[:2], -1, -1)
@@ -265,6 +297,21 @@ class _Tile:
         image = of_seen.new_zeros((*of_seen.shape[:3], *self.transform))
         image[..., first : first + height, first : first + width] = of_seen
         return torch.fft.rfft2(image)
+
+    def of_coordinates(self, spectrum: Tensor, of_seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Cotangents (B, D, C, height, width) of rows and columns, from those of `see`.
+
+        What is looked up is a quadratic between knots, of which a difference is the derivative.
+        """
+        image = self._blurred(spectrum).expand(-1, *self.shape[:2], -1, -1)
+        flat, rows, columns = self._lookup_arguments(image)
+        found = []
+        for down, across in ((_NUDGE, 0.0), (0.0, _NUDGE)):
+            after = spline_lookup(flat, rows + down, columns + across, self.backend)
+            before = spline_lookup(flat, rows - down, columns - across, self.backend)
+            slope = (after - before) / (2.0 * _NUDGE)
+            found.append(slope.reshape(of_seen.shape) * of_seen)
+        return found[0], found[1]
 
     def of_kernel(self, spectrum: Tensor, shape: torch.Size) -> Tensor:
         """(D or 1, C or 1, K, K) of the sum over the batch."""

@@ -19,6 +19,8 @@ class PlaneBlur:
         image_size: height and width.
         coordinates: where the pixels look, if that is not simply every pixel a texel further.
         backend: what looks up.
+        illumination: (C or 1, height, width), what the image of every plane is multiplied by; or
+            None.
     """
 
     kernels: Tensor
@@ -27,10 +29,11 @@ class PlaneBlur:
     image_size: tuple[int, int]
     coordinates: Coordinates | None
     backend: str
+    illumination: Tensor | None = None
 
     def __call__(self, maps: Tensor) -> Tensor:
         """(B, D, C, height, width) of maps (B, D or 1, C or 1, H, W)."""
-        return convolve_patches(
+        image = convolve_patches(
             maps,
             self.kernels,
             self.layout,
@@ -39,10 +42,12 @@ class PlaneBlur:
             self.coordinates,
             self.backend,
         )
+        return image if self.illumination is None else image * self.illumination
 
     def white(self) -> Tensor:
         """What maps of ones become, (D or 1, C or 1, height, width)."""
-        return uniform_image(self.kernels, self.layout, self.image_size)
+        image = uniform_image(self.kernels, self.layout, self.image_size)
+        return image if self.illumination is None else image * self.illumination
 
 
 def uniform_image(kernels: Tensor, layout: Sequence[Patch], image_size: tuple[int, int]) -> Tensor:

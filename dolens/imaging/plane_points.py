@@ -8,6 +8,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.edge_rays import edge_rays
+from dolens.imaging.light_edges import AZIMUTHS, light_edges
+from dolens.imaging.moving_pupil import depends_on_parameters
 from dolens.imaging.pupil import ExitPupil, aim
 from dolens.imaging.scene import Scene
 from dolens.optics.backend import trace_rays
@@ -50,6 +53,9 @@ def plane_points(
     `RayRenderer`.  In a lens of rotational symmetry points of one radius share their rays, turned
     about the axis.
 
+    Where gradients of the lens are wanted and apertures cut the disc, rays along their edges follow
+    the samples (`edge_rays`): their weights are zero and have gradients.
+
     Args:
         system: the lens.
         scene: depths and wavelengths.
@@ -69,7 +75,7 @@ def plane_points(
         x, y = radius, torch.zeros_like(radius)
     ray, weight = pupil_rays(system, scene.wavelengths, (x, y), pupil, disc, backend)
     rows, columns = [], []
-    for depth, magnification in zip(scene.depths, scene.magnifications(system), strict=True):
+    for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
         t, _ = distance_to_plane(ray, -depth, -1.0)
         scale = magnification / pitch
         columns.append(torch.addcmul(ray.x, t, ray.l) * scale)
@@ -106,20 +112,31 @@ def pupil_rays(
     Returns:
         The rays in front of the lens, (C, N, S), and their shares in the irradiance relative to
         that of an axial pixel: cos⁴ over its mean over the axial disc; zero where one is lost.
+        Rays along the edges of apertures may follow, S then counts them as well.
     """
     sensor_z = system.vertices[-1]
     x, y = (p.to(sensor_z.dtype)[:, None] for p in points)
     disc_x, disc_y = (d[: len(x)] * pupil.radius for d in disc)
     ray = aim(x, y, sensor_z, disc_x, disc_y, pupil.z)
     there, valid = _before_the_lens(system, ray, wavelengths, backend)
-    # The disc's weight on the axis, as `View.weight` has it.
-    squared = (float(sensor_z.detach()) - pupil.z) ** 2
-    axial = squared / (squared + pupil.axial_radius**2)
-    share = (pupil.radius / pupil.axial_radius) ** 2 / (axial * disc_x.shape[-1])
-    return there, torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
+    share = (pupil.radius / pupil.axial_radius) ** 2
+    share = share / (pupil.axial_mean(sensor_z) * disc_x.shape[-1])
+    weight = torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
+    if not depends_on_parameters(system):
+        return there, weight
+    middle = wavelengths[len(wavelengths) // 2]
+    found = light_edges(system, middle, points, pupil.numbers(), backend)
+    if not found.any:
+        return there, weight
+    angle = torch.arange(AZIMUTHS, dtype=weight.dtype, device=weight.device)
+    angle = (angle * (2.0 * math.pi / AZIMUTHS)).expand(len(x), -1)
+    arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    edge = (found.middle[:, None], arms, found.radius, found.surface)
+    rim = edge_rays(system, wavelengths, points, pupil, edge, backend)
+    there = Components(*(torch.cat(pair, -1) for pair in zip(there, rim.ray, strict=True)))
+    return there, torch.cat((weight, rim.weight), -1)
 
 
-@torch.no_grad()
 def chief_ray_points(
     system: OpticalSystem,
     scene: Scene,
@@ -141,7 +158,7 @@ def chief_ray_points(
         backend: what traces.
 
     Returns:
-        Rows and columns from the axis in the image of a pinhole, each (N, D, C); no gradient.
+        Rows and columns from the axis in the image of a pinhole, each (N, D, C).
 
     Raises:
         InputError: such a ray misses a surface or is totally reflected, so that it says nothing.
@@ -159,7 +176,7 @@ def chief_ray_points(
         )
     there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
     rows, columns = [], []
-    for depth, magnification in zip(scene.depths, scene.magnifications(system), strict=True):
+    for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
         t, _ = distance_to_plane(there, -depth, -1.0)
         scale = magnification / pitch
         columns.append(torch.addcmul(there.x, t, there.l) * scale)

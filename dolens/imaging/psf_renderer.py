@@ -23,6 +23,7 @@ from dolens.imaging.patch_convolution import (
     patches,
 )
 from dolens.imaging.plane_blur import PlaneBlur
+from dolens.imaging.moving_pupil import moving_exit_pupil
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.scene import PlanarScene, Scene, texture_origin
@@ -151,7 +152,6 @@ class PsfRenderer(Unprepared):
         centres: Sequence[tuple[float, float]],
         seed: int,
         values: Mapping[str, Tensor] | None = None,
-        followed: float | None = None,
     ) -> Tensor:
         """Image each texture on a window of its own of the renderer's sensor, all at once.
 
@@ -166,7 +166,6 @@ class PsfRenderer(Unprepared):
             centres: where each texture's centre lies; see `Scene`.
             seed: of the points in the pupil's strata.
             values: lens parameters.
-            followed: see `field_point_spread_functions`; functions with diffraction ignore it.
 
         Returns:
             (W, images, C, height, width).
@@ -175,7 +174,7 @@ class PsfRenderer(Unprepared):
             _View(window, centre, texture[None])
             for window, centre, texture in zip(windows, centres, textures, strict=True)
         ]
-        return torch.cat(self._render(lens, scene, views, seed, values, followed))
+        return torch.cat(self._render(lens, scene, views, seed, values))
 
     def _render(
         self,
@@ -184,7 +183,6 @@ class PsfRenderer(Unprepared):
         views: Sequence[_View],
         seed: int,
         values: Mapping[str, Tensor] | None,
-        followed: float | None = None,
     ) -> list[Tensor]:
         """Images (B, images, C, height, width) of views of the sensor, all rays traced at once."""
         options = {"device": lens.device, "dtype": lens.dtype}
@@ -196,9 +194,10 @@ class PsfRenderer(Unprepared):
             pupil = self.pupil
             if pupil is None:
                 pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
         parts = [replace(self, sensor=view.sensor) for view in views]
         x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
-        found = self.point_spread_functions(system, scene, pupil, seed, backend, (x, y), followed)
+        found = self.point_spread_functions(system, scene, pupil, seed, backend, (x, y))
         self._warn_of_loss(found)
         looks = [None] * len(views)
         if self.registration == "chief_rays":
@@ -230,10 +229,10 @@ class PsfRenderer(Unprepared):
     ) -> Tensor:
         """The image by functions that are known, of pixels that look where coordinates say."""
         area = (self.sensor.height, self.sensor.width)
-        layout = patches(*area, *self.fields, textures)
+        layout, functions, lit = patches(*area, *self.fields, textures), found.functions, None
         if self.illumination == "map":
-            layout = self._illuminated(layout, system, scene, pupil, found.light, backend)
-        blur = PlaneBlur(found.functions, layout, origin, area, coordinates, backend)
+            functions, layout, lit = self._illuminated(found, layout, system, scene, pupil, backend)
+        blur = PlaneBlur(functions, layout, origin, area, coordinates, backend, lit)
         return scene.blend(scene.on_planes(textures), blur)
 
     def _warn_of_loss(self, found: FieldFunctions) -> None:
@@ -251,7 +250,6 @@ class PsfRenderer(Unprepared):
         seed: int,
         backend: str,
         points: tuple[Tensor, Tensor] | None = None,
-        followed: float | None = None,
     ) -> FieldFunctions:
         """The functions at the grid's points, row after row, or at others.
 
@@ -284,11 +282,10 @@ class PsfRenderer(Unprepared):
             centred,
             symmetric,
             backend,
-            followed,
         )
         if self.diffraction == "none":
             return found
-        f_number = working_f_number(pupil, float(system.vertices[-1].detach()))
+        f_number = working_f_number(pupil.numbers(), float(system.vertices[-1].detach()))
         blurred = with_diffraction_limit(found.functions, pitch, shared.wavelengths, f_number)
         return found._replace(functions=blurred)
 
@@ -320,28 +317,28 @@ class PsfRenderer(Unprepared):
 
     def _illuminated(
         self,
+        found: FieldFunctions,
         layout: list[Patch],
         system: OpticalSystem,
         scene: Scene,
         pupil: ExitPupil,
-        light: Tensor,
         backend: str,
-    ) -> list[Patch]:
-        """Weights that give every pixel its own illumination, whatever the functions' own is."""
+    ) -> tuple[Tensor, list[Patch], Tensor]:
+        """Functions of unit light, patches of those that have any, and each pixel's illumination.
+
+        Pixels whose functions are partly dark get their light from the others.
+        """
         wavelengths, symmetric = self.shared(scene).wavelengths, is_rotationally_symmetric(system)
         wanted = relative_illumination(system, wavelengths, self.sensor, pupil, symmetric, backend)
-        lit, shares = torch.zeros_like(wanted), []
-        for patch, own in zip(layout, light[..., None, None], strict=True):
-            share = torch.where(own > 0.0, patch.weight, 0.0)
-            lit[:, patch.top : patch.bottom, patch.left : patch.right] += share
-            shares.append(share / torch.where(own > 0.0, own, 1.0))
-        scale = wanted / torch.where(lit > 0.0, lit, 1.0)
-        return [
-            patch._replace(
-                weight=share * scale[:, patch.top : patch.bottom, patch.left : patch.right]
-            )
-            for patch, share in zip(layout, shares, strict=True)
-        ]
+        bright = found.light.detach() > 0.0
+        light = torch.where(bright, found.light, 1.0)
+        covered, lit = torch.zeros_like(wanted), []
+        for patch, some in zip(layout, bright[..., None, None], strict=True):
+            share = torch.where(some, patch.weight, 0.0)
+            covered[:, patch.top : patch.bottom, patch.left : patch.right] += share
+            lit.append(patch._replace(weight=share))
+        scale = wanted / torch.where(covered > 0.0, covered, 1.0)
+        return found.functions / light[:, None, :, None, None], lit, scale
 
     def _coordinates(
         self, scene: Scene, textures: Tensor, look: tuple[Tensor, Tensor] | None

@@ -86,18 +86,12 @@ class RayRenderer(Unprepared):
         centres: Sequence[tuple[float, float]],
         seed: int,
         values: Mapping[str, Tensor] | None = None,
-        followed: float | None = None,
     ) -> Tensor:
         """Image each texture on a window of its own; as `PsfRenderer.render_windows`.
-
-        Gradients are those of the image, distortion included, whatever is to be followed; a line of
-        the log says so.
 
         Returns:
             (W, images, C, height, width).
         """
-        if followed is not None and any(v.requires_grad for v in (values or {}).values()):
-            say_once("renderer rays: gradients take a moving image for a worse one; psf does not")
         images = []
         for i, (window, centre) in enumerate(zip(windows, centres, strict=True)):
             renderer, placed = replace(self, sensor=window), replace(scene, texture_centre=centre)
