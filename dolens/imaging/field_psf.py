@@ -16,7 +16,7 @@ from dolens.imaging.psf import splat
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.sampling import square_to_disc, stratified_square
-from dolens.imaging.scene import PlanarScene, Scene
+from dolens.imaging.scene import Scene
 from dolens.imaging.wave.propagation import DiffractionSettings
 from dolens.imaging.wave.wave_psf import propagation, wave_kernels
 from dolens.optics.system import OpticalSystem

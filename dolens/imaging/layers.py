@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -85,6 +85,7 @@ class LayeredScene(Scene):
         wavelengths: Sequence[float],
         texture_centre: tuple[float, float] = (0.0, 0.0),
         reach: int = 15,
+        follows: Literal["magnification", "world"] = "magnification",
     ) -> "LayeredScene":
         """Planes evenly spaced in vergence, 1/depth: blur grows evenly from one to the next.
 
@@ -98,6 +99,7 @@ class LayeredScene(Scene):
             wavelengths: nm.
             texture_centre: of `Scene`.
             reach: of `LayeredScene`.
+            follows: of `Scene`.
         """
         if not 0.0 < nearest < farthest < float("inf"):
             raise InputError(
@@ -108,7 +110,7 @@ class LayeredScene(Scene):
             raise InputError(f"scene: layers must be at least 1, not {layers}")
         shares = [i / (layers - 1) for i in range(layers)] if layers > 1 else [0.5]
         depths = tuple(1.0 / ((1.0 - share) / nearest + share / farthest) for share in shares)
-        return cls(depths, tuple(wavelengths), texture_centre, reach)
+        return cls(depths, tuple(wavelengths), texture_centre, reach, follows=follows)
 
     def labels(self) -> list[str]:
         """The one image's: `0.5-8m`."""

@@ -104,9 +104,7 @@ class _Probe:
         across, up = (self.pupil.radius * places).unbind(-1)
         ray = aim(self.x, self.y, self.system.vertices[-1], across, up, self.pupil.z)
         rays = Rays.from_components(ray, self.wavelength)
-        hit = trace_rays(
-            self.system, rays, self.backend, -1.0, record=False, first=1, last=None
-        )
+        hit = trace_rays(self.system, rays, self.backend, -1.0, record=False, first=1, last=None)
         clipped = hit.status == Status.VIGNETTED
         valid = hit.valid & (hit.direction[..., 2] < 0.0)
         return valid, torch.where(clipped, hit.surface.long(), 0)
@@ -185,9 +183,10 @@ class EdgeMap:
             part = (place - first).clamp(0.0, 1.0)
             return [first, first + 1], [1.0 - part, part]
         nodes, shares = [], []
-        down, across = ((p - low) / step for p, low, step in zip(
-            (y, x), self.low[::-1], self.step[::-1], strict=True
-        ))
+        down, across = (
+            (p - low) / step
+            for p, low, step in zip((y, x), self.low[::-1], self.step[::-1], strict=True)
+        )
         for row, row_share in _neighbours(down):
             for column, column_share in _neighbours(across):
                 nodes.append(row * _GRID + column)

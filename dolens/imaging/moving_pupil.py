@@ -65,15 +65,7 @@ def moving_exit_pupil(
     if not depends_on_parameters(system):
         return pupil
     options = {"dtype": system.dtype, "device": system.device}
-    z, ratio = torch.tensor(pupil.z, **options), None
-    middle = wavelengths[len(wavelengths) // 2]
-    paraxial = ParaxialNumbers.differentiable(system)
-    if paraxial is not None:
-        there, diameter = paraxial.exit_pupil(middle)
-        if isinstance(there, Tensor):
-            z = z + (there - there.detach()).to(z)
-        if isinstance(diameter, Tensor):
-            ratio = (diameter / diameter.detach()).to(z)
+    z, ratio = _pupil_plane(system, wavelengths, pupil)
     axial = torch.tensor(pupil.axial_radius, **options)
     limit = _limit(system, wavelengths, pupil)
     if limit is not None:
@@ -84,10 +76,35 @@ def moving_exit_pupil(
     return ExitPupil(z, axial * (pupil.radius / pupil.axial_radius), axial)
 
 
-@torch.no_grad()
-def _limit(
+def moving_chief_pupil(
     system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil
-) -> _Limit | None:
+) -> ExitPupil:
+    """The pupil with the gradient of its z alone: enough for chief rays, and no ray is traced."""
+    pupil = pupil.numbers()
+    if not depends_on_parameters(system):
+        return pupil
+    return pupil._replace(z=_pupil_plane(system, wavelengths, pupil)[0])
+
+
+def _pupil_plane(
+    system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil
+) -> tuple[Tensor, Tensor | None]:
+    """z with its gradient, and a one whose gradient is that of the paraxial diameter's logarithm;
+    None where that has none.
+    """
+    z, ratio = torch.tensor(pupil.z, dtype=system.dtype, device=system.device), None
+    paraxial = ParaxialNumbers.differentiable(system)
+    if paraxial is not None:
+        there, diameter = paraxial.exit_pupil(wavelengths[len(wavelengths) // 2])
+        if isinstance(there, Tensor):
+            z = z + (there - there.detach()).to(z)
+        if isinstance(diameter, Tensor):
+            ratio = (diameter / diameter.detach()).to(z)
+    return z, ratio
+
+
+@torch.no_grad()
+def _limit(system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil) -> _Limit | None:
     """The edge that the rim of the axial disc is nearest to."""
     options = {"dtype": system.dtype, "device": system.device}
     angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)

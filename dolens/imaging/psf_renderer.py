@@ -16,6 +16,7 @@ from dolens.imaging.field_psf import (
     wave_point_spread_functions,
 )
 from dolens.imaging.illumination import relative_illumination
+from dolens.imaging.moving_pupil import moving_exit_pupil
 from dolens.imaging.patch_convolution import (
     Coordinates,
     Patch,
@@ -23,7 +24,6 @@ from dolens.imaging.patch_convolution import (
     patches,
 )
 from dolens.imaging.plane_blur import PlaneBlur
-from dolens.imaging.moving_pupil import moving_exit_pupil
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.scene import PlanarScene, Scene, texture_origin

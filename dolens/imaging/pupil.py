@@ -42,7 +42,7 @@ class ExitPupil(NamedTuple):
 
     def numbers(self) -> "ExitPupil":
         """The same without gradients."""
-        return ExitPupil(*(float(torch.as_tensor(v).detach()) for v in self))
+        return ExitPupil(*(float(v.detach() if isinstance(v, Tensor) else v) for v in self))
 
     def axial_mean(self, sensor_z: float | Tensor) -> float | Tensor:
         """The mean of cos⁴ over the axial disc of radius a at distance L from a sensor plane, as

@@ -218,7 +218,7 @@ class RayRenderer(Unprepared):
         view: View,
         moving: "_Moving",
     ) -> Tensor:
-        """The render in one kernel, and outside of it how a sample's share moves."""
+        """The render in one kernel."""
         wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64)
         table = pack(system, wavelengths, -1.0, 1, len(system.surfaces), False)
         pieces, scale = [(0, view.height * view.width)], 1.0
@@ -226,12 +226,12 @@ class RayRenderer(Unprepared):
             replayed = self._replayed(view.seed)
             pieces = [self._chunk(i) for i in sorted(replayed)]
             scale = self._chunks / len(replayed)
-        image = rendering.render(
+        return rendering.render(
             table.values,
             table.indices,
             textures,
             system.vertices[-1],
-            moving.joined(system),
+            moving.seen_by_kernel(system, view),
             table.codes,
             table.extras,
             view.integers(),
@@ -239,10 +239,6 @@ class RayRenderer(Unprepared):
             torch.tensor(pieces),
             scale,
         )
-        share = _share(system, view, moving.pupil)
-        if share.requires_grad:
-            image = image * (share / share.detach())
-        return image
 
     def _samples(
         self, system: OpticalSystem, view: View, pupil: ExitPupil, start: int, end: int
@@ -375,13 +371,16 @@ class _Moving(NamedTuple):
     @property
     def still(self) -> list[float]:
         """The magnifications without gradients."""
-        return [float(torch.as_tensor(m).detach()) for m in self.magnifications]
+        return [float(m.detach() if isinstance(m, Tensor) else m) for m in self.magnifications]
 
     def joined(self, system: OpticalSystem) -> Tensor:
         """All of it in one tensor, (3 + planes,), in the lens's precision."""
-        options = {"dtype": system.dtype, "device": system.device}
-        values = [*self.pupil, *self.magnifications]
-        return torch.stack([torch.as_tensor(v, **options) for v in values])
+        return _stacked([*self.pupil, *self.magnifications], system)
+
+    def seen_by_kernel(self, system: OpticalSystem, view: View) -> Tensor:
+        """As `kernels.rendering.render` takes it: a sample's share for the axial radius."""
+        share = _share(system, view, self.pupil)
+        return _stacked([*self.pupil[:2], share, *self.magnifications], system)
 
     def of(self, joined: Tensor) -> "_Moving":
         """The inverse of `joined`; the numbers themselves where nothing moves."""
@@ -389,6 +388,11 @@ class _Moving(NamedTuple):
             return self
         values = joined.unbind()
         return _Moving(ExitPupil(*values[:3]), values[3:])
+
+
+def _stacked(values: Sequence[float | Tensor], system: OpticalSystem) -> Tensor:
+    options = {"dtype": system.dtype, "device": system.device}
+    return torch.stack([torch.as_tensor(v, **options) for v in values])
 
 
 def _channel(ray: Components, channel: int) -> Components:

@@ -50,8 +50,8 @@ def render(
         indices: (media, C), float64, a column a channel.
         textures: (B, C, H, W), linear light.
         sensor_z: (), mm from the first vertex.
-        moving: (3 + depths,): of the view the pupil's z, radius and axial radius and the planes'
-            magnifications, for their cotangents alone; values are the view's.
+        moving: (3 + depths,): of the view the pupil's z and radius, the weight along the axis and
+            the planes' magnifications, for their cotangents alone; values are the view's.
         codes: (steps, Code.ROW), int64, on the CPU.
         extras: int64, on the CPU.
         integers: of a `View`.
@@ -92,8 +92,6 @@ def render_adjoint(
     wanted: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Cotangents of values, indices, textures, sensor_z and moving from that of the image.
-
-    Weights hold constant what they are divided by, so that of the axial radius is zero.
 
     Args beyond those of `render`:
         of_image: (B, depths, C, height, width).

@@ -16,12 +16,15 @@ from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.optics.lens import Lens
 from experiments.views.base import NOISE_OFFSET, Views, seed_of
+from experiments.views.truth import check_truth, chief_ray_looks, looked_up
 
 
 class DepthViews:
     """Textured planes at several depths, in front of the whole sensor.
 
-    The truth is what a distortion-free pinhole sees.
+    With `truth` "pinhole" the truth is what a distortion-free pinhole sees; with "chief_rays" it is
+    the texture where the chief rays of the reference wavelength look, so that distortion is no
+    error, and image and truth move together with the lens.
 
     Args:
         scene: depths and wavelengths.
@@ -31,6 +34,7 @@ class DepthViews:
             training renderer, which then judges its own approximations.
         psf_size: pixels along each side of the point spread functions that networks ask for.
         psf_pupil_samples: their strata along each side of the pupil.
+        truth: `pinhole` or `chief_rays`.
         seed: of rendering and noise.
 
     Raises:
@@ -45,8 +49,15 @@ class DepthViews:
         evaluation_renderer: Renderer | None = None,
         psf_size: int = 65,
         psf_pupil_samples: int = 48,
+        truth: str = "pinhole",
         seed: int = 0,
     ) -> None:
+        self.truth = check_truth(truth)
+        if self.truth != "pinhole" and not scene.separate_planes:
+            raise InputError(
+                f"views.truth: '{truth}' needs planes that make images of their own; allowed for "
+                "layers: pinhole"
+            )
         self.scene = scene
         self.renderer = renderer
         self.readout = readout
@@ -79,8 +90,9 @@ class DepthViews:
         return self.scene.plane_labels()
 
     def check(self, lens: Lens) -> None:
-        """Raise `InputError` where a depth lies inside the lens."""
+        """Raise `InputError` where a depth lies inside the lens; fix the scene's scale for it."""
         self.scene.check(lens.system())
+        self.scene = self.scene.fixed_for(lens.system())
 
     def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
         """Let the training renderer look at the lens as it is now."""
@@ -95,8 +107,17 @@ class DepthViews:
         image = renderer.render(lens, self.scene, textures, seed, values)
         generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
         raw = self.readout.develop(self.readout(image, generator))
-        truth = linear_to_srgb(pinhole_image(self.scene.colours(textures), self.sensor))
-        return Views(truth[:, None].expand_as(raw), raw)
+        return Views(self._truth(lens, values, textures).expand_as(raw), raw)
+
+    def _truth(self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor) -> Tensor:
+        """(B, D or 1, 3, H, W), display-encoded."""
+        colours = self.scene.colours(textures)
+        if self.truth == "pinhole":
+            return linear_to_srgb(pinhole_image(colours, self.sensor))[:, None]
+        ((rows, columns),) = chief_ray_looks(lens, values, self.scene, self.sensor, [self.sensor])
+        centre = self.scene.texture_centre
+        planes = [looked_up(colours, r, c, centre) for r, c in zip(rows, columns, strict=True)]
+        return linear_to_srgb(torch.stack(planes, 1))
 
     def point_spread_functions(
         self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None

@@ -12,19 +12,18 @@ from dolens.errors import InputError
 from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.auto_windows import AutoWindows
 from dolens.imaging.color import linear_to_srgb
-from dolens.imaging.distortion import chief_ray_maps
 from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.pupil import ExitPupil, paraxial_exit_pupil, sampled_exit_pupil
+from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.readout import Readout
-from dolens.imaging.scene import PlanarScene, texture_origin
+from dolens.imaging.scene import PlanarScene, pinhole_image
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
-from dolens.imaging.texture import bilinear
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from experiments.views.base import NOISE_OFFSET, Views, seed_of
 from experiments.views.field_windows import FieldWindows
+from experiments.views.truth import check_truth, chief_ray_looks, looked_up, nearest_texel
 
 EVERYWHERE = "field"
 
@@ -36,9 +35,10 @@ class FieldViews:
     windows at fractions of the half diagonal, at azimuths that go around from texture to texture,
     and one drawn evenly from the whole field, `field`.
 
-    The truth is the texture where the chief rays of the reference wavelength look: distortion,
-    which a camera's calibration undoes, is part of it, and lateral colour is not.  It moves with
-    the lens, and the renderer is told so: else gradients would hold the image where it is.
+    With `truth` "chief_rays" the truth is the texture where the chief rays of the reference
+    wavelength look: distortion, which a camera's calibration undoes, is part of it, and lateral
+    colour is not.  It moves with the lens as the image does, and both carry the derivative.  With
+    "pinhole" it is what a distortion-free pinhole sees, and distortion is an error.
 
     Args:
         scene: one depth, and wavelengths.
@@ -51,6 +51,7 @@ class FieldViews:
         training_windows: `circle`: drawn evenly from the area of the circle about the sensor, so
             that the edge of the field counts by its area; `radius`: evenly from the distances to
             the middle; `area`: from the sensor, of which corners are a small part.
+        truth: `chief_rays` or `pinhole`.
         seed: of windows, rendering and noise.
 
     Raises:
@@ -67,8 +68,10 @@ class FieldViews:
         evaluation_renderer: PsfRenderer | RayRenderer | None = None,
         zones: Mapping[str, float] | None = None,
         training_windows: str = "circle",
+        truth: str = "chief_rays",
         seed: int = 0,
     ) -> None:
+        self.truth = check_truth(truth)
         self.scene = scene
         self.whole = sensor
         self.renderer = renderer
@@ -120,8 +123,9 @@ class FieldViews:
         return list(self.zones)
 
     def check(self, lens: Lens) -> None:
-        """Raise `InputError` where the depth lies inside the lens."""
+        """Raise `InputError` where the depth lies inside the lens; fix the scene's scale for it."""
         self.scene.check(lens.system())
+        self.scene = self.scene.fixed_for(lens.system())
 
     def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
         """Find what training windows share until the next time: the renderer, and the pupil."""
@@ -151,7 +155,6 @@ class FieldViews:
             centres,
             seed,
             values,
-            lens.primary_wavelength,
         )
         field = torch.stack([self.windows.coordinates(window, textures) for window in windows])
         truth, image, field = (
@@ -179,7 +182,6 @@ class FieldViews:
             self._auto.prepare(lens, self.scene, values)
         return self._auto.choice.renderer
 
-    @torch.no_grad()
     def _looked_at(
         self,
         lens: Lens,
@@ -187,25 +189,22 @@ class FieldViews:
         textures: Tensor,
         windows: Sequence[Sensor],
     ) -> tuple[Tensor, list[tuple[float, float]]]:
-        """What chief rays of windows see of textures (W, 3, h, w): (W, 3, H, W), display-encoded.
+        """What windows should see of textures (W, 3, h, w): (W, 3, H, W), display-encoded.
 
         Textures lie where their windows look, to a whole texel: `texture_centre` of each.
         """
-        system = lens.system(values)
-        backend = choose_backend(system, lens.backend)
-        wavelengths = (lens.primary_wavelength,)
-        scene = self.scene.as_planes(wavelengths=wavelengths)
-        pupil = paraxial_exit_pupil(system, wavelengths)
-        looks = chief_ray_maps(system, scene, self.whole, windows, pupil, backend)
+        if self.truth == "pinhole":
+            centres = [(float(round(w.centre_row)), float(round(w.centre_column))) for w in windows]
+            truth = [
+                pinhole_image(texture, window, centre)
+                for texture, window, centre in zip(textures, windows, centres, strict=True)
+            ]
+            return linear_to_srgb(torch.stack(truth)), centres
         truth, centres = [], []
-        for texture, look in zip(textures, looks, strict=True):
-            rows, columns = (c[0, 0] for c in look)
-            centre = (float(rows.mean().round()), float(columns.mean().round()))
-            row, column = texture_origin(texture.shape[-2:], centre)
-            truth.append(
-                bilinear(texture, (rows + row).to(texture), (columns + column).to(texture))
-            )
-            centres.append(centre)
+        looks = chief_ray_looks(lens, values, self.scene, self.whole, windows)
+        for texture, (rows, columns) in zip(textures, looks, strict=True):
+            centres.append(nearest_texel(rows, columns))
+            truth.append(looked_up(texture, rows[0], columns[0], centres[-1]))
         return linear_to_srgb(torch.stack(truth)), centres
 
     def point_spread_functions(

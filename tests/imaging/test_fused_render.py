@@ -6,7 +6,8 @@ from torch.nn import functional
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.imaging.ray_renderer import RayRenderer
+from dolens.imaging.pupil import ExitPupil
+from dolens.imaging.ray_renderer import RayRenderer, _moving
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
 from dolens.kernels import rendering
@@ -96,7 +97,8 @@ def test_wavelengths_part_at_the_first_surface_they_meet(last):
         ended = []
         system, renderer = lens.system(), RayRenderer(Sensor(9, 20, 0.6), 5)
         view = renderer._view(system, scene, (40, 43), 5, "reference")
-        ray, _ = renderer._samples(system, view, 0, 180)
+        pupil = ExitPupil(view.pupil_z, view.pupil_radius, view.axial_radius)
+        ray, _ = renderer._samples(system, view, pupil, 0, 180)
         for wavelength in LINES:
             hit = lens.sensor_to_scene(Rays.from_components(ray, wavelength), first=3)
             ended.append(hit.status == Status.TIR)
@@ -216,9 +218,10 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
     view = renderer._view(system, scene, (40, 43), 0, "reference")
-    ray, weight = renderer._samples(system, view, 0, 180)
+    moving = _moving(system, scene, view, "reference")
+    ray, weight = renderer._samples(system, view, moving.pupil, 0, 180)
     shown = scene.on_planes(texture(40))
-    images = [renderer._shade(system, scene, view, shown, ray, weight, backend)
+    images = [renderer._shade(system, scene, view, moving, shown, ray, weight, None, backend)
               for backend in ("reference", "cpu")]  # fmt: skip
     assert torch.allclose(*images, rtol=1e-11, atol=0)
 
@@ -247,7 +250,7 @@ def test_the_operators_are_what_pytorch_asks_of_one(wavefront_coding, monkeypatc
     monkeypatch.setattr(rendering, "render", render)
     RayRenderer(Sensor(3, 4, 0.0069), 2).render(lens, PlanarScene([6000.0], LINES), texture(12), 0)
     detached = [a.detach() if isinstance(a, torch.Tensor) else a for a in calls[0]]
-    for index in (0, 1, 2, 3):
+    for index in (0, 1, 2, 3, 4):
         detached[index].requires_grad_()
     tests = ("test_schema", "test_faketensor", "test_autograd_registration")
     torch.library.opcheck(operator, tuple(detached), test_utils=tests)

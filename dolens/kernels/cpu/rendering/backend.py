@@ -68,7 +68,8 @@ def render_adjoint(
 
     Returns:
         Gradients of `values`, `indices`, `textures` and `sensor_z`, and (3 + depths,), float64:
-        those of the pupil's z, radius and axial radius and of the planes' magnifications.
+        those of the pupil's z and radius, of the weight along the axis, and of the planes'
+        magnifications.
     """
     job = _RenderJob(table, textures, sensor_z, view, pieces, derivatives=True)
     job.lengths[Length.SCALE] = scale
@@ -76,10 +77,10 @@ def render_adjoint(
     groups = min(_TEXTURE_GROUPS if of_textures else _GROUPS, len(job.blocks))
     bounds = np.array([len(job.blocks) * g // groups for g in range(groups + 1)])
     cut = table.values.numel()
-    # Then the planes' magnifications from the last to the first, the pupil's radius, its z, and
-    # the sensor's.
+    # Then the planes' magnifications from the last to the first, the weight along the axis, the
+    # pupil's radius, its z, and the sensor's.
     end = cut + table.indices.numel()
-    sums = torch.zeros((groups, end + len(view.depths) + 3), dtype=torch.float64)
+    sums = torch.zeros((groups, end + len(view.depths) + 4), dtype=torch.float64)
     image = of_image.contiguous()
     job.view[Place.IMAGE], job.view[Place.GROUPS] = image.data_ptr(), bounds.ctypes.data
     job.view[Place.OF_LENS] = int(of_lens)
@@ -95,14 +96,14 @@ def render_adjoint(
     of_texture = torch.zeros_like(textures)
     if texture_sums is not None:
         of_texture = _unpad(texture_sums.sum(0), textures)
-    *of_magnifications, of_radius, of_pupil_z, of_sensor_z = total[end:].unbind()
+    *of_magnifications, of_share, of_radius, of_pupil_z, of_sensor_z = total[end:].unbind()
     scales = [of / m for of, m in zip(of_magnifications[::-1], view.magnifications, strict=True)]
     return (
         total[:cut].to(table.values.dtype, copy=True),
         total[cut:end].reshape(table.indices.shape).clone(),
         of_texture,
         of_sensor_z.to(sensor_z.dtype, copy=True),
-        torch.stack([of_pupil_z, of_radius, torch.zeros_like(of_radius), *scales]),
+        torch.stack([of_pupil_z, of_radius, of_share, *scales]),
     )
 
 

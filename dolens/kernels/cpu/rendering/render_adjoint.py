@@ -143,7 +143,7 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                                 add_texels(to, width, job[38], scratch, pixels)
                         if of_lens:
                             # Behind the cotangents of the aim, one of each plane's magnification.
-                            sums[job[35] - 4 - d] += types.float64(
+                            sums[job[35] - 5 - d] += types.float64(
                                 of_rays(state, scratch, cotangents)
                             )
                     if not of_lens:
@@ -155,9 +155,10 @@ def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
                     for k in range(job[8] - 1, -1, -1):
                         back(job, k, lanes)
                         add_sums(job, k, lanes, sums)
-                    of_z, of_pupil_z, of_radius = of_aim(lengths, stack, cotangents, scratch)
-                    sums[job[35] - 1] += types.float64(of_z)
-                    sums[job[35] - 2] += types.float64(of_pupil_z)
-                    sums[job[35] - 3] += types.float64(of_radius)
+                    aims = of_aim(lengths, stack, cotangents, scratch)
+                    sums[job[35] - 1] += types.float64(aims[0])
+                    sums[job[35] - 2] += types.float64(aims[1])
+                    sums[job[35] - 3] += types.float64(aims[2])
+                    sums[job[35] - 4] += types.float64(aims[3])
 
     return kernel

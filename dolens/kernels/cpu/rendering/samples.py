@@ -101,19 +101,25 @@ def sampler(real: types.Type) -> Sampler:
 
     @njit(**OPTIONS)
     def of_aim(lengths, state, cotangents, scratch):  # noqa: ANN001, ANN202
-        """Cotangents of the sensor's z, the pupil's z and its radius from those of a block's rays
-        and weights, summed.
+        """Cotangents of the sensor's z, the pupil's z, its radius and the weight along the axis
+        from those of a block's rays and weights, summed.
 
         Rays start at P, aim at the pupil's point A, and with A - P = Q·d
         of_A = (of_d - (of_d·d) d)/Q, of_P = of_position - of_A, and of_radius = of_A·A/radius.
         """
         src, cot, rows = carray(state, 1280), carray(cotangents, 768), carray(scratch, 1664)
-        distance, per_radius = lengths[3] - lengths[5], one / lengths[4]
-        of_z, of_pupil_z, of_radius = zero, zero, zero
+        distance, per_radius, per_weight = (
+            lengths[3] - lengths[5],
+            one / lengths[4],
+            one / lengths[6],
+        )
+        of_z, of_pupil_z, of_radius, of_share = zero, zero, zero, zero
         for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
             of_weight = rows[384 + i] * rows[1536 + i]
-            of_n = cot[640 + i] + four * of_weight * rows[256 + i] / n
+            weighted = of_weight * rows[256 + i]
+            of_share += weighted
+            of_n = cot[640 + i] + four * weighted / n
             along = cot[384 + i] * l + cot[512 + i] * m + of_n * n
             q = distance / n
             inverse = one / q
@@ -122,6 +128,6 @@ def sampler(real: types.Type) -> Sampler:
             of_z += cot[256 + i] - z
             of_pupil_z += z
             of_radius += x * (src[i] + q * l) + y * (src[128 + i] + q * m)
-        return of_z, of_pupil_z, of_radius * per_radius
+        return of_z, of_pupil_z, of_radius * per_radius, of_share * per_weight
 
     return Sampler(place_pixels, sample, of_aim)
