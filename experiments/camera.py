@@ -23,7 +23,7 @@ from dolens.reconstruction import (
 )
 from experiments.adversary import Adversary
 from experiments.lens_least_squares import LensLeastSquares
-from experiments.views.base import Imaging, Views
+from experiments.views.base import Comparison, Imaging, Views
 
 
 class CameraModule(lightning.LightningModule):
@@ -174,7 +174,23 @@ class CameraModule(lightning.LightningModule):
         Lightning does not come here when it resumes within an epoch: what was found at its start is
         in the checkpoint.
         """
-        self.views.prepare(self.lens, self.variables())
+        self.views.prepare(self.lens, self.variables(), self._comparison())
+
+    def _comparison(self) -> Comparison | None:
+        """What the renderer's gradients are for; None where the lens is not varied."""
+        if not len(self.variables):
+            return None
+
+        def loss(taken: Views, values: Mapping[str, Tensor]) -> Tensor:
+            functions = self._functions(values)
+            # No statistics or dropout of its own may move while gradients are compared.
+            training = self.network.training
+            self.network.eval()
+            restored = self.restore(taken, functions)
+            self.network.train(training)
+            return self.loss_over_views(restored, taken.truth.to(restored.dtype))["total"]
+
+        return Comparison([self.variables.scaled], self.variables, loss)
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
         """Start the step's clock."""

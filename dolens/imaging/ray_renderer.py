@@ -33,8 +33,9 @@ from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane, trace_surfaces
 
 _SEED_RANGE = 2**63 - 1
-# Rays along the edges of apertures, a pixel and wavelength, where these cut light: for gradients.
-_EDGE_RAYS = 2
+# Rays along the edges of apertures, a pixel and wavelength, where these cut light: as many as half
+# the strata along a side of the pupil, since an edge is a line.
+_FEWEST_EDGE_RAYS = 2
 
 
 @dataclass(frozen=True)
@@ -259,6 +260,11 @@ class RayRenderer(Unprepared):
         ray = aim(x, y, sensor_z, disc_x * radius, disc_y * radius, pupil.z)
         return ray, (ray.n * ray.n) ** 2 * _share(system, view, pupil)
 
+    @property
+    def _edge_samples(self) -> int:
+        """Rays along edges, for each pixel and wavelength."""
+        return max(_FEWEST_EDGE_RAYS, self.pupil_samples // 2)
+
     def _edge_rays(
         self,
         system: OpticalSystem,
@@ -275,11 +281,11 @@ class RayRenderer(Unprepared):
             return None
         pixel = torch.arange(start, end, device=system.device)[:, None]
         # Beyond the numbers of the pupil's samples.
-        number = torch.arange(_EDGE_RAYS, device=system.device) + view.pupil_samples**2
+        stratum = torch.arange(self._edge_samples, device=system.device)
+        number = stratum + view.pupil_samples**2
         words = random_words(view.seed, pixel, number)
         jitter, _, *area = (uniform(word, system.dtype) for word in words)
-        stratum = torch.arange(_EDGE_RAYS, device=system.device)
-        angle = (stratum + jitter) * (2.0 * math.pi / _EDGE_RAYS)
+        angle = (stratum + jitter) * (2.0 * math.pi / self._edge_samples)
         rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)[:, 0]
         columns = (pixel % view.width).to(system.dtype)[:, 0]
         if view.pixel_area:
@@ -302,7 +308,7 @@ class RayRenderer(Unprepared):
         """A black image, whose gradient is that of the light at the edges of apertures."""
         names, planes = list(parameters), len(shown)
         images = shown[0].shape[0]
-        per_piece = max(1, self.chunk_rays // _EDGE_RAYS)
+        per_piece = max(1, self.chunk_rays // self._edge_samples)
         pixels = view.height * view.width
         starts = range(0, pixels, per_piece)
         sizes = [min(per_piece, pixels - start) for start in starts]

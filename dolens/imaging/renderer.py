@@ -30,8 +30,17 @@ class Renderer(Protocol):
     def rays_per_image(self, scene: Scene) -> int:
         """Rays traced through the lens for one render, all wavelengths together."""
 
-    def prepare(self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None) -> None:
-        """Look at the lens as it is now; `render` need not be called with the same one."""
+    def prepare(
+        self,
+        lens: Lens,
+        scene: Scene,
+        values: Mapping[str, Tensor] | None = None,
+        measure: Any = None,
+    ) -> None:
+        """Look at the lens as it is now; `render` need not be called with the same one.
+
+        `measure`, a `choice.agreement.GradientMeasure`, says which gradients matter.
+        """
 
     def numbers(self) -> dict[str, float]:
         """What the renderer has to say of itself, as metrics."""
@@ -46,7 +55,13 @@ class Renderer(Protocol):
 class Unprepared:
     """A renderer whose settings say everything."""
 
-    def prepare(self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None) -> None:
+    def prepare(
+        self,
+        lens: Lens,
+        scene: Scene,
+        values: Mapping[str, Tensor] | None = None,
+        measure: Any = None,
+    ) -> None:
         """Nothing depends on the lens."""
 
     def with_pupil(

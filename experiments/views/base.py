@@ -1,6 +1,6 @@
 """What every way of looking offers to the camera module."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
@@ -30,6 +30,20 @@ class Views(NamedTuple):
     field: Tensor | None = None
 
 
+class Comparison(NamedTuple):
+    """The training's own loss and variables, for judging gradients.
+
+    Attributes:
+        variables: tensors that are varied.
+        values: the lens's parameters by name, as functions of them.
+        loss: of raw images and truths (B, V, 3, H, W), as of `Views`, and the lens's parameters.
+    """
+
+    variables: Sequence[Tensor]
+    values: Callable[[], Mapping[str, Tensor]]
+    loss: Callable[[Views, Mapping[str, Tensor]], Tensor]
+
+
 class Imaging(Protocol):
     """A scene, renderers and a readout.
 
@@ -53,8 +67,13 @@ class Imaging(Protocol):
     def check(self, lens: Lens) -> None:
         """Raise `InputError` where the lens cannot look at the scene."""
 
-    def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
-        """Look at the lens as it is now, at the start of an epoch."""
+    def prepare(
+        self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
+    ) -> None:
+        """Look at the lens as it is now, at the start of an epoch.
+
+        `comparison` says which gradients a renderer that chooses its model has to get right.
+        """
 
     def take(
         self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.choice.agreement import GradientMeasure
 from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.imaging.readout import Readout
@@ -15,7 +16,7 @@ from dolens.imaging.scene import Scene, pinhole_image
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.optics.lens import Lens
-from experiments.views.base import NOISE_OFFSET, Views, seed_of
+from experiments.views.base import NOISE_OFFSET, Comparison, Views, seed_of
 from experiments.views.truth import check_truth, chief_ray_looks, looked_up
 
 
@@ -94,9 +95,24 @@ class DepthViews:
         self.scene.check(lens.system())
         self.scene = self.scene.fixed_for(lens.system())
 
-    def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
+    def prepare(
+        self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
+    ) -> None:
         """Let the training renderer look at the lens as it is now."""
-        self.renderer.prepare(lens, self.scene, values)
+        self.renderer.prepare(lens, self.scene, values, self._measure(lens, comparison))
+
+    def _measure(self, lens: Lens, comparison: Comparison | None) -> GradientMeasure | None:
+        """The training's loss as a function of images of textures; of planes of their own."""
+        if comparison is None or not self.scene.separate_planes:
+            return None
+
+        def loss(image: Tensor, textures: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+            generator = torch.Generator(image.device).manual_seed(self.seed + NOISE_OFFSET)
+            raw = self.readout.develop(self.readout(image.to(lens.dtype), generator))
+            truth = self._truth(lens, values, textures.to(raw)).expand_as(raw)
+            return comparison.loss(Views(truth, raw), values)
+
+        return GradientMeasure(comparison.variables, comparison.values, loss)
 
     def take(
         self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int

@@ -3,12 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.choice.agreement import GradientMeasure
 from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.auto_windows import AutoWindows
 from dolens.imaging.color import linear_to_srgb
@@ -21,7 +23,7 @@ from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
-from experiments.views.base import NOISE_OFFSET, Views, seed_of
+from experiments.views.base import NOISE_OFFSET, Comparison, Views, seed_of
 from experiments.views.field_windows import FieldWindows
 from experiments.views.truth import check_truth, chief_ray_looks, looked_up, nearest_texel
 
@@ -127,13 +129,35 @@ class FieldViews:
         self.scene.check(lens.system())
         self.scene = self.scene.fixed_for(lens.system())
 
-    def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
+    def prepare(
+        self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
+    ) -> None:
         """Find what training windows share until the next time: the renderer, and the pupil."""
         if self._auto is not None:
-            self._auto.prepare(lens, self.scene, values)
+            measure = partial(self._measure, lens, comparison) if comparison else None
+            self._auto.prepare(lens, self.scene, values, measure)
         elif isinstance(self.renderer, PsfRenderer):
             whole = replace(self.renderer, sensor=self.whole)
             self._pupil = whole.with_pupil(lens, self.scene, values).pupil
+
+    def _measure(
+        self,
+        lens: Lens,
+        comparison: Comparison,
+        windows: Sequence[Sensor],
+        centres: Sequence[tuple[float, float]],
+    ) -> GradientMeasure:
+        """The training's loss as a function of windows' images of textures."""
+
+        def loss(image: Tensor, textures: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+            generator = torch.Generator(image.device).manual_seed(self.seed + NOISE_OFFSET)
+            raw = self.readout.develop(self.readout(image, generator))
+            textures = textures.to(raw)
+            truth = self._truth(lens, values, textures, windows, centres)[:, None]
+            field = torch.stack([self.windows.coordinates(w, textures) for w in windows])
+            return comparison.loss(Views(truth, raw, field[:, None]), values)
+
+        return GradientMeasure(comparison.variables, comparison.values, loss)
 
     def take(
         self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
@@ -143,7 +167,8 @@ class FieldViews:
         rows = [self._shown(stage, index * count + i) for i in range(count)]
         windows = [window for row in rows for window in row]
         repeated = textures.repeat_interleave(len(rows[0]), dim=0)
-        truth, centres = self._looked_at(lens, values, repeated, windows)
+        looks, centres = self._looked_at(lens, values, windows)
+        truth = _seen(repeated, looks, windows, centres)
         renderer = replace(self.evaluation_renderer, sensor=self.whole)
         if stage == "train":
             renderer = self._training_renderer(lens, values)
@@ -183,29 +208,28 @@ class FieldViews:
         return self._auto.choice.renderer
 
     def _looked_at(
+        self, lens: Lens, values: Mapping[str, Tensor], windows: Sequence[Sensor]
+    ) -> tuple[list[tuple[Tensor, Tensor]] | None, list[tuple[float, float]]]:
+        """Rows and columns that windows look at, None for a pinhole's, and where their textures
+        lie, to a whole texel: `texture_centre` of each.
+        """
+        if self.truth == "pinhole":
+            centres = [(float(round(w.centre_row)), float(round(w.centre_column))) for w in windows]
+            return None, centres
+        looks = chief_ray_looks(lens, values, self.scene, self.whole, windows)
+        return looks, [nearest_texel(rows, columns) for rows, columns in looks]
+
+    def _truth(
         self,
         lens: Lens,
         values: Mapping[str, Tensor],
         textures: Tensor,
         windows: Sequence[Sensor],
-    ) -> tuple[Tensor, list[tuple[float, float]]]:
-        """What windows should see of textures (W, 3, h, w): (W, 3, H, W), display-encoded.
-
-        Textures lie where their windows look, to a whole texel: `texture_centre` of each.
-        """
-        if self.truth == "pinhole":
-            centres = [(float(round(w.centre_row)), float(round(w.centre_column))) for w in windows]
-            truth = [
-                pinhole_image(texture, window, centre)
-                for texture, window, centre in zip(textures, windows, centres, strict=True)
-            ]
-            return linear_to_srgb(torch.stack(truth)), centres
-        truth, centres = [], []
-        looks = chief_ray_looks(lens, values, self.scene, self.whole, windows)
-        for texture, (rows, columns) in zip(textures, looks, strict=True):
-            centres.append(nearest_texel(rows, columns))
-            truth.append(looked_up(texture, rows[0], columns[0], centres[-1]))
-        return linear_to_srgb(torch.stack(truth)), centres
+        centres: Sequence[tuple[float, float]],
+    ) -> Tensor:
+        """What windows should see of textures (W, 3, h, w): (W, 3, H, W), display-encoded."""
+        looks, _ = self._looked_at(lens, values, windows)
+        return _seen(textures, looks, windows, centres)
 
     def point_spread_functions(
         self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
@@ -262,3 +286,20 @@ class FieldViews:
             self._auto.load_state(state)
         elif "pupil" in state:
             self._pupil = ExitPupil(*map(float, state["pupil"]))
+
+
+def _seen(
+    textures: Tensor,
+    looks: Sequence[tuple[Tensor, Tensor]] | None,
+    windows: Sequence[Sensor],
+    centres: Sequence[tuple[float, float]],
+) -> Tensor:
+    """Textures (W, 3, h, w) where windows look, by a pinhole where it is not said where."""
+    if looks is None:
+        rows = zip(textures, windows, centres, strict=True)
+        return linear_to_srgb(torch.stack([pinhole_image(*row) for row in rows]))
+    found = [
+        looked_up(texture, rows[0], columns[0], centre)
+        for texture, (rows, columns), centre in zip(textures, looks, centres, strict=True)
+    ]
+    return linear_to_srgb(torch.stack(found))

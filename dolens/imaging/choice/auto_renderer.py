@@ -12,24 +12,19 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.choice.agreement import Agreement, GradientMeasure
 from dolens.imaging.choice.chosen import Choice, settings_of
-from dolens.imaging.choice.cost import psf_cost, rays_cost
 from dolens.imaging.choice.finding import Finding
-from dolens.imaging.choice.plan import Plan, plan
-from dolens.imaging.choice.probe import probe_texture
-from dolens.imaging.choice.reference import Reference, rays_samples, reference
+from dolens.imaging.choice.plan import Plan
 from dolens.imaging.choice.tightening import tightened
+from dolens.imaging.choice.trial import Trial, with_values
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.scene import PlanarScene, Scene
+from dolens.imaging.scene import Scene
 from dolens.imaging.sensor import Sensor
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 
 logger = logging.getLogger(__name__)
-
-# The reference's samples along each side of the pupil.
-REFERENCE_SAMPLES = 24
 
 
 class AutoRenderer:
@@ -40,9 +35,12 @@ class AutoRenderer:
 
     Args:
         sensor: the pixels.
-        tolerance: RMS error on a photograph-like probe image, in grey levels: 1/255 of full scale
-            in linear light, before the sensor's own noise.
+        tolerance: RMS error on the worse of two probe images, one like a photograph and one of fine
+            detail, in grey levels: 1/255 of full scale in linear light, before the sensor's own
+            noise.
         gradients: whether the lens's gradients matter too, and not only the image.
+        gradient_cosine: the least cosine of the angle between a plan's gradient and that of rays.
+        gradient_norm: by how much the ratio of their norms may differ from 1.
         diffraction: whether to model it where it shows; where not, the log says what it would
             change.
         seed: of the probe and its reference.
@@ -55,9 +53,18 @@ class AutoRenderer:
         gradients: bool = True,
         diffraction: bool = True,
         seed: int = 0,
+        gradient_cosine: float = 0.95,
+        gradient_norm: float = 0.15,
     ) -> None:
         if not tolerance > 0.0:
             raise InputError(f"renderer: tolerance must be positive (grey levels), not {tolerance}")
+        if not 0.0 < gradient_cosine < 1.0 or not gradient_norm > 0.0:
+            raise InputError(
+                "renderer: gradient_cosine must be between 0 and 1 and gradient_norm positive, not "
+                f"{gradient_cosine} and {gradient_norm}"
+            )
+        self.gradient_cosine = gradient_cosine
+        self.gradient_norm = gradient_norm
         self.sensor = sensor
         self.tolerance = tolerance
         self.gradients = gradients
@@ -96,29 +103,46 @@ class AutoRenderer:
         return image.to(lens.dtype)
 
     @torch.no_grad()
-    def prepare(self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None) -> None:
+    def prepare(
+        self,
+        lens: Lens,
+        scene: Scene,
+        values: Mapping[str, Tensor] | None = None,
+        measure: GradientMeasure | None = None,
+    ) -> None:
         """Measure what the plan errs by for the lens as it is now; plan anew where it is too much,
         and where there is none.
+
+        Args:
+            lens: as of `render`, and the scene.
+            scene: planes and wavelengths.
+            values: parameters of the lens as it is now.
+            measure: the variables and the loss whose gradients are to be those of rays; None: the
+                squared error to the truth, with respect to those values that require gradients.
         """
         if self.choice is None:
-            self.make_plan(lens, scene, values)
+            self.make_plan(lens, scene, values, measure)
             return
         started = time.perf_counter()
-        current = with_values(lens, values)
-        single, double = in_both_precisions(current)
-        texture, whole = self._probe(scene)
-        judge = reference(single, whole, self.sensor, texture, REFERENCE_SAMPLES, self.seed)
+        trial = self._trial(lens, scene, values, measure)
         choice = self.choice
-        error = self._measured(choice.renderer, choice.dtype, single, double, texture, whole, judge)
-        if error <= max(self.tolerance, choice.error):
-            seconds = choice.seconds + time.perf_counter() - started
+        error = trial.error(choice.renderer, choice.dtype)
+        agreed = trial.agreement(choice.renderer, choice.dtype)
+        seconds = choice.seconds + time.perf_counter() - started
+        if error <= max(self.tolerance, choice.error) and not self._much_worse(choice, agreed):
             renderer = choice.renderer.with_pupil(lens, scene, values)
-            self.choice = replace(choice, renderer=renderer, error=error, seconds=seconds)
-            logger.info("renderer auto: the plan still serves, error %.2g grey levels", error)
+            self.choice = replace(
+                choice, renderer=renderer, error=error, agreement=agreed, seconds=seconds
+            )
+            logger.info(
+                "renderer auto: the plan still serves, error %.2g grey levels%s",
+                error,
+                f"; {agreed}" if agreed else "",
+            )
             return
         logger.info("renderer auto: the lens has changed, error %.2g grey levels", error)
-        self.make_plan(lens, scene, values)
-        self.choice = replace(self.choice, seconds=self.choice.seconds + choice.seconds)
+        self.make_plan(lens, scene, values, measure)
+        self.choice = replace(self.choice, seconds=self.choice.seconds + seconds)
 
     def numbers(self) -> dict[str, float]:
         """The plan as metrics, `auto/…`."""
@@ -154,112 +178,104 @@ class AutoRenderer:
 
     @torch.no_grad()
     def make_plan(
-        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
+        self,
+        lens: Lens,
+        scene: Scene,
+        values: Mapping[str, Tensor] | None = None,
+        measure: GradientMeasure | None = None,
     ) -> Choice:
-        """Choose, measure on the probe image, log; the choice is kept for `render`."""
+        """Choose, measure on the probe images, log; the choice is kept for `render`."""
         started = time.perf_counter()
         self.plans += 1
-        current = with_values(lens, values)
-        single, double = in_both_precisions(current)
-        backend = choose_backend(double.system(), lens.backend)
-        texture, whole = self._probe(scene)
-        planes = replace(whole, texture_centre=scene.texture_centre)
-        judge = reference(single, whole, self.sensor, texture, REFERENCE_SAMPLES, self.seed)
+        trial = self._trial(lens, scene, values, measure)
 
-        def attempt(tolerance: float) -> tuple[float, Plan]:
-            found = plan(
-                single.system(),
-                double.system(),
-                planes,
-                self.sensor,
-                tolerance,
-                self.gradients,
-                self.diffraction,
-                backend,
-            )
-            measured = (single, double, texture, whole, judge)
-            return self._measured(found.renderer, found.dtype, *measured), found
+        def attempt(tolerance: float) -> tuple[float, tuple[Plan, float, Agreement | None]]:
+            found = trial.plan(tolerance)
+            error = trial.error(found.renderer, found.dtype)
+            agreed = trial.agreement(found.renderer, found.dtype)
+            return max(error, self.tolerance * self.excess(agreed)), (found, error, agreed)
 
-        error, found = tightened(attempt, self.tolerance)
+        worst, (found, error, agreed) = tightened(attempt, self.tolerance)
         renderer, dtype, findings = found.renderer, found.dtype, list(found.findings)
-        surfaces = len(lens.surfaces)
-        samples, noise = rays_samples(single, whole, self.sensor, texture, self.tolerance)
-        times = rays_cost(self.sensor, samples**2, planes, surfaces) / psf_cost(
-            renderer, planes, surfaces
-        )
+        samples, noise, times = trial.rays_instead(renderer)
         # Rays know no diffraction.
         of_rays = math.hypot(noise, found.without_diffraction if self.diffraction else 0.0)
         verdict = (
             f"{samples**2} rays a pixel and colour would err by {of_rays:.2g} at {times:.2g} times "
             f"the cost"
         )
-        if of_rays <= self.tolerance and (times < 1.0 or error > self.tolerance):
+        if of_rays <= self.tolerance and (times < 1.0 or worst > self.tolerance):
+            because = f"functions err by {error:.2g}" + (f", {agreed}" if agreed else "")
             findings = [
-                Finding("model", "rays", of_rays, f"functions err by {error:.2g}; {verdict}"),
+                Finding("model", "rays", of_rays, f"{because}; {verdict}"),
                 *(f for f in findings if f.what == "diffraction"),
             ]
             renderer, dtype = RayRenderer(self.sensor, samples), torch.float32
-            error = self._measured(renderer, dtype, single, double, texture, whole, judge)
+            error, agreed = trial.error(renderer, dtype), trial.agreement(renderer, dtype)
         else:
             findings.insert(0, Finding("model", "psf", error, verdict))
             if not scene.separate_planes:
                 because = "not measured: the probe's planes make images of their own"
                 findings.append(Finding("occlusion", "blurred planes", 0.0, because))
         renderer = renderer.with_pupil(lens, scene, values)
-        self._other = (single if dtype == torch.float32 else double).requires_grad_(False)
+        self._other = trial.lens(dtype).requires_grad_(False)
         self.choice = Choice(
             renderer,
             dtype,
             tuple(findings),
             error,
-            judge.uncertainty,
+            trial.uncertainty,
             self.tolerance,
             time.perf_counter() - started,
+            agreed,
         )
         for line in self.choice.lines():
             logger.info("%s", line)
+        self.warn_of_misses("renderer auto", error, agreed)
+        return self.choice
+
+    def warn_of_misses(self, who: str, error: float, agreed: Agreement | None) -> None:
+        """Log which of the tolerances a choice misses."""
         if error > self.tolerance:
             logger.warning(
-                "renderer auto: the tolerance of %g grey levels is not met: %.2g is the best found",
+                "%s: the tolerance of %g grey levels is not met: %.2g is the best found",
+                who,
                 self.tolerance,
                 error,
             )
-        return self.choice
+        if self.excess(agreed) > 1.0:
+            logger.warning(
+                "%s: the tolerance of gradients (cosine %g, norm within %g) is not met: %s",
+                who,
+                self.gradient_cosine,
+                self.gradient_norm,
+                agreed,
+            )
 
-    def _probe(self, scene: Scene) -> tuple[Tensor, PlanarScene]:
-        """A texture that covers the sensor, and the scene with it in its place."""
-        sensor = self.sensor
-        texture = probe_texture(sensor, len(scene.wavelengths), self.seed)
-        centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
-        return texture, scene.as_planes(texture_centre=centre)
+    def excess(self, agreed: Agreement | None) -> float:
+        """How many times their tolerance gradients err by; 0 where they do not matter."""
+        return agreed.excess(self.gradient_cosine, self.gradient_norm) if agreed else 0.0
 
-    def _measured(
+    def _much_worse(self, choice: Choice, agreed: Agreement | None) -> bool:
+        """Whether gradients that were as good as asked for no longer are."""
+        return self.excess(agreed) > max(1.0, 1.5 * self.excess(choice.agreement))
+
+    def _trial(
         self,
-        renderer: PsfRenderer | RayRenderer,
-        dtype: torch.dtype,
-        single: Lens,
-        double: Lens,
-        texture: Tensor,
-        scene: PlanarScene,
-        judge: Reference,
-    ) -> float:
-        """Error against the reference, which has no diffraction."""
-        lens = single if dtype == torch.float32 else double
-        if isinstance(renderer, PsfRenderer):
-            renderer = replace(renderer, diffraction="none")
-        return judge.error(renderer.render(lens, scene, texture, self.seed + 1))
-
-
-def with_values(lens: Lens, values: Mapping[str, Tensor] | None) -> Lens:
-    """The lens with some of its parameters replaced."""
-    changed = copy.deepcopy(lens)
-    parameters = dict(changed.named_parameters())
-    for name, value in (values or {}).items():
-        parameters[name].copy_(value)
-    return changed
-
-
-def in_both_precisions(lens: Lens) -> tuple[Lens, Lens]:
-    """Copies in single and in double precision."""
-    single, double = (copy.deepcopy(lens).to(d) for d in (torch.float32, torch.float64))
-    return single, double
+        lens: Lens,
+        scene: Scene,
+        values: Mapping[str, Tensor] | None,
+        measure: GradientMeasure | None,
+    ) -> Trial:
+        """The lens as it is, before the probe images."""
+        return Trial(
+            with_values(lens, values),
+            scene,
+            self.sensor,
+            values if self.gradients else None,
+            measure if self.gradients else None,
+            self.gradients,
+            self.diffraction,
+            self.tolerance,
+            self.seed,
+        )

@@ -2,27 +2,33 @@
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from dolens.imaging.choice.auto_renderer import (
-    REFERENCE_SAMPLES,
-    AutoRenderer,
-    in_both_precisions,
-    with_values,
+from dolens.imaging.choice.agreement import (
+    Agreement,
+    GradientMeasure,
+    Render,
+    agreement,
+    gradient,
+    gradients_of_rays,
+    judging_samples,
 )
-from dolens.imaging.choice.chosen import settings_of
+from dolens.imaging.choice.auto_renderer import AutoRenderer
+from dolens.imaging.choice.chosen import gradient_numbers, settings_of
 from dolens.imaging.choice.plan import Plan, plan
 from dolens.imaging.choice.probe import probe_texture
 from dolens.imaging.choice.reference import Reference, reference
 from dolens.imaging.choice.tightening import tightened
+from dolens.imaging.choice.trial import REFERENCE_SAMPLES, in_both_precisions, with_values
 from dolens.imaging.distortion import chief_ray_maps
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.pupil import paraxial_exit_pupil
+from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import choose_backend
@@ -33,6 +39,9 @@ logger = logging.getLogger(__name__)
 # Sides of the reference's parts of a window, pixels.
 _SIDE = 12
 _DIFFRACTION = ("none", "limit", "wave")
+
+# From windows and the places of their textures' centres to what gradients are judged by.
+WindowMeasure = Callable[[Sequence[Sensor], Sequence[tuple[float, float]]], GradientMeasure]
 
 
 @dataclass(frozen=True)
@@ -45,12 +54,14 @@ class WindowChoice:
             diffraction, grey levels.
         uncertainty: of these, the largest.
         seconds: that choosing and measuring took.
+        agreement: of the gradients with those of rays; None where they were not asked for.
     """
 
     renderer: PsfRenderer
     errors: Mapping[str, float]
     uncertainty: float
     seconds: float
+    agreement: Agreement | None = None
 
     @property
     def worst(self) -> float:
@@ -64,7 +75,8 @@ class WindowChoice:
             f"{renderer.fields[0]}×{renderer.fields[1]} fields, {renderer.pupil_samples}² rays, "
             f"{renderer.size} pixels, colours {renderer.colours}, diffraction "
             f"{renderer.diffraction}; errors in grey levels: {errors} (±{self.uncertainty:.2g}); "
-            f"{self.seconds:.1f} s"
+            + (f"{self.agreement}; " if self.agreement else "")
+            + f"{self.seconds:.1f} s"
         )
 
 
@@ -90,40 +102,46 @@ class AutoWindows:
 
     @torch.no_grad()
     def prepare(
-        self, lens: Lens, scene: PlanarScene, values: Mapping[str, Tensor] | None = None
+        self,
+        lens: Lens,
+        scene: PlanarScene,
+        values: Mapping[str, Tensor] | None = None,
+        measure: WindowMeasure | None = None,
     ) -> None:
         """Measure the choice for the lens as it is now; choose where there is none, or where it
         errs too much.
+
+        Args:
+            lens: the lens.
+            scene: one depth, and wavelengths.
+            values: its parameters as they are now.
+            measure: of gradients, of windows and their textures' centres; None: only images count.
         """
         started, before = time.perf_counter(), self.choice
-        trial = _Trial(self, with_values(lens, values), scene)
+        auto = self.auto
+        trial = _Trial(self, with_values(lens, values), scene, measure if auto.gradients else None)
         if before is not None:
             renderer = before.renderer.with_pupil(lens, scene, values)
-            errors = trial.errors(renderer)
+            errors, agreed = trial.errors(renderer), trial.agreement(renderer)
             seconds = before.seconds + time.perf_counter() - started
-            if max(errors.values()) <= max(self.auto.tolerance, before.worst):
-                self.choice = WindowChoice(renderer, errors, trial.uncertainty, seconds)
+            well = auto.excess(agreed) <= max(1.0, 1.5 * auto.excess(before.agreement))
+            if max(errors.values()) <= max(auto.tolerance, before.worst) and well:
+                self.choice = WindowChoice(renderer, errors, trial.uncertainty, seconds, agreed)
                 logger.info("renderer auto, windows: still serves, %s", self.choice)
                 return
         self.plans += 1
 
         def attempt(tolerance: float) -> tuple[float, WindowChoice]:
             renderer = self._planned(trial, tolerance).with_pupil(lens, scene, values)
-            errors = trial.errors(renderer)
+            errors, agreed = trial.errors(renderer), trial.agreement(renderer)
             seconds = time.perf_counter() - started + (before.seconds if before else 0.0)
-            found = WindowChoice(renderer, errors, trial.uncertainty, seconds)
-            return found.worst, found
+            found = WindowChoice(renderer, errors, trial.uncertainty, seconds, agreed)
+            return max(found.worst, auto.tolerance * auto.excess(agreed)), found
 
-        _, best = tightened(attempt, self.auto.tolerance)
+        _, best = tightened(attempt, auto.tolerance)
         self.choice = best
         logger.info("renderer auto, windows: %s", best)
-        if best.worst > self.auto.tolerance:
-            logger.warning(
-                "renderer auto, windows: the tolerance of %g grey levels is not met: %.2g is the "
-                "best found",
-                self.auto.tolerance,
-                best.worst,
-            )
+        auto.warn_of_misses("renderer auto, windows", best.worst, best.agreement)
 
     def _planned(self, trial: "_Trial", tolerance: float) -> PsfRenderer:
         """The union of the windows' plans."""
@@ -149,17 +167,21 @@ class AutoWindows:
         if self.choice is None:
             return {}
         renderer, choice = self.choice.renderer, self.choice
-        return {f"auto/error_grey_levels/{n}": error for n, error in choice.errors.items()} | {
-            "auto/error_grey_levels": choice.worst,
-            "auto/uncertainty_grey_levels": choice.uncertainty,
-            "auto/tolerance_grey_levels": self.auto.tolerance,
-            "auto/plan_s": choice.seconds,
-            "auto/plans": float(self.plans),
-            "auto/pupil_samples": float(renderer.pupil_samples),
-            "auto/fields": float(renderer.fields[0] * renderer.fields[1]),
-            "auto/psf_pixels": float(renderer.size),
-            "auto/diffraction": float(renderer.diffraction != "none"),
-        }
+        return (
+            {f"auto/error_grey_levels/{n}": error for n, error in choice.errors.items()}
+            | {
+                "auto/error_grey_levels": choice.worst,
+                "auto/uncertainty_grey_levels": choice.uncertainty,
+                "auto/tolerance_grey_levels": self.auto.tolerance,
+                "auto/plan_s": choice.seconds,
+                "auto/plans": float(self.plans),
+                "auto/pupil_samples": float(renderer.pupil_samples),
+                "auto/fields": float(renderer.fields[0] * renderer.fields[1]),
+                "auto/psf_pixels": float(renderer.size),
+                "auto/diffraction": float(renderer.diffraction != "none"),
+            }
+            | gradient_numbers(choice.agreement)
+        )
 
     def state(self) -> dict[str, Any]:
         """The choice, as plain values."""
@@ -181,8 +203,14 @@ class AutoWindows:
 class _Trial:
     """Windows of a lens as it is, what they look at, and what rays make of it."""
 
-    def __init__(self, owner: AutoWindows, lens: Lens, scene: PlanarScene) -> None:
-        self.lens, self.scene, self.auto = lens, scene, owner.auto
+    def __init__(
+        self,
+        owner: AutoWindows,
+        lens: Lens,
+        scene: PlanarScene,
+        measure: WindowMeasure | None,
+    ) -> None:
+        self.lens, self.scene, self.auto, self.sensor = lens, scene, owner.auto, owner.sensor
         self.names, self.windows = list(owner.windows), list(owner.windows.values())
         self.single, self.double = in_both_precisions(lens)
         self.backend = choose_backend(self.double.system(), lens.backend)
@@ -203,6 +231,11 @@ class _Trial:
                 self.windows, self.centres, self.textures, strict=True
             )
         ]
+        # Each texture has a window to itself.
+        self._each = [w for w in self.windows for _ in range(len(self.textures[0]))]
+        self._centre_each = [c for c in self.centres for _ in range(len(self.textures[0]))]
+        self._measure = measure(self._each, self._centre_each) if measure else None
+        self._of_rays: tuple[Tensor, Tensor] | None = None
 
     @property
     def uncertainty(self) -> float:
@@ -227,18 +260,37 @@ class _Trial:
     def errors(self, renderer: PsfRenderer) -> dict[str, float]:
         """RMS errors of the windows, rendered together; of the model without diffraction."""
         renderer = replace(renderer, diffraction="none")
-        images = renderer.render_windows(
-            self.lens,
-            self.scene,
-            torch.cat(self.textures),
-            self.windows,
-            self.centres,
-            self.auto.seed + 1,
-        )
-        errors = [
-            judge.error(image[None]) for judge, image in zip(self.judges, images, strict=True)
-        ]
+        images = self._rendered(renderer)({}, self.auto.seed + 1)
+        parts = images.split(len(self.textures[0]))
+        errors = [judge.error(part) for judge, part in zip(self.judges, parts, strict=True)]
         return dict(zip(self.names, errors, strict=True))
+
+    def agreement(self, renderer: PsfRenderer) -> Agreement | None:
+        """How well gradients of all windows agree with those of rays, both without diffraction."""
+        if self._measure is None or not self._measure.variables:
+            return None
+        textures, seed = torch.cat(self.textures), self.auto.seed
+        if self._of_rays is None:
+            window, count = self.windows[0], len(self._each)
+            side = judging_samples(window.height, count * window.width, len(self.scene.wavelengths))
+            rays = self._rendered(RayRenderer(self.sensor, side))
+            self._of_rays = gradients_of_rays(rays, textures, self._measure, seed + 2)
+        rendered = self._rendered(replace(renderer, diffraction="none"))
+        return agreement(gradient(rendered, textures, self._measure, (seed + 4,)), self._of_rays)
+
+    def _rendered(self, renderer: PsfRenderer | RayRenderer) -> Render:
+        def render(values: Mapping[str, Tensor], seed: int) -> Tensor:
+            return renderer.render_windows(
+                self.lens,
+                self.scene,
+                torch.cat(self.textures),
+                self._each,
+                self._centre_each,
+                seed,
+                values,
+            )
+
+        return render
 
     def _centres(self, sensor: Sensor) -> list[tuple[float, float]]:
         """Where windows look, to a whole texel."""

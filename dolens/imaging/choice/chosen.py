@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 
+from dolens.imaging.choice.agreement import Agreement
 from dolens.imaging.choice.finding import Finding
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
@@ -23,6 +24,7 @@ class Choice:
         uncertainty: of that error, grey levels.
         tolerance: grey levels that were asked for.
         seconds: that choosing took.
+        agreement: of the gradients with those of rays; None where they were not asked for.
     """
 
     renderer: PsfRenderer | RayRenderer
@@ -32,14 +34,16 @@ class Choice:
     uncertainty: float
     tolerance: float
     seconds: float
+    agreement: Agreement | None = None
 
     def lines(self) -> list[str]:
         """The plan, for people: a line a decision."""
         model = "psf" if isinstance(self.renderer, PsfRenderer) else "rays"
         return [
             f"renderer auto: {model}, error {self.error:.2g} of {self.tolerance:g} grey levels "
-            f"(±{self.uncertainty:.2g}) on the probe image, planned in {self.seconds:.1f} s",
+            f"(±{self.uncertainty:.2g}) on the probe images, planned in {self.seconds:.1f} s",
             *(f"  {finding}" for finding in self.findings),
+            *([f"  {self.agreement}"] if self.agreement else []),
         ]
 
     def numbers(self) -> dict[str, float]:
@@ -58,7 +62,18 @@ class Choice:
             numbers["auto/fields"] = float(renderer.fields[0] * renderer.fields[1])
             numbers["auto/psf_pixels"] = float(renderer.size)
             numbers["auto/diffraction"] = float(renderer.diffraction != "none")
-        return numbers
+        return numbers | gradient_numbers(self.agreement)
+
+
+def gradient_numbers(agreement: Agreement | None) -> dict[str, float]:
+    """How gradients agree, as metrics."""
+    if agreement is None:
+        return {}
+    return {
+        "auto/gradient_cosine": agreement.cosine,
+        "auto/gradient_norm_ratio": agreement.norm_ratio,
+        "auto/gradient_noise": agreement.noise,
+    }
 
 
 def settings_of(renderer: PsfRenderer | RayRenderer) -> dict[str, Any]:

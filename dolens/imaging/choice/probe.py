@@ -35,12 +35,26 @@ def probe_image(height: int, width: int, seed: int = 0) -> Tensor:
     return image.clamp(0.0, 1.0)[None]
 
 
+def fine_detail(height: int, width: int, seed: int = 0) -> Tensor:
+    """(1, 3, height, width), float64, linear light: squares of two texels, bright or dark.
+
+    What photographs have at their sharpest edges and textures all over: half of its power lies
+    above a quarter of the sampling frequency, where 1/f noise has hardly any.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    squares = torch.rand(1, 3, -(-height // 2), -(-width // 2), generator=generator)
+    signs = torch.where(squares < 0.5, -1.0, 1.0).double()
+    image = MEAN + CONTRAST * signs.repeat_interleave(2, -2).repeat_interleave(2, -1)
+    return image[..., :height, :width]
+
+
 def probe_texture(sensor: Sensor, channels: int, seed: int) -> Tensor:
-    """(1, channels, H, W), float64: a probe image wider than a sensor all around, its colours in
-    turn.
+    """(2, channels, H, W), float64: probe images wider than a sensor all around, their colours in
+    turn: one like a photograph, and one of fine detail.
     """
     size = (sensor.height + 2 * _MARGIN, sensor.width + 2 * _MARGIN)
-    return probe_image(*size, seed)[:, [i % 3 for i in range(channels)]]
+    images = torch.cat((probe_image(*size, seed), fine_detail(*size, seed)))
+    return images[:, [i % 3 for i in range(channels)]]
 
 
 def probe_power(side: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""The converged image of a probe by rays, on some windows of the sensor, and errors against it."""
+"""The converged images of probes by rays, on some windows of the sensor, and errors against it."""
 
 import math
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class Reference:
 
     Attributes:
         windows: top row and left column of each, and its height and width.
-        images: of each window, (2, D, C, height, width).
+        images: of each window, (2, B, D, C, height, width).
     """
 
     windows: tuple[tuple[int, int, int, int], ...]
@@ -29,25 +29,29 @@ class Reference:
 
     @property
     def noise(self) -> float:
-        """RMS noise of the mean of both renders, grey levels."""
-        squares = [(one - two).square() / 4.0 for one, two in self.images]
-        return _rms(squares)
+        """RMS noise of the mean of both renders, grey levels; of the noisiest of the B images."""
+        return float(self._noise().max())
 
     @property
     def uncertainty(self) -> float:
         """Grey levels below which an error is lost in that noise: the noise of its estimate."""
-        values = sum(pair[0].numel() for pair in self.images)
+        values = sum(pair[0, 0].numel() for pair in self.images)
         return self.noise * (2.0 / values) ** 0.25
 
     def error(self, image: Tensor) -> float:
-        """RMS error of an image (1, D, C, height, width) of the sensor, without the noise of the
-        reference, in grey levels.
+        """RMS error of images (B, D, C, height, width) of the sensor, without the noise of the
+        reference, in grey levels; of the worst of them.
         """
         squares = []
         for (top, left, height, width), pair in zip(self.windows, self.images, strict=True):
-            part = image[0, ..., top : top + height, left : left + width].to(pair)
+            part = image[..., top : top + height, left : left + width].to(pair)
             squares.append((part - pair.mean(0)).square())
-        return math.sqrt(max(_rms(squares) ** 2 - self.noise**2, 0.0))
+        remaining = _rms(squares).square() - self._noise().square()
+        return math.sqrt(max(float(remaining.max()), 0.0))
+
+    def _noise(self) -> Tensor:
+        """(B,), of each image."""
+        return _rms([(one - two).square() / 4.0 for one, two in self.images])
 
 
 @torch.no_grad()
@@ -72,14 +76,15 @@ def reference(
     images = []
     for window in windows:
         renderer = RayRenderer(sensor.window(*window), pupil_samples)
-        pair = [renderer.render(lens, scene, texture, 2 * seed + i)[0] for i in range(2)]
+        pair = [renderer.render(lens, scene, texture, 2 * seed + i) for i in range(2)]
         images.append(torch.stack(pair))
     return Reference(windows, tuple(images))
 
 
-def _rms(squares: list[Tensor]) -> float:
-    total = sum(float(s.double().sum()) for s in squares)
-    return math.sqrt(total / sum(s.numel() for s in squares)) / GREY_LEVEL
+def _rms(squares: list[Tensor]) -> Tensor:
+    """(B,), grey levels, from squares (B, ...) on several windows."""
+    total = sum(s.double().flatten(1).sum(1) for s in squares)
+    return (total / sum(s[0].numel() for s in squares)).sqrt() / GREY_LEVEL
 
 
 def rays_samples(
