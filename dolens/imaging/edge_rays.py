@@ -16,8 +16,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.imaging.moving_pupil import edge_distances
-from dolens.imaging.pupil import ExitPupil, aim
+from dolens.imaging.aim import aim
+from dolens.imaging.axial_limit import edge_distances
+from dolens.imaging.pupil import ExitPupil
 from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem

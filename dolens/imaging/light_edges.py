@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.imaging.pupil import ExitPupil, aim
+from dolens.imaging.aim import aim
+from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Rays, Status

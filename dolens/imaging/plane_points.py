@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.aim import aim
 from dolens.imaging.edge_rays import edge_rays
 from dolens.imaging.light_edges import AZIMUTHS, light_edges
 from dolens.imaging.moving_pupil import depends_on_parameters
-from dolens.imaging.pupil import ExitPupil, aim
+from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.scene import Scene
 from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Components, Rays, Status

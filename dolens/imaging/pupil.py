@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.aim import aim
+from dolens.imaging.axial_limit import axial_limit, limiting_radius
 from dolens.imaging.sensor import Sensor
 from dolens.optics.backend import trace_rays
 from dolens.optics.paraxial_numbers import ParaxialNumbers
@@ -50,32 +52,6 @@ class ExitPupil(NamedTuple):
         """
         squared = (sensor_z - self.z) ** 2
         return squared / (squared + self.axial_radius**2)
-
-
-def aim(
-    x: Tensor,
-    y: Tensor,
-    sensor_z: Tensor,
-    pupil_x: Tensor,
-    pupil_y: Tensor,
-    pupil_z: float | Tensor,
-) -> Components:
-    """Rays from points of the sensor towards points of the pupil plane, travelling towards -z.
-
-    A pupil behind the sensor is virtual: the rays then travel away from its points.
-    """
-    dx, dy, dz = pupil_x - x, pupil_y - y, pupil_z - sensor_z
-    inverse = torch.rsqrt(dx * dx + dy * dy + dz * dz)
-    inverse = torch.where(dz > 0.0, -inverse, inverse)
-    z = sensor_z.expand(inverse.shape)
-    return Components(
-        x.expand(inverse.shape),
-        y.expand(inverse.shape),
-        z,
-        dx * inverse,
-        dy * inverse,
-        dz * inverse,
-    )
 
 
 def paraxial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> ExitPupil:
@@ -140,8 +116,10 @@ def axial_exit_pupil(
     """The largest disc in the paraxial exit pupil's plane that real axial rays fill.
 
     Rays from the sensor's centre are traced backwards at many radii and azimuths, and again in
-    between to narrow the first radius that fails, for every wavelength.  Sampling this disc, and
-    no larger one, lets every axial sample through, so that a white scene renders white.
+    between to narrow the first radius that fails, for every wavelength.  Where an aperture's edge
+    ends them, the radius is that of the ray that grazes it, so that it is a smooth function of the
+    lens.  Sampling this disc, and no larger one, lets every axial sample through, so that a white
+    scene renders white.
 
     Args:
         system: the lens.
@@ -172,6 +150,9 @@ def axial_exit_pupil(
                 "no light reaches the centre of the sensor: every axial ray is stopped"
             )
         low, high = float(radii[first - 1]), float(radii[first])
+    limit = axial_limit(system, wavelengths, z, low)
+    if limit is not None:
+        low = limiting_radius(system, limit, z, low, high, backend)
     return ExitPupil(z, low, low)
 
 

@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.aim import aim
 from dolens.imaging.edge_rays import EdgeRays, edge_rays
 from dolens.imaging.light_edges import EdgeMap, edge_map
 from dolens.imaging.moving_pupil import depends_on_parameters, moving_exit_pupil
-from dolens.imaging.pupil import ExitPupil, aim, sampled_exit_pupil
+from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.replay import replay

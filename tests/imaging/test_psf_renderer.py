@@ -9,12 +9,13 @@ import yaml
 
 from dolens import load_lens
 from dolens.errors import InputError
+from dolens.imaging.aim import aim
 from dolens.imaging.choice.probe import probe_image
 from dolens.imaging.field_psf import field_point_spread_functions
 from dolens.imaging.illumination import relative_illumination
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.pupil import aim, sampled_exit_pupil
+from dolens.imaging.pupil import sampled_exit_pupil
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
