@@ -1,5 +1,6 @@
 """A camera as one Lightning module: a lens, how it looks, reconstruction and loss."""
 
+import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ from dolens.reconstruction import (
 )
 from experiments.adversary import Adversary
 from experiments.lens_least_squares import LensLeastSquares
+from experiments.photograph_scores import PhotographScores, scores_by_photograph
 from experiments.views.base import Comparison, Imaging, Views
 
 
@@ -87,6 +89,7 @@ class CameraModule(lightning.LightningModule):
         self.step_seconds: list[float] = []
         self.optics_seconds: list[float] = []
         self._evaluations: list[dict[str, Tensor]] = []
+        self.test_scores: PhotographScores | None = None
         self._step_started = self._optics_started = 0.0
         # Of the lens as it begins, so that a resumed run measures steps as an uninterrupted one.
         steps = self.lens_steps if len(self.variables) else None
@@ -316,8 +319,14 @@ class CameraModule(lightning.LightningModule):
         rows, self._evaluations = self._evaluations, []
         if not rows:
             return
-        for name in rows[0]:
-            by_view = torch.cat([row[name] for row in rows]).mean(dim=0).float()
+        crops = {name: torch.cat([row[name] for row in rows]).float().cpu() for name in rows[0]}
+        photographs = self._photographs_of_crops(stage, len(crops["psnr_db"]))
+        scores = scores_by_photograph(crops, photographs, self.views.labels())
+        if stage == "test":
+            kept = {name: found for name, found in scores.metrics.items() if name != "loss"}
+            self.test_scores = dataclasses.replace(scores, metrics=kept)
+        for name, found in scores.metrics.items():
+            by_view = found.mean(dim=0)  # each photograph counts once
             headline = name in ("loss", "psnr_db")
             self.log(f"{stage}/{name}", by_view.mean(), prog_bar=headline)
             if name != "loss":
@@ -325,9 +334,18 @@ class CameraModule(lightning.LightningModule):
                     self.log(f"{stage}/{name}/{label}", value)
                 self.log(f"{stage}/{name}/worst", by_view.min())
 
+    def _photographs_of_crops(self, stage: str, count: int) -> list[str]:
+        """The photograph of each of the first crops; a crop of its own where the data tell none."""
+        data = getattr(self.trainer, "datamodule", None)
+        if not hasattr(data, "evaluation_photographs"):
+            return [str(number) for number in range(count)]
+        return data.evaluation_photographs({"val": "validation", "test": "test"}[stage])[:count]
+
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
         numbers = {f"variables/{n}": float(v) for n, v in self._variable_numbers().items()}
+        if self.test_scores is not None:
+            numbers |= self.test_scores.numbers("test")
         if isinstance(getattr(self.network, "pretrained", None), bool):
             numbers["network/pretrained"] = float(self.network.pretrained)
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)

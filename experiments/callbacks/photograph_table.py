@@ -1,0 +1,27 @@
+"""The table of a test, photograph by photograph."""
+
+from pathlib import Path
+
+import lightning
+
+from experiments.photograph_scores import TABLE
+from experiments.tables import write_table
+
+
+class PhotographTable(lightning.Callback):
+    """`test_photographs.csv`: a row of scores for each test photograph and view.
+
+    `scripts/compare.py` pairs runs by it.
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Write it."""
+        scores = getattr(pl_module, "test_scores", None)
+        if scores is not None:
+            write_table(self.folder / TABLE, scores.rows())
