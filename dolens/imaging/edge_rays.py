@@ -20,13 +20,16 @@ from dolens.imaging.aim import aim
 from dolens.imaging.axial_limit import edge_distances
 from dolens.imaging.pupil import ExitPupil
 from dolens.optics.backend import trace_rays
-from dolens.optics.rays import Components, Rays
+from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
 
 # Newton's iterations towards the edge, and the share of the radius that differences are taken over.
-_ITERATIONS, _STEP = 2, 5e-3
-# Rays so far inside and outside tell whether this is the edge of the light.
-_BESIDE = 1e-3
+_ITERATIONS, _STEP = 3, 1e-3
+# Rays inside and outside by this share of the radius, for each precision, tell whether this is the
+# edge of the light: where two edges nearly coincide the farther one must not pass for it.
+_BESIDE = {torch.float64: 1e-6, torch.float32: 3e-4}
+# How often another edge is tried where the first is not the light's.
+_ROUNDS = 3
 
 
 class EdgeRays(NamedTuple):
@@ -66,8 +69,7 @@ def edge_rays(
         None where no edge cuts the disc.
     """
     middle, arms, radius, surface = edge
-    cut = surface > 0
-    if not bool(cut.any()):
+    if not bool((surface > 0).any()):
         return None
     options = {"dtype": system.dtype, "device": system.device}
     every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)[:, None]
@@ -75,22 +77,51 @@ def edge_rays(
     weight = torch.zeros(shape, **options)
     parts = [torch.zeros(shape, **options) for _ in range(6)]
     parts[5].fill_(-1.0)
-    for number in torch.unique(surface[cut]).tolist():
-        where = surface == number
-        beam = _Beam(
-            system,
-            every,
-            tuple(p.to(**options)[:, None].expand(where.shape)[where] for p in points),
-            pupil,
-            middle.to(**options).expand(*where.shape, 2)[where],
-            arms.to(**options)[where],
-            int(number),
-            backend,
-        )
-        ray, found = beam.at_edge(radius.to(**options)[where])
-        weight = _filled(weight, where, found / surface.shape[-1])
-        parts = [_filled(part, where, c) for part, c in zip(parts, ray, strict=True)]
+    done = torch.zeros(shape, dtype=torch.bool, device=system.device)
+    for _ in range(_ROUNDS):
+        others = torch.zeros_like(surface)
+        for number in torch.unique(surface[surface > 0]).tolist():
+            where = surface == number
+            beam = _Beam(
+                system,
+                every,
+                tuple(p.to(**options)[:, None].expand(where.shape)[where] for p in points),
+                pupil,
+                middle.to(**options).expand(*where.shape, 2)[where],
+                arms.to(**options)[where],
+                int(number),
+                backend,
+            )
+            found = beam.at_edge(radius.to(**options)[where])
+            new = found.counts & ~done[:, where]
+            weight = _added(weight, where, torch.where(new, found.weight, 0.0) / surface.shape[-1])
+            parts = [
+                _filled(part, where, torch.where(new, c, part[:, where]))
+                for part, c in zip(parts, found.ray, strict=True)
+            ]
+            done = _filled(done, where, done[:, where] | new)
+            others[where] = torch.where(new, 0, found.other).amax(0)
+        # Near where two edges cross, the light ends at the other one.
+        surface = torch.where(done.all(0), 0, others)
+        if not bool((surface > 0).any()):
+            break
     return EdgeRays(Components(*parts), weight)
+
+
+def _added(whole: Tensor, where: Tensor, values: Tensor) -> Tensor:
+    """(C, P, J) with values (C, n) added where a mask (P, J) says so."""
+    return whole + torch.zeros_like(whole).masked_scatter(where.expand(whole.shape), values)
+
+
+class _Found(NamedTuple):
+    """Rays (C, n) in object space, their weights, which of them are at the light's edge, and the
+    surface whose edge is within it, or 0.
+    """
+
+    ray: Components
+    weight: Tensor
+    counts: Tensor
+    other: Tensor
 
 
 def _filled(whole: Tensor, where: Tensor, values: Tensor) -> Tensor:
@@ -134,20 +165,21 @@ class _Beam:
         slope = torch.ones_like(radius)
         for _ in range(_ITERATIONS):
             step = _STEP * radius
-            near, far = self.distance(radius - step, pupil), self.distance(radius + step, pupil)
-            slope = (far - near) / (2.0 * step)
-            change = -0.5 * (near + far) / torch.where(slope < 0.0, slope, 1.0)
+            here, further = self.distance(radius, pupil), self.distance(radius + step, pupil)
+            slope = (further - here) / step
+            change = -here / torch.where(slope < 0.0, slope, 1.0)
             radius = radius + torch.where(slope < 0.0, change, 0.0).clamp(-0.1, 0.1)
         return radius, slope
 
-    def at_edge(self, radius: Tensor) -> tuple[Components, Tensor]:
-        """Rays (C, n) in object space at the edge, and J times their weights."""
+    def at_edge(self, radius: Tensor) -> _Found:
+        """Rays (C, n) at the edge, from radii (n,) near it; weights are those of J = 1 azimuths."""
         still = self.pupil.numbers()
         radius = radius.expand(len(self.wavelength), -1)
         radius, slope = self.refined(radius, still)
         with torch.no_grad():
-            inside, passes = self._through(radius * (1.0 - _BESIDE), still)
-            _, beyond = self._through(radius * (1.0 + _BESIDE), still)
+            beside = _BESIDE[self.system.dtype]
+            inside, passes, other = self._through(radius * (1.0 - beside), still)
+            _, beyond, _ = self._through(radius * (1.0 + beside), still)
             place = (self.middle + radius[..., None] * self.arms).norm(dim=-1)
             counts = passes & ~beyond & (place < 1.0) & (slope < 0.0) & (radius > 0.0)
             safe = torch.where(slope < 0.0, slope, -1.0)
@@ -156,11 +188,12 @@ class _Beam:
             factor = torch.where(counts, -2.0 * radius * inside.n**4 * share / safe, 0.0)
         distance = self.distance(radius, self.pupil)
         moved = distance - distance.detach()
-        return inside, factor * moved
+        return _Found(inside, factor * moved, counts, other)
 
-    def _through(self, radius: Tensor, pupil: ExitPupil) -> tuple[Components, Tensor]:
-        """Rays before the lens, and which got there."""
+    def _through(self, radius: Tensor, pupil: ExitPupil) -> tuple[Components, Tensor, Tensor]:
+        """Rays before the lens, which got there, and the edge that stopped the others, or 0."""
         rays = Rays.from_components(self.rays(radius, pupil), self.wavelength)
         hit = trace_rays(self.system, rays, self.backend, -1.0, record=False, first=1, last=None)
         there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
-        return there, hit.valid & (there.n < 0.0)
+        clipped = torch.where(hit.status == Status.VIGNETTED, hit.surface.long(), 0)
+        return there, hit.valid & (there.n < 0.0), clipped

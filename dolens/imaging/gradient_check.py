@@ -81,7 +81,11 @@ def natural_scale(lens: Lens, name: str) -> float:
 
 
 def gradient_rows(
-    loss: Loss, lens: Lens, names: Sequence[str], seeds: Sequence[int]
+    loss: Loss,
+    lens: Lens,
+    names: Sequence[str],
+    seeds: Sequence[int],
+    step: float | None = None,
 ) -> list[GradientRow]:
     """Compare derivatives of a loss with differences of it, one parameter after the other.
 
@@ -91,6 +95,8 @@ def gradient_rows(
         lens: where the parameters' values come from.
         names: of the parameters.
         seeds: of the samples; two at least for a noise.
+        step: of the differences in units of the scale; None: one that changes the loss by some
+            thousandths, which drowns the noise of samples that cross an edge.
     """
     stored = {n: p.detach() for n, p in lens.named_parameters()}
     for name in names:
@@ -109,7 +115,7 @@ def gradient_rows(
                 for n, g in zip(names, gradients, strict=True)
             }
         )
-    return [_row(loss, lens, start, name, seeds, [f[name] for f in found]) for name in names]
+    return [_row(loss, lens, start, name, seeds, [f[name] for f in found], step) for name in names]
 
 
 @torch.no_grad()
@@ -120,6 +126,7 @@ def _row(
     name: str,
     seeds: Sequence[int],
     autograd: Sequence[float],
+    step: float | None,
 ) -> GradientRow:
     scale = natural_scale(lens, name)
 
@@ -130,11 +137,11 @@ def _row(
         )
         return up, down
 
-    step = _FIRST
-    up, down = pair(step, seeds[0])
-    size = 0.5 * abs(up + down)
-    change = max(abs(up - down) / 2.0, 1e-12 * size)
-    step = min(max(step * _CHANGE * size / change, _LEAST), _LARGEST)
+    if step is None:
+        up, down = pair(_FIRST, seeds[0])
+        size = 0.5 * abs(up + down)
+        change = max(abs(up - down) / 2.0, 1e-12 * size)
+        step = min(max(_FIRST * _CHANGE * size / change, _LEAST), _LARGEST)
     differences = []
     for seed in seeds:
         up, down = pair(step, seed)

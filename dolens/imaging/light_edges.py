@@ -16,7 +16,7 @@ from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
 
 # Azimuths of the edge, points along each side of the disc in the search for its middle, and
 # halvings of the interval that the edge lies in: Newton's iteration does the rest.
-AZIMUTHS, _SIDE, _HALVINGS = 48, 20, 9
+AZIMUTHS, _SIDE, _HALVINGS = 48, 20, 10
 # Radii of a symmetric lens, or points along each side of the sensor of another.
 _RADII, _GRID = 17, 5
 # An edge as near to the disc's own cuts no light that counts.

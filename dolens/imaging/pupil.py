@@ -25,6 +25,8 @@ _RADII = 64
 _NEGLIGIBLE = 2e-3
 # Radii, over the axial one, at which that light is looked for: the crescent may be a thin one.
 _LARGEST, _FINE_RADII = 2.0, 256
+# A larger disc is wider than what was found by this factor, and by whole shares 1/_STEPS.
+_ROOM, _STEPS = 1.01, 32
 
 
 class ExitPupil(NamedTuple):
@@ -90,8 +92,8 @@ def sampled_exit_pupil(
     axial = axial_exit_pupil(system, wavelengths, backend)
     options = {"dtype": system.dtype, "device": system.device}
     places = torch.tensor([0.0, 0.25, 0.75, 1.0], **options)
-    rows = torch.stack((places, places)).flatten() * (sensor.height - 1)
-    columns = torch.stack((places, 1.0 - places)).flatten() * (sensor.width - 1)
+    rows = torch.stack((places, places)).flatten() * sensor.height - 0.5
+    columns = torch.stack((places, 1.0 - places)).flatten() * sensor.width - 0.5
     x, y = (p[:, None, None] for p in sensor.positions(rows, columns))
     angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
     share = (torch.arange(_FINE_RADII, **options)[:, None] + 0.5) * (_LARGEST / _FINE_RADII)
@@ -106,7 +108,9 @@ def sampled_exit_pupil(
     if float(lost.max()) <= _NEGLIGIBLE:
         return axial
     farthest = float(torch.where(passes, share, 0.0).max()) + 0.5 * _LARGEST / _FINE_RADII
-    return axial._replace(radius=farthest * axial.radius)
+    # Room for other colours and azimuths, and steps that hardly any change of the lens passes.
+    larger = math.ceil(_ROOM * farthest * _STEPS) / _STEPS
+    return axial._replace(radius=larger * axial.radius)
 
 
 @torch.no_grad()
