@@ -185,7 +185,9 @@ class _Beam:
             safe = torch.where(slope < 0.0, slope, -1.0)
             share = (still.radius / still.axial_radius) ** 2
             share = share / still.axial_mean(float(self.system.vertices[-1].detach()))
-            factor = torch.where(counts, -2.0 * radius * inside.n**4 * share / safe, 0.0)
+            # cos⁴ of the ray at the sensor, as every sample's.
+            bright = self.rays(radius, still).n ** 4
+            factor = torch.where(counts, -2.0 * radius * bright * share / safe, 0.0)
         distance = self.distance(radius, self.pupil)
         moved = distance - distance.detach()
         return _Found(inside, factor * moved, counts, other)
