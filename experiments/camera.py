@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from dolens.errors import InputError
 from dolens.imaging.color import linear_to_srgb
 from dolens.optics.lens import Lens
-from dolens.optimize.operands import View, operand
 from dolens.optimize.variables import DesignVariables
 from dolens.reconstruction import (
     RelativisticDiscriminators,
@@ -23,6 +22,8 @@ from dolens.reconstruction import (
     structural_similarity,
 )
 from experiments.adversary import Adversary
+from experiments.camera_operands import CameraOperands
+from experiments.checkpoints import refuse_another
 from experiments.lens_least_squares import LensLeastSquares
 from experiments.photograph_scores import PhotographScores, scores_by_photograph
 from experiments.views.base import Comparison, Imaging, Views
@@ -50,7 +51,8 @@ class CameraModule(lightning.LightningModule):
         variables: settings of `DesignVariables`; empty or None trains the network alone.
         discriminator: judges the restored images besides; None for no adversarial term.
         operands: what the lens must be besides, as of a merit function: Σ (weight·deviation)² is
-            added to the loss.
+            added to the loss.  Objects are at the views' `object_distance`; see `CameraOperands`.
+            A step of the lens after which a chief ray does not reach the stop is taken back.
         view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
     """
 
@@ -73,7 +75,7 @@ class CameraModule(lightning.LightningModule):
         self.lens = lens.requires_grad_(False)
         self.variables = DesignVariables(lens, variables or {})
         self.variables.write_to(self.lens)
-        self.operands = [operand(settings, lens) for settings in operands]
+        self.operands = CameraOperands(operands, lens, views.object_distance)
         self.network = network
         self.loss = loss
         self.adversary = Adversary(discriminator, learning_rates) if discriminator else None
@@ -95,6 +97,7 @@ class CameraModule(lightning.LightningModule):
         steps = self.lens_steps if len(self.variables) else None
         self._spots = views.spots(self.lens, steps.rings, steps.arms) if steps else []
         views.check(lens)
+        self.operands.check(lens, self.variables())
         missing = {"optics", "network"} - set(self.learning_rates)
         if missing:
             raise InputError(f"learning_rates: '{missing.pop()}' is missing (optics and network)")
@@ -128,15 +131,7 @@ class CameraModule(lightning.LightningModule):
 
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """What the operands add to the loss, and their values by label."""
-        found: dict[str, Tensor] = {}
-        total = torch.zeros((), device=self.lens.device)
-        if self.operands:
-            view = View(self.lens.system(values), self.lens.primary_wavelength, None)
-            for entry in self.operands:
-                for label, value in entry.values(view).items():
-                    found[label] = value.detach()
-                    total = total + (entry.weight * entry.deviation(value)).square()
-        return total, found
+        return self.operands.penalty(self.lens, values)
 
     def _functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
         """Point spread functions of the lens as it is, where the network asks for them."""
@@ -238,6 +233,7 @@ class CameraModule(lightning.LightningModule):
         """Step; move the lens, if that is done apart; project its variables onto their bounds (S17)
         and store them in it.  A checkpoint of this step has it all.
         """
+        before = self.variables.scaled.detach().clone()
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         # `global_step` counts this step only when this method is done.
         if not len(self.variables):
@@ -248,11 +244,26 @@ class CameraModule(lightning.LightningModule):
                 pitch, group = self.views.sensor.pixel_pitch, optimizer.param_groups[0]
                 share = group["lr"] / self.learning_rates["network"]
                 found = self.lens_steps.step(
-                    self.lens, self.variables, self._spots, pitch, self.operands, share
+                    self.lens,
+                    self.variables,
+                    self._spots,
+                    pitch,
+                    self.operands.entries,
+                    share,
+                    self.operands.object_distance,
                 )
                 self.log_dict({f"lens_step/{name}": value for name, value in found.items()})
         self.variables.project()
+        self.operands.take_back_if_unreachable(
+            self.lens, self.variables, before, lambda: self._forget_last_step(optimizer)
+        )
         self.variables.write_to(self.lens)
+
+    def _forget_last_step(self, optimizer: Any) -> None:
+        """Drop what led to the lens's last step: Adam's momentum, least squares' reach."""
+        optimizer.state.pop(self.variables.scaled, None)
+        if self.lens_steps is not None:
+            self.lens_steps.reject()
 
     def on_after_backward(self) -> None:
         """Close the optics' share of the backward pass."""
@@ -348,9 +359,12 @@ class CameraModule(lightning.LightningModule):
             numbers |= self.test_scores.numbers("test")
         if isinstance(getattr(self.network, "pretrained", None), bool):
             numbers["network/pretrained"] = float(self.network.pretrained)
-        numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
+        if hasattr(self.loss, "perceptual_available"):  # a loss of a user's own may know no such
+            numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.views.rays())
         numbers |= self.views.numbers()
+        if self.operands.entries:
+            numbers["lens_steps/taken_back"] = float(self.operands.taken_back)
         if self.lens_steps is not None:
             numbers |= self.lens_steps.numbers()
         if self.step_seconds:
@@ -374,7 +388,7 @@ class CameraModule(lightning.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say whose checkpoint it is, in plain values."""
-        checkpoint["dolens"] = self._identity()
+        checkpoint["dolens"] = self.identity()
         checkpoint["dolens_views"] = self.views.state()
         if self.lens_steps is not None:
             checkpoint["dolens_lens_steps"] = self.lens_steps.state()
@@ -383,22 +397,15 @@ class CameraModule(lightning.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a checkpoint of another experiment before any weight is loaded."""
-        found, own = checkpoint.get("dolens"), self._identity()
-        if not isinstance(found, dict):
-            raise InputError("ckpt_path: this file is no checkpoint of a dolens camera")
-        for key, value in own.items():
-            if found.get(key) != value:
-                raise InputError(
-                    f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
-                    f"{value!r}; resume with the experiment and settings that wrote it"
-                )
+        refuse_another(checkpoint.get("dolens"), self.identity())
         self.views.load_state(self.lens, checkpoint.get("dolens_views", {}))
         if self.lens_steps is not None and "dolens_lens_steps" in checkpoint:
             self.lens_steps.load_state(checkpoint["dolens_lens_steps"])
         if self.adversary is not None:
             self.adversary.optimizer.load_state_dict(checkpoint["dolens_adversary"])
 
-    def _identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must have in common with this module, as plain values."""
         return {
             "experiment": self.experiment,
             "lens": self.lens.name,

@@ -21,6 +21,7 @@ from dolens.optimize.merit import MeritValue
 from dolens.optimize.rims import fitted_semi_diameters
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
+from experiments.checkpoints import refuse_another
 from experiments.design_tables import iteration_row, spot_labels, spot_table
 from experiments.search import Progress, gradient_iteration, least_squares_iteration
 
@@ -230,6 +231,14 @@ class DesignModule(lightning.LightningModule):
     def on_fit_end(self) -> None:
         """Leave the lens of the best round."""
         self._fit_seconds = time.perf_counter() - self._fit_started
+        self._leave_best()
+
+    def on_test_start(self) -> None:
+        """The same with a checkpoint's best round, where nothing was trained."""
+        if not self._fit_seconds and math.isfinite(float(self.best_merit)):
+            self._leave_best()
+
+    def _leave_best(self) -> None:
         with torch.no_grad():
             self.variables.scaled.copy_(self.best)
             self.variables.write_to(self.lens)
@@ -346,7 +355,7 @@ class DesignModule(lightning.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say which design it is, and what has been done."""
-        checkpoint["dolens"] = self._identity()
+        checkpoint["dolens"] = self.identity()
         checkpoint["history"] = self.history
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -355,16 +364,11 @@ class DesignModule(lightning.LightningModule):
         Raises:
             InputError: it is one.
         """
-        found, own = checkpoint.get("dolens"), self._identity()
-        for key, value in own.items():
-            if not isinstance(found, dict) or found.get(key) != value:
-                raise InputError(
-                    f"ckpt_path: the checkpoint's {key} is not this run's, {value!r}; resume with "
-                    "the experiment and settings that wrote it"
-                )
+        refuse_another(checkpoint.get("dolens"), self.identity())
         self.history = list(checkpoint.get("history", []))
 
-    def _identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must have in common with this module, as plain values."""
         return {
             "experiment": self.experiment,
             "lens": self.lens.name,

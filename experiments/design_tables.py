@@ -8,7 +8,11 @@ from dolens.optics.lens import Lens
 from dolens.optimize import MeritFunction, MeritSettings
 from experiments.search import Progress
 
-_DEFAULTS = {"gaussian_quadrature": {"rings": 6, "arms": 12}, "square_grid": {"count": 31}}
+SQUARE_GRID_COUNT = 31
+_DEFAULTS = {
+    "gaussian_quadrature": {"rings": 6, "arms": 12},
+    "square_grid": {"count": SQUARE_GRID_COUNT},
+}
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,7 @@ class LensLeastSquares:
         pitch: float,
         operands: Sequence[Operand] = (),
         share: float = 1.0,
+        object_distance: float | None = None,
     ) -> dict[str, float]:
         """One step, by the gradient that was gathered; it is used up.
 
@@ -128,9 +129,13 @@ class LensLeastSquares:
             pitch: of the pixels, mm.
             operands: what the lens must be besides; the gradient is without them.
             share: of the reach, as a schedule has it.
+            object_distance: of the operands, mm in front of the first vertex; None for infinity.
 
         Returns:
             Numbers to log: `reach` (pixels), `slope_kept` by the last step, `moved` (RMS, pixels).
+
+        Raises:
+            UnreachableField: a chief ray that operands ask for does not reach the stop.
         """
         gathered, self._gathered = self._gathered, None
         if gathered is None or not share > 0.0:
@@ -156,7 +161,7 @@ class LensLeastSquares:
             self.reach * share * pitch,
             lower.clamp(max=0.0),
             upper.clamp(min=0.0),
-            OperandModel.of(lens, variables, operands, None) if operands else None,
+            OperandModel.of(lens, variables, operands, object_distance) if operands else None,
         )
         scaled.copy_(point + step)
         variables.project()
@@ -164,6 +169,11 @@ class LensLeastSquares:
         self.taken += 1
         self._last, self._slope = step, float(gradient @ step)
         return numbers | {"reach": self.reach, "moved": float((moves @ step).norm()) / pitch}
+
+    def reject(self) -> None:
+        """Move rays less far the next time: the lens cannot be judged after the last step."""
+        self.reach = max(_SHORTER * self.reach, self.least)
+        self._last, self._slope = None, 0.0
 
     def numbers(self) -> dict[str, float]:
         """How many steps were taken, and how far rays may move now (pixels)."""

@@ -20,6 +20,7 @@ from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImage, SpotImager
 from dolens.optics.lens import Lens
+from experiments.checkpoints import refuse_another
 from experiments.pose_iteration import iterate, loss_of, optimizer_of, slopes_of
 from experiments.pose_measurements import draw, repetitions, simulated_at
 from experiments.pose_results import (
@@ -331,7 +332,7 @@ class MisalignmentModule(lightning.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say which experiment it is, and what has been done."""
-        checkpoint["dolens"] = self._identity()
+        checkpoint["dolens"] = self.identity()
         checkpoint["history"], checkpoint["seconds"] = self.history, self.seconds
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -340,14 +341,12 @@ class MisalignmentModule(lightning.LightningModule):
         Raises:
             InputError: it is one.
         """
-        if checkpoint.get("dolens") != self._identity():
-            raise InputError(
-                "ckpt_path: the checkpoint is of another experiment, other fits or other stages"
-            )
+        refuse_another(checkpoint.get("dolens"), self.identity())
         self.history = list(checkpoint.get("history", []))
         self.seconds = dict(checkpoint.get("seconds", {}))
 
-    def _identity(self) -> dict[str, Any]:
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must have in common with this module, as plain values."""
         return {
             "experiment": self.experiment,
             "lens": self.lens.name,

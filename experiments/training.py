@@ -17,7 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription, save_lens
 from experiments.callbacks.interruption import InterruptionNotice
+from experiments.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
 from experiments.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
+from experiments.unread_settings import refuse_unread
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +32,13 @@ OmegaConf.register_new_resolver(
 )
 OmegaConf.register_new_resolver("count", len, replace=True)
 
+# The top-level keys that `run` itself takes; all others must be read by one of these.
+TAKEN = (
+    *("lens", "module", "data", "callbacks", "logger", "trainer"),
+    *("seed", "backend", "lens_dtype", "threads", "matmul_precision"),
+    *("train", "test", "ckpt_path", "objective"),
+)
+
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -38,6 +47,8 @@ def run(cfg: DictConfig) -> float:
     started = time.perf_counter()
     folder = Path(HydraConfig.get().runtime.output_dir)
     refuse_subprocess_ddp_in_sweep(cfg)
+    refuse_unread(cfg, TAKEN)
+    settings = settings_of(cfg)  # before Hydra resolves in place what it instantiates
     if str(cfg.objective).startswith("test/") and not cfg.test:
         raise InputError(f"objective: '{cfg.objective}' needs test=true, or name another metric")
     if cfg.threads:
@@ -47,9 +58,14 @@ def run(cfg: DictConfig) -> float:
     torch.set_float32_matmul_precision(cfg.matmul_precision)
     lens = build_lens(cfg)
     module = instantiate(cfg.module)(lens=lens)
+    checkpoint = cfg.ckpt_path
+    if checkpoint is not None:
+        refuse_idle_checkpoint(cfg, module)
+        checkpoint = checked_checkpoint(checkpoint, module, settings, cfg.train)
     data = instantiate(cfg.data)
     callbacks = [instantiate(c) for c in (cfg.callbacks or {}).values() if c]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
+    callbacks.append(SettingsInCheckpoints(settings))
     loggers = [instantiate(entry) for entry in (cfg.logger or {}).values() if entry]
     trainer: lightning.Trainer = instantiate(cfg.trainer, callbacks=callbacks, logger=loggers)
     (folder / "lens").mkdir(exist_ok=True)
@@ -62,13 +78,13 @@ def run(cfg: DictConfig) -> float:
     status = "failed"
     try:
         if cfg.train:
-            trainer.fit(
-                module, data, ckpt_path=checked_checkpoint(cfg.ckpt_path), weights_only=True
-            )
+            trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
         metrics: dict[str, Any] = dict(trainer.callback_metrics)
         if cfg.test:
             # The weights as the last step left them: every run is judged after the same work.
-            trainer.test(module, data, verbose=False)
+            # Where nothing was trained, they are the checkpoint's.
+            trained = None if cfg.train else checkpoint
+            trainer.test(module, data, ckpt_path=trained, weights_only=True, verbose=False)
             metrics.update(trainer.callback_metrics)
         status = "finished"
     except (KeyboardInterrupt, SystemExit):  # Lightning turns Ctrl-C into an exit
@@ -77,7 +93,7 @@ def run(cfg: DictConfig) -> float:
     finally:
         save_lens(module.lens, folder / "lens" / "final.yaml")
         write_json(folder / "run.json", {**info, "status": status})
-    metrics.update(getattr(module, "summary", dict)())
+    metrics.update(summary_of(module))
     metrics["cost/wall_s"] = time.perf_counter() - started
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
     numbers = plain_metrics(metrics)
@@ -85,7 +101,8 @@ def run(cfg: DictConfig) -> float:
     for entry in loggers:
         # Once, at the end and with the metrics, or TensorBoard's HPARAMS tab stays empty.
         if isinstance(entry, TensorBoardLogger):
-            entry.log_hyperparams(hyperparameters(cfg), numbers)
+            # At the last step: a loader takes a step back for a restart, and drops all before it.
+            entry.log_hyperparams(hyperparameters(cfg), numbers, step=trainer.global_step)
         entry.finalize("success")
     logger.info("Run folder: %s", folder)
     if cfg.objective not in numbers:
@@ -112,22 +129,34 @@ def build_lens(cfg: DictConfig) -> Any:
     )
 
 
-def checked_checkpoint(path: str | None) -> str | None:
-    """The path, if it can be loaded safely.
+def refuse_idle_checkpoint(cfg: DictConfig, module: lightning.LightningModule) -> None:
+    """Refuse a checkpoint that nothing would load.
 
     Raises:
-        InputError: the file is missing or is no checkpoint of plain tensors and values.
+        InputError: the run neither trains nor tests, or its module trains nothing.
     """
-    if path is None:
-        return None
-    if not Path(path).is_file():
-        raise InputError(f"ckpt_path: {path} does not exist")
+    if not (cfg.train or cfg.test):
+        raise InputError("ckpt_path: train=false test=false loads no checkpoint; leave it out")
+    if type(module).training_step is lightning.LightningModule.training_step:
+        raise InputError(
+            f"ckpt_path: {type(module).__name__} trains nothing that a checkpoint could hold; "
+            "leave it out"
+        )
+
+
+def summary_of(module: lightning.LightningModule) -> dict[str, float]:
+    """What a module says of the whole run; nothing where it fails, which is logged.
+
+    The run is finished: what was measured before must not be lost with this.
+    """
     try:
-        torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"ckpt_path: {path} is not a safe checkpoint ({reason})") from None
-    return path
+        return plain_metrics(getattr(module, "summary", dict)())
+    except Exception:
+        logger.exception(
+            "%s.summary() failed: metrics.json is written without its numbers",
+            type(module).__name__,
+        )
+        return {}
 
 
 def refuse_subprocess_ddp_in_sweep(cfg: DictConfig) -> None:

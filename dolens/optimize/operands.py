@@ -26,7 +26,19 @@ _KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
 
 
 class UnreachableField(ArithmeticError):
-    """The chief ray of a field does not reach the stop: the lens cannot be judged."""
+    """The chief ray of a field does not reach the stop: the lens cannot be judged.
+
+    Args:
+        field: (x, y), degrees or mm.
+    """
+
+    def __init__(self, field: tuple[float, float]) -> None:
+        super().__init__(field)
+        self.field = field
+
+    def __str__(self) -> str:
+        x, y = self.field
+        return f"the chief ray of field ({x:g}, {y:g}) does not reach the stop"
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.reconstruction.edge_weights import MEAN, STANDARD_DEVIATION, load_edge_weights
 from dolens.reconstruction.perceptual import VGG16Features, load_vgg16_weights, perceptual_loss
 from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
 
 logger = logging.getLogger(__name__)
 
-PERCEPTUAL_CHOICES = ("auto", "vgg16", "none")
+PERCEPTUAL_CHOICES = ("auto", "vgg16", "vgg16_edges", "none")
 
 
 def mean_squared_error(restored: Tensor, truth: Tensor) -> Tensor:
@@ -65,8 +66,9 @@ class RestorationLoss(nn.Module):
         tv_weight: α₂.
         perceptual_weight: α₃; at 0 no VGG-16 weights are looked for.
         perceptual: "vgg16" requires the perceptual term; "auto" leaves it out, with a warning,
-            where VGG-16's weights cannot be had; "none" leaves it out.
-        vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`.
+            where VGG-16's weights cannot be had; "vgg16_edges" requires it with weights that were
+            trained on to find edges, whose features are larger; "none" leaves it out.
+        vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`, `load_edge_weights`.
         l1_weight: of the mean absolute error; at 0 it is not computed.
 
     Attributes:
@@ -74,7 +76,7 @@ class RestorationLoss(nn.Module):
 
     Raises:
         InputError: a negative weight, another word for `perceptual`, or a wrong weights file.
-        PretrainedWeightsUnavailable: `perceptual="vgg16"` and no weights were found.
+        PretrainedWeightsUnavailable: `perceptual` requires weights and none were found.
     """
 
     def __init__(
@@ -152,6 +154,12 @@ def _check_choice(perceptual: str) -> None:
 
 
 def _find_features(perceptual: str, vgg16_weights: str | None) -> tuple[VGG16Features, ...]:
+    if perceptual == "vgg16_edges":
+        weights = load_edge_weights(vgg16_weights)
+        logger.warning(
+            "THE PERCEPTUAL TERM IS THAT OF EDGES: VGG-16 trained on with BSDS500, not S20's"
+        )
+        return (VGG16Features(weights, MEAN, STANDARD_DEVIATION),)
     try:
         return (VGG16Features(load_vgg16_weights(vgg16_weights)),)
     except PretrainedWeightsUnavailable as error:

@@ -1,6 +1,6 @@
 """The perceptual loss: distance between images as the first layers of VGG-16 see them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +31,9 @@ class VGG16Features(nn.Module):
     quarter of the resolution.
 
     Args:
-        weights: what `load_vgg16_weights` returns; copied as float32.
+        weights: what `load_vgg16_weights` or `load_edge_weights` returns; copied as float32.
+        mean: of R, G, B in [0, 1], which the weights were trained with; default: ImageNet's.
+        standard_deviation: likewise.
 
     Raises:
         RuntimeError: names or shapes in `weights` that do not fit (as `load_state_dict`).
@@ -40,13 +42,18 @@ class VGG16Features(nn.Module):
     mean: Tensor
     standard_deviation: Tensor
 
-    def __init__(self, weights: Mapping[str, Tensor]) -> None:
+    def __init__(
+        self,
+        weights: Mapping[str, Tensor],
+        mean: Sequence[float] = IMAGENET_MEAN,
+        standard_deviation: Sequence[float] = IMAGENET_STANDARD_DEVIATION,
+    ) -> None:
         super().__init__()
         self.layers = _empty_layers()
         copies = {name: value.detach().float().clone() for name, value in weights.items()}
         self.layers.load_state_dict(copies, assign=True)
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1))
-        deviation = torch.tensor(IMAGENET_STANDARD_DEVIATION).view(3, 1, 1)
+        self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1))
+        deviation = torch.tensor(standard_deviation).view(3, 1, 1)
         self.register_buffer("standard_deviation", deviation)
         self.requires_grad_(False)
         self.eval()
@@ -54,7 +61,7 @@ class VGG16Features(nn.Module):
     def forward(self, image: Tensor) -> Tensor:
         """Map sRGB images (B, 3, H, W) to features (B, 256, H//4, W//4); H, W at least 4.
 
-        Values are clamped to [0, 1] and normalised as in ImageNet training.  Gradients reach
+        Values are clamped to [0, 1] and normalised as in the weights' training.  Gradients reach
         the image where it lies inside [0, 1].
         """
         return self.layers((image.clamp(0.0, 1.0) - self.mean) / self.standard_deviation)

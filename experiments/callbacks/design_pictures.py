@@ -14,6 +14,7 @@ from dolens.imaging.modulation import modulation
 from dolens.imaging.ray_fans import ray_fans
 from dolens.imaging.spots import spot_diagram, working_f_numbers
 from dolens.optics.lens import Lens
+from dolens.optimize import MeritSettings
 from dolens.plotting import (
     before_after_figure,
     history_figure,
@@ -25,7 +26,7 @@ from dolens.plotting import (
 )
 from experiments.callbacks.figures import log_figure
 from experiments.design import DesignModule
-from experiments.design_tables import spot_table
+from experiments.design_tables import SQUARE_GRID_COUNT, spot_table
 
 logger = logging.getLogger(__name__)
 
@@ -72,10 +73,12 @@ def design_drawings(
     waves = list(settings.wavelengths_of(lens))
     distance = lens.object_distance
 
+    pupil = pupil_note(settings)
+
     def spots(of: Lens, title: str) -> Figure:
-        return spots_figure(
-            spot_diagram(of, fields, waves, object_distance=distance), title=f"Spots, {title}"
-        )
+        found = spot_diagram(of, fields, waves, object_distance=distance)
+        rays = int((found.weight > 0.0).sum())
+        return spots_figure(found, title=f"Spots, {title}: {rays} rays over the whole stop{pupil}")
 
     def layouts() -> Figure:
         # Drawn in the y-z plane: fields beside it would be drawn elsewhere than they are.
@@ -94,7 +97,7 @@ def design_drawings(
             most = min(most, _BLURRED / max(blur, 1e-12))
         frequencies = torch.linspace(0.0, most, _FREQUENCIES, dtype=torch.float64)
         found = modulation(of, fields, waves, frequencies, object_distance=distance)
-        return modulation_figure(found, title=f"Geometric MTF, {title}")
+        return modulation_figure(found, title=f"Geometric MTF, {title}, of the whole stop{pupil}")
 
     def curves() -> Figure:
         return rms_curves_figure(
@@ -102,6 +105,7 @@ def design_drawings(
             if any(_size(field) > 0.0 for field in fields)
             else None,
             rms_against_wavelength(lens, fields, _interval(waves), object_distance=distance),
+            title=f"RMS spot radius, rays over the whole stop{pupil}",
         )
 
     drawings = {
@@ -109,7 +113,8 @@ def design_drawings(
         "spots": lambda: spots(lens, "final"),
         "spots_initial": lambda: spots(initial, "initial"),
         "ray_fans": lambda: ray_fans_figure(
-            ray_fans(lens, fields, waves, object_distance=distance), title="Ray fans, final"
+            ray_fans(lens, fields, waves, object_distance=distance),
+            title=f"Ray fans, final, across the whole stop{pupil}",
         ),
         "modulation": lambda: transfer(lens, "final"),
         "modulation_initial": lambda: transfer(initial, "initial"),
@@ -123,6 +128,31 @@ def design_drawings(
             merits, damping if any(value == value for value in damping) else None
         )
     return drawings
+
+
+def pupil_note(settings: MeritSettings) -> str:
+    """Lines for titles: which rays the run's RMS spot radii are of, where not the figure's.
+
+    The figures' rays fill the stop evenly, and radii count from each colour's own centroid.
+
+    Args:
+        settings: of `rms_spot_um`.
+
+    Returns:
+        Lines, each with a line break before it; empty where only the number of rays differs.
+    """
+    notes = []
+    if settings.sampling == "square_grid":
+        options = settings.sampling_options
+        count = options.get("count") or SQUARE_GRID_COUNT
+        half_width = options.get("half_width")
+        width = "the first surface" if half_width is None else f"±{half_width:g} mm"
+        notes.append(f"{count}×{count} rays over {width}")
+    if settings.colours == "together":
+        notes.append("one centroid for all colours")
+    if settings.reference == "chief":
+        notes.append("the chief ray as centre")
+    return "\n(rms_spot_um: " + ",\n".join(notes) + ")" if notes else ""
 
 
 def _size(field: tuple[float, float]) -> float:

@@ -56,7 +56,10 @@ class Imaging(Protocol):
 
     @property
     def object_distance(self) -> float:
-        """Of the scene, mm in front of the first vertex; for drawings."""
+        """Of the scene (the first of several depths), mm in front of the first vertex.
+
+        Operands and drawings of the lens take it.
+        """
 
     def labels(self) -> Sequence[str]:
         """Names of the evaluation's views, for metrics."""

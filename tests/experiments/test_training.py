@@ -21,7 +21,8 @@ from tiny_experiment import TINY, TINY_DOUBLET, TINY_NETWORK
 from dolens import load_lens
 from dolens.errors import InputError
 from dolens.imaging.readout import Readout
-from experiments.training import run
+from experiments.training import TAKEN, run
+from experiments.unread_settings import refuse_unread
 
 EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experiment").glob("*.yaml"))
 UNTESTED = ["test=false", "objective=train/loss"]
@@ -57,6 +58,7 @@ def test_every_experiment_composes_and_resolves(composed, name, tmp_path):
     assert cfg.module.experiment == name
     if name.startswith("wavefront_coding"):
         assert cfg.lens.surfaces["5"].type == "xy_polynomial"
+    refuse_unread(cfg, TAKEN)  # no experiment sets what nothing reads
 
 
 def test_a_run_leaves_the_whole_run_folder(composed, tmp_path):
@@ -346,7 +348,7 @@ BAD_INPUT = {
     "objective without its test": (["test=false"], "needs test=true"),
     "unknown precision": (["lens_dtype=float16"], "allowed: float32, float64"),
     "missing checkpoint": (["ckpt_path=nowhere.ckpt"], "nowhere.ckpt does not exist"),
-    "unknown perceptual loss": (["loss.perceptual=vgg"], "auto, vgg16, none"),
+    "unknown perceptual loss": (["loss.perceptual=vgg"], "auto, vgg16, vgg16_edges, none"),
     "missing weights": (
         ["loss.perceptual=vgg16", "loss.vgg16_weights=nowhere.pth"],
         "nowhere.pth",

@@ -154,7 +154,9 @@ def test_a_given_file_that_is_missing_is_an_error_in_every_mode(perceptual):
 
 
 def test_another_word_gets_the_allowed_ones_and_the_nearest():
-    with pytest.raises(InputError, match=r"vgg19: .* auto, vgg16, none; did you mean vgg16\?"):
+    with pytest.raises(
+        InputError, match=r"vgg19: .* auto, vgg16, vgg16_edges, none; did you mean vgg16\?"
+    ):
         RestorationLoss(perceptual="vgg19")
 
 

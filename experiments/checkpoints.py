@@ -1,0 +1,153 @@
+"""What a checkpoint says of the run that wrote it, and what a run that takes it up may change."""
+
+import logging
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from dolens.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+SETTINGS = "dolens_settings"
+# What a run may change without being another one: what it writes, and which parts of it are done.
+_FREE = ("hydra", "callbacks", "logger", "ckpt_path", "train", "test", "objective")
+# So many differences are named where a checkpoint is refused.
+_NAMED = 4
+
+
+class SettingsInCheckpoints(lightning.Callback):
+    """Writes a run's settings into its checkpoints, as plain values.
+
+    Args:
+        settings: name → value, as `settings_of` gives them.
+    """
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        self.settings = dict(settings)
+
+    def on_save_checkpoint(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        checkpoint: dict[str, Any],
+    ) -> None:
+        """Add them."""
+        checkpoint[SETTINGS] = dict(self.settings)
+
+
+def settings_of(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration that decides a run's numbers, flat: name → plain value.
+
+    Interpolations stay as they are written, so that a value that many parts refer to is there once,
+    and folders of the machine are not there at all.
+    """
+    kept = OmegaConf.masked_copy(cfg, [key for key in cfg if key not in _FREE])
+    return dict(_flat(OmegaConf.to_container(kept, resolve=False), ""))
+
+
+def _flat(node: Any, name: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            yield from _flat(value, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, node
+
+
+def checked_checkpoint(
+    path: str, module: lightning.LightningModule, settings: Mapping[str, Any], training: bool
+) -> str:
+    """The path of a checkpoint that a run can take up; one warning names every other difference.
+
+    Args:
+        path: of the file.
+        module: that is to be given its state.
+        settings: of this run, as `settings_of` gives them.
+        training: whether the run goes on training, and not only tests what was trained.
+
+    Raises:
+        InputError: the file is missing, is no checkpoint of plain tensors and values, or is of
+            another experiment, lens, network or (where training goes on) precision of the lens.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"ckpt_path: {path} does not exist")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"ckpt_path: {path} is not a safe checkpoint ({reason})") from None
+    if not isinstance(checkpoint, Mapping) or "state_dict" not in checkpoint:
+        raise InputError(f"ckpt_path: {path} holds no state of a module")
+    if callable(getattr(module, "identity", None)):
+        refuse_another(checkpoint.get("dolens"), module.identity())
+    written = checkpoint.get(SETTINGS)
+    if not isinstance(written, Mapping):
+        logger.warning(
+            "ckpt_path: %s does not say which settings it was written with (lens, seed, precision, "
+            "learning rates, ...); whether this run has the same ones is not known",
+            path,
+        )
+    else:
+        _compare(written, settings, training)
+    _refuse_other_shapes(checkpoint["state_dict"], module.state_dict())
+    return path
+
+
+def refuse_another(found: Any, own: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint whose module says that it is another one.
+
+    Args:
+        found: what the checkpoint says of its module.
+        own: what this run's module says of itself.
+
+    Raises:
+        InputError: they differ; the message names the first difference.
+    """
+    if not isinstance(found, Mapping):
+        raise InputError("ckpt_path: this file is no checkpoint of a dolens experiment")
+    for key, value in own.items():
+        if found.get(key) != value:
+            raise InputError(
+                f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
+                f"{value!r}; resume with the experiment and settings that wrote it"
+            )
+
+
+def _compare(written: Mapping[str, Any], own: Mapping[str, Any], training: bool) -> None:
+    names = [*own, *(name for name in written if name not in own)]
+    differences = {
+        name: f"{name} is {_shown(own, name)}, was {_shown(written, name)}"
+        for name in names
+        if name not in own or name not in written or own[name] != written[name]
+    }
+    fixed = [n for n in differences if n.startswith("lens.") or (training and n == "lens_dtype")]
+    if fixed:
+        more = f" and {len(fixed) - _NAMED} more" if len(fixed) > _NAMED else ""
+        raise InputError(
+            "ckpt_path: the checkpoint is of another lens, whose state it would put in the place "
+            f"of this one: {'; '.join(differences[n] for n in fixed[:_NAMED])}{more}"
+        )
+    if differences:
+        logger.warning(
+            "ckpt_path: this run differs from the one that wrote the checkpoint: %s. Weights, "
+            "learning rates and schedules that the checkpoint holds go on as they were",
+            "; ".join(differences.values()),
+        )
+
+
+def _shown(settings: Mapping[str, Any], name: str) -> str:
+    return repr(settings[name]) if name in settings else "not set"
+
+
+def _refuse_other_shapes(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+    for name, value in own.items():
+        if name in found and found[name].shape != value.shape:
+            raise InputError(
+                f"ckpt_path: {name} has shape {tuple(found[name].shape)} in the checkpoint and "
+                f"{tuple(value.shape)} in this run; resume with the settings that wrote it"
+            )

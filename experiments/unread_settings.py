@@ -1,0 +1,123 @@
+"""Settings that a user or an experiment makes and that nothing reads are errors.
+
+Whether a setting is read is tried out: the parts of the configuration that a run takes are resolved
+with it and without it.  A setting whose absence changes nothing is not read, whichever way an
+interpolation might have led to it.
+"""
+
+import copy
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import Any
+
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dolens.errors import InputError
+
+# Resolved to this where a part cannot be resolved at all.
+_BROKEN = object()
+
+
+def refuse_unread(cfg: DictConfig, taken: Sequence[str]) -> None:
+    """Refuse settings that nothing reads, before any work is done.
+
+    What the command line sets must be read, and so must every top-level key that differs from the
+    configuration without an experiment.  Defaults that an experiment does not use are allowed, and
+    so are settings without content: null, [] and {}.
+
+    Args:
+        cfg: the composed configuration, as Hydra gives it to the job.
+        taken: top-level keys that the run itself takes.
+
+    Raises:
+        InputError: the first such setting.
+    """
+    own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    OmegaConf.set_struct(own, False)
+    before = _resolved(own, taken)
+    if any(part is _BROKEN for part in before):
+        return  # what is wrong with it is said where it is used
+    named_by_hydra = str(OmegaConf.to_container(HydraConfig.instance().cfg.hydra, resolve=False))
+    choices = HydraConfig.get().runtime.choices
+    for path in (*_set_by_command_line(), *_set_by_experiment(own)):
+        top = path.split(".")[0]
+        if top in taken or f"${{{path}" in named_by_hydra or not _has_content(own, path):
+            continue
+        without = copy.deepcopy(own)
+        _delete(without, path)
+        if _resolved(without, taken) == before:
+            choice = choices.get(top)
+            setting = f"{path}={choice}" if path == top and choice else path
+            raise InputError(
+                f"{setting}: nothing in experiment={choices.get('experiment')} reads this setting; "
+                "leave it out, or give it to what should read it in the experiment's file"
+            )
+
+
+def _resolved(cfg: DictConfig, taken: Sequence[str]) -> list[Any]:
+    """The parts that a run takes, as plain containers with no interpolation left."""
+    found = []
+    for key in taken:
+        try:
+            node = cfg.get(key)
+            is_node = isinstance(node, DictConfig | ListConfig)
+            found.append(OmegaConf.to_container(node, resolve=True) if is_node else node)
+        except OmegaConfBaseException:
+            found.append(_BROKEN)
+    return found
+
+
+def _set_by_command_line() -> Iterator[str]:
+    """Paths of what the job's overrides set."""
+    task = list(HydraConfig.get().overrides.task)
+    for override in OverridesParser.create().parse_overrides(task):
+        path = _path_of(override)
+        if path is not None and path != "experiment":
+            yield path
+
+
+def _path_of(override: Override) -> str | None:
+    """Where an override puts its value; None where it deletes."""
+    if override.is_delete():
+        return None
+    path = override.package if override.package is not None else override.key_or_group
+    return path.replace("/", ".")
+
+
+def _set_by_experiment(cfg: DictConfig) -> Iterator[str]:
+    """Top-level keys that differ from the configuration without an experiment."""
+    if not GlobalHydra.instance().is_initialized():
+        return  # a launcher that brings its jobs to other processes: they cannot compose
+    sources = tuple(source.path for source in HydraConfig.get().runtime.config_sources)
+    plain = _without_experiment(HydraConfig.get().job.config_name or "train", sources)
+    for key, value in OmegaConf.to_container(cfg, resolve=False).items():
+        if key not in plain or value != plain[key]:
+            yield str(key)
+
+
+@cache
+def _without_experiment(name: str, sources: tuple[str, ...]) -> dict[str, Any]:
+    """The defaults; composed once for all jobs of a sweep."""
+    return OmegaConf.to_container(compose(name, overrides=["~experiment"]), resolve=False)
+
+
+def _has_content(cfg: DictConfig, path: str) -> bool:
+    """Whether there is something at a path that could be read."""
+    try:
+        node = OmegaConf.select(cfg, path, throw_on_missing=False)
+    except OmegaConfBaseException:
+        return True
+    return node is not None and not (isinstance(node, DictConfig | ListConfig) and not len(node))
+
+
+def _delete(cfg: DictConfig, path: str) -> None:
+    """Take away what lies at a path."""
+    parent, _, last = path.rpartition(".")
+    node = OmegaConf.select(cfg, parent) if parent else cfg
+    del node[int(last) if isinstance(node, ListConfig) else last]
