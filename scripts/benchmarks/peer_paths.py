@@ -1,5 +1,6 @@
 """Where other programs lie: the command line's words, what is skipped, and versions."""
 
+import re
 import sys
 import types
 from collections.abc import Mapping, Sequence
@@ -70,4 +71,10 @@ def _version(peer: type[Peer], folder: Path) -> str:
     for found in distributions(path=[str(folder)]):
         if found.name == peer.module:
             return found.version
+    # What a checkout without its history says of itself.
+    for file in (folder / "pyproject.toml", folder / peer.module / "version.py"):
+        if file.is_file():
+            said = re.search(r"""version(?:__)?\s*=\s*["']([^"']+)""", file.read_text("utf-8"))
+            if said:
+                return said[1]
     return "of unknown version"
