@@ -50,7 +50,7 @@ def measure(
     if "peer_render" in parts and "do" in paths:
         peer_renders.measure(results, plan.seconds, plan.threads[-1])
     if "peer_design" in parts:
-        peer_designs.measure(results, paths, plan.threads[-1], quick)
+        peer_designs.measure(results, paths, plan.lenses, plan.threads[-1], quick)
 
 
 def _compare(
