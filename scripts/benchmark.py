@@ -2,7 +2,8 @@
 
 python scripts/benchmark.py --quick        about two minutes
 python scripts/benchmark.py                everything; about three quarters of an hour on two cores
-python scripts/benchmark.py --peers        with Optiland and the source's program, where installed
+python scripts/benchmark.py --peers do=PATH deeplens=PATH optiland=PATH
+                                           other programs beside ours; see docs/peers.md
 
 Writes outputs/benchmark/<date_time>/{results.csv,results.json,benchmark.png}.  Contenders run by
 turns on the same rays; numbers are medians with quartiles; ratios are of neighbouring runs.
@@ -22,6 +23,7 @@ from benchmarks import (
     figure,
     jacobians,
     memory,
+    peer_paths,
     peers,
     rendering,
     starting,
@@ -30,6 +32,8 @@ from benchmarks import (
 from benchmarks.cases import LENSES, ROOT
 from benchmarks.results import Results
 from benchmarks.tracing import FORWARD, GRADIENT, GRADIENT_OF_RAYS, Plan, compare
+
+from dolens.errors import InputError
 
 PARTS = ("trace", "rays", "memory", "peak", "jacobian", "b_spline", "render", "start")
 BUSY = 0.7  # processes of the last minute
@@ -41,26 +45,36 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     many = _list_of(str)
     parser.add_argument("--quick", action="store_true", help="fewer rays and runs: two minutes")
-    parser.add_argument("--peers", action="store_true", help="other programs, where installed")
+    words = [f"{peer.word}=PATH" for peer in peer_paths.PEERS]
+    text = f"other programs by path ({', '.join(words)}); of --parts those of peers alone"
+    parser.add_argument("--peers", nargs="*", metavar="NAME=PATH", help=text)
     parser.add_argument("--rays", type=_list_of(lambda text: int(float(text))), help="1e4,1e5,...")
-    parser.add_argument("--lenses", type=many, default=LENSES, help=", ".join(LENSES))
-    parser.add_argument("--parts", type=many, default=PARTS, help=", ".join(PARTS))
+    parser.add_argument("--lenses", type=many, help=", ".join(LENSES))
+    parser.add_argument("--parts", type=many, help=", ".join((*PARTS, *peers.PARTS)))
     parser.add_argument("--dtypes", type=many, default=tuple(DTYPES), help=", ".join(DTYPES))
     parser.add_argument("--threads", type=many, default=("1", "all"), help="1,all")
     parser.add_argument("--seconds", type=float, help="for each comparison")
     parser.add_argument("--pixels", type=int, help="along each side of the render")
     parser.add_argument("--output", type=Path, help="folder of this run")
     options = parser.parse_args(given)
+    beside = options.peers is not None
+    options.lenses = options.lenses or (peers.LENSES if beside else LENSES)
+    options.parts = options.parts or (peers.PARTS if beside else PARTS)
+    try:
+        options.peers = peer_paths.parse(options.peers or ()) if beside else None
+    except InputError as error:
+        parser.error(str(error))
     for chosen, known in (
-        (options.lenses, LENSES),
-        (options.parts, PARTS),
+        (options.lenses, peers.LENSES if beside else LENSES),
+        (options.parts, (*PARTS, *peers.PARTS) if beside else PARTS),
         (options.dtypes, DTYPES),
     ):
         unknown = set(chosen) - set(known)
         if unknown:
             parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(known)}")
     quick = options.quick
-    options.rays = options.rays or ((10_000, 100_000) if quick else (10**4, 10**5, 10**6, 10**7))
+    most = (10**4, 10**5) if beside else (10**4, 10**5, 10**6, 10**7)
+    options.rays = options.rays or (most[:1] if beside and quick else most[:2] if quick else most)
     options.seconds = options.seconds or (0.4 if quick else 4.0)
     options.pixels = options.pixels or (64 if quick else rendering.WIDTH)
     options.output = options.output or (
@@ -96,10 +110,12 @@ def main(options: argparse.Namespace) -> int:
             backends,
         )
         _measure(results, plan, options)
-    if options.peers:
-        peers.measure(results, Plan(**vars(plan) | _on_cpu(threads)))
+    if options.peers is not None:
+        on_cpu = Plan(**vars(plan) | _on_cpu(threads))
+        peers.measure(results, on_cpu, options.peers, options.parts, options.quick)
     summary = aims.summarise(results.rows)
-    aims.print_summary(summary)
+    if set(options.parts) & set(PARTS):
+        aims.print_summary(summary)
     results.write(summary)
     figure.draw(results.rows, options.output / "benchmark.png")
     failed = [row for row in results.rows if row.failed]
@@ -159,8 +175,8 @@ def _environment(options: argparse.Namespace, cores: int) -> dict:
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "options": " ".join(sys.argv[1:]) or "none",
     }
-    if options.peers:
-        environment["peers"] = peers.describe()
+    if options.peers is not None:
+        environment["peers"] = peer_paths.describe(options.peers)
     return environment
 
 

@@ -6,6 +6,7 @@ about 1e-7, where catalogues print five or six decimals.
 """
 
 import difflib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -55,6 +56,12 @@ _ALIASES = {
     "POLYSTYR": "POLYSTYRENE",
     "E48R": "ZEONEX-E48R",
 }
+# Names of Schott's old scheme (F2, BAF8, LASFN9).  Others made glasses of their own by these names,
+# and the package lacks many of Schott's.
+_OLD_NAME = re.compile(
+    r"(BAFN?|BAK|BALF|BALKN?|BASF|BK|F|FK|FN|K|KF|KZFN|KZFSN?|LAFN?|LAK[LN]?|LASFN?|LF|LLF|PK|PSK"
+    r"|SF[LN]?|SK|SSKN?|TIFN?|UBK|UK|ZKN?)[1-9]\d*[A-Z]*"
+)
 # What the package calls a formula → the formula and the attribute that holds its terms.
 _FORMULAS: dict[str, tuple[Formula, str]] = {
     "Sellmeier": (sellmeier, "coefficients"),
@@ -124,9 +131,10 @@ def find_glass(text: str, air: float = 1.0) -> Glass:
     Raises:
         InputError: no glass has that name (the message names near ones), or several makers have
             one (the message names them: their glasses differ), or it has no dispersion formula.
+            A name of Schott's old scheme that only another maker has here, for example `F6`, needs
+            its maker: Schott's own F6 is another glass.
     """
-    # Ohara and Sumita print blanks within some names, the package does not.
-    maker, colon, name = ("".join(part.upper().split()) for part in text.rpartition(":"))
+    maker, colon, name = (_key(part) for part in text.rpartition(":"))
     catalog = _catalog()
     if colon and maker not in catalog:
         raise InputError(
@@ -144,12 +152,28 @@ def find_glass(text: str, air: float = 1.0) -> Glass:
             "glass as nd/Vd, for example 1.5168/64.17, or by its catalogue name, for example "
             "N-BK7 or SCHOTT:N-BK7)"
         )
+    choice = " or ".join(f"{known}:{catalog[known][name][0]}" for known in makers)
     if len(makers) > 1:
-        choice = " or ".join(f"{known}:{catalog[known][name][0]}" for known in makers)
         raise InputError(
             f"material '{text}' is in the catalogues of {', '.join(makers)}; write {choice}"
         )
+    if not maker and makers != ["SCHOTT"] and is_old_name(name):
+        raise InputError(
+            f"material '{text}' is a name that SCHOTT gave too, to a glass that the catalogue here "
+            f"lacks; write {choice}, or nd/Vd of the glass meant"
+        )
     return _read(makers[0], *catalog[makers[0]][name], air)
+
+
+def makers_of(name: str) -> tuple[str, ...]:
+    """Return the makers that have a glass of that name here, in any case; none where nobody has."""
+    key = _ALIASES.get(_key(name), _key(name))
+    return tuple(maker for maker, glasses in _catalog().items() if key in glasses)
+
+
+def is_old_name(name: str) -> bool:
+    """Tell whether a name is of Schott's old scheme, which several makers used, such as `F6`."""
+    return _OLD_NAME.fullmatch(_key(name)) is not None
 
 
 def suggestion(word: str, allowed: Iterable[str]) -> str:
@@ -160,6 +184,11 @@ def suggestion(word: str, allowed: Iterable[str]) -> str:
         return ""
     *others, final = near
     return f"; did you mean {', '.join(others)}{' or ' if others else ''}{final}?"
+
+
+def _key(text: str) -> str:
+    """A name in capitals; Ohara and Sumita print blanks within some, the package does not."""
+    return "".join(text.upper().split())
 
 
 @cache

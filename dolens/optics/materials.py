@@ -87,8 +87,8 @@ def parse_material(text: str, model: IndexModel) -> Medium:
         The medium; of nd/Vd the one with B = (nd - 1)/Vd / (1/λF² - 1/λC²) and A = nd - B/λd².
 
     Raises:
-        InputError: the text is none of these, or names glasses of several makers, or the number
-            is not from 1 to 10, or nd < 1, or Vd is not positive.
+        InputError: the text is none of these, or a name that several makers gave (see
+            `find_glass`), or the number is not from 1 to 10, or nd < 1, or Vd is not positive.
     """
     name = str(text).strip()
     if name.lower() == "air":

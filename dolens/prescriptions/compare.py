@@ -60,7 +60,8 @@ def _flat(prescription: Mapping[str, Any], medium: Callable[[str], str]) -> dict
             flat[(key,)] = _plain(value)
     if ("wavelengths",) in flat:
         flat.setdefault(("reference_wavelength",), flat[("wavelengths",)][0])
-    return {k: medium(v) if "material" in k[-1] else v for k, v in flat.items()}
+    # A constant index is a number in YAML and a name in a lens.
+    return {k: medium(str(v)) if "material" in k[-1] else v for k, v in flat.items()}
 
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:

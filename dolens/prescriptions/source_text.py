@@ -107,7 +107,8 @@ def source_text_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     header = {"index_model": "dfc"}
     header |= {key: prescription[key] for key in _HEADER_KEYS if prescription.get(key) is not None}
     sensor = prescription["sensor"]
-    lines = [_line("O", 0.0, "0", 0.0, prescription.get("object_material", "air"), where)]
+    before = prescription.get("object_material", "air")
+    lines = [_line("O", 0.0, "0", 0.0, before, f"{where}: object")]
     shapes: dict[str, dict[str, Any]] = {}
     distance = 0.0
     for n, row in surfaces.items():
@@ -129,7 +130,7 @@ def source_text_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
             shapes[n] = {"type": kind, "parameters": names}
         distance = as_number(row.get("thickness", sensor["distance"]), f"{place}: 'thickness'")
     lines.append(
-        _line("I", distance, "0", as_number(sensor.get("diameter") or 0.0, where), "air", "")
+        _line("I", distance, "0", as_number(sensor.get("diameter") or 0.0, where), "air", where)
     )
     extra = json.dumps({**header, **({"surfaces": shapes} if shapes else {})})
     text = "\n".join((str(prescription.get("name", "")), f"{_COLUMNS} # {extra}", *lines, ""))
@@ -215,8 +216,14 @@ def _line(
 ) -> str:
     name = str(material)
     written = name.upper() if name in ("air", "occluder") else name
-    if source_material(written, place) != name:
-        raise InputError(f"{place}: a .txt file cannot hold material '{name}'")
+    try:
+        held = source_material(written, place) == name
+    except InputError:
+        held = False
+    if not held:
+        raise InputError(
+            f"{place}: a .txt file cannot hold material '{name}' (allowed: nd/Vd, air, occluder)"
+        )
     return f"{letter} {distance!r} {roc} {diameter!r} {written}"
 
 

@@ -1,8 +1,8 @@
 """From the text of a Zemax `.zmx` file to a prescription.
 
-Held: sequential systems of STANDARD and EVENASPH surfaces, glass by model (nd, Vd) or by name,
-circular and rectangular apertures and obscurations (`zemax_apertures`), fields as angles or object
-heights, wavelengths, and UNIT MM, CM, IN or METER.
+Held: sequential systems of STANDARD and EVENASPH surfaces, glass by model (nd, Vd) or by its name
+in the catalogues of GCAT (`zemax_glass`), circular and rectangular apertures and obscurations
+(`zemax_apertures`), fields as angles or object heights, wavelengths, and UNIT MM, CM, IN or METER.
 Everything else that bends rays is an error that says so.
 
 CURV 0, without a decimal point, is a plane; Zemax itself writes 0.0, and that is a curvature
@@ -25,6 +25,7 @@ from dolens.prescriptions.conditions import PUPIL_KEYS
 from dolens.prescriptions.decimals import number_in_text, radius_of, scaled
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
+from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_system import factor_to_mm, read_system
 
 _TYPES = ("STANDARD", "EVENASPH")
@@ -60,14 +61,16 @@ def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:
             f"{', '.join(map(str, stops)) or 'none'}"
         )
     prescription["stop"] = stops[0]
-    distance = _object(prescription, file, factor, where)
+    catalogues = [word for line in file.system.get("GCAT", []) for word in line.arguments] or None
+    distance = _object(prescription, file, catalogues, factor, where)
     if distance is not None:
         prescription["object_distance"] = distance
     rows, hard = [], []
     before = prescription["object_material"]
     for n, block in enumerate(file.surfaces[1:-1], 1):
         place = f"{where}: surface {n}"
-        row = _row(block, before, factor, place)
+        material = read_glass(_arguments(block, "GLAS"), catalogues, place)
+        row = _row(block, before, material, factor, place)
         aperture, clips = read_apertures(block, factor, place)
         beam = n == stops[0] and not prescription.keys().isdisjoint(PUPIL_KEYS)
         sized = not aperture.keys().isdisjoint(("semi_diameter", "aperture"))
@@ -115,13 +118,17 @@ def _with_sensor(
 
 
 def _object(
-    prescription: dict[str, Any], file: ZemaxFile, factor: Fraction, where: str
+    prescription: dict[str, Any],
+    file: ZemaxFile,
+    catalogues: list[str] | None,
+    factor: Fraction,
+    where: str,
 ) -> float | None:
     """Set the medium before surface 1; return the object's distance, or None for infinity."""
     block, place = file.surfaces[0], f"{where}: surface 0 (the object)"
     if _type(block, place) != "STANDARD" or _value(block, "CURV", place) != 0.0:
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
-    prescription["object_material"] = _material(block, place)
+    prescription["object_material"] = read_glass(_arguments(block, "GLAS"), catalogues, place)
     words = _arguments(block, "DISZ")
     if not words or words[0].upper() == "INFINITY":
         return None
@@ -129,13 +136,12 @@ def _object(
     return None if abs(distance) >= _INFINITE else distance
 
 
-def _row(block: Block, before: str, factor: Fraction, place: str) -> dict[str, Any]:
-    """Type, radius, coefficients and medium of a surface."""
+def _row(block: Block, before: str, material: str, factor: Fraction, place: str) -> dict[str, Any]:
+    """Type, radius, coefficients and medium of a surface between two media."""
     kind = _type(block, place)
     row: dict[str, Any] = {"type": "sphere"}
     curvature = scaled(_arguments(block, "CURV", "0")[0], 1 / factor, f"{place}: CURV")
     conic = _value(block, "CONI", place)
-    material = _material(block, place)
     coefficients = _coefficients(block, factor, place)
     if kind == "EVENASPH":
         curvature, conic = _without_square(curvature, conic, coefficients.pop("a2", 0.0), place)
@@ -190,31 +196,6 @@ def _without_square(
             "it is no curvature, as the conic goes on differently"
         )
     return curvature + 2.0 * square, -1.0
-
-
-def _material(block: Block, place: str) -> str:
-    """The medium behind a surface: air, glass as nd/Vd, or a name from a catalogue."""
-    words = _arguments(block, "GLAS")
-    if not words or words[0].upper() == "AIR":
-        return "air"
-    name, how = words[0], words[1] if len(words) > 1 else "0"
-    if name.upper() == "MIRROR":
-        raise InputError(f"{place}: GLAS MIRROR is not held (allowed: refracting surfaces)")
-    if not (name == "___BLANK" or how == "1"):
-        if how == "4" and any(number_in_text(w, f"{place}: GLAS") for w in words[9:11]):
-            raise InputError(f"{place}: GLAS {name} with offsets of nd or Vd is not held")
-        return name
-    if len(words) < 5:
-        raise InputError(f"{place}: GLAS {name} needs nd and Vd: '___BLANK 1 0 nd Vd'")
-    if len(words) > 5 and number_in_text(words[5], f"{place}: GLAS {name}"):
-        raise InputError(f"{place}: GLAS {name}: the deviation of its dispersion (ΔPgF) must be 0")
-    return "/".join(_plain(word, f"{place}: GLAS {name}") for word in words[3:5])
-
-
-def _plain(word: str, place: str) -> str:
-    """Decimal text without an exponent; as it stands where it is so already."""
-    value = number_in_text(word, place)
-    return word if word.replace(".", "", 1).isdecimal() and word[-1] != "." else f"{value!r}"
 
 
 def _is_dummy(row: dict[str, Any], before: str) -> bool:

@@ -10,10 +10,10 @@ from dolens.prescriptions.checks import as_integer, as_number
 from dolens.prescriptions.compare import require_same
 from dolens.prescriptions.decimals import shifted
 from dolens.prescriptions.zemax_apertures import aperture_lines
+from dolens.prescriptions.zemax_glass import canonical, catalogue_line, glass_line
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 
 _TYPES = ("plane", "aperture", "sphere", "conic", "even_asphere")
-_PAIR = re.compile(r"\s*([\d.]+)\s*/\s*([\d.]+)\s*")
 _D_LINE = 587.5618
 _POWER = re.compile(r"a(\d+)")
 
@@ -23,8 +23,9 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
 
     Every semi-diameter is written as an aperture, since it clips, and the system's
     aperture floats by the stop.  Zemax cannot do without a wavelength and a field: where the
-    prescription has none, the d line and the axis are written.  A catalogue's name goes into GCAT.
-    `occluder` is written as air, which it is in the index models that a file can hold.
+    prescription has none, the d line and the axis are written.  A glass's maker goes into GCAT, its
+    nd and Vd beside its name; a constant index is a model glass whose Vd is 0.  `occluder` is
+    written as air, which it is in the index models that a file can hold.
 
     Raises:
         InputError: one line that names the surface and key which the format cannot hold.
@@ -44,7 +45,7 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
         "SURF 0",
         "  TYPE STANDARD",
         "  CURV 0.0",
-        *_glass(prescription.get("object_material", "air"), where),
+        *glass_line(prescription.get("object_material", "air"), f"{where}: object"),
         f"  DISZ {'INFINITY' if distance is None else _text(distance, where)}",
         '  DIAM 0 0 0 0 1 ""',
     ]
@@ -64,7 +65,7 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     ]
     text = "\n".join((*lines, ""))
     found = prescription_from_zemax(text, where)
-    require_same(prescription, found, ".zmx", where, _medium, _ALWAYS)
+    require_same(prescription, found, ".zmx", where, canonical, _ALWAYS)
     return text
 
 
@@ -79,8 +80,8 @@ def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where:
         raise InputError(f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths'")
     kind, points = next(iter((prescription.get("fields") or {"angles": [[0.0, 0.0]]}).items()))
     x, y = ([_text(point[axis], f"{where}: fields") for point in points] for axis in (0, 1))
-    materials = [str(row.get("material")) for row in surfaces.values()]
-    catalogues = sorted({name.partition(":")[0] for name in materials if ":" in name})
+    materials = [row.get("material") for row in surfaces.values()]
+    materials.append(prescription.get("object_material", "air"))
     notes = str(prescription.get("source") or "").splitlines()
     return [
         "VERS 170912 299 0",
@@ -91,7 +92,7 @@ def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where:
         *_pupil(prescription, where),
         "ENVD 20 1 0",
         "GFAC 0 0",
-        *([f"GCAT {' '.join(catalogues)}"] if catalogues else []),
+        *catalogue_line(materials, where),
         f"FTYP {int(kind == 'heights')} 0 {len(points)} {len(waves)} 0 0 0",
         f"XFLN {' '.join(x)}",
         f"YFLN {' '.join(y)}",
@@ -136,7 +137,7 @@ def _surface(row: Mapping[str, Any], place: str) -> list[str]:
             if n % 2 or not 4 <= n <= 16:
                 raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a4 to a16)")
             lines.append(f"  PARM {n // 2} {_text(row[key], place)}")
-    lines += _glass(row.get("material"), place)
+    lines += glass_line(row.get("material"), place)
     return lines + aperture_lines(row, place)
 
 
@@ -147,24 +148,6 @@ def _curvature(row: Mapping[str, Any], place: str) -> float:
     if radius == 0.0:
         raise InputError(f"{place}: 'radius' is 0; write .inf for a plane")
     return 1.0 / radius
-
-
-def _glass(material: object, place: str) -> list[str]:
-    name = _medium(str(material))
-    if name == "air":
-        return []
-    pair = _PAIR.fullmatch(name)
-    if pair:
-        return [f"  GLAS ___BLANK 1 0 {pair[1]} {pair[2]} 0 0 0 0 0 0"]
-    if len(name.split()) != 1:
-        raise InputError(f"{place}: a .zmx file cannot hold material '{material}'")
-    return [f"  GLAS {name} 0 0 1.5 40 0 0 0 0 0 0"]
-
-
-def _medium(name: str) -> str:
-    """A medium as the format tells it apart: air is air, and a catalogue is not the glass's."""
-    word = name.rpartition(":")[2].strip()
-    return "air" if word.lower() in ("air", "occluder") else word
 
 
 def _text(value: object, place: str) -> str:

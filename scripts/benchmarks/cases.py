@@ -27,6 +27,7 @@ CUBIC = 1e-4  # of the phase plate's x³ and y³, as in the reference rays
 # One freeform surface, to time it alone; 16×16 coefficients.
 _SPLINE_SIZE, _SPLINE_HALF_WIDTH = 16, 6.0
 HALF_FIELD["b_spline"] = 5.0
+HALF_FIELD["asphere"] = 0.5
 
 
 @dataclass(frozen=True)

