@@ -228,8 +228,9 @@ def _motion(element: ElementState, vertices: Sequence[Tensor]) -> tuple[Tensor, 
     """Rotation, pivot and displacement of one element."""
     p = element.parameters
     z = vertices[element.first - 1]
-    x, y, along = element.pivot
-    pivot = torch.stack([torch.full_like(z, x), torch.full_like(z, y), z + along])
+    zero = torch.zeros_like(z)
+    # Added as a tensor: a Python number makes a scalar double under torch.func's forward mode.
+    pivot = torch.stack([zero, zero, z]) + z.new_tensor(element.pivot)
     displacement = torch.stack([p[name] for name in DISPLACEMENTS])
     return rotation_matrix(*(p[name] for name in TILTS)), pivot, displacement
 
