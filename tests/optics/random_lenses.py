@@ -142,9 +142,11 @@ def random_lens(seed: int, wild: bool) -> tuple[Lens, Draw]:
     draw = Draw(2 * seed + int(wild), wild)
     while True:
         try:
-            return lens_from_prescription(prescription(draw)), draw
+            lens = lens_from_prescription(prescription(draw))
         except InputError:
             continue  # an aperture beyond the surface's end
+        if all(torch.isfinite(p.detach().float()).all() for p in lens.parameters()):
+            return lens, draw
 
 
 def random_rays(lens: Lens, draw: Draw, count: int, sense: float) -> Rays:

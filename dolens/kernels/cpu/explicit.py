@@ -84,7 +84,9 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             residual = sag - n * t
             slope = l * sx + m * sy - n
             size = math.fabs(slope)
-            allowed = rounding * (math.fabs(sag) + math.fabs(t) + scale) - math.fabs(residual)
+            steep = size if size > one else one
+            allowed = rounding * (math.fabs(sag) + (math.fabs(t) + scale) * steep)
+            allowed -= math.fabs(residual)
             # Compared one by one: a minimum would lose a NaN.
             met = one if dst[256 + i] > grazing else zero
             met = met if sense * slope < zero else zero

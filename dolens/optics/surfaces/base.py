@@ -289,10 +289,11 @@ class Surface(nn.Module):
             x, y = torch.addcmul(ray.x, ray.l, t), torch.addcmul(ray.y, ray.m, t)
             sag, sx, sy, exists = cls.sag_and_gradient(p, x, y)
             z = ray.n * t
-            rounding = 64.0 * epsilon * (sag.abs() + t.abs() + scale)
-            margin = torch.minimum(
-                rounding - (sag - z).abs(), sense * (ray.n - ray.l * sx - ray.m * sy)
-            )
+            crossing = sense * (ray.n - ray.l * sx - ray.m * sy)
+            # Where the surface is steep along the ray, the rounding of t counts so much more.
+            steep = crossing.abs().clamp(min=1.0)
+            rounding = 64.0 * epsilon * torch.addcmul(sag.abs(), t.abs() + scale, steep)
+            margin = torch.minimum(rounding - (sag - z).abs(), crossing)
             if exists is not None:
                 margin = torch.minimum(margin, exists)
         return t, margin.masked_fill(lost, -1.0)
