@@ -282,10 +282,8 @@ class Surface(nn.Module):
         lost = t != t
         t = t.masked_fill(lost, 0.0)
         ray = ray._replace(x=ray.x.masked_fill(lost, 0.0), y=ray.y.masked_fill(lost, 0.0))
-        for _ in range(2 if torch.is_grad_enabled() else 1):
-            t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
         with torch.no_grad():
-            # Read the residual off the final point: convergence is checked, never assumed.
+            # Read the residual off the root: convergence is checked, never assumed.
             x, y = torch.addcmul(ray.x, ray.l, t), torch.addcmul(ray.y, ray.m, t)
             sag, sx, sy, exists = cls.sag_and_gradient(p, x, y)
             z = ray.n * t
@@ -296,6 +294,8 @@ class Surface(nn.Module):
             margin = torch.minimum(rounding - (sag - z).abs(), crossing)
             if exists is not None:
                 margin = torch.minimum(margin, exists)
+        for _ in range(2 if torch.is_grad_enabled() else 1):
+            t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
         return t, margin.masked_fill(lost, -1.0)
 
     @classmethod
