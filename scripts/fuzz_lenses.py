@@ -38,7 +38,11 @@ def main() -> int:
             for dtype in PRECISIONS:
                 traced += 2 * len(bundle.position)
                 for rule, count in violations(lens, bundle, sense, dtype, jacobians).items():
-                    place = (rule, str(dtype).removeprefix("torch."), "wild" if wild else "ordinary")
+                    place = (
+                        rule,
+                        str(dtype).removeprefix("torch."),
+                        "wild" if wild else "ordinary",
+                    )
                     rays[place] += count
                     lenses[place].add(number)
                     seeds[place].setdefault(number, f"{number} {way}")

@@ -26,9 +26,7 @@ def cases(seed: int, wild: bool, count: int) -> Iterator[tuple[str, Lens, Rays, 
         yield "returning", lens, back, -1.0
 
 
-def send(
-    lens: Lens, rays: Rays, sense: float, backend: str, record: bool = False
-) -> TracedRays:
+def send(lens: Lens, rays: Rays, sense: float, backend: str, record: bool = False) -> TracedRays:
     """Trace by one backend."""
     lens.backend = backend
     return (lens.trace if sense > 0.0 else lens.sensor_to_scene)(rays, record)
@@ -51,7 +49,12 @@ def chosen(rays: Rays, which: torch.Tensor) -> Rays:
 
 
 def undecided(
-    lens: Lens, rays: Rays, sense: float, dtype: torch.dtype, tries: int = 64, roundings: float = 4.0
+    lens: Lens,
+    rays: Rays,
+    sense: float,
+    dtype: torch.dtype,
+    tries: int = 64,
+    roundings: float = 4.0,
 ) -> torch.Tensor:
     """Which rays have another fate by one and the same backend when the inputs are rounded anew.
 
