@@ -49,12 +49,15 @@ def change_axes_forward(real: types.Type) -> Callable[..., None]:
         p, w = carray(record, 32), carray(work, 6144)
         for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            crosses = math.fabs(n) > grazing
-            below = p[2] - src[256 + i]
-            t = below / (n if crosses else one)
-            t = t if crosses else zero
+            # Factors, since a branch about the division would stop vectorisation.
+            crosses, stays = (one, zero) if math.fabs(n) > grazing else (zero, one)
+            cosine = n if n > grazing else grazing
+            if n < zero:
+                cosine = n if n < -grazing else -grazing
+            t = crosses * ((p[2] - src[256 + i]) / cosine)
             x, y = src[i] - p[0] + t * l, src[128 + i] - p[1] + t * m
-            dst[i], dst[128 + i], dst[256 + i] = turn(p, x, y, zero if crosses else -below)
+            z = stays * (src[256 + i] - p[2])
+            dst[i], dst[128 + i], dst[256 + i] = turn(p, x, y, z)
             dst[384 + i], dst[512 + i], dst[640 + i] = turn(p, l, m, n)
             dst[768 + i] = src[768 + i] + w[i] * t
             dst[896 + i], dst[1024 + i] = src[896 + i], src[1024 + i]
@@ -74,9 +77,9 @@ def change_axes_adjoint(real: types.Type) -> Callable[..., None]:
         for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
             t = dst[1152 + i]
-            crosses = math.fabs(n) > grazing
+            crosses, stays = (one, zero) if math.fabs(n) > grazing else (zero, one)
             x, y = src[i] - p[0] + t * l, src[128 + i] - p[1] + t * m
-            z = zero if crosses else src[256 + i] - p[2]
+            z = stays * (src[256 + i] - p[2])
             px, py, pz = cot[i], cot[128 + i], cot[256 + i]
             dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
             cot[2432 + i] = px * x + dl * l
@@ -91,8 +94,10 @@ def change_axes_adjoint(real: types.Type) -> Callable[..., None]:
             qx, qy, qz = turn_back(p, px, py, pz)
             dl, dm, dn = turn_back(p, dl, dm, dn)
             path = cot[768 + i]
-            along = (qx * l + qy * m + w[i] * path) / (n if crosses else one)
-            along = along if crosses else -qz
+            cosine = n if n > grazing else grazing
+            if n < zero:
+                cosine = n if n < -grazing else -grazing
+            along = crosses * ((qx * l + qy * m + w[i] * path) / cosine) - stays * qz
             cot[i], cot[128 + i], cot[256 + i] = qx, qy, -along
             cot[384 + i], cot[512 + i], cot[640 + i] = dl + t * qx, dm + t * qy, dn - t * along
             cot[896 + i] = path * t
