@@ -116,7 +116,9 @@ def test_a_posed_lens_has_a_jacobian_in_single_precision():
     )
     lens.backend = "reference"
     expected = ray_jacobian(lens, rays, ["thicknesses.*", "elements.*"]).derivatives
-    found = ray_jacobian(copy.deepcopy(lens).float(), rays, ["thicknesses.*", "elements.*"]).derivatives
+    found = ray_jacobian(
+        copy.deepcopy(lens).float(), rays, ["thicknesses.*", "elements.*"]
+    ).derivatives
     assert found.dtype == torch.float32
     torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
 
