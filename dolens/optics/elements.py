@@ -178,7 +178,8 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
 
     Within one element, and between surfaces that nothing carries, only z changes.  Otherwise the
     rays are first carried along their line to the level of the next vertex: turning a point that
-    is metres away would lose in float32 what the lens needs.
+    is metres away would lose in float32 what the lens needs.  Rays that run along that level never
+    reach it, and are turned where they are.
 
     Args:
         ray: mm, in the axes `now`.
@@ -192,12 +193,12 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
     if now.elements == then.elements:
         return Components(x, y, z + (now.z - then.z), l, m, n), None
     step, turn = relative_axes(now, then)
-    # The distance of a ray that crosses at grazing incidence is finite and means nothing.
-    cosine = torch.where(n < 0.0, n.clamp(max=-_GRAZING), n.clamp(min=_GRAZING))
-    distance = (step[2] - z) / cosine
+    along = n.abs() <= _GRAZING
+    below = step[2] - z
+    distance = (below / n.masked_fill(along, 1.0)).masked_fill(along, 0.0)
     near = (torch.addcmul(x - step[0], distance, l), torch.addcmul(y - step[1], distance, m))
     # Now (near, 0) counts from the next vertex, still along the axes `now`.
-    position = _turn(turn, near[0], near[1], torch.zeros_like(near[0]))
+    position = _turn(turn, near[0], near[1], -below.masked_fill(~along, 0.0))
     return Components(*position, *_turn(turn, l, m, n)), distance
 
 
@@ -228,8 +229,9 @@ def _motion(element: ElementState, vertices: Sequence[Tensor]) -> tuple[Tensor, 
     """Rotation, pivot and displacement of one element."""
     p = element.parameters
     z = vertices[element.first - 1]
-    x, y, along = element.pivot
-    pivot = torch.stack([torch.full_like(z, x), torch.full_like(z, y), z + along])
+    zero = torch.zeros_like(z)
+    # Added as a tensor: a Python number makes a scalar double under torch.func's forward mode.
+    pivot = torch.stack([zero, zero, z]) + z.new_tensor(element.pivot)
     displacement = torch.stack([p[name] for name in DISPLACEMENTS])
     return rotation_matrix(*(p[name] for name in TILTS)), pivot, displacement
 

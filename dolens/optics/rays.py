@@ -83,7 +83,7 @@ class TracedRays:
             that the ray met, when the trace was asked to record them.
 
     Numbers of invalid rays are finite and carry no gradient.  A vignetted ray is traced on as if
-    unclipped; a missed or totally reflected one goes on from the vertex plane, unrefracted.
+    unclipped; those of a missed or totally reflected one mean nothing.
     """
 
     position: Tensor

@@ -50,10 +50,11 @@ def transfer(ray: Components, distance: Tensor) -> Components:
 def distance_to_plane(ray: Components, z: Tensor | float, sense: float) -> tuple[Tensor, Tensor]:
     """Distance (mm) along rays to the plane at z, and a margin: their cosine in this sense.
 
-    The distance of rays that do not travel towards it is finite and means nothing.
+    The margin counts from the smallest cosine that is divided by, `GRAZING`: a ray along the plane
+    misses it.  The distance of rays that do not travel towards it is finite and means nothing.
     """
-    cosine = ray.n if sense > 0.0 else -ray.n
-    return sense * (z - ray.z) / cosine.clamp(min=GRAZING), cosine.detach()
+    cosine = (ray.n if sense > 0.0 else -ray.n).clamp(min=GRAZING)
+    return sense * (z - ray.z) / cosine, cosine.detach() - GRAZING
 
 
 def enter_lens(
@@ -122,7 +123,12 @@ def trace_surfaces(
         t, met = shape.intersect(parameters, PlaneRay(x, y, l, m, n), sense, surface.semi_diameter)
         met = towards if met is None else torch.minimum(towards, met)
         t = t.clamp(-limit, limit)
-        x, y, z = torch.addcmul(x, t, l), torch.addcmul(y, t, m), t * n
+        x, y = torch.addcmul(x, t, l), torch.addcmul(y, t, m)
+        if not shape.closed_form:
+            # There is no point of the surface to refract at, and a sag far off may overflow.
+            lost = ~(met > 0.0)
+            x, y, t = (v.masked_fill(lost, 0.0) for v in (x, y, t))
+        z = t * n
         inside = surface.aperture.margin(x, y)
         if path is not None:
             path = path + before * (to_plane + t if carried is None else carried + to_plane + t)
@@ -199,8 +205,8 @@ def first_failure(traced: Trace) -> tuple[Tensor, Tensor]:
 
 
 def stop_gradient_where_invalid(values: Tensor, valid: Tensor) -> Tensor:
-    """The same numbers; those of invalid rays pass no gradient."""
-    return torch.where(valid, values, values.detach())
+    """The same numbers; those of invalid rays pass no gradient, and are finite."""
+    return torch.where(valid, values, values.detach().nan_to_num(0.0, 0.0, 0.0))
 
 
 def traced_rays(traced: Trace, path_before: Tensor | None) -> TracedRays:

@@ -40,13 +40,13 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to a conic and through it."""
     clamp, safe_sqrt, arrive, refract, _ = arithmetic(real)
     distance = conic_distance(real)
-    zero, one, two, three = real(0.0), real(1.0), real(2.0), real(3.0)
+    zero, one, two, three, grazing = real(0.0), real(1.0), real(2.0), real(3.0), real(1e-9)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, 1280), carray(after, 1280)
-        p, w = carray(record, 32), carray(work, 6144)
+        p, w, q = carray(record, 32), carray(work, 6144), carray(codes, 24)
         shift, limit, sense, tag, c, k = p[0], p[12], p[18], p[19], p[24], p[25]
-        edge = p[14]
+        edge, refracts = p[14], q[5] != 0
         bent = (one + k) * c
         for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
@@ -57,17 +57,21 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
             t = clamp(t, limit)
             x, y, z = x + t * l, y + t * m, t * n
             branch = one - bent * z
-            met = squared if squared < met else met
-            met = branch if branch < met else met
+            # Compared one by one: a minimum would lose a NaN.
+            met = one if met > grazing else zero
+            met = met if squared > zero else zero
+            met = met if branch > zero else zero
             gx, gy = -c * x, -c * y
             inverse = one / safe_sqrt(gx * gx + gy * gy + branch * branch)
             dst[i], dst[128 + i], dst[256 + i] = x, y, z
             travelled = t0 + t
             dst[1152 + i] = travelled
             dst[768 + i] = src[768 + i] + w[i] * travelled
-            l, m, n, transmitted = refract(  # noqa: E741
-                l, m, n, gx * inverse, gy * inverse, branch * inverse, w[128 + i], sense
-            )
+            transmitted = one
+            if refracts:
+                l, m, n, transmitted = refract(  # noqa: E741
+                    l, m, n, gx * inverse, gy * inverse, branch * inverse, w[128 + i], sense
+                )
             dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
             ended, vignetted = src[896 + i], src[1024 + i]
             ended = ended if ended > zero or met > zero else tag + three

@@ -1,6 +1,7 @@
 """Running the drivers of Jacobians and of least squares on tensors."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -76,7 +77,8 @@ def normal_equations(
 
     Returns:
         All float64: number of rays and Σ w·r² (2,); Jᵀwr (P,); JᵀwJ (P, P); and by groups
-        (G, 2 + K + K·P): number of rays, Σ w, Σ w·r, Σ w·J.
+        (G, 2 + K + K·P): number of rays, Σ w, Σ w·r, Σ w·J.  Where products overflow in single
+        precision, everything is computed once more in double.
     """
     count, wanted, p = rays[0].shape[0], len(outputs), variables.count
     by_group = 2 + wanted * (1 + p)
@@ -93,6 +95,19 @@ def normal_equations(
         job[Job.TARGET_ROW], job[Job.TARGET_COLUMN] = target.stride()
         job[Job.WEIGHT_ROW] = 0 if weight is None else weight.stride(0)
         program.run(normal_equations_driver, chunks, _SMALL)
+    if table.values.dtype == torch.float32 and not bool(torch.isfinite(sums).all()):
+        # Squares of r¹⁶ and the like overflow in single precision before they are summed.
+        position, direction, column = rays
+        return normal_equations(
+            replace(table, values=table.values.double()),
+            variables,
+            outputs,
+            (position.double(), direction.double(), column),
+            target.double(),
+            None if weight is None else weight.double(),
+            group,
+            groups,
+        )
     head, right, square, rest = sums.sum(0).split([2, p, p * p, groups * by_group])
     lower = square.reshape(p, p)
     return head, right, lower + lower.tril(-1).mT, rest.reshape(groups, by_group)

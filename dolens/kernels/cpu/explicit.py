@@ -84,12 +84,14 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             residual = sag - n * t
             slope = l * sx + m * sy - n
             size = math.fabs(slope)
-            met = dst[256 + i]
-            crossing = -sense * slope
-            met = crossing if crossing < met else met
-            met = w[896 + i] if w[896 + i] < met else met
-            allowed = rounding * (math.fabs(sag) + math.fabs(t) + scale) - math.fabs(residual)
-            met = allowed if allowed < met else met
+            steep = size if size > one else one
+            allowed = rounding * (math.fabs(sag) + (math.fabs(t) + scale) * steep)
+            allowed -= math.fabs(residual)
+            # Compared one by one: a minimum would lose a NaN.
+            met = one if dst[256 + i] > grazing else zero
+            met = met if sense * slope < zero else zero
+            met = met if w[896 + i] > zero else zero
+            met = met if allowed > zero else zero
             # One step more, too short to matter for the slopes.
             t = t - clamp(
                 residual / math.copysign(size if size > grazing else grazing, slope), scale

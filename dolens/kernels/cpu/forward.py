@@ -1,9 +1,11 @@
 """Driver of the forward trace: blocks of rays through all steps, in cache."""
 
+import math
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import carray, njit, types
 
 from dolens.kernels.cpu import compiler
@@ -139,6 +141,12 @@ def forward_driver(real: types.Type) -> Callable[..., None]:
     at = real_at(real)
     _, load, _, step = streams(real)
     zero = real(0.0)
+    largest = real(np.finfo(str(real)).max)
+
+    @njit(**OPTIONS)
+    def finite(value):  # noqa: ANN001, ANN202
+        """The number, or zero: rays that are not valid may overflow."""
+        return value if math.fabs(value) <= largest else zero
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
         job = carray(job_, 64)
@@ -158,18 +166,18 @@ def forward_driver(real: types.Type) -> Callable[..., None]:
             position = carray(shifted(at(job[18]), 3 * start), 384)
             direction = carray(shifted(at(job[19]), 3 * start), 384)
             for i in range(count):
-                position[3 * i] = state[i]
-                position[3 * i + 1] = state[128 + i]
-                position[3 * i + 2] = state[256 + i] + exit_z
+                position[3 * i] = finite(state[i])
+                position[3 * i + 1] = finite(state[128 + i])
+                position[3 * i + 2] = finite(state[256 + i] + exit_z)
             for i in range(count):
-                direction[3 * i] = state[384 + i]
-                direction[3 * i + 1] = state[512 + i]
-                direction[3 * i + 2] = state[640 + i]
+                direction[3 * i] = finite(state[384 + i])
+                direction[3 * i + 1] = finite(state[512 + i])
+                direction[3 * i + 2] = finite(state[640 + i])
             path = carray(shifted(at(job[20]), start), 128)
             status = carray(shifted(int8_at(job[21]), start), 128)
             surface = carray(shifted(int16_at(job[22]), start), 128)
             for i in range(count):
-                path[i] = state[768 + i]
+                path[i] = finite(state[768 + i])
             for i in range(count):
                 ended, vignetted = state[896 + i], state[1024 + i]
                 code = types.int64(ended if ended > zero else vignetted)

@@ -11,7 +11,7 @@ from dolens.kernels.cpu.arithmetic import arithmetic
 def plane_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to a plane and through it."""
     _, safe_sqrt, arrive, _, _ = arithmetic(real)
-    zero, one, two, three = real(0.0), real(1.0), real(2.0), real(3.0)
+    zero, one, two, three, grazing = real(0.0), real(1.0), real(2.0), real(3.0), real(1e-9)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, 1280), carray(after, 1280)
@@ -33,7 +33,7 @@ def plane_forward(real: types.Type) -> Callable[..., None]:
                 squared = one
             dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
             ended, vignetted = src[896 + i], src[1024 + i]
-            ended = ended if ended > zero or met > zero else tag + three
+            ended = ended if ended > zero or met > grazing else tag + three
             dst[896 + i] = ended if ended > zero or squared > zero else tag + two
             inside = edge - (x * x + y * y)
             dst[1024 + i] = vignetted if vignetted > zero or inside > zero else tag + one

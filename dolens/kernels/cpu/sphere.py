@@ -17,9 +17,9 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, 1280), carray(after, 1280)
-        p, w = carray(record, 32), carray(work, 6144)
+        p, w, q = carray(record, 32), carray(work, 6144), carray(codes, 24)
         shift, limit, sense, tag, c = p[0], p[12], p[18], p[19], p[24]
-        edge = p[14]
+        edge, refracts = p[14], q[5] != 0
         # Three loops: a processor looks only so far ahead, and this way finds several iterations'
         # divisions and roots to work on at once.
         for i in range(128):
@@ -38,15 +38,16 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
             t = clamp(sense * f / (near if near > grazing else grazing), limit)
             dst[i], dst[128 + i], dst[256 + i] = x + t * l, y + t * m, t * n
             dst[1152 + i] += t
-            dst[896 + i] = squared if squared < met else met
+            dst[896 + i] = squared if met > grazing else zero
         for i in range(128):
             x, y, z, met = dst[i], dst[128 + i], dst[256 + i], dst[896 + i]
             nx, ny, nz = -c * x, -c * y, one - c * z
-            met = nz if nz < met else met
+            met = met if nz > zero else zero
             dst[768 + i] = src[768 + i] + w[i] * dst[1152 + i]
-            l, m, n, transmitted = refract(  # noqa: E741
-                src[384 + i], src[512 + i], src[640 + i], nx, ny, nz, w[128 + i], sense
-            )
+            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
+            transmitted = one
+            if refracts:
+                l, m, n, transmitted = refract(l, m, n, nx, ny, nz, w[128 + i], sense)  # noqa: E741
             dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
             ended, vignetted = src[896 + i], src[1024 + i]
             ended = ended if ended > zero or met > zero else tag + three

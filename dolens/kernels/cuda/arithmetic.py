@@ -39,6 +39,12 @@ def clamp(value, limit):
 
 
 @triton.jit
+def finite(value):
+    """The number, or zero where it has overflowed."""
+    return tl.where(tl.abs(value) < float("inf"), value, 0.0)
+
+
+@triton.jit
 def away_from_zero(value):
     """The value, or ± 1e-9 of its sign where it is smaller."""
     size = tl.abs(value)
@@ -50,7 +56,7 @@ def away_from_zero(value):
 def distance_to_plane(z, n, sense):
     """Distance (mm) along rays to the plane z = 0, and whether they travel towards it."""
     towards = sense * n
-    return divide(-sense * z, tl.where(towards > GRAZING, towards, GRAZING)), towards > 0.0
+    return divide(-sense * z, tl.where(towards > GRAZING, towards, GRAZING)), towards > GRAZING
 
 
 @triton.jit

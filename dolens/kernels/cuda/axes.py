@@ -6,7 +6,7 @@ They mirror `change_axes` and `to_lens_axes` of `dolens.optics.elements`.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import away_from_zero, divide
+from dolens.kernels.cuda.arithmetic import GRAZING, divide
 from dolens.kernels.cuda.layout import STEP, TURN
 from dolens.kernels.cuda.sums import add_sum
 
@@ -52,19 +52,22 @@ def _turn_sums(sums, px, py, pz, x, y, z, a, b, c, l, m, n, alive):
 def change_axes(record, x, y, z, l, m, n):
     """Carry rays along their line to the level of the next vertex, and turn them.
 
-    Returns position, direction, and the distance.
+    Those that run along that level are turned where they are.  Returns position, direction, and
+    the distance.
     """
     step = record + STEP
-    t = divide(tl.load(step + 2) - z, away_from_zero(n))
+    crosses = tl.abs(n) > GRAZING
+    below = tl.load(step + 2) - z
+    t = tl.where(crosses, divide(below, tl.where(crosses, n, 1.0)), 0.0)
     x = x - tl.load(step) + t * l
     y = y - tl.load(step + 1) + t * m
-    x, y, z = _turn(record, x, y, tl.zeros_like(x))
+    x, y, z = _turn(record, x, y, tl.where(crosses, 0.0, -below))
     l, m, n = _turn(record, l, m, n)
     return x, y, z, l, m, n, t
 
 
 @triton.jit
-def change_axes_adjoint(record, sums, index, x, y, l, m, n, t, px, py, pz, a, b, c, path, alive):
+def change_axes_adjoint(record, sums, index, x, y, z, l, m, n, t, px, py, pz, a, b, c, path, alive):
     """Cotangents in front of `change_axes`, and that of the index, from those behind it.
 
     Args x to n are the ray in front, t the distance, px to c and path the cotangents behind.
@@ -72,10 +75,13 @@ def change_axes_adjoint(record, sums, index, x, y, l, m, n, t, px, py, pz, a, b,
     step, of_step = record + STEP, sums + STEP
     x = x - tl.load(step) + t * l
     y = y - tl.load(step + 1) + t * m
-    _turn_sums(sums, px, py, pz, x, y, tl.zeros_like(x), a, b, c, l, m, n, alive)
-    qx, qy, _ = _turn_back(record, px, py, pz)
+    crosses = tl.abs(n) > GRAZING
+    z = tl.where(crosses, 0.0, z - tl.load(step + 2))
+    _turn_sums(sums, px, py, pz, x, y, z, a, b, c, l, m, n, alive)
+    qx, qy, qz = _turn_back(record, px, py, pz)
     a, b, c = _turn_back(record, a, b, c)
-    along = divide(qx * l + qy * m + index * path, n)
+    along = divide(qx * l + qy * m + index * path, tl.where(crosses, n, 1.0))
+    along = tl.where(crosses, along, -qz)
     add_sum(of_step, -qx, alive)
     add_sum(of_step + 1, -qy, alive)
     add_sum(of_step + 2, along, alive)

@@ -84,7 +84,8 @@ def explicit_intersect(
     sag, sx, sy, margin = sag_and_slopes(record, codes, extras, x + l * t, y + m * t, FORM)
     residual = sag - n * t
     slope = l * sx + m * sy - n
-    allowed = rounding * (tl.abs(sag) + tl.abs(t) + scale)
+    steep = tl.where(tl.abs(slope) > 1.0, tl.abs(slope), 1.0)
+    allowed = rounding * (tl.abs(sag) + (tl.abs(t) + scale) * steep)
     met = (sense * slope < 0.0) & (margin > 0.0) & (tl.abs(residual) < allowed)
     # One step more, too short to matter for the slopes.
     t = clamp(t - clamp(divide(residual, away_from_zero(slope)), scale), limit)

@@ -3,6 +3,7 @@
 import triton
 import triton.language as tl
 
+from dolens.kernels.cuda.arithmetic import finite
 from dolens.kernels.cuda.layout import OFFSET, ROW
 from dolens.kernels.cuda.rays import (
     first_sense,
@@ -62,9 +63,10 @@ def forward_kernel(
             row, record, extras, index, ratio, x, y, z, l, m, n, path, ended, vignetted, KINDS
         )
     z = z + tl.load(values + exit_place)
-    store_vectors(out_position, rays, mask, x, y, z)
-    store_vectors(out_direction, rays, mask, l, m, n)
-    tl.store(out_path + rays, path, mask=mask)
+    # Rays that are not valid may overflow.
+    store_vectors(out_position, rays, mask, finite(x), finite(y), finite(z))
+    store_vectors(out_direction, rays, mask, finite(l), finite(m), finite(n))
+    tl.store(out_path + rays, finite(path), mask=mask)
     failed = tl.where(ended > 0, ended, vignetted)
     tl.store(out_status + rays, (failed & 3).to(tl.int8), mask=mask)
     tl.store(out_surface + rays, (failed >> 2).to(tl.int16), mask=mask)

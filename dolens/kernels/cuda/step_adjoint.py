@@ -151,7 +151,7 @@ def step_adjoint(
     if HAS_CHANGE_AXES & KINDS:
         if kind == CHANGE_AXES:
             px, py, pz, a, b, c, of_front = change_axes_adjoint(
-                record, sums, index, x0, y0, l, m, n, t, px, py, pz, a, b, c, path, alive
+                record, sums, index, x0, y0, z0, l, m, n, t, px, py, pz, a, b, c, path, alive
             )
     if HAS_LENS_AXES & KINDS:
         if kind == LENS_AXES:

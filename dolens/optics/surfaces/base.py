@@ -138,7 +138,8 @@ class Surface(nn.Module):
         optional: names that a prescription may leave out; every other is then zero.
         kernel: what the fast kernels call it; None: they have none, and the reference traces.
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
-            Neither is inherited, since a subclass may have another sag.
+        closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
+            These three are not inherited, since a subclass may have another sag.
     """
 
     kind: ClassVar[str] = ""
@@ -147,11 +148,13 @@ class Surface(nn.Module):
     arrays: ClassVar[tuple[str, ...]] = ()
     optional: ClassVar[tuple[str, ...]] = ()
     rotational: ClassVar[bool] = False
+    closed_form: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         cls.kernel = cls.__dict__.get("kernel")
         cls.rotational = cls.__dict__.get("rotational", False)
+        cls.closed_form = cls.__dict__.get("closed_form", False)
 
     def __init__(
         self,
@@ -275,20 +278,25 @@ class Surface(nn.Module):
         with torch.no_grad():
             start = cls.start(p, ray, sense).clamp(-FAR * scale, FAR * scale)
         t = find_root(step, p, start, ray, scale)
-        for _ in range(2 if torch.is_grad_enabled() else 1):
-            t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
+        # Lost rays take their derivatives, which nobody uses, at the vertex: they are finite there.
+        lost = t != t
+        t = t.masked_fill(lost, 0.0)
+        ray = ray._replace(x=ray.x.masked_fill(lost, 0.0), y=ray.y.masked_fill(lost, 0.0))
         with torch.no_grad():
-            # Read the residual off the final point: convergence is checked, never assumed.
+            # Read the residual off the root: convergence is checked, never assumed.
             x, y = torch.addcmul(ray.x, ray.l, t), torch.addcmul(ray.y, ray.m, t)
             sag, sx, sy, exists = cls.sag_and_gradient(p, x, y)
             z = ray.n * t
-            rounding = 64.0 * epsilon * (sag.abs() + t.abs() + scale)
-            margin = torch.minimum(
-                rounding - (sag - z).abs(), sense * (ray.n - ray.l * sx - ray.m * sy)
-            )
+            crossing = sense * (ray.n - ray.l * sx - ray.m * sy)
+            # Where the surface is steep along the ray, the rounding of t counts so much more.
+            steep = crossing.abs().clamp(min=1.0)
+            rounding = 64.0 * epsilon * torch.addcmul(sag.abs(), t.abs() + scale, steep)
+            margin = torch.minimum(rounding - (sag - z).abs(), crossing)
             if exists is not None:
                 margin = torch.minimum(margin, exists)
-        return t, margin
+        for _ in range(2 if torch.is_grad_enabled() else 1):
+            t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
+        return t, margin.masked_fill(lost, -1.0)
 
     @classmethod
     def normal(

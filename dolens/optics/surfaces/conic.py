@@ -73,6 +73,7 @@ class Conic(Surface):
     kind = "conic"
     kernel = Kind.CONIC
     rotational = True
+    closed_form = True
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -148,6 +149,7 @@ class Sphere(Conic):
     kind = "sphere"
     kernel = Kind.SPHERE
     rotational = True
+    closed_form = True
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:

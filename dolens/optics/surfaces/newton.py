@@ -31,8 +31,8 @@ class _Root(torch.autograd.Function):
             t = t - change
             # Newton converges quadratically: after a step of √ε the next is below rounding.
             if bool((change.abs() <= math.sqrt(epsilon) * (t.abs() + scale)).all()):
-                break
-        return t
+                return t
+        return t.masked_fill(~(change.abs() < scale), math.nan)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -103,7 +103,8 @@ def find_root(
         scale: mm; no step is longer, and it sets the tolerance near zero.
 
     Returns:
-        t, mm.  The caller checks the residual: a ray that has not converged is not marked here.
+        t, mm; NaN where the iteration still takes its longest steps in the end, or has overflowed.
+        The caller checks the residual: other rays that have not converged are not marked here.
     """
     names = tuple(parameters)
     tensors = (start, *ray, *parameters.values())

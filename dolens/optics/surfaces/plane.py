@@ -22,6 +22,7 @@ class Plane(Surface):
     kind = "plane"
     kernel = Kind.PLANE
     rotational = True
+    closed_form = True
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
@@ -79,3 +80,4 @@ class Aperture(Plane):
     kind = "aperture"
     kernel = Kind.PLANE
     rotational = True
+    closed_form = True
