@@ -100,9 +100,9 @@ class MisalignmentModule(lightning.LightningModule):
         self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
         self.unmodelled = unmodelled_of(unmodelled)
         self.measured = None
+        if measurement is not None and self.unmodelled != Unmodelled():
+            raise InputError("unmodelled: a photograph has effects of its own; leave them out")
         if measurement is not None:
-            if self.unmodelled != Unmodelled():
-                raise InputError("unmodelled: a photograph has effects of its own; leave them out")
             self.measured = read_measurements(measurement, len(sources) * len(planes))
             sensor = self.measured.sensor
         self.sensor, self.wavelength = sensor, float(wavelength)

@@ -15,8 +15,8 @@ from dolens.imaging.spot_image import SpotImager
 
 # One linear step is exact enough within so many bounds; longer ones are followed by others.
 _NEAR = 5.0
-# Steps that follow, at most, and which of them is the last: a part of a bound.
-_STEPS, _SMALL = 8, 0.1
+# Steps that are tried then, at most, and which of them is the last: a part of a bound.
+_IMAGES, _SMALL = 16, 0.1
 
 
 @dataclass(frozen=True)
@@ -106,30 +106,41 @@ def _estimate(
     """θ (P,) by Gauss-Newton steps with the derivatives of the pose, and whether it has settled.
 
     A step is A⁺ of what the images lack, in units of their noise, with A as it is at the pose.  The
-    first is all that an error of some bounds needs.  After a longer one images are made again,
-    until a step is small.
+    first is all that an error of some bounds needs.  Where it is longer images are made anew after
+    each, a step that makes them worse is halved, and the last is small.
     """
     at = pose.scale * pose.scaled.detach()
-    moved = known.correction(measurement)
+    moved = torch.zeros_like(at)
     if held is not None:
-        moved = moved + known.inheritance @ (held.found[place] - held.at)
-    if float((moved.abs() / known.bounds).max()) <= _NEAR:
-        return at + moved, True
+        moved = known.inheritance @ (held.found[place] - held.at)
+    step = known.correction(measurement)
+    if float(((moved + step).abs() / known.bounds).max()) <= _NEAR:
+        return at + moved + step, True
     there = copy.deepcopy(pose)
     if held is not None:
         there.put(held.values(place))
-    for _ in range(_STEPS):
+
+    def lacking(theta: Tensor) -> Tensor | None:
         try:
-            found = there.images(imager, (at + moved) / pose.scale)
+            found = there.images(imager, theta / pose.scale)
         except InputError:
-            # So far off that no light reaches the sensor: what the first steps found stands.
-            return at + moved, False
-        step = known.correction(measurement, torch.stack([one.image for one in found]))
-        if not bool(step.isfinite().all()):
-            return at + moved, False
-        moved = moved + step
+            # No light reaches the sensor from there.
+            return None
+        return known.lacking(measurement, torch.stack([one.image for one in found]))
+
+    left = lacking(at + moved)
+    if left is None:
+        return at + moved, False
+    step = known.correction_of(left)
+    for _ in range(_IMAGES):
         if float((step.abs() / known.bounds).max()) < _SMALL:
-            return at + moved, True
+            return at + moved + step, True
+        tried = lacking(at + moved + step)
+        if tried is not None and float(tried @ tried) < float(left @ left):
+            moved, left = moved + step, tried
+            step = known.correction_of(left)
+        else:
+            step = 0.5 * step
     return at + moved, False
 
 

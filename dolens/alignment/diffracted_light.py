@@ -20,7 +20,8 @@ _RAYS, _DEGREE = 48, 16
 _FRINGES, _PIXELS = 8.0, 2.0
 # Copies of the image meet the window at 1.
 _OVERSAMPLING = 1.15
-_MOST = 3000
+# Samples across a pupil: so that its edge is where it belongs, and what memory is meant for.
+_FEWEST, _MOST = 256, 3000
 # By how much the source moves, over its distance, to find the image's movement.
 _STEP = 1e-4
 
@@ -118,13 +119,14 @@ def diffracted_light(
     if not len(landing):
         raise InputError("unmodelled.diffraction: no light from the source reaches the sensor")
     low, high = landing.amin(0), landing.amax(0)
-    # An edge's first fringe is as wide as √(λ·d), d the way to the focus: the spot over its cone.
-    fringe = (wave * (high - low) / width).sqrt().amax()
+    # An edge's first fringe is as wide as √(λ·d), d the way to the focus: the spot over its cone;
+    # in the focus as λ over the cone.
+    fringe = torch.maximum((wave * (high - low) / width).sqrt(), wave / width).amax()
     reach = _FRINGES * fringe + _PIXELS * sensor.pixel_pitch
     margin = 0.5 * source_diameter * float(torch.linalg.matrix_norm(movement, 2))
     first, last = _on_sensor(sensor, low - reach, high + reach, front.centre[0], margin)
     period = _OVERSAMPLING * torch.maximum(last - low + reach, high + reach - first)
-    samples = 4 * math.ceil(float((period * width).amax()) / wave / 4.0)
+    samples = max(_FEWEST, 4 * math.ceil(float((period * width).amax()) / wave / 4.0))
     if samples > _MOST:
         raise InputError(
             f"unmodelled.diffraction: light is spread over {float((high - low).amax()):.2g} mm, "
