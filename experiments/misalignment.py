@@ -289,9 +289,12 @@ class MisalignmentModule(lightning.LightningModule):
                 draws = range(1, self.monte_carlo + 1)
                 found = self._estimates(number, draws, self.unmodelled, self.estimates)
                 self.estimates[fit.name] = found
-                spread = (fit.name, pose.names, found.values, known.bounds / pose.units, truth)
-                self.log_dict(spread_metrics(*spread))
-                rows = spread_columns(rows, *spread[1:])
+                values = found.values[found.settled]
+                self.log(f"pose_unsettled/{fit.name}", float(len(draws) - len(values)))
+                spread = (fit.name, pose.names, values, known.bounds / pose.units, truth)
+                if len(values) > 1:
+                    self.log_dict(spread_metrics(*spread))
+                    rows = spread_columns(rows, *spread[1:])
             self.results += rows
         write_table(self.folder / "history.csv", self.history)
         write_table(self.folder / "poses.csv", self.results)

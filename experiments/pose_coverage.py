@@ -90,7 +90,12 @@ class PoseCoverageModule(MisalignmentModule):
         self.log_dict(self.summary(), batch_size=1)
 
     def over_bound(self, case: str, fit: str) -> Tensor:
-        """(M, P): errors over their bounds."""
+        """(M, P): errors over their bounds, of the measurements whose estimates have settled."""
+        found = self.found[case, fit]
+        return self._every(case, fit)[found.settled]
+
+    def _every(self, case: str, fit: str) -> Tensor:
+        """(draws, P): errors over their bounds."""
         number = self._number(fit)
         pose, truth = self.poses[number], self.truth(number)
         true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
@@ -111,10 +116,10 @@ class PoseCoverageModule(MisalignmentModule):
                 numbers[f"coverage/{case}/{key}"] = value
             freedom = sum(len(self.poses[self._number(fit)].names) for fit in fits)
             total = torch.stack([self.found[case, fit].chi_squared for fit in fits]).sum(0)
-            numbers[f"coverage/{case}/chi_squared"] = float(total.mean()) / freedom
+            settled = torch.stack([self.found[case, fit].settled for fit in fits])
+            numbers[f"coverage/{case}/chi_squared"] = float(total[settled.all(0)].mean()) / freedom
             first = probability(total[:1], freedom)
             numbers[f"coverage/{case}/first_draw_probability"] = float(first)
-            settled = torch.stack([self.found[case, fit].settled for fit in fits])
             numbers[f"coverage/{case}/unsettled"] = float((~settled).sum())
         return numbers
 
@@ -143,7 +148,7 @@ class PoseCoverageModule(MisalignmentModule):
                         f"{name} over bound": float(off)
                         for name, off in zip(
                             self.poses[number].names,
-                            self.over_bound(case, fit.name)[draw],
+                            self._every(case, fit.name)[draw],
                             strict=True,
                         )
                     },
@@ -161,7 +166,7 @@ class PoseCoverageModule(MisalignmentModule):
                 off["rms_over_bound"],
                 100.0 * off["within_1"],
                 100.0 * off["within_2"],
-                float(found.chi_squared.mean()) / freedom,
+                float(found.chi_squared[found.settled].mean()) / freedom,
             )
 
     def _variable_rows(self, case: str, fit: str) -> list[Row]:
@@ -177,7 +182,7 @@ class PoseCoverageModule(MisalignmentModule):
                     "case": case,
                     "fit": fit,
                     "variable": name,
-                    "measurements": self.draws,
+                    "measurements": len(off),
                     "bound": bound,
                     "mean_error": bound * float(off.mean()),
                     "rms_error": bound * float(off.square().mean().sqrt()),

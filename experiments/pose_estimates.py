@@ -53,7 +53,7 @@ class Estimates:
             covariance: of the χ² distribution with P degrees of freedom where the model holds, and
             independent of what is held; NaN where no truth is known.
         settled: (M,), bool: the first step went a few bounds at most, or the last was a small part
-            of one.
+            of one.  The others are no estimates: steps ended before they were small.
     """
 
     values: Tensor
@@ -131,16 +131,16 @@ def _estimate(
     left = lacking(at + moved)
     if left is None:
         return at + moved, False
-    step = known.correction_of(left)
+    step, share = known.correction_of(left), 1.0
     for _ in range(_IMAGES):
         if float((step.abs() / known.bounds).max()) < _SMALL:
             return at + moved + step, True
-        tried = lacking(at + moved + step)
+        tried = lacking(at + moved + share * step)
         if tried is not None and float(tried @ tried) < float(left @ left):
-            moved, left = moved + step, tried
-            step = known.correction_of(left)
+            moved, left = moved + share * step, tried
+            step, share = known.correction_of(left), 1.0
         else:
-            step = 0.5 * step
+            share = 0.5 * share
     return at + moved, False
 
 
