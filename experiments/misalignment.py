@@ -294,7 +294,7 @@ class MisalignmentModule(lightning.LightningModule):
                 spread = (fit.name, pose.names, values, known.bounds / pose.units, truth)
                 if len(values) > 1:
                     self.log_dict(spread_metrics(*spread))
-                    rows = spread_columns(rows, *spread[1:])
+                rows = spread_columns(rows, *spread[1:])
             self.results += rows
         write_table(self.folder / "history.csv", self.history)
         write_table(self.folder / "poses.csv", self.results)
