@@ -89,8 +89,8 @@ def diffracted_light(
     Optics, 3.10): the reference sphere is a plane far away.  Its rays (stationary phase) land where
     geometrical optics has them.  The pupil's edge is sharp in direction, as that of a stop in the
     front focal plane is.  For a stop at the distance R from the focus, seen at δ from it, fringes
-    at the rim are wider in truth, or narrower, by the factor √(R/(R + δ)) at most: 3 % for the singlet
-    of Section VI, whose image differs by 1.3 % of its light from that about the exit pupil.
+    at the rim are wider in truth, or narrower, by the factor √(R/(R + δ)) at most: 3 % for Section
+    VI's bench, whose image differs by 1.3 % of its light from that about the exit pupil.
 
     Args:
         lens: as it stands.
