@@ -16,23 +16,29 @@ from dolens.alignment.information import Knowledge, knowledge
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.photograph import read_measurements
 from dolens.alignment.pose import Pose
+from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImage, SpotImager
 from dolens.optics.lens import Lens
 from experiments.checkpoints import refuse_another
+from experiments.pose_estimates import Estimates, Held, estimates
 from experiments.pose_iteration import iterate, loss_of, optimizer_of, slopes_of
-from experiments.pose_measurements import draw, repetitions, simulated_at
+from experiments.pose_measurements import draw, making, repetitions, simulated_at
 from experiments.pose_results import (
     error_over_bound,
     pose_metrics,
     pose_rows,
+    spread_columns,
     spread_metrics,
 )
 from experiments.pose_settings import Stage, fit_of, plain_imager, spot_imager, stage_of
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
+
+# Columns of a row of poses.csv that the log has too.
+_LOGGED = 8
 
 
 class MisalignmentModule(lightning.LightningModule):
@@ -42,7 +48,6 @@ class MisalignmentModule(lightning.LightningModule):
         lens: as designed; its elements may have poses.
         experiment: name of the experiment; a checkpoint of another one is refused.
         sources: (S, 3), mm, in the lens's axes.
-        planes: where the sensor stands for a source's images, mm from `sensor_distance`.
         wavelength: nm.
         sensor: the pixels; a measurement that is read brings its own.
         fits: name → `variables`, `truth`, and `held: {from, variables}`.
@@ -55,10 +60,13 @@ class MisalignmentModule(lightning.LightningModule):
         measurement: settings of `read_measurement`, for a photograph in the place of a simulation,
             or a list of them, one for each source on each plane; the fits then have no truth.
         folder: of the run.
-        monte_carlo: measurements with other photons, for each fit, whose estimates (by one step of
-            weighted least squares, from what the fits that they hold would have found) are compared
-            with the bound and the truth; 0 for none.
+        monte_carlo: measurements with other photons and, where it has tolerances, another lens, for
+            each fit, whose estimates (by steps of weighted least squares, from what the fits that
+            they hold would have found) are compared with the bound and the truth; 0 for none.
         seed: of simulations.
+        planes: where the sensor stands for a source's images, mm from `sensor_distance`.
+        unmodelled: settings of `Unmodelled`: what simulated measurements have and the fit's model
+            has not.
 
     Raises:
         InputError: a setting that is unknown or out of range.
@@ -83,6 +91,7 @@ class MisalignmentModule(lightning.LightningModule):
         monte_carlo: int = 0,
         seed: int = 0,
         planes: Sequence[float] = (0.0,),
+        unmodelled: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -90,7 +99,10 @@ class MisalignmentModule(lightning.LightningModule):
             raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
         self.lens = lens.requires_grad_(False)
         self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.unmodelled = unmodelled_of(unmodelled)
         self.measured = None
+        if measurement is not None and self.unmodelled != Unmodelled():
+            raise InputError("unmodelled: a photograph has effects of its own; leave them out")
         if measurement is not None:
             self.measured = read_measurements(measurement, len(sources) * len(planes))
             sensor = self.measured.sensor
@@ -128,7 +140,7 @@ class MisalignmentModule(lightning.LightningModule):
         self.history: list[dict[str, float | str]] = []
         self.results: list[Row] = []
         self.known: dict[str, Knowledge] = {}
-        self.estimates: dict[str, Tensor] = {}
+        self.estimates: dict[str, Estimates] = {}
         self.seconds: dict[str, float] = {}
         self._measurements: dict[int, Measurement] = {}
 
@@ -160,7 +172,14 @@ class MisalignmentModule(lightning.LightningModule):
             return self.measured
         if seed == 0 and number in self._measurements:
             return self._measurements[number]
-        found = simulated_at(
+        found = self.simulation(number, seed, self.unmodelled)
+        if seed == 0:
+            self._measurements[number] = found
+        return found
+
+    def simulation(self, number: int, seed: int, unmodelled: Unmodelled) -> Measurement:
+        """One of a fit's measurements, with these effects."""
+        return simulated_at(
             self.true_pose(number),
             self.wavelength,
             self.sensor,
@@ -168,10 +187,9 @@ class MisalignmentModule(lightning.LightningModule):
             self.read_noise,
             draw(self.seed, number, seed),
             self.full_well,
+            unmodelled,
+            making(self.seed, seed),
         )
-        if seed == 0:
-            self._measurements[number] = found
-        return found
 
     def finest(self, number: int) -> SpotImager:
         """The imager of a fit's last stage, by which its result is judged."""
@@ -267,21 +285,25 @@ class MisalignmentModule(lightning.LightningModule):
             self.known[fit.name] = known
             truth = self.truth(number)
             rows = pose_rows(fit.name, pose, self.initial[number], known, truth)
-            self.results += rows
             self.log_dict(pose_metrics(rows))
             if self.monte_carlo and self.measured is None:
-                self.estimates[fit.name] = self._estimates(number, known)
-                bounds = known.bounds / pose.units
-                self.log_dict(
-                    spread_metrics(fit.name, pose.names, self.estimates[fit.name], bounds, truth)
-                )
+                draws = range(1, self.monte_carlo + 1)
+                found = self._estimates(number, draws, self.unmodelled, self.estimates)
+                self.estimates[fit.name] = found
+                values = found.values[found.settled]
+                self.log(f"pose_unsettled/{fit.name}", float(len(draws) - len(values)))
+                spread = (fit.name, pose.names, values, known.bounds / pose.units, truth)
+                if len(values) > 1:
+                    self.log_dict(spread_metrics(*spread))
+                rows = spread_columns(rows, *spread[1:])
+            self.results += rows
         write_table(self.folder / "history.csv", self.history)
         write_table(self.folder / "poses.csv", self.results)
         for row in self.results:
             logger.info(
                 "%s %s: true %.5g, initial %.5g, found %.5g, error %.2g, bound %.2g (%.2g if all "
                 "that it holds were exact)",
-                *(row[key] for key in row),
+                *list(row.values())[:_LOGGED],
             )
 
     def _knowledge(self, number: int) -> Knowledge:
@@ -298,18 +320,36 @@ class MisalignmentModule(lightning.LightningModule):
         known = knowledge(both, finest, measurement, *own)
         return known.holding(len(pose.names), covariance)
 
-    def _estimates(self, number: int, known: Knowledge) -> Tensor:
-        """(M, P), degrees and mm: what other measurements lead to, those of an earlier fit too."""
+    def _estimates(
+        self,
+        number: int,
+        draws: Sequence[int],
+        unmodelled: Unmodelled,
+        earlier: Mapping[str, Estimates],
+    ) -> Estimates:
+        """What other measurements lead to, from where a fit ended, those of an earlier fit too."""
         fit, pose = self.fits[number], self.poses[number]
-        theta = pose.scale * pose.scaled.detach()
-        seeds = range(1, self.monte_carlo + 1)
-        moved = torch.stack([known.correction(self.measurement(number, seed)) for seed in seeds])
+        held = None
         if fit.held_from is not None:
             before = self.poses[self._number(fit.held_from)]
             places = [before.names.index(name) for name in fit.held]
-            off = self.estimates[fit.held_from] * before.units - before.scale * before.scaled
-            moved = moved + off[:, places] @ known.inheritance.T
-        return (theta + moved) / pose.units
+            units, truth = before.units[places], self.truth(number)
+            held = Held(
+                fit.held,
+                units,
+                (before.scale * before.scaled.detach())[places],
+                earlier[fit.held_from].values[:, places] * units,
+                torch.tensor([truth.get(n, torch.nan) for n in fit.held]).double() * units,
+            )
+        return estimates(
+            pose,
+            self.known[fit.name],
+            self.finest(number),
+            lambda seed: self.simulation(number, seed, unmodelled),
+            draws,
+            self.truth(number),
+            held,
+        )
 
     def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:
         """Of a fit's pose, or of another point u."""

@@ -67,6 +67,48 @@ def error_over_bound(rows: Sequence[Row]) -> float | None:
     return math.sqrt(sum(r * r for r in ratios) / len(ratios)) if ratios else None
 
 
+def spread_columns(
+    rows: Sequence[Row],
+    names: Sequence[str],
+    estimates: Tensor,
+    bounds: Tensor,
+    truth: Mapping[str, float],
+) -> list[Row]:
+    """Rows of `pose_rows` with what estimates from M measurements say of each variable.
+
+    Further columns are `measurements`, their number; `rms_over_bound` of the errors; and
+    `within_1`, `within_2` and `within_95`, the shares of them within one bound, within two, and
+    within 1.96.  A normal error without bias has 0.683, 0.954 and 0.95 there.
+
+    Args:
+        rows: of the fit.
+        names: of P variables.
+        estimates: (M, P).
+        bounds: (P,), in their units.
+        truth: by name.
+    """
+    wide: list[Row] = []
+    for place, (row, name) in enumerate(zip(rows, names, strict=True)):
+        off = (estimates[:, place] - truth.get(name, math.nan)) / bounds[place]
+        wide.append({**row, "measurements": float(len(off)), **error_statistics(off)})
+    return wide
+
+
+def error_statistics(off: Tensor) -> dict[str, float]:
+    """Root mean square of errors over their bounds, and how many of them lie within some bounds.
+
+    Args:
+        off: of any shape; NaN where there is no truth.
+    """
+    within = {"within_1": 1.0, "within_2": 2.0, "within_95": _WITHIN}
+    shares = {key: float((off.abs() < times).double().mean()) for key, times in within.items()}
+    known = bool(off.isfinite().all())
+    return {
+        "rms_over_bound": float(off.square().mean().sqrt()),
+        **{key: share if known else math.nan for key, share in shares.items()},
+    }
+
+
 def spread_metrics(
     fit: str,
     names: Sequence[str],
@@ -75,8 +117,9 @@ def spread_metrics(
     truth: Mapping[str, float],
 ) -> dict[str, float]:
     """How estimates from M measurements scatter: `pose_spread_over_bound/<fit>/<variable>`, which
-    has a standard error of 1/√(2M); `pose_bias_over_bound/...` of their mean, 1/√M; and
-    `pose_coverage/...`, the share of 95 % intervals (± 1.96 bounds) that hold the truth.
+    has a standard error of 1/√(2M); `pose_bias_over_bound/...` of their mean, 1/√M;
+    `pose_coverage/...`, the share of 95 % intervals (± 1.96 bounds) that hold the truth; and
+    `pose_within_1_bound/...` and `pose_within_2_bounds/...`, of narrower and wider ones.
 
     Args:
         fit: its name.
@@ -92,5 +135,8 @@ def spread_metrics(
         if name in truth:
             off = (estimates[:, place] - truth[name]) / bounds[place]
             numbers[f"pose_bias_over_bound/{fit}/{name}"] = float(off.mean())
-            numbers[f"pose_coverage/{fit}/{name}"] = float((off.abs() < _WITHIN).double().mean())
+            found = error_statistics(off)
+            numbers[f"pose_coverage/{fit}/{name}"] = found["within_95"]
+            numbers[f"pose_within_1_bound/{fit}/{name}"] = found["within_1"]
+            numbers[f"pose_within_2_bounds/{fit}/{name}"] = found["within_2"]
     return numbers

@@ -2,21 +2,24 @@
 
 import copy
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from dolens.alignment.diffracted_light import diffracted_light, on_disc
+from dolens.alignment.unmodelled import Unmodelled
 from dolens.errors import InputError
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_image import SpotImage
-from dolens.optics.elements import from_lens_axes, to_lens_axes
+from dolens.optics.elements import Axes, from_lens_axes, to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays
 
 _AT_A_TIME = 1 << 20
+_IN_CACHE = 1 << 14
 # Of directions that are drawn, about a third pass.
 _DRAWN = 4
 # Of the light behind the lens; with less on the pixels, their shares mean nothing.
@@ -94,13 +97,14 @@ def simulated(
     generator: torch.Generator,
     full_well: float | None = None,
     planes: Sequence[float] = (0.0,),
+    unmodelled: Unmodelled | None = None,
 ) -> Measurement:
     """Photons that leave each source in random directions and are counted where they land.
 
     Rims are sharp, pixels are squares that count, and nothing is smoothed.
 
     Args:
-        lens: as it stands.
+        lens: as it stands, with the radii and indices that it truly has.
         sources: (S, 3), mm.
         wavelength: nm.
         sensor: the pixels.
@@ -110,32 +114,28 @@ def simulated(
         full_well: electrons at which a pixel saturates, and is not trusted; None: never.
         planes: where the sensor stands, mm from where the lens has it; an exposure of each source
             on each.
+        unmodelled: the source's size, background and diffraction; None: none of them.
 
     Raises:
         InputError: no light passes.
     """
+    effects = unmodelled or Unmodelled()
     images = []
     moved = [copy.deepcopy(lens) for _ in planes]
     for one, plane in zip(moved, planes, strict=True):
         one.sensor_distance.add_(plane)
     for source, one in itertools.product(sources.double(), moved):
         image = torch.zeros(sensor.height * sensor.width, dtype=torch.float64)
-        passed = 0
-        while passed < photons:
-            count = min(_AT_A_TIME, _DRAWN * (photons - passed) + 1024)
-            rays = _directions(one, source, wavelength, count, generator)
-            hit = one.trace(rays)
-            x, y = (c[hit.valid].double() for c in hit.position[:, :2].unbind(-1))
-            if not len(x):
-                raise InputError("no light from the source reaches the sensor plane")
-            x, y = x[: photons - passed], y[: photons - passed]
-            passed += len(x)
+        light = (one, source, wavelength, sensor, photons, effects.source_diameter, generator)
+        for x, y in (_by_waves if effects.diffraction else _by_rays)(*light):
             rows, columns = (p.round() for p in sensor.pixels(x, y))
             inside = (
                 (rows >= 0) & (rows < sensor.height) & (columns >= 0) & (columns < sensor.width)
             )
             place = (rows * sensor.width + columns)[inside].long()
             image += torch.bincount(place, minlength=len(image))
+        if effects.background > 0.0:
+            image += torch.poisson(torch.full_like(image, effects.background), generator)
         noise = torch.randn(image.shape, generator=generator, dtype=torch.float64)
         images.append((image + read_noise * noise).reshape(sensor.height, sensor.width))
     stacked = torch.stack(images)
@@ -145,20 +145,77 @@ def simulated(
     return Measurement(stacked, mask, read_noise, sensor)
 
 
+def _by_rays(
+    lens: Lens,
+    source: Tensor,
+    wavelength: float,
+    sensor: Sensor,
+    photons: int,
+    source_diameter: float,
+    generator: torch.Generator,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Where photons land, x and y in mm, some at a time."""
+    passed = 0
+    while passed < photons:
+        count = min(_AT_A_TIME, _DRAWN * (photons - passed) + 1024)
+        rays = _directions(lens, source, wavelength, count, source_diameter, generator)
+        hit = lens.trace(rays)
+        x, y = (c[hit.valid].double() for c in hit.position[:, :2].unbind(-1))
+        if not len(x):
+            raise InputError("no light from the source reaches the sensor plane")
+        x, y = x[: photons - passed], y[: photons - passed]
+        passed += len(x)
+        yield x, y
+
+
+def _by_waves(
+    lens: Lens,
+    source: Tensor,
+    wavelength: float,
+    sensor: Sensor,
+    photons: int,
+    source_diameter: float,
+    generator: torch.Generator,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The same with diffraction, all at once."""
+    light = diffracted_light(lens, source, wavelength, sensor, source_diameter)
+    yield light.photons(photons, source_diameter, generator)
+
+
 def _directions(
-    lens: Lens, source: Tensor, wavelength: float, count: int, generator: torch.Generator
+    lens: Lens,
+    source: Tensor,
+    wavelength: float,
+    count: int,
+    source_diameter: float,
+    generator: torch.Generator,
 ) -> Rays:
     """At most so many rays of even density in solid angle, towards the first surface as it is."""
     system = lens.system()
     axes = system.axes[0]
     radius = _REACH * system.surfaces[0].semi_diameter
-    u, v, keep = torch.rand(3, count, generator=generator, dtype=torch.float64)
-    rho, angle = radius * u.sqrt(), 2.0 * torch.pi * v
-    local = Components(rho * angle.cos(), rho * angle.sin(), *4 * (torch.zeros_like(rho),))
-    d = torch.stack(to_lens_axes(local, axes)[:3], -1) - source
+    drawn = torch.rand(3, count, generator=generator, dtype=torch.float64)
+    start = source.expand(count, 3)
+    if source_diameter > 0.0:
+        u, v = torch.rand(2, count, generator=generator, dtype=torch.float64)
+        across = on_disc(u, v, 0.5 * source_diameter)
+        start = source + torch.stack([*across, torch.zeros_like(u)], -1)
+    # Parts that fit into a processor's cache take less time than all at once.
+    parts = zip(drawn.split(_IN_CACHE, 1), start.split(_IN_CACHE), strict=True)
+    found = [_aimed(axes, radius, u, v, begun) for (u, v, _), begun in parts]
+    d, density = (torch.cat(part) for part in zip(*found, strict=True))
+    chosen = drawn[2] * density.max() < density
+    return Rays(start[chosen], d[chosen], wavelength)
+
+
+def _aimed(axes: Axes, radius: float, u: Tensor, v: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vectors (N, 3) from points (N, 3) to those of even density on a disc in a surface's
+    vertex plane, and how much solid angle a part of its area takes (N,).
+    """
+    x, y = on_disc(u, v, radius)
+    local = Components(x, y, *4 * (torch.zeros_like(x),))
+    d = torch.stack(to_lens_axes(local, axes)[:3], -1) - start
     distance = d.norm(dim=-1)
-    cosine = from_lens_axes(Components(*local[:3], *(d / distance[:, None]).unbind(-1)), axes).n
-    density = cosine / distance**2
-    chosen = keep * density.max() < density
-    d = d[chosen] / distance[chosen, None]
-    return Rays(source.expand(d.shape), d, wavelength)
+    d = d / distance[:, None]
+    cosine = from_lens_axes(Components(*local[:3], *d.unbind(-1)), axes).n
+    return d, cosine / distance**2

@@ -105,7 +105,8 @@ def _corner(module: MisalignmentModule, number: int) -> Figure:
     found = torch.tensor([pose.found()[name] for name in pose.names], dtype=torch.float64)
     truth = module.truth(number)
     true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
-    points = module.estimates.get(fit.name)
+    estimates = module.estimates.get(fit.name)
+    points = None if estimates is None else estimates.values
     # Estimates scatter about the truth, where that is known; the truth lies about one estimate.
     about_truth = points is not None and bool(true.isfinite().all())
     return corner_figure(

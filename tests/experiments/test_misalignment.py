@@ -24,6 +24,7 @@ TINY = [
     "sensor.pixel_pitch=0.2208",
     "photons=100000",
     "imager.rays=10000",
+    "monte_carlo=0",
     "+trainer.enable_progress_bar=false",
     "callbacks.pictures=null",
 ]
@@ -153,6 +154,7 @@ def test_three_planes_tell_bench_and_lens_at_once(composed, tmp_path):
             "sensor.pixel_pitch=0.2208",
             "photons=30000",
             "imager.rays=6000",
+            "monte_carlo=0",
             "stages=[{optimizer: adam, iterations: 25, learning_rate: 0.2},"
             "{optimizer: dls, iterations: 10},"
             "{optimizer: dls, iterations: 2, loss: noise_weighted, damping: 1.0e-6}]",
