@@ -1,6 +1,7 @@
 """How fast and how wrong, as one Lightning module: a test, and nothing to train."""
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,6 @@ import lightning
 import torch
 
 from dolens.errors import InputError
-from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
 from dolens.plotting import Point, pareto_front
@@ -18,7 +17,7 @@ from dolens.prescriptions import lens_from_prescription
 from experiments.measurements.functions import function_rows
 from experiments.measurements.renders import (
     Subject,
-    gradient_cosine,
+    gradient_agreements,
     render_contenders,
     render_rows,
 )
@@ -106,6 +105,8 @@ class SpeedVsErrorModule(lightning.LightningModule):
         for row in self.rows:
             if row["scene"] == scene and row["part"] == part:
                 model = str(row["model"])
+                if not math.isfinite(float(row[error])):
+                    continue
                 point = Point(str(row["setting"]), row[cost], row[error], model == "auto")
                 families.setdefault(model, []).append(point)
         return families
@@ -126,6 +127,13 @@ class SpeedVsErrorModule(lightning.LightningModule):
         contenders = render_contenders(subject, self.pupil_samples, self.fields, self.tolerances)
         rows, judge = render_rows(subject, contenders, self.reference_samples, self.seconds)
         name, numbers = subject.name, self._numbers
+        agreements = gradient_agreements(subject, contenders)
+        for row in rows:
+            found = agreements.get(str(row["setting"]))
+            row["gradient_cosine"] = found.cosine if found else float("nan")
+            row["gradient_norm_ratio"] = found.norm_ratio if found else float("nan")
+            row["gradient_error"] = found.error if found else float("nan")
+            row["gradient_noise"] = found.noise if found else float("nan")
         by_setting = {row["setting"]: row for row in rows}
         front = {p.label for p in pareto_front(_points(rows))}
         for row in rows:
@@ -141,13 +149,8 @@ class SpeedVsErrorModule(lightning.LightningModule):
             if supplement is not None:
                 ratio = supplement["with_gradient_s"] / row["with_gradient_s"]
                 numbers[f"cost/supplement_over_auto_{tolerance:g}/{name}"] = ratio
-            chosen = contender.renderer.choice.renderer
-            if isinstance(chosen, PsfRenderer):
-                # Rays that cost as much, as far as they can be so few: one a pixel at least.
-                same = RayRenderer(subject.sensor, _SUPPLEMENT)
-                found = gradient_cosine(subject, same, contender.renderer)
-                numbers[f"gradient/cosine_auto_{tolerance:g}/{name}"] = found["cosine"]
-                row["gradient_cosine"] = found["cosine"]
+            numbers[f"gradient/cosine_auto_{tolerance:g}/{name}"] = row["gradient_cosine"]
+            numbers[f"gradient/norm_ratio_auto_{tolerance:g}/{name}"] = row["gradient_norm_ratio"]
         if supplement is not None:
             numbers[f"error/supplement_rays/{name}"] = supplement["error_grey_levels"]
         return rows

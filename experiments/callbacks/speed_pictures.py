@@ -30,6 +30,12 @@ _AXES = {
         "RMS error on a photograph-like image, grey levels",
     ),
 }
+_GRADIENT_AXES = (
+    "with_gradient_s",
+    "gradient_error",
+    "s an image, forward and back",
+    "error of the gradient over that of rays, relative",
+)
 _LEAST_ERROR = {"trace": 1e-10, "psf": None, "render": None}
 
 
@@ -49,7 +55,7 @@ class SpeedPictures(lightning.Callback):
 
 
 def speed_figures(module: SpeedVsErrorModule) -> dict[str, Figure]:
-    """Figures by name: `<part>_<scene>`."""
+    """Figures by name: `<part>_<scene>`, and of renders' gradients `gradient_<scene>`."""
     figures = {}
     for subject in module.subjects:
         for part in module.parts:
@@ -61,4 +67,9 @@ def speed_figures(module: SpeedVsErrorModule) -> dict[str, Figure]:
             figures[f"{part}_{subject.name}"] = pareto_figure(
                 families, cost_label, error_label, f"{subject.name}: {part}", floor
             )
+        if "render" in module.parts:
+            cost, error, *labels = _GRADIENT_AXES
+            families = module.points(subject.name, "render", cost, error)
+            title = f"{subject.name}: gradients"
+            figures[f"gradient_{subject.name}"] = pareto_figure(families, *labels, title, None)
     return figures

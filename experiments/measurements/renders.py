@@ -6,13 +6,22 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.imaging.choice.agreement import (
+    Agreement,
+    Render,
+    agreement,
+    gradient,
+    gradients_of_rays,
+    image_measure,
+    judging_samples,
+)
 from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.probe import probe_image
 from dolens.imaging.choice.reference import Reference, reference
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.renderer import Renderer
-from dolens.imaging.scene import PlanarScene
+from dolens.imaging.scene import PlanarScene, pinhole_image
 from dolens.imaging.sensor import Sensor
 from dolens.optics.lens import Lens
 from experiments.measurements.timing import by_turns, peak_megabytes
@@ -201,30 +210,32 @@ def _without_diffraction(renderer: Renderer) -> Renderer:
     return renderer
 
 
-def gradient_cosine(
-    subject: Subject, one: Renderer, other: Renderer, seeds: Sequence[int] = (1, 2, 3, 4)
-) -> Mapping[str, float]:
-    """How well the gradients of two renderers agree in direction: of an image's difference from a
-    sharp one, with respect to the subject's variables, summed over seeds.
+def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> dict[str, Agreement]:
+    """How well contenders' gradients agree with those of rays, by setting: of the squared error to
+    what a pinhole sees, with respect to the subject's variables in units of their magnitudes.
+
+    All without diffraction; of contenders by many rays, which are slow, none is asked.
     """
+    lens, scene, sensor = subject.lens, subject.scene, subject.sensor
     texture = subject.texture()
-    names = list(subject.variables)
-    lens = subject.lens
-    stored = {n: p.detach() for n, p in lens.variables(names).items()}
-    scales = {n: float(p.abs().max()) or 1.0 for n, p in stored.items()}
+    truth = pinhole_image(texture, sensor)[:, None]
+    stored = lens.variables(list(subject.variables))
+    values = {n: p.detach().clone().requires_grad_() for n, p in stored.items()}
+    measure = image_measure(values, truth)
+    side = judging_samples(sensor.height, sensor.width, len(scene.wavelengths))
 
-    def gradient(renderer: Renderer) -> Tensor:
-        total = 0.0
-        for seed in seeds:
-            values = {n: p.clone().requires_grad_() for n, p in stored.items()}
-            image = renderer.render(lens, subject.scene, texture, seed, values)
-            image.square().mean().backward()
-            flat = [(values[n].grad * scales[n]).reshape(-1).double() for n in names]
-            total = total + torch.cat(flat)
-        return total
+    def rendered(renderer: Renderer) -> Render:
+        def render(values: Mapping[str, Tensor], seed: int) -> Tensor:
+            return renderer.render(lens, scene, texture, seed, values)
 
-    first, second = gradient(one), gradient(other)
-    return {
-        "cosine": float(torch.cosine_similarity(first, second, dim=0)),
-        "norm_ratio": float(second.norm() / first.norm()),
-    }
+        return render
+
+    judge = gradients_of_rays(rendered(RayRenderer(sensor, side)), texture, measure, 101)
+    found = {}
+    for contender in contenders:
+        if _is_slow(contender):
+            continue
+        render = rendered(_without_diffraction(contender.renderer))
+        own = gradient(render, texture, measure, (1,))
+        found[contender.setting] = agreement(own, judge)
+    return found

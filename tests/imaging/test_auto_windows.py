@@ -9,7 +9,7 @@ import torch
 from dolens import load_lens
 from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.auto_windows import AutoWindows
-from dolens.imaging.choice.probe import GREY_LEVEL, probe_image
+from dolens.imaging.choice.probe import GREY_LEVEL, fine_detail, probe_image
 from dolens.imaging.distortion import chief_ray_maps
 from dolens.imaging.pupil import axial_exit_pupil
 from dolens.imaging.ray_renderer import RayRenderer
@@ -41,13 +41,20 @@ def chosen(lens, tolerance, values=None, shares=(0.0, 0.5, 0.75, 1.0)):
 
 
 def measured(lens, renderer, window):
-    """RMS error of a window in grey levels against rays, on a photograph-like image."""
+    """RMS error of a window in grey levels against rays, on the worse of two images: one like a
+    photograph, and one of fine detail.
+    """
+    size = (SIDE + 64, SIDE + 64, 5)
+    textures = (probe_image(*size), fine_detail(*size))
+    return max(measured_on(texture, lens, renderer, window) for texture in textures)
+
+
+def measured_on(texture, lens, renderer, window):
     system = lens.double().system()
     pupil, middle = axial_exit_pupil(system, LINES[1:2]), PlanarScene(SCENE.depths, LINES[1:2])
     (look,) = chief_ray_maps(system, middle, WHOLE, [window], pupil, "reference")
     lens.float()
     centre = tuple(float(c.mean().round()) for c in look)
-    texture = probe_image(SIDE + 64, SIDE + 64, seed=5)
     image = renderer.render_windows(lens, SCENE, texture, [window], [centre], seed=11)[0]
     scene = PlanarScene(SCENE.depths, LINES, centre)
     one, two = (

@@ -44,6 +44,12 @@ class Agreement:
     norm_ratio: float
     noise: float
 
+    @property
+    def error(self) -> float:
+        """Length of the difference of the two over that of the rays' gradient."""
+        ratio = self.norm_ratio
+        return math.sqrt(max(1.0 + ratio * ratio - 2.0 * ratio * self.cosine, 0.0))
+
     def excess(self, least_cosine: float, norm_tolerance: float) -> float:
         """How much worse than tolerated, as a ratio: at most 1 where both tolerances are kept.
 
