@@ -19,9 +19,11 @@ from dolens.reconstruction import (
     Restoration,
     RestorationLoss,
     psnr_db,
-    structural_similarity,
 )
 from experiments.adversary import Adversary
+from experiments.calibration import Calibration
+from experiments.calibration import check as check_calibrations
+from experiments.evaluation import Evaluation
 from experiments.lens_least_squares import LensLeastSquares
 from experiments.views.base import Imaging, Views
 
@@ -50,6 +52,7 @@ class CameraModule(lightning.LightningModule):
         operands: what the lens must be besides, as of a merit function: Σ (weight·deviation)² is
             added to the loss.
         view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
+        calibrations: point spread functions that tests give the network besides; see `Evaluation`.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class CameraModule(lightning.LightningModule):
         discriminator: RelativisticDiscriminators | None = None,
         operands: Sequence[Mapping[str, Any]] = (),
         view_norm: float = 1.0,
+        calibrations: Mapping[str, Calibration] | None = None,
     ) -> None:
         super().__init__()
         self.lens = lens.requires_grad_(False)
@@ -86,12 +90,14 @@ class CameraModule(lightning.LightningModule):
         self.view_norm = view_norm
         self.step_seconds: list[float] = []
         self.optics_seconds: list[float] = []
-        self._evaluations: list[dict[str, Tensor]] = []
+        self.evaluation = Evaluation(calibrations)
         self._step_started = self._optics_started = 0.0
         # Of the lens as it begins, so that a resumed run measures steps as an uninterrupted one.
         steps = self.lens_steps if len(self.variables) else None
         self._spots = views.spots(self.lens, steps.rings, steps.arms) if steps else []
         views.check(lens)
+        views.expose(self.lens)
+        check_calibrations(self.evaluation.calibrations, lens)
         missing = {"optics", "network"} - set(self.learning_rates)
         if missing:
             raise InputError(f"learning_rates: '{missing.pop()}' is missing (optics and network)")
@@ -135,11 +141,24 @@ class CameraModule(lightning.LightningModule):
                     total = total + (entry.weight * entry.deviation(value)).square()
         return total, found
 
-    def _functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
-        """Point spread functions of the lens as it is, where the network asks for them."""
-        if not self.network.needs_point_spread_function:
-            return None
-        return self.views.point_spread_functions(self.lens, values)
+    def take(
+        self,
+        values: Mapping[str, Tensor],
+        batch: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> tuple[Views, Tensor | None]:
+        """Images of textures, and point spread functions where the network asks for them.
+
+        In the lens's own precision, whatever the trainer's: lenses need all digits.
+        """
+        with torch.autocast(self.device.type, enabled=False):
+            taken = self.views.take(self.lens, values, batch, stage, index, judge)
+            functions = None
+            if self.network.needs_point_spread_function:
+                functions = self.views.point_spread_functions(self.lens, values)
+        return taken, functions
 
     # ---------------------------------------------------------------- training
 
@@ -184,8 +203,7 @@ class CameraModule(lightning.LightningModule):
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
         started = time.perf_counter()
         values = self.variables()
-        taken = self.views.take(self.lens, values, batch, "train", self.global_step)
-        functions = self._functions(values)
+        taken, functions = self.take(values, batch, "train", self.global_step)
         self.optics_seconds.append(time.perf_counter() - started)
         if taken.raw.requires_grad:
             # The image's gradient is the network's last; what comes after it is the lens's.
@@ -266,48 +284,29 @@ class CameraModule(lightning.LightningModule):
         """
         with torch.no_grad():
             values = self.variables()
-            taken = self.views.take(self.lens, values, batch, stage, index)
-            restored = self.restore(taken, self._functions(values))
+            taken, functions = self.take(values, batch, stage, index)
+            restored = self.restore(taken, functions)
             return taken.truth, linear_to_srgb(taken.raw), restored.clamp(0.0, 1.0)
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
         """Measure on the validation photographs."""
-        self._evaluate(batch, "val", batch_idx)
+        self.evaluation.measure(self, batch, "val", batch_idx)
 
     def test_step(self, batch: Tensor, batch_idx: int) -> None:
         """Measure on the test photographs."""
-        self._evaluate(batch, "test", batch_idx)
+        self.evaluation.measure(self, batch, "test", batch_idx)
 
     def on_validation_epoch_end(self) -> None:
         """Log the means."""
-        self._log_evaluations("val")
+        self._log_evaluations()
 
     def on_test_epoch_end(self) -> None:
         """Log the means."""
-        self._log_evaluations("test")
+        self._log_evaluations()
 
-    def _evaluate(self, batch: Tensor, stage: str, index: int) -> None:
-        truth, raw, restored = self.evaluation_images(batch, stage, index)
-        loss = self.loss_over_views(restored, truth.to(restored.dtype))
-        row = {"loss": loss["total"].expand(truth.shape[:2])}
-        for name, image in (("", restored), ("raw_", raw)):
-            for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
-                found = measure(image.flatten(0, 1), truth.flatten(0, 1).to(image.dtype))
-                row[f"{name}{metric}"] = found.unflatten(0, truth.shape[:2])
-        self._evaluations.append(row)
-
-    def _log_evaluations(self, stage: str) -> None:
-        rows, self._evaluations = self._evaluations, []
-        if not rows:
-            return
-        for name in rows[0]:
-            by_view = torch.cat([row[name] for row in rows]).mean(dim=0).float()
-            headline = name in ("loss", "psnr_db")
-            self.log(f"{stage}/{name}", by_view.mean(), prog_bar=headline)
-            if name != "loss":
-                for label, value in zip(self.views.labels(), by_view, strict=True):
-                    self.log(f"{stage}/{name}/{label}", value)
-                self.log(f"{stage}/{name}/worst", by_view.min())
+    def _log_evaluations(self) -> None:
+        for name, value in self.evaluation.means(self.views.labels()).items():
+            self.log(name, value, prog_bar=name.count("/") == 1 and "psnr_db" in name)
 
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
@@ -316,7 +315,7 @@ class CameraModule(lightning.LightningModule):
             numbers["network/pretrained"] = float(self.network.pretrained)
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.views.rays())
-        numbers |= self.views.numbers()
+        numbers |= self.views.numbers() | self.evaluation.costs()
         if self.lens_steps is not None:
             numbers |= self.lens_steps.numbers()
         if self.step_seconds:

@@ -1,12 +1,14 @@
 """Every texture at every depth of a scene: what an extended depth of field is about."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.aperture import axial_f_number
 from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.psf import axial_point_spread_functions
 from dolens.imaging.readout import Readout
@@ -14,8 +16,9 @@ from dolens.imaging.renderer import Renderer
 from dolens.imaging.scene import Scene, pinhole_image
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
+from dolens.imaging.wave.diffraction_limit import with_diffraction_limit
 from dolens.optics.lens import Lens
-from experiments.views.base import NOISE_OFFSET, Views, seed_of
+from experiments.views.base import NOISE_OFFSET, Views, exposed, seed_of
 
 
 class DepthViews:
@@ -32,9 +35,12 @@ class DepthViews:
         psf_size: pixels along each side of the point spread functions that networks ask for.
         psf_pupil_samples: their strata along each side of the pupil.
         seed: of rendering and noise.
+        judges: make the test images besides, of the same sensor, by name.
+        psf_diffraction: of the functions that networks ask for: `none`, or `limit`, blurred by a
+            perfect pupil's diffraction, as a measurement would find them.
 
     Raises:
-        InputError: the renderers' sensors differ.
+        InputError: the renderers' sensors differ, or an unknown word.
     """
 
     def __init__(
@@ -46,6 +52,8 @@ class DepthViews:
         psf_size: int = 65,
         psf_pupil_samples: int = 48,
         seed: int = 0,
+        judges: Mapping[str, Renderer] | None = None,
+        psf_diffraction: str = "none",
     ) -> None:
         self.scene = scene
         self.renderer = renderer
@@ -54,11 +62,20 @@ class DepthViews:
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
         self.seed = seed
-        if self.evaluation_renderer.sensor != renderer.sensor:
+        self._judges = dict(judges or {})
+        if psf_diffraction not in ("none", "limit"):
             raise InputError(
-                f"evaluation_renderer.sensor: {self.evaluation_renderer.sensor} is not that of "
-                f"the training renderer, {renderer.sensor}"
+                f"views.psf_diffraction '{psf_diffraction}' is unknown; allowed: none, limit"
             )
+        self.psf_diffraction = psf_diffraction
+        self._f_number: float | None = None
+        others = {f"judges.{name}": judge for name, judge in self._judges.items()}
+        for name, other in {"evaluation_renderer": self.evaluation_renderer, **others}.items():
+            if other.sensor != renderer.sensor:
+                raise InputError(
+                    f"{name}.sensor: {other.sensor} is not that of "
+                    f"the training renderer, {renderer.sensor}"
+                )
 
     @property
     def sensor(self) -> Sensor:
@@ -82,15 +99,27 @@ class DepthViews:
         """Raise `InputError` where a depth lies inside the lens."""
         self.scene.check(lens.system())
 
+    def expose(self, lens: Lens) -> None:
+        """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
+        self.readout = exposed(self.readout, lens)
+        self._f_number = axial_f_number(lens)
+
     def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
         """Let the training renderer look at the lens as it is now."""
         self.renderer.prepare(lens, self.scene, values)
 
     def take(
-        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
     ) -> Views:
         """Image textures at every depth."""
         renderer = self.renderer if stage == "train" else self.evaluation_renderer
+        renderer = renderer if judge is None else self._judges[judge]
         seed = seed_of(self.seed, stage, index)
         image = renderer.render(lens, self.scene, textures, seed, values)
         generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
@@ -98,14 +127,28 @@ class DepthViews:
         truth = linear_to_srgb(pinhole_image(self.scene.colours(textures), self.sensor))
         return Views(truth[:, None].expand_as(raw), raw)
 
+    def judges(self) -> list[str]:
+        """Those that were given."""
+        return list(self._judges)
+
     def point_spread_functions(
-        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
     ) -> Tensor:
         """(depths, 3, K, K), on the axis."""
         samples = pupil_samples or self.psf_pupil_samples
-        return axial_point_spread_functions(
-            lens, self.scene, self.sensor, self.psf_size, samples, values
+        scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
+        functions = axial_point_spread_functions(
+            lens, scene, self.sensor, self.psf_size, samples, values
         )
+        if self.psf_diffraction == "none":
+            return functions
+        f_number = self._f_number or axial_f_number(lens)
+        pitch = self.sensor.pixel_pitch
+        return with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Of each depth: on the axis, and towards the sensor's edges."""

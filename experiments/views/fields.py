@@ -23,7 +23,7 @@ from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.imaging.texture import bilinear
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
-from experiments.views.base import NOISE_OFFSET, Views, seed_of
+from experiments.views.base import NOISE_OFFSET, Views, exposed, seed_of
 from experiments.views.field_windows import FieldWindows
 
 EVERYWHERE = "field"
@@ -123,6 +123,10 @@ class FieldViews:
         """Raise `InputError` where the depth lies inside the lens."""
         self.scene.check(lens.system())
 
+    def expose(self, lens: Lens) -> None:
+        """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
+        self.readout = exposed(self.readout, lens)
+
     def prepare(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
         """Find what training windows share until the next time: the renderer, and the pupil."""
         if self._auto is not None:
@@ -132,7 +136,13 @@ class FieldViews:
             self._pupil = whole.with_pupil(lens, self.scene, values).pupil
 
     def take(
-        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
     ) -> Views:
         """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
         seed, count = seed_of(self.seed, stage, index), len(textures)
@@ -208,10 +218,19 @@ class FieldViews:
             centres.append(centre)
         return linear_to_srgb(torch.stack(truth)), centres
 
+    def judges(self) -> list[str]:
+        """None: windows are judged by the evaluation renderer alone."""
+        return []
+
     def point_spread_functions(
-        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
     ) -> Tensor:
         """(zones, 3, K, K), at the middles of the zones' windows."""
+        scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
         found = []
         for share in self.zones.values():
             window = self.windows.zone(share, 0)
@@ -220,8 +239,8 @@ class FieldViews:
             )
             system = lens.system(values)
             backend = choose_backend(system, lens.backend)
-            pupil = sampled_exit_pupil(system, self.scene.wavelengths, window, backend)
-            functions = renderer.point_spread_functions(system, self.scene, pupil, 0, backend)
+            pupil = sampled_exit_pupil(system, scene.wavelengths, window, backend)
+            functions = renderer.point_spread_functions(system, scene, pupil, 0, backend)
             found.append(functions.functions[0, 0])
         return torch.stack(found)
 
