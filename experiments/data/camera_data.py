@@ -43,7 +43,8 @@ class CropDataModule(lightning.LightningDataModule):
             steps_per_epoch is None.
         scale_range: (smallest, largest) photograph pixels per texel in training, drawn
             log-uniformly.
-        evaluation_crops_per_photograph: crops of each validation and test photograph.
+        evaluation_crops_per_photograph: crops of each validation and test photograph at most;
+            they do not overlap, so that a small photograph gives fewer.
         evaluation_scale: photograph pixels per texel in validation and test.
         flip_horizontal: mirror half of the training crops left and right.
         flip_vertical: mirror half of the training crops top and bottom.
@@ -95,6 +96,7 @@ class CropDataModule(lightning.LightningDataModule):
         self.num_workers = _count("data.num_workers", num_workers, 0)
         self.seed = _count("data.seed", seed, 0)
         self._photographs: dict[Split, Sequence[Photograph]] = {}
+        self._evaluation: dict[Split, EvaluationCrops] = {}
 
     @property
     def item_size(self) -> tuple[int, int]:
@@ -170,6 +172,10 @@ class CropDataModule(lightning.LightningDataModule):
         """The test crops, always the same."""
         return self._evaluation_loader("test")
 
+    def evaluation_photographs(self, split: Split) -> list[str]:
+        """The name of the photograph that each evaluation crop of a split is cut from, in order."""
+        return self._evaluation_crops(split).names()
+
     def first_sample(self) -> tuple[int, int]:
         """(Global number of the next training sample, samples that remain in the epoch).
 
@@ -189,13 +195,18 @@ class CropDataModule(lightning.LightningDataModule):
         first = progress.total.processed * self.batch_size
         return first, (self.steps_per_epoch - done) * self.batch_size
 
+    def _evaluation_crops(self, split: Split) -> EvaluationCrops:
+        if split not in self._evaluation:
+            self._evaluation[split] = EvaluationCrops(
+                self.photographs(split),
+                self.item_size,
+                self.evaluation_crops_per_photograph,
+                self.evaluation_scale,
+            )
+        return self._evaluation[split]
+
     def _evaluation_loader(self, split: Split) -> DataLoader:
-        dataset = EvaluationCrops(
-            self.photographs(split),
-            self.item_size,
-            self.evaluation_crops_per_photograph,
-            self.evaluation_scale,
-        )
+        dataset = self._evaluation_crops(split)
         return DataLoader(dataset, shuffle=False, **self._loader_arguments())
 
     def _loader_arguments(self) -> dict[str, Any]:

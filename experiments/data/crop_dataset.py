@@ -11,6 +11,7 @@ from experiments.data.crops import (
     centred_crop,
     check_scale_range,
     check_size,
+    crops_that_fit,
     random_crop,
     random_order,
 )
@@ -83,12 +84,14 @@ class TrainingCrops(Dataset):
 
 
 class EvaluationCrops(Dataset):
-    """A fixed list of crops: `count` of each photograph, by `centred_crops`.
+    """A fixed list of crops, by `centred_crops`: no two share a pixel of a photograph.
+
+    A photograph gives `count` crops, or as many as it holds without overlap, at least one.
 
     Args:
-        photographs: what to cut from; may decode on demand.
+        photographs: what to cut from; may decode on demand, here once where `count` is above 1.
         size: (height, width) of an item in texels.
-        count: crops of each photograph.
+        count: crops of each photograph at most.
         scale: photograph pixels per texel.
 
     Raises:
@@ -110,15 +113,25 @@ class EvaluationCrops(Dataset):
         check_scale_range((scale, scale))
         self.photographs = photographs
         self.size = size
-        self.count = count
         self.scale = scale
+        self.counts = [
+            1 if count == 1 else min(count, crops_that_fit(photographs[number], size, scale))
+            for number in range(len(photographs))
+        ]
+        self._crops = [(p, n) for p, crops in enumerate(self.counts) for n in range(crops)]
 
     def __len__(self) -> int:
-        return len(self.photographs) * self.count
+        return len(self._crops)
 
     def __getitem__(self, index: int) -> Tensor:
         """Crop `index`, photograph by photograph: (3, height, width) float32, linear light."""
         if not 0 <= index < len(self):
             raise IndexError(f"crop {index} of {len(self)}")
-        photograph, number = divmod(index, self.count)
-        return centred_crop(self.photographs[photograph], self.size, self.count, number, self.scale)
+        photograph, number = self._crops[index]
+        count = self.counts[photograph]
+        return centred_crop(self.photographs[photograph], self.size, count, number, self.scale)
+
+    def names(self) -> list[str]:
+        """The name of the photograph of every crop, in the order of the crops."""
+        names = [self.photographs[number].name for number in range(len(self.photographs))]
+        return [names[photograph] for photograph, _ in self._crops]

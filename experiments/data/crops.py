@@ -93,8 +93,8 @@ def centred_crops(
 ) -> Tensor:
     """Cut `count` crops evenly spaced over a photograph; nothing in this is random.
 
-    One crop is cut from the centre.  More lie on a grid whose rows and columns are chosen to
-    overlap as little as possible.  A photograph too small for the crop is treated as in
+    One crop is cut from the centre.  More lie on a grid and share no pixel of the photograph, so
+    that no part of it counts twice.  A photograph too small for one crop is treated as in
     `random_crop`.
 
     Args:
@@ -107,7 +107,8 @@ def centred_crops(
         (count, 3, height, width) float32, linear light in [0, 1].
 
     Raises:
-        InputError: a size or count below 1, a scale that is not positive.
+        InputError: a size or count below 1, a scale that is not positive, or a photograph that
+            cannot hold so many crops without overlap (see `crops_that_fit`).
     """
     if count < 1:
         raise InputError(f"crops of one photograph: {count}; allowed: 1 or more")
@@ -123,11 +124,33 @@ def centred_crop(
     if not 0 <= number < count:
         raise InputError(f"crop {number} of {count}; allowed: 0 to one less than their count")
     region = _region(photo, size, _scale(photo, size, (scale, scale), 0.0))
+    most = _most_crops(photo, region)
+    if count > most:
+        raise InputError(
+            f"{photo.name}: {count} crops of {region[0]}×{region[1]} of its "
+            f"{photo.height}×{photo.width} pixels would overlap; allowed: at most {most}"
+        )
     rows, columns = _grid(photo, region, count)
     cell = (2 * number + 1) * rows * columns // (2 * count)
     top = _cell_start(cell // columns, rows, photo.height, region[0])
     left = _cell_start(cell % columns, columns, photo.width, region[1])
     return _cut(photo, (top, left), region, size)
+
+
+def crops_that_fit(photo: Photograph, size: tuple[int, int], scale: float = 1.0) -> int:
+    """Count the crops that a photograph holds side by side, without overlap; at least 1.
+
+    Args:
+        photo: where to cut.
+        size: (height, width) of a crop in texels.
+        scale: photograph pixels along the side of one texel.
+
+    Raises:
+        InputError: a size below 1, a scale that is not positive.
+    """
+    check_size(size)
+    check_scale_range((scale, scale))
+    return _most_crops(photo, _region(photo, size, _scale(photo, size, (scale, scale), 0.0)))
 
 
 def check_size(size: tuple[int, int]) -> None:
@@ -206,27 +229,23 @@ def _cut(
     return crop if depth is None else torch.cat((crop, depth[None]))
 
 
+def _most_crops(photo: Photograph, region: tuple[int, int]) -> int:
+    """How many regions (height, width) in pixels lie side by side on a photograph."""
+    return (photo.height // region[0]) * (photo.width // region[1])
+
+
 def _grid(photo: Photograph, region: tuple[int, int], count: int) -> tuple[int, int]:
-    """(rows, columns) with at least `count` cells: least overlap, then fewest cells."""
+    """(rows, columns) with at least `count` cells that a region fits into: fewest cells."""
 
-    def cost(grid: tuple[int, int]) -> tuple[float, int, float]:
+    def cost(grid: tuple[int, int]) -> tuple[int, float]:
         rows, columns = grid
-        overlap = max(
-            _overlap(rows, photo.height, region[0]), _overlap(columns, photo.width, region[1])
-        )
         cell_shape = (photo.height * region[1] * columns) / (photo.width * region[0] * rows)
-        return overlap, rows * columns, abs(math.log(cell_shape))
+        return rows * columns, abs(math.log(cell_shape))
 
-    return min(((rows, math.ceil(count / rows)) for rows in range(1, count + 1)), key=cost)
-
-
-def _overlap(cells: int, extent: int, length: int) -> float:
-    """The share of a crop that its neighbour along one axis covers too."""
-    return 0.0 if cells == 1 else max(0.0, 1.0 - (extent - length) / ((cells - 1) * length))
+    grids = ((rows, math.ceil(count / rows)) for rows in range(1, photo.height // region[0] + 1))
+    return min((grid for grid in grids if grid[1] <= photo.width // region[1]), key=cost)
 
 
 def _cell_start(cell: int, cells: int, extent: int, length: int) -> int:
-    """Where the crop of a cell begins: centred in it if it fits, else from edge to edge."""
-    if cells * length <= extent:
-        return ((2 * cell + 1) * extent - cells * length) // (2 * cells)
-    return 0 if cells == 1 else (extent - length) * cell // (cells - 1)
+    """Where the crop of a cell begins, centred in it."""
+    return ((2 * cell + 1) * extent - cells * length) // (2 * cells)

@@ -41,12 +41,22 @@ def test_items_do_not_depend_on_what_was_asked_before():
 
 def test_evaluation_goes_photograph_by_photograph():
     photographs = _photographs(2)
-    dataset = EvaluationCrops(photographs, (8, 6), count=3, scale=1.5)
+    dataset = EvaluationCrops(photographs, (6, 5), count=3, scale=1.5)
     assert len(dataset) == 6
-    expected = torch.cat([centred_crops(photo, (8, 6), 3, 1.5) for photo in photographs])
+    assert dataset.names() == ["0", "0", "0", "1", "1", "1"]
+    expected = torch.cat([centred_crops(photo, (6, 5), 3, 1.5) for photo in photographs])
     assert torch.equal(torch.stack([dataset[index] for index in range(6)]), expected)
     with pytest.raises(IndexError):
         dataset[6]
+
+
+def test_a_small_photograph_gives_fewer_crops_than_a_large_one():
+    large, small = torch.zeros(3, 40, 60), torch.zeros(3, 30, 31)
+    photographs = [Photograph("large", large.byte()), Photograph("small", small.byte())]
+    dataset = EvaluationCrops(photographs, (20, 20), count=4)
+    assert dataset.names() == ["large"] * 4 + ["small"]
+    assert len(dataset) == 5
+    assert torch.equal(dataset[4], centred_crops(photographs[1], (20, 20), 1)[0])
 
 
 def test_no_photographs_is_an_error():

@@ -10,6 +10,7 @@ from experiments.data.crops import (
     _grid,
     centred_crop,
     centred_crops,
+    crops_that_fit,
     linear_light,
     random_crop,
     random_order,
@@ -130,7 +131,7 @@ def test_a_small_photograph_is_enlarged_with_one_warning(caplog):
     photo = _noise(10, 20, "tiny.png")
     with caplog.at_level(logging.WARNING):
         crops = [random_crop(photo, (30, 30), 0, index) for index in range(5)]
-        crops.extend(centred_crops(photo, (30, 30), 2))
+        crops.extend(centred_crops(photo, (30, 30), 1))
     assert all(crop.shape == (3, 30, 30) for crop in crops)
     assert [record.message.split(":")[0] for record in caplog.records] == ["tiny.png"]
 
@@ -151,12 +152,30 @@ def test_centred_crops_do_not_overlap_where_there_is_room(count):
     assert seen.sum() == count * 300
 
 
-def test_crops_that_must_overlap_reach_from_edge_to_edge():
-    corners = sorted(
-        (int(crop[0, 0, 0]), int(crop[1, 0, 0]))
-        for crop in _bytes(centred_crops(_where(), (40, 60), 4))
-    )
-    assert corners == [(0, 0), (0, 20), (20, 0), (20, 20)]
+@pytest.mark.parametrize("count", range(1, 13))
+def test_every_count_that_fits_is_cut_without_overlap(count):
+    # Three by four crops of 20 × 20 fill the photograph but for a few pixels.
+    photo = _where(62, 83)
+    assert crops_that_fit(photo, (20, 20)) == 12
+    seen = torch.zeros(62, 83)
+    for crop in _bytes(centred_crops(photo, (20, 20), count)):
+        top, left = int(crop[0, 0, 0]), int(crop[1, 0, 0])
+        seen[top : top + 20, left : left + 20] += 1
+    assert seen.max() == 1
+    assert seen.sum() == count * 400
+
+
+def test_more_crops_than_fit_are_refused():
+    with pytest.raises(
+        InputError, match="where: 2 crops of 40×60 of its 60×80 pixels would overlap"
+    ):
+        centred_crops(_where(), (40, 60), 2)
+    with pytest.raises(InputError, match="at most 4"):
+        centred_crops(_where(), (20, 20), 5, scale=1.5)
+
+
+def test_a_photograph_smaller_than_a_crop_holds_one():
+    assert crops_that_fit(_noise(10, 19, "one"), (30, 30)) == 1
 
 
 def test_the_grid_follows_the_photograph():

@@ -1,0 +1,192 @@
+"""Photographs of packages that the machine has: found where they are installed, known by hash."""
+
+import csv
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, get_args
+
+import torch
+from torch.nn.functional import avg_pool2d
+
+from dolens.errors import InputError
+from dolens.imaging.color import linear_to_srgb
+from experiments.data.camera_data import CropDataModule, Split
+from experiments.data.crops import linear_light
+from experiments.data.photographs import Photograph, read_photograph
+from experiments.data.photos import TRAIN, read_installed
+
+MANIFEST = Path(__file__).with_suffix(".csv")
+"""The project's own list; its columns are those of `Entry`."""
+
+_COLUMNS = ("split", "package", "version", "path", "sha256", "title")
+
+# What XDG_DATA_DIRS means where it is not set, by the XDG Base Directory Specification.
+_XDG_DEFAULT = "/usr/local/share/:/usr/share/"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A photograph of a list.
+
+    Attributes:
+        split: `train`, `validation` or `test`.
+        package: the Debian package that brings it.
+        version: of the package, where the file was taken from.
+        path: of the file, relative to a folder of shared data.
+        sha256: of the file, hexadecimal.
+        title: a few words on what it shows.
+    """
+
+    split: Split
+    package: str
+    version: str
+    path: str
+    sha256: str
+    title: str
+
+
+class PackagePhotographsDataModule(CropDataModule):
+    """Crops of photographs that installed packages bring; nothing is downloaded.
+
+    A manifest names the files with their hashes and says which split each belongs to.  A file is
+    taken from the first folder that has it.  Training besides sees photographs of scikit-image;
+    validation and test do not.
+
+    Args:
+        manifest: a CSV file with the columns split, package, version, path, sha256, title; None:
+            the project's own.
+        folders: folders of shared data to search, in order (packages unpacked by hand have one in
+            `usr/share`); None: those of the environment's XDG_DATA_DIRS.
+        shrink_to: photographs are averaged over k×k pixels in linear light, with the largest whole
+            k that leaves the longer side at least this long; pixels of large photographs are soft.
+        scikit_image: names of scikit-image's photographs to train on besides.
+        **crops: the arguments of `CropDataModule`.
+
+    Raises:
+        InputError: the manifest is not readable as such, or lists a file twice; at set-up, a file
+            is missing or altered (the line names it and its package).
+    """
+
+    def __init__(
+        self,
+        manifest: str | None = None,
+        folders: Sequence[str] | None = None,
+        shrink_to: int = 1280,
+        scikit_image: Sequence[str] = TRAIN,
+        **crops: Any,
+    ) -> None:
+        super().__init__(**crops)
+        self.entries = read_manifest(MANIFEST if manifest is None else Path(manifest))
+        self.folders = data_folders() if folders is None else [Path(f) for f in folders]
+        if isinstance(shrink_to, bool) or not isinstance(shrink_to, int) or shrink_to < 1:
+            raise InputError(f"data.shrink_to: {shrink_to!r}; allowed: an integer of 1 or more")
+        self.shrink_to = shrink_to
+        self.scikit_image = tuple(scikit_image)
+
+    def load_split(self, split: Split) -> list[Photograph]:
+        """Find all files of a split, check them, and read them, one byte a channel."""
+        entries = [entry for entry in self.entries if entry.split == split]
+        files = find_files(entries, self.folders)
+        found = [
+            shrunk(read_photograph(file, entry.path), self.shrink_to)
+            for entry, file in zip(entries, files, strict=True)
+        ]
+        besides = self.scikit_image if split == "train" else ()
+        return found + [read_installed(name) for name in besides]
+
+
+def data_folders() -> list[Path]:
+    """The folders of shared data that the environment's XDG_DATA_DIRS names, in its order."""
+    named = os.environ.get("XDG_DATA_DIRS", "") or _XDG_DEFAULT
+    return [Path(folder) for folder in named.split(os.pathsep) if folder]
+
+
+def read_manifest(path: Path) -> list[Entry]:
+    """Read a list of photographs.
+
+    Raises:
+        InputError: the file is missing, has other columns, an unknown split, a path that leaves the
+            folder, a path or hash that stands twice, or a split without photographs.
+    """
+    if not path.is_file():
+        raise InputError(f"data.manifest: {path} does not exist")
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if tuple(reader.fieldnames or ()) != _COLUMNS:
+            raise InputError(f"{path}: columns {reader.fieldnames}; allowed: {', '.join(_COLUMNS)}")
+        rows = list(reader)
+    entries = [_entry(path, line, row) for line, row in enumerate(rows, start=2)]
+    for name in ("path", "sha256"):
+        seen: set[str] = set()
+        for line, entry in enumerate(entries, start=2):
+            value = getattr(entry, name)
+            if value in seen:
+                raise InputError(f"{path}, line {line}: {name} {value} stands twice")
+            seen.add(value)
+    for split in get_args(Split):
+        if not any(entry.split == split for entry in entries):
+            raise InputError(f"{path}: no photographs to {split}; allowed: one or more")
+    return entries
+
+
+def find_files(entries: Sequence[Entry], folders: Sequence[Path]) -> list[Path]:
+    """The files of entries, each from the first folder that has it, with their hashes checked.
+
+    Raises:
+        InputError: files are missing, or one is not the file that was listed.
+    """
+    files = [_first(entry, folders) for entry in entries]
+    missing = [entry for entry, file in zip(entries, files, strict=True) if file is None]
+    if missing:
+        packages = sorted({entry.package for entry in missing})
+        raise InputError(
+            f"{missing[0].path}: missing (with {len(missing) - 1} other photographs) from "
+            f"{', '.join(map(str, folders))}; install the Debian packages {' '.join(packages)}, or "
+            "unpack them and name their usr/share in data.folders"
+        )
+    for entry, file in zip(entries, files, strict=True):
+        with file.open("rb") as content:
+            if hashlib.file_digest(content, "sha256").hexdigest() != entry.sha256:
+                raise InputError(
+                    f"{file}: not the file that the manifest lists (SHA-256 differs); install the "
+                    f"Debian package {entry.package}, version {entry.version}"
+                )
+    return files
+
+
+def shrunk(photograph: Photograph, least: int) -> Photograph:
+    """A photograph averaged over k×k pixels in linear light, its last rows and columns left off.
+
+    Args:
+        photograph: without depth.
+        least: pixels that the longer side keeps; k is the largest whole number that leaves them.
+    """
+    factor = max(photograph.height, photograph.width) // least
+    if factor <= 1 or min(photograph.height, photograph.width) < factor:
+        return photograph
+    light = torch.cat([avg_pool2d(linear_light(band[None]), factor) for band in photograph.encoded])
+    encoded = (linear_to_srgb(light) * 255.0).round().to(torch.uint8)
+    return Photograph(photograph.name, encoded)
+
+
+def _entry(path: Path, line: int, row: dict[str, str]) -> Entry:
+    if None in row or None in row.values():
+        raise InputError(f"{path}, line {line}: {len(_COLUMNS)} values are needed")
+    entry = Entry(**row)
+    if entry.split not in get_args(Split):
+        raise InputError(
+            f"{path}, line {line}: split '{entry.split}'; allowed: {', '.join(get_args(Split))}"
+        )
+    inside = PurePosixPath(entry.path)
+    if inside.is_absolute() or ".." in inside.parts or not inside.parts:
+        raise InputError(
+            f"{path}, line {line}: path '{entry.path}'; allowed: one within a folder of shared data"
+        )
+    return entry
+
+
+def _first(entry: Entry, folders: Sequence[Path]) -> Path | None:
+    return next((f / entry.path for f in folders if (f / entry.path).is_file()), None)
