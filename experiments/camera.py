@@ -23,8 +23,9 @@ from dolens.reconstruction import (
 from experiments.adversary import Adversary
 from experiments.calibration import Calibration
 from experiments.calibration import check as check_calibrations
-from experiments.evaluation import Evaluation
+from experiments.evaluation import Evaluation, means_of, without_loss
 from experiments.lens_least_squares import LensLeastSquares
+from experiments.photograph_scores import PhotographScores
 from experiments.views.base import Imaging, Views
 
 
@@ -91,6 +92,7 @@ class CameraModule(lightning.LightningModule):
         self.step_seconds: list[float] = []
         self.optics_seconds: list[float] = []
         self.evaluation = Evaluation(calibrations)
+        self.test_scores: dict[str, PhotographScores] = {}
         self._step_started = self._optics_started = 0.0
         # Of the lens as it begins, so that a resumed run measures steps as an uninterrupted one.
         steps = self.lens_steps if len(self.variables) else None
@@ -305,12 +307,25 @@ class CameraModule(lightning.LightningModule):
         self._log_evaluations()
 
     def _log_evaluations(self) -> None:
-        for name, value in self.evaluation.means(self.views.labels()).items():
-            self.log(name, value, prog_bar=name.count("/") == 1 and "psnr_db" in name)
+        found = self.evaluation.scores(self._photographs_of_crops, self.views.labels())
+        for stage, scores in found.items():
+            for name, value in means_of(scores).items():
+                headline = stage in ("val", "test") and name in ("loss", "psnr_db")
+                self.log(f"{stage}/{name}", value, prog_bar=headline)
+        self.test_scores.update({s: without_loss(v) for s, v in found.items() if "test" in s})
+
+    def _photographs_of_crops(self, stage: str, count: int) -> list[str]:
+        """The photograph of each of the first crops; a crop of its own where the data tell none."""
+        data = getattr(self.trainer, "datamodule", None)
+        if not hasattr(data, "evaluation_photographs"):
+            return [str(number) for number in range(count)]
+        return data.evaluation_photographs({"val": "validation", "test": "test"}[stage])[:count]
 
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
         numbers = {f"variables/{n}": float(v) for n, v in self._variable_numbers().items()}
+        for stage, scores in self.test_scores.items():
+            numbers |= scores.numbers(stage)
         if isinstance(getattr(self.network, "pretrained", None), bool):
             numbers["network/pretrained"] = float(self.network.pretrained)
         numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)

@@ -2,7 +2,8 @@
 
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -12,6 +13,7 @@ from dolens.imaging.color import linear_to_srgb
 from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db, structural_similarity
 from experiments.calibration import Calibration
+from experiments.photograph_scores import PhotographScores, scores_by_photograph
 from experiments.views.base import Imaging, Views, seed_of
 
 
@@ -44,9 +46,9 @@ class Camera(Protocol):
 class Evaluation:
     """Rows of numbers, one for each crop and view, and their means by name.
 
-    A stage is `val` or `test`; a test is done again by every judge of the views, whose numbers are
-    called `test_<judge>/…`, and with every wrong calibration: `test/psnr_db_miscalibrated/<kind>`.
-    All see the same textures and the same noise.
+    A stage is `val` or `test`; it is done again by every judge of the views, whose numbers are
+    called `test_<judge>/…`, and a test with every wrong calibration besides,
+    `test/psnr_db_miscalibrated/<kind>`.  All see the same textures and the same noise.
 
     Args:
         calibrations: name → the functions that a network is given instead of the exact ones.
@@ -61,10 +63,7 @@ class Evaluation:
     def measure(self, camera: Camera, batch: Tensor, stage: str, index: int) -> None:
         """Image, restore and compare textures (B, 3, h, w); see `Imaging.take` for the others."""
         values = camera.variables()
-        judges: Sequence[str | None] = (None,)
-        if stage == "test":
-            judges = (None, *camera.views.judges())
-        for judge in judges:
+        for judge in (None, *camera.views.judges()):
             started = time.perf_counter()
             taken, functions = camera.take(values, batch, stage, index, judge)
             if judge is not None:
@@ -94,23 +93,21 @@ class Evaluation:
         for name, values in row.items():
             kept.setdefault(name, []).append(values)
 
-    def means(self, labels: Sequence[str]) -> dict[str, Tensor]:
-        """Metrics `<stage>/<name>` with the views' own and the worst one's; rows are forgotten.
+    def scores(
+        self, photographs: Callable[[str, int], Sequence[str]], labels: Sequence[str]
+    ) -> dict[str, PhotographScores]:
+        """Scores by photograph of every stage that was measured; the rows are forgotten.
 
         Args:
+            photographs: stage, `val` or `test`, and number of crops → the photograph of each.
             labels: of the views.
         """
         rows, self._rows = self._rows, {}
-        found: dict[str, Tensor] = {}
+        found: dict[str, PhotographScores] = {}
         for stage, columns in rows.items():
-            for name, values in columns.items():
-                by_view = torch.cat(values).mean(dim=0).float()
-                found[f"{stage}/{name}"] = by_view.mean()
-                if name == "loss":
-                    continue
-                for label, value in zip(labels, by_view, strict=True):
-                    found[f"{stage}/{name}/{label}"] = value
-                found[f"{stage}/{name}/worst"] = by_view.min()
+            crops = {name: torch.cat(values).float().cpu() for name, values in columns.items()}
+            of_crops = photographs(stage.partition("_")[0], len(crops["psnr_db"]))
+            found[stage] = scores_by_photograph(crops, of_crops, labels)
         return found
 
     def costs(self) -> dict[str, float]:
@@ -119,6 +116,29 @@ class Evaluation:
             f"cost/judge_{name}_s": statistics.median(values)
             for name, values in self._seconds.items()
         }
+
+
+def means_of(scores: PhotographScores) -> dict[str, Tensor]:
+    """Means over photographs, each of which counts once: of all views, of each, and of the worst.
+
+    The loss has no value of its own for each view.
+    """
+    found: dict[str, Tensor] = {}
+    for name, values in scores.metrics.items():
+        by_view = values.mean(dim=0)
+        found[name] = by_view.mean()
+        if name == "loss":
+            continue
+        for label, value in zip(scores.views, by_view, strict=True):
+            found[f"{name}/{label}"] = value
+        found[f"{name}/worst"] = by_view.min()
+    return found
+
+
+def without_loss(scores: PhotographScores) -> PhotographScores:
+    """What a table of photographs keeps."""
+    kept = {name: values for name, values in scores.metrics.items() if name != "loss"}
+    return replace(scores, metrics=kept)
 
 
 def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:

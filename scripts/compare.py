@@ -1,7 +1,9 @@
-"""Tables of test PSNR and SSIM over seeds: `python scripts/compare.py RUN_FOLDER ...`.
+"""Tables of test metrics over seeds: `python scripts/compare.py RUN_FOLDER ...`.
 
-Runs of one experiment (and one way to move the lens) are a row, and their seeds its spread.  With
-`--against EXPERIMENT` a row besides says what each gains, seed by seed.
+Runs that differ in nothing but the seed are a row: their mean, and half their range over seeds.
+What else tells runs of one experiment apart stands in the row's name.  Runs with other views have a
+table of their own.  With `--against ROW` a row besides says what each gains, with a 95 % interval
+over seeds and photographs where the runs kept test_photographs.csv.
 """
 
 import argparse
@@ -11,74 +13,175 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import yaml
+import torch
+
+from dolens.errors import InputError
+from dolens.reconstruction.intervals import Interval, gain_interval
+from experiments.compared_runs import Run, grouped, read_run
+from experiments.photograph_scores import format_interval, statistics_of
 
 METRICS = ("psnr_db", "ssim", "raw_psnr_db")
 
-
-def read_run(folder: Path) -> tuple[str, int, dict[str, float]]:
-    """Name, seed and metrics of a run."""
-    choices = yaml.safe_load((folder / ".hydra" / "hydra.yaml").read_text())["hydra"]
-    config = yaml.safe_load((folder / ".hydra" / "config.yaml").read_text())
-    name = choices["runtime"]["choices"]["experiment"]
-    lens = (config.get("optimizer") or {}).get("lens", "adam")
-    if lens != "adam" and config.get("variables"):
-        name = f"{name}, {lens}"
-    return name, int(config["seed"]), json.loads((folder / "metrics.json").read_text())
+Group = Mapping[int, Run]
 
 
-def table(
-    runs: Mapping[str, Mapping[int, Mapping[str, float]]], metric: str, against: str | None
-) -> list[str]:
-    """Lines of a table in Markdown: a row for each name, a column for each view."""
-    some = next(iter(next(iter(runs.values())).values()))
+def views_of(group: Group, metric: str) -> tuple[str, ...]:
+    """The views that every run of a group has a metric of, `worst` among them."""
     prefix = f"test/{metric}/"
-    views = [key.removeprefix(prefix) for key in some if key.startswith(prefix)]
-    lines = [
-        f"| {metric} | seeds | {' | '.join(views)} |",
-        "|" + "---|" * (len(views) + 2),
-    ]
-    for name, seeds in runs.items():
-        cells = [_cell([run[prefix + view] for run in seeds.values()]) for view in views]
-        lines.append(f"| {name} | {len(seeds)} | {' | '.join(cells)} |")
-    for name, seeds in runs.items():
-        if against is None or name == against:
-            continue
-        both = sorted(seeds.keys() & runs[against].keys())
-        gains = (
-            [seeds[s][prefix + view] - runs[against][s][prefix + view] for s in both]
-            for view in views
+    runs = [run.metrics for run in group.values()]
+    return tuple(
+        key.removeprefix(prefix)
+        for key in runs[0]
+        if key.startswith(prefix) and all(key in metrics for metrics in runs)
+    )
+
+
+def gain(group: Group, against: Group, metric: str, view: str) -> Interval | None:
+    """What a group gains in a view, over the seeds that both have; None where they share none.
+
+    The interval is NaN where a run kept no scores of photographs, or of others than the rest.
+    """
+    seeds = sorted(group.keys() & against.keys())
+    if not seeds:
+        return None
+    runs = [group[seed] for seed in seeds], [against[seed] for seed in seeds]
+    scores = [run.scores for side in runs for run in side]
+    first = scores[0]
+    comparable = first is not None and all(
+        other is not None
+        and (other.photographs, other.views) == (first.photographs, first.views)
+        and metric in other.metrics
+        for other in scores
+    )
+    if comparable and view in statistics_of(first.views):
+        return gain_interval(
+            *(torch.stack([run.scores.metrics[metric] for run in side]) for side in runs),
+            statistics_of(first.views)[view],
+            torch.Generator().manual_seed(0),
         )
-        cells = [_cell(gain, "+") if gain else "" for gain in gains]
-        lines.append(f"| {name} - {against} | {len(both)} | {' | '.join(cells)} |")
+    key = f"test/{metric}/{view}"
+    means = [statistics.mean(run.metrics[key] for run in side) for side in runs]
+    return Interval(means[0] - means[1], float("nan"), float("nan"), len(seeds), 0)
+
+
+def tables(groups: Mapping[str, Group], metric: str, against: str | None) -> list[str]:
+    """Lines of Markdown: a table for each set of views, a row for each group and each gain."""
+    of_views: dict[tuple[str, ...], list[str]] = {}
+    for name, group in groups.items():
+        of_views.setdefault(views_of(group, metric), []).append(name)
+    without = of_views.pop((), [])
+    lines: list[str] = []
+    for views, names in of_views.items():
+        lines += [
+            f"| {metric} | seeds | photographs | {' | '.join(views)} |",
+            "|" + "---|" * (len(views) + 3),
+        ]
+        for name in names:
+            cells = [
+                _cell([_value(run, metric, v) for run in groups[name].values()]) for v in views
+            ]
+            lines.append(_row(name, len(groups[name]), _photographs(groups[name]), cells))
+        if against in names:
+            others = [name for name in names if name != against]
+            lines += [_gain_row(groups, name, against, metric, views) for name in others]
+        elif against is not None and against not in without:
+            lines += ["", f"No gains over {against}: it has other views."]
+        lines.append("")
+    if without:
+        lines += [f"No test/{metric} of: {'; '.join(without)}.", ""]
     return lines
 
 
-def _cell(values: Sequence[float], sign: str = "") -> str:
+def gains(groups: Mapping[str, Group], metrics: Sequence[str], against: str) -> dict[str, float]:
+    """Every gain with its interval as flat numbers, `gain/<metric>/<view>/<row>/<what>`."""
+    numbers: dict[str, float] = {}
+    for metric in metrics:
+        views = views_of(groups[against], metric)
+        for name, group in groups.items():
+            if name == against or views_of(group, metric) != views:
+                continue
+            for view in views:
+                found = gain(group, groups[against], metric, view)
+                if found is None:
+                    continue
+                values = vars(found).items()
+                key = f"gain/{metric}/{view}/{name}"
+                numbers |= {f"{key}/{what}": value for what, value in values if value == value}
+    return numbers
+
+
+def _gain_row(
+    groups: Mapping[str, Group], name: str, against: str, metric: str, views: Sequence[str]
+) -> str:
+    found = [gain(groups[name], groups[against], metric, view) for view in views]
+    title = f"{name} - {against}"
+    if None in found:
+        return _row(title, 0, "", ["no seed in common"] * len(views))
+    digits = 3 if max(abs(interval.estimate) for interval in found) < 0.15 else 2
+    counts = {interval.photographs for interval in found}
+    photographs = str(min(counts)) if counts != {0} else "not paired"
+    return _row(title, found[0].seeds, photographs, [format_interval(i, digits) for i in found])
+
+
+def _row(name: str, seeds: int, photographs: str, cells: Sequence[str]) -> str:
+    return f"| {name} | {seeds} | {photographs} | {' | '.join(cells)} |"
+
+
+def _value(run: Run, metric: str, view: str) -> float:
+    return run.metrics[f"test/{metric}/{view}"]
+
+
+def _photographs(group: Group) -> str:
+    """How many photographs each of the runs was tested on."""
+    counts = {len(run.scores.photographs) if run.scores else "?" for run in group.values()}
+    return ", ".join(sorted(map(str, counts)))
+
+
+def _cell(values: Sequence[float]) -> str:
     """The mean, and half the range."""
-    digits = 3 if max(map(abs, values)) < 2.0 and not sign else 2
-    digits = 3 if sign and max(map(abs, values)) < 0.15 else digits
+    digits = 3 if max(map(abs, values)) < 2.0 else 2
     mean, spread = statistics.mean(values), 0.5 * (max(values) - min(values))
-    return f"{mean:{sign}.{digits}f} ± {spread:.{digits}f}"
+    return f"{mean:.{digits}f} ± {spread:.{digits}f}"
+
+
+def _row_named(groups: Mapping[str, Group], wanted: str) -> str:
+    """The row that a name or an experiment means."""
+    rows = [
+        name
+        for name, group in groups.items()
+        if wanted in (name, next(iter(group.values())).experiment)
+    ]
+    if wanted in groups:
+        return wanted
+    if not rows:
+        raise InputError(f"--against: '{wanted}' is not among {', '.join(groups)}")
+    if len(rows) > 1:
+        raise InputError(f"--against: '{wanted}' is several rows; choose one: {'; '.join(rows)}")
+    return rows[0]
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, help="run folders")
-    parser.add_argument("--against", help="the experiment that others are compared with")
+    parser.add_argument("--against", help="the row, or experiment, that others are compared with")
     parser.add_argument("--metrics", nargs="+", default=METRICS)
+    parser.add_argument("--json", type=Path, help="a file for the gains and their intervals")
     given = parser.parse_args(arguments)
-    runs: dict[str, dict[int, dict[str, float]]] = {}
-    for folder in given.folders:
-        if not (folder / "metrics.json").is_file():
-            parser.error(f"{folder} is no finished run folder: metrics.json is missing")
-        name, seed, metrics = read_run(folder)
-        runs.setdefault(name, {})[seed] = metrics
-    if given.against is not None and given.against not in runs:
-        parser.error(f"--against: '{given.against}' is not among {', '.join(runs)}")
-    for metric in given.metrics:
-        print("\n".join([*table(runs, metric, given.against), ""]))
+    try:
+        if given.json is not None and given.against is None:
+            raise InputError("--json: gains need --against")
+        groups = grouped([read_run(folder) for folder in given.folders])
+        against = _row_named(groups, given.against) if given.against else None
+        for metric in given.metrics:
+            print("\n".join(tables(groups, metric, against)))
+    except InputError as problem:
+        parser.error(str(problem))
+    if against is not None:
+        print("Gains: estimate [95 % interval over seeds and photographs, paired].")
+    if given.json is not None:
+        numbers = gains(groups, given.metrics, against)
+        given.json.write_text(json.dumps(numbers, indent=2, sort_keys=True) + "\n")
     return 0
 
 

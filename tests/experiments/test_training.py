@@ -65,6 +65,7 @@ def test_a_run_leaves_the_whole_run_folder(composed, tmp_path):
     for name in (
         "run.json",
         "metrics.json",
+        "test_photographs.csv",
         "checkpoints/last.ckpt",
         "checkpoints/best.ckpt",
         "lens/initial.yaml",
