@@ -63,11 +63,11 @@ def test_a_judge_s_metrics_stand_for_the_test_s(tmp_path):
 
 
 def test_linear_bounds_find_the_textbook_s_tendencies():
-    dim, bright = bound_gains([8000.0, 6000.0, 4500.0], [50.0, 5000.0], 3.0)
+    dim, bright = bound_gains([8000.0, 6000.0, 4500.0], [50.0, 5000.0], 3.0, (0.0,))
     # The brighter, the further a plain lens is stopped down.
     assert bright.plain_f_number > dim.plain_f_number > 8.5
     # Where the depth is known a plate gains more, and the more so the brighter it is.
     assert bright.own > dim.own > dim.shared
     # One plane needs no plate: the weakest is best, and gains nothing.
-    (flat,) = bound_gains([5760.0], [1000.0], 3.0)
+    (flat,) = bound_gains([5760.0], [1000.0], 3.0, (0.0,))
     assert flat.plate == 0.5e-5 and flat.shared <= 0.0

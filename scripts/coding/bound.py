@@ -58,7 +58,10 @@ class _Candidate:
 
 @torch.no_grad()
 def bound_gains(
-    depths: Sequence[float], lights: Sequence[float], read_noise: float
+    depths: Sequence[float],
+    lights: Sequence[float],
+    read_noise: float,
+    shifts: Sequence[float] = _FOCUS_SHIFTS,
 ) -> list[BoundGain]:
     """Gains over the best plain lens, F-number and focus searched, at several light levels.
 
@@ -69,9 +72,10 @@ def bound_gains(
         depths: of the scene, mm.
         lights: electrons of a white pixel at full aperture.
         read_noise: electrons.
+        shifts: of the sensor that are tried, mm.
     """
     spectrum = natural_spectrum(_SIDE, _SIDE, _VARIANCE, _OUTER_SCALE, torch.zeros(()))
-    plain, coded = list(_plain(depths)), list(_coded(depths))
+    plain, coded = list(_plain(depths, shifts)), list(_coded(depths, shifts))
     full = coded[0].f_number
     found = []
     for light in lights:
@@ -97,18 +101,20 @@ def bound_gains(
     return found
 
 
-def _plain(depths: Sequence[float]) -> Iterator[_Candidate]:
+def _plain(depths: Sequence[float], shifts: Sequence[float]) -> Iterator[_Candidate]:
     for loss in _LOSSES:
         lens = _lens(_FULL / math.sqrt(loss))
-        for shift in _FOCUS_SHIFTS:
-            yield _candidate(lens, depths, _FOCUS + shift, 0.0)
+        f_number = axial_f_number(lens)
+        for shift in shifts:
+            yield _candidate(lens, f_number, depths, _FOCUS + shift, 0.0)
 
 
-def _coded(depths: Sequence[float]) -> Iterator[_Candidate]:
+def _coded(depths: Sequence[float], shifts: Sequence[float]) -> Iterator[_Candidate]:
     lens = _lens(_FULL)
+    f_number = axial_f_number(lens)
     for plate in _PLATES:
-        for shift in _FOCUS_SHIFTS:
-            yield _candidate(lens, depths, _FOCUS + shift, plate)
+        for shift in shifts:
+            yield _candidate(lens, f_number, depths, _FOCUS + shift, plate)
 
 
 def _lens(semi_diameter: float) -> Lens:
@@ -117,11 +123,12 @@ def _lens(semi_diameter: float) -> Lens:
     return lens_from_prescription(prescription, torch.float32, where=str(_LENS), backend="auto")
 
 
-def _candidate(lens: Lens, depths: Sequence[float], focus: float, plate: float) -> _Candidate:
+def _candidate(
+    lens: Lens, f_number: float, depths: Sequence[float], focus: float, plate: float
+) -> _Candidate:
     scene, pitch = PlanarScene(tuple(depths), (_WAVELENGTH,)), _SENSOR.pixel_pitch
     values = {"sensor_distance": torch.tensor(focus)}
     values |= {f"surfaces.5.{name}": torch.tensor(plate) for name in ("x3", "y3")}
     functions = axial_point_spread_functions(lens, scene, _SENSOR, _SIZE, _SAMPLES, values)
-    f_number = axial_f_number(lens)
     functions = with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
     return _Candidate(functions[:, 0], f_number, plate)
