@@ -179,7 +179,10 @@ def main(arguments: Sequence[str]) -> int:
     except InputError as problem:
         parser.error(str(problem))
     if against is not None:
-        print("Gains: estimate [95 % interval over seeds and photographs, paired].")
+        print(
+            "Gains: estimate [95 % interval over the seeds and photographs counted, paired]; one "
+            "seed says nothing about others."
+        )
     if given.json is not None:
         numbers = gains(groups, given.metrics, against)
         given.json.write_text(json.dumps(numbers, indent=2, sort_keys=True) + "\n")

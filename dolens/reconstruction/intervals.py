@@ -43,10 +43,12 @@ def bootstrap_interval(
     unbiased s²/n (McCarthy and Snowden 1985).  What seeds and photographs do together counts up to
     three times, which makes the interval a little too wide rather than too narrow.
 
-    The percentiles are those that Student's t asks for (Hesterberg 2015, "expanded percentile"):
-    Φ(t_{α/2, ν}) in place of α/2, with ν by Welch and Satterthwaite from jackknife variances over
-    seeds and over photographs.  With one seed the interval says nothing about other seeds.  Two or
-    three of either cannot show how far others would go: the interval is then too narrow.
+    Each end is the farther of two.  One is the resamples' percentile that Student's t asks for
+    (Hesterberg 2015, "expanded percentile"): Φ(-t_{α/2, ν}) in place of α/2.  It follows skewed
+    scores, but never leaves the resamples, which few seeds or photographs cannot spread far enough.
+    The other is the estimate ± t_{α/2, ν} standard deviations of the resamples.  ν is by Welch and
+    Satterthwaite from jackknife variances over seeds and over photographs.  With one seed the
+    interval says nothing about other seeds.
 
     Paired comparisons put the scores of both cameras into the last axis of the same tensor: then
     every resample has the same seeds and photographs for both.
@@ -77,8 +79,11 @@ def bootstrap_interval(
     of_photographs = _weights(photographs, resamples, generator)
     found = statistic(torch.einsum("rs,spk,rp->rk", of_seeds, scores, of_photographs))
     degrees = _degrees_of_freedom(scores, statistic)
-    tail = float(ndtr(stdtrit(degrees, 0.5 * (1.0 - level))))
-    low, high = torch.quantile(found, torch.tensor([tail, 1.0 - tail], dtype=found.dtype)).tolist()
+    quantile = float(stdtrit(degrees, 0.5 * (1.0 + level)))
+    tails = torch.tensor([ndtr(-quantile), ndtr(quantile)], dtype=found.dtype)
+    low, high = torch.quantile(found, tails).tolist()
+    half_width = quantile * float(found.std())
+    low, high = min(low, estimate - half_width), max(high, estimate + half_width)
     return Interval(estimate, low, high, seeds, photographs)
 
 

@@ -31,10 +31,11 @@ def test_each_photograph_counts_once_however_many_crops_it_has():
 def test_numbers_have_counts_and_intervals():
     numbers = _scores().numbers("test")
     assert numbers["test/photographs"] == 2 and numbers["test/crops"] == 3
-    for view, lowest, highest in (("/near", 2.0, 10.0), ("/far", 6.0, 12.0), ("/worst", 2.0, 10.0)):
-        # Two photographs: no resample goes beyond them.
-        assert numbers[f"error/test/psnr_db{view}/low"] == pytest.approx(lowest)
-        assert numbers[f"error/test/psnr_db{view}/high"] == pytest.approx(highest)
+    # Two photographs: the mean ± t of one degree of freedom standard deviations, s/√2.
+    for view, mean, deviation in (("near", 6.0, 4.0), ("far", 9.0, 3.0), ("worst", 6.0, 4.0)):
+        half = 12.706 * deviation
+        low, high = (numbers[f"error/test/psnr_db/{view}/{end}"] for end in ("low", "high"))
+        assert (low, high) == pytest.approx((mean - half, mean + half), rel=0.02)
     assert "error/test/psnr_db/low" in numbers
 
 

@@ -33,20 +33,38 @@ def test_one_factor_has_students_interval(shape):
     assert found.high == pytest.approx(mean + half, abs=0.05 * half)
 
 
+def test_few_photographs_have_students_interval_too():
+    # No resample of three photographs goes beyond them; t at two degrees of freedom does.
+    scores = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)[None, :, None]
+    found = bootstrap_interval(scores, first, seeded(), resamples=40000)
+    half = student_t.ppf(0.975, 2) / math.sqrt(3)
+    assert found.low == pytest.approx(2.0 - half, rel=0.02)
+    assert found.high == pytest.approx(2.0 + half, rel=0.02)
+
+
+def test_the_interval_reaches_further_to_the_side_of_rare_scores():
+    scores = torch.zeros(1, 30, 1, dtype=torch.float64)
+    scores[0, :2] = 10.0
+    found = bootstrap_interval(scores, first, seeded())
+    half = student_t.ppf(0.975, 29) * float(scores.std()) / math.sqrt(30)
+    assert found.low == pytest.approx(found.estimate - half, abs=0.05 * half)
+    assert found.high > found.estimate + 1.05 * half
+
+
 @pytest.mark.parametrize("level", [0.8, 0.95])
 @pytest.mark.parametrize(
     ("seeds", "photographs", "of_seeds", "of_photographs"),
-    [(5, 40, 0.1, 0.5), (5, 40, 0.3, 0.3), (1, 40, 0.0, 1.0)],
+    [(5, 40, 0.1, 0.5), (5, 40, 0.3, 0.3), (1, 40, 0.0, 1.0), (1, 3, 0.0, 1.0)],
 )
 def test_coverage_of_normal_scores(level, seeds, photographs, of_seeds, of_photographs):
-    generator, covered, trials = seeded(2), 0, 400
+    generator, covered, trials = seeded(2), 0, 300
     for _ in range(trials):
         scores = (
             of_seeds * torch.randn(seeds, 1, 1, generator=generator)
             + of_photographs * torch.randn(1, photographs, 1, generator=generator)
             + 0.2 * torch.randn(seeds, photographs, 1, generator=generator)
         )
-        found = bootstrap_interval(scores, first, generator, level, resamples=1000)
+        found = bootstrap_interval(scores, first, generator, level, resamples=500)
         covered += found.low <= 0.0 <= found.high
     # Within four standard deviations of the count, and above by what is a little too wide.
     spread = math.sqrt(level * (1 - level) / trials)
