@@ -1,6 +1,5 @@
 """A camera as one Lightning module: a lens, how it looks, reconstruction and loss."""
 
-import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,13 +18,15 @@ from dolens.reconstruction import (
     Restoration,
     RestorationLoss,
     psnr_db,
-    structural_similarity,
 )
 from experiments.adversary import Adversary
+from experiments.calibration import Calibration
+from experiments.calibration import check as check_calibrations
 from experiments.camera_operands import CameraOperands
 from experiments.checkpoints import refuse_another
+from experiments.evaluation import Evaluation, means_of, without_loss
 from experiments.lens_least_squares import LensLeastSquares
-from experiments.photograph_scores import PhotographScores, scores_by_photograph
+from experiments.photograph_scores import PhotographScores
 from experiments.views.base import Comparison, Imaging, Views
 
 
@@ -54,6 +55,7 @@ class CameraModule(lightning.LightningModule):
             added to the loss.  Objects are at the views' `object_distance`; see `CameraOperands`.
             A step of the lens after which a chief ray does not reach the stop is taken back.
         view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
+        calibrations: point spread functions that tests give the network besides; see `Evaluation`.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class CameraModule(lightning.LightningModule):
         discriminator: RelativisticDiscriminators | None = None,
         operands: Sequence[Mapping[str, Any]] = (),
         view_norm: float = 1.0,
+        calibrations: Mapping[str, Calibration] | None = None,
     ) -> None:
         super().__init__()
         self.lens = lens.requires_grad_(False)
@@ -90,14 +93,16 @@ class CameraModule(lightning.LightningModule):
         self.view_norm = view_norm
         self.step_seconds: list[float] = []
         self.optics_seconds: list[float] = []
-        self._evaluations: list[dict[str, Tensor]] = []
-        self.test_scores: PhotographScores | None = None
+        self.evaluation = Evaluation(calibrations)
+        self.test_scores: dict[str, PhotographScores] = {}
         self._step_started = self._optics_started = 0.0
         # Of the lens as it begins, so that a resumed run measures steps as an uninterrupted one.
+        views.check(lens)
         steps = self.lens_steps if len(self.variables) else None
         self._spots = views.spots(self.lens, steps.rings, steps.arms) if steps else []
-        views.check(lens)
         self.operands.check(lens, self.variables())
+        views.expose(self.lens)
+        check_calibrations(self.evaluation.calibrations, lens)
         missing = {"optics", "network"} - set(self.learning_rates)
         if missing:
             raise InputError(f"learning_rates: '{missing.pop()}' is missing (optics and network)")
@@ -133,7 +138,23 @@ class CameraModule(lightning.LightningModule):
         """What the operands add to the loss, and their values by label."""
         return self.operands.penalty(self.lens, values)
 
-    def _functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
+    def take(
+        self,
+        values: Mapping[str, Tensor],
+        batch: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> tuple[Views, Tensor | None]:
+        """Images of textures, and point spread functions where the network asks for them.
+
+        In the lens's own precision, whatever the trainer's: lenses need all digits.
+        """
+        with torch.autocast(self.device.type, enabled=False):
+            taken = self.views.take(self.lens, values, batch, stage, index, judge)
+            return taken, self.functions(values)
+
+    def functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
         """Point spread functions of the lens as it is, where the network asks for them."""
         if not self.network.needs_point_spread_function:
             return None
@@ -180,7 +201,7 @@ class CameraModule(lightning.LightningModule):
             return None
 
         def loss(taken: Views, values: Mapping[str, Tensor]) -> Tensor:
-            functions = self._functions(values)
+            functions = self.functions(values)
             # No statistics or dropout of its own may move while gradients are compared.
             training = self.network.training
             self.network.eval()
@@ -198,8 +219,7 @@ class CameraModule(lightning.LightningModule):
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
         started = time.perf_counter()
         values = self.variables()
-        taken = self.views.take(self.lens, values, batch, "train", self.global_step)
-        functions = self._functions(values)
+        taken, functions = self.take(values, batch, "train", self.global_step)
         self.optics_seconds.append(time.perf_counter() - started)
         if taken.raw.requires_grad:
             # The image's gradient is the network's last; what comes after it is the lens's.
@@ -296,54 +316,33 @@ class CameraModule(lightning.LightningModule):
         """
         with torch.no_grad():
             values = self.variables()
-            taken = self.views.take(self.lens, values, batch, stage, index)
-            restored = self.restore(taken, self._functions(values))
+            taken, functions = self.take(values, batch, stage, index)
+            restored = self.restore(taken, functions)
             return taken.truth, linear_to_srgb(taken.raw), restored.clamp(0.0, 1.0)
 
     def validation_step(self, batch: Tensor, batch_idx: int) -> None:
         """Measure on the validation photographs."""
-        self._evaluate(batch, "val", batch_idx)
+        self.evaluation.measure(self, batch, "val", batch_idx)
 
     def test_step(self, batch: Tensor, batch_idx: int) -> None:
         """Measure on the test photographs."""
-        self._evaluate(batch, "test", batch_idx)
+        self.evaluation.measure(self, batch, "test", batch_idx)
 
     def on_validation_epoch_end(self) -> None:
         """Log the means."""
-        self._log_evaluations("val")
+        self._log_evaluations()
 
     def on_test_epoch_end(self) -> None:
         """Log the means."""
-        self._log_evaluations("test")
+        self._log_evaluations()
 
-    def _evaluate(self, batch: Tensor, stage: str, index: int) -> None:
-        truth, raw, restored = self.evaluation_images(batch, stage, index)
-        loss = self.loss_over_views(restored, truth.to(restored.dtype))
-        row = {"loss": loss["total"].expand(truth.shape[:2])}
-        for name, image in (("", restored), ("raw_", raw)):
-            for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
-                found = measure(image.flatten(0, 1), truth.flatten(0, 1).to(image.dtype))
-                row[f"{name}{metric}"] = found.unflatten(0, truth.shape[:2])
-        self._evaluations.append(row)
-
-    def _log_evaluations(self, stage: str) -> None:
-        rows, self._evaluations = self._evaluations, []
-        if not rows:
-            return
-        crops = {name: torch.cat([row[name] for row in rows]).float().cpu() for name in rows[0]}
-        photographs = self._photographs_of_crops(stage, len(crops["psnr_db"]))
-        scores = scores_by_photograph(crops, photographs, self.views.labels())
-        if stage == "test":
-            kept = {name: found for name, found in scores.metrics.items() if name != "loss"}
-            self.test_scores = dataclasses.replace(scores, metrics=kept)
-        for name, found in scores.metrics.items():
-            by_view = found.mean(dim=0)  # each photograph counts once
-            headline = name in ("loss", "psnr_db")
-            self.log(f"{stage}/{name}", by_view.mean(), prog_bar=headline)
-            if name != "loss":
-                for label, value in zip(self.views.labels(), by_view, strict=True):
-                    self.log(f"{stage}/{name}/{label}", value)
-                self.log(f"{stage}/{name}/worst", by_view.min())
+    def _log_evaluations(self) -> None:
+        found = self.evaluation.scores(self._photographs_of_crops, self.views.labels())
+        for stage, scores in found.items():
+            for name, value in means_of(scores).items():
+                headline = stage in ("val", "test") and name in ("loss", "psnr_db")
+                self.log(f"{stage}/{name}", value, prog_bar=headline)
+        self.test_scores.update({s: without_loss(v) for s, v in found.items() if "test" in s})
 
     def _photographs_of_crops(self, stage: str, count: int) -> list[str]:
         """The photograph of each of the first crops; a crop of its own where the data tell none."""
@@ -355,14 +354,14 @@ class CameraModule(lightning.LightningModule):
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""
         numbers = {f"variables/{n}": float(v) for n, v in self._variable_numbers().items()}
-        if self.test_scores is not None:
-            numbers |= self.test_scores.numbers("test")
+        for stage, scores in self.test_scores.items():
+            numbers |= scores.numbers(stage)
         if isinstance(getattr(self.network, "pretrained", None), bool):
             numbers["network/pretrained"] = float(self.network.pretrained)
         if hasattr(self.loss, "perceptual_available"):  # a loss of a user's own may know no such
             numbers["loss/perceptual_available"] = float(self.loss.perceptual_available)
         numbers["cost/rays"] = float(self.views.rays())
-        numbers |= self.views.numbers()
+        numbers |= self.views.numbers() | self.evaluation.costs()
         if self.operands.entries:
             numbers["lens_steps/taken_back"] = float(self.operands.taken_back)
         if self.lens_steps is not None:

@@ -40,8 +40,10 @@ class Run:
     scores: PhotographScores | None
 
 
-def read_run(folder: Path) -> Run:
+def read_run(folder: Path, judge: str | None = None) -> Run:
     """Read a run folder.
+
+    With a judge of the views, as `wave`, its metrics `test_wave/…` stand for `test/…`.
 
     The configuration is the composed one before interpolation, so that values which follow the seed
     or the folder are the same in all runs.  `threads` is left out, and `ckpt_path` too where the
@@ -63,9 +65,19 @@ def read_run(folder: Path) -> Run:
         int(config["seed"]),
         {k: str(v) for k, v in choices.items() if k != "experiment" and not k.startswith("hydra/")},
         _flat({key: value for key, value in config.items() if key not in left_out}),
-        json.loads((folder / "metrics.json").read_text(encoding="utf-8")),
-        read_scores(folder),
+        _judged(json.loads((folder / "metrics.json").read_text(encoding="utf-8")), judge),
+        read_scores(folder, f"test_{judge}" if judge else "test"),
     )
+
+
+def _judged(metrics: Mapping[str, float], judge: str | None) -> dict[str, float]:
+    """The metrics with those of a judge in place of the test's own."""
+    if judge is None:
+        return dict(metrics)
+    kept = {name: value for name, value in metrics.items() if not name.startswith("test/")}
+    own = f"test_{judge}/"
+    found = {name: value for name, value in metrics.items() if name.startswith(own)}
+    return kept | {name.replace(own, "test/", 1): value for name, value in found.items()}
 
 
 def grouped(runs: Sequence[Run]) -> dict[str, dict[int, Run]]:

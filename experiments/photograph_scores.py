@@ -12,8 +12,14 @@ from dolens.errors import InputError
 from dolens.reconstruction.intervals import Interval, bootstrap_interval
 from experiments.tables import Row
 
-TABLE = "test_photographs.csv"
-"""The table's name in a run folder."""
+
+def table_name(stage: str = "test") -> str:
+    """The table's name in a run folder: `test`, or `test_<judge>`."""
+    return f"{stage}_photographs.csv"
+
+
+TABLE = table_name()
+
 
 _SEED = 0  # of resamples: the same run folder gives the same interval
 
@@ -95,13 +101,13 @@ def scores_by_photograph(
     )
 
 
-def read_scores(folder: Path) -> PhotographScores | None:
+def read_scores(folder: Path, stage: str = "test") -> PhotographScores | None:
     """Read the table of a run folder; None where there is none.
 
     Raises:
         InputError: the table is not one that `PhotographScores.rows` gives.
     """
-    path = folder / TABLE
+    path = folder / table_name(stage)
     if not path.is_file():
         return None
     with path.open(newline="", encoding="utf-8") as file:

@@ -165,13 +165,14 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, help="run folders")
     parser.add_argument("--against", help="the row, or experiment, that others are compared with")
+    parser.add_argument("--judge", help="whose scores: wave for test_wave/...; without it test/...")
     parser.add_argument("--metrics", nargs="+", default=METRICS)
     parser.add_argument("--json", type=Path, help="a file for the gains and their intervals")
     given = parser.parse_args(arguments)
     try:
         if given.json is not None and given.against is None:
             raise InputError("--json: gains need --against")
-        groups = grouped([read_run(folder) for folder in given.folders])
+        groups = grouped([read_run(folder, given.judge) for folder in given.folders])
         against = _row_named(groups, given.against) if given.against else None
         for metric in given.metrics:
             print("\n".join(tables(groups, metric, against)))

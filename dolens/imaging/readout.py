@@ -1,7 +1,8 @@
 """From the irradiance on the pixels to the numbers that a sensor gives, and back to colours."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -19,7 +20,8 @@ class Readout:
 
     In this order, s being the irradiance relative to that of a white plane on the axis:
 
-    1. exposure: s becomes E·s, where 1 is full scale;
+    1. exposure: s becomes E·(N₀/N)²·s, where 1 is full scale, N the lens's F-number and N₀ the
+       reference F-number that the exposure is stated for; without one it becomes E·s;
     2. colour filters: each pixel keeps one colour;
     3. shot noise of N electrons at full scale: variance E·s/N (`add_shot_noise`);
     4. read noise: variance σ²;
@@ -29,6 +31,10 @@ class Readout:
     Off saturation the mean is E·s and the variance is E·s/N + σ² + Δ²/12, the photon transfer
     curve, with the step Δ = 1/((1 - b)·(2ⁿ - 1)) as long as the noise is not small against Δ.  The
     converter saturates at full scale, before the pixel does.
+
+    With a reference F-number the exposure time is the same for all apertures: a lens stopped down
+    by one stop gives half the electrons, so the share of shot noise grows by √2 and that of read
+    noise by 2, as `develop` divides the exposure out.
 
     Gradients pass the rounding as if it were not there (straight-through).  Where a value is
     clipped, beyond the ends of the range, they are zero, which is the derivative: a saturated pixel
@@ -46,6 +52,8 @@ class Readout:
             mean is too high.  Where nothing is clipped or quantised it has no effect.
         pattern: colour filters, `RGGB`, `GRBG`, `GBRG` or `BGGR`; None where a pixel sees all
             channels.
+        reference_f_number: N₀, that `exposure` is stated for; None: any lens has this exposure.
+        f_number: N, of the lens in front; None: the reference.  `behind` sets it.
     """
 
     exposure: float = 1.0
@@ -55,6 +63,27 @@ class Readout:
     saturate: bool = False
     black_level: float = 0.0
     pattern: str | None = None
+    reference_f_number: float | None = None
+    f_number: float | None = None
+
+    @classmethod
+    def at_light(cls, light: float, full_well: float, **others: Any) -> Self:
+        """A sensor that counts `light` electrons where a white plane on the axis is imaged.
+
+        Args:
+            light: electrons of a white pixel behind the lens at the reference F-number.
+            full_well: electrons at full scale.
+            **others: of `Readout`; `read_noise` is a share of full scale.
+
+        Raises:
+            InputError: white lies beyond full scale, or a number is not positive.
+        """
+        good = _is_number(light, above=0.0)
+        _require("light", light, good, "electrons above 0")
+        well = _is_number(full_well, above=0.0)
+        _require("full_well", full_well, well, "electrons above 0")
+        _require("light", light, light <= full_well, f"at most the full well, {full_well:g}")
+        return cls(exposure=light / full_well, full_well=full_well, **others)
 
     def __post_init__(self) -> None:
         _require("exposure", self.exposure, _is_number(self.exposure, above=0.0), "above 0")
@@ -67,8 +96,23 @@ class Readout:
         _require("saturate", self.saturate, isinstance(self.saturate, bool), "true or false")
         black = self.black_level == 0.0 or _is_number(self.black_level, above=0.0, below=1.0)
         _require("black_level", self.black_level, black, "at least 0 and below 1")
+        for key in ("reference_f_number", "f_number"):
+            value = getattr(self, key)
+            good = value is None or _is_number(value, above=0.0)
+            _require(key, value, good, "null, or a number above 0")
         if self.pattern is not None:
             check_pattern(self.pattern)
+
+    def behind(self, f_number: float) -> Self:
+        """The same sensor, exposed for the same time, behind a lens of another F-number."""
+        return replace(self, f_number=f_number)
+
+    @property
+    def relative_exposure(self) -> float:
+        """E·(N₀/N)², what the irradiance of a white plane on the axis becomes; 1 is full scale."""
+        if self.reference_f_number is None or self.f_number is None:
+            return self.exposure
+        return self.exposure * (self.reference_f_number / self.f_number) ** 2
 
     def __call__(self, image: Tensor, generator: torch.Generator) -> Tensor:
         """Read an image out.
@@ -86,7 +130,8 @@ class Readout:
         Raises:
             InputError: a pattern and not three channels.
         """
-        raw = image if self.exposure == 1.0 else self.exposure * image
+        exposure = self.relative_exposure
+        raw = image if exposure == 1.0 else exposure * image
         if self.pattern is not None:
             raw = mosaic(raw, self.pattern)
         if self.full_well is not None:
@@ -114,7 +159,8 @@ class Readout:
             InputError: with a pattern, not one channel, or fewer than 3×3 pixels.
         """
         linear = raw if self.pattern is None else demosaic(raw, self.pattern)
-        return linear if self.exposure == 1.0 else linear / self.exposure
+        exposure = self.relative_exposure
+        return linear if exposure == 1.0 else linear / exposure
 
 
 def quantise(signal: Tensor, bits: int) -> Tensor:

@@ -4,12 +4,14 @@ from pathlib import Path
 
 import lightning
 
-from experiments.photograph_scores import TABLE
+from experiments.photograph_scores import table_name
 from experiments.tables import write_table
 
 
 class PhotographTable(lightning.Callback):
     """`test_photographs.csv`: a row of scores for each test photograph and view.
+
+    Every other judge has a table of its own, `test_wave_photographs.csv`.
 
     `scripts/compare.py` pairs runs by it.
 
@@ -22,6 +24,5 @@ class PhotographTable(lightning.Callback):
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write it."""
-        scores = getattr(pl_module, "test_scores", None)
-        if scores is not None:
-            write_table(self.folder / TABLE, scores.rows())
+        for stage, scores in getattr(pl_module, "test_scores", {}).items():
+            write_table(self.folder / table_name(stage), scores.rows())

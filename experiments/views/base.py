@@ -5,6 +5,8 @@ from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
+from dolens.imaging.aperture import axial_f_number
+from dolens.imaging.readout import Readout
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.lens import Lens
@@ -70,6 +72,13 @@ class Imaging(Protocol):
     def check(self, lens: Lens) -> None:
         """Raise `InputError` where the lens cannot look at the scene."""
 
+    def expose(self, lens: Lens) -> None:
+        """Set the sensor's exposure by the aperture of the lens as it begins.
+
+        It is held from then on: what variables change of the F-number is left out of value and
+        derivative alike.
+        """
+
     def prepare(
         self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
     ) -> None:
@@ -79,14 +88,30 @@ class Imaging(Protocol):
         """
 
     def take(
-        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
     ) -> Views:
-        """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`."""
+        """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`.
+
+        With a judge, one of `judges`, it makes the images; the noise is the same.
+        """
+
+    def judges(self) -> Sequence[str]:
+        """Names of renderers that make the test images besides."""
 
     def point_spread_functions(
-        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
     ) -> Tensor:
-        """(views, 3, K, K), of the training's views."""
+        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's."""
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Rays of spots that stand for what the views see, one entry for each object distance."""
@@ -102,6 +127,13 @@ class Imaging(Protocol):
 
     def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
         """Go on with what another one's `state` held."""
+
+
+def exposed(readout: Readout, lens: Lens) -> Readout:
+    """The readout behind a lens: as it is where it has no reference F-number."""
+    if readout.reference_f_number is None:
+        return readout
+    return readout.behind(axial_f_number(lens))
 
 
 def seed_of(seed: int, stage: str, index: int) -> int:

@@ -1,12 +1,14 @@
 """Every texture at every depth of a scene: what an extended depth of field is about."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.imaging.aperture import axial_f_number
 from dolens.imaging.choice.agreement import GradientMeasure
 from dolens.imaging.color import linear_to_srgb
 from dolens.imaging.psf import axial_point_spread_functions
@@ -15,8 +17,9 @@ from dolens.imaging.renderer import Renderer
 from dolens.imaging.scene import Scene, pinhole_image
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
+from dolens.imaging.wave.diffraction_limit import with_diffraction_limit
 from dolens.optics.lens import Lens
-from experiments.views.base import NOISE_OFFSET, Comparison, Views, seed_of
+from experiments.views.base import NOISE_OFFSET, Comparison, Views, exposed, seed_of
 from experiments.views.truth import check_truth, chief_ray_looks, looked_up
 
 
@@ -37,9 +40,12 @@ class DepthViews:
         psf_pupil_samples: their strata along each side of the pupil.
         truth: `pinhole` or `chief_rays`.
         seed: of rendering and noise.
+        judges: make the test images besides, of the same sensor, by name.
+        psf_diffraction: of the functions that networks ask for: `none`, or `limit`, blurred by a
+            perfect pupil's diffraction, as a measurement would find them.
 
     Raises:
-        InputError: the renderers' sensors differ.
+        InputError: the renderers' sensors differ, or an unknown word.
     """
 
     def __init__(
@@ -52,6 +58,8 @@ class DepthViews:
         psf_pupil_samples: int = 48,
         truth: str = "pinhole",
         seed: int = 0,
+        judges: Mapping[str, Renderer] | None = None,
+        psf_diffraction: str = "none",
     ) -> None:
         self.truth = check_truth(truth)
         if self.truth != "pinhole" and not scene.separate_planes:
@@ -66,11 +74,20 @@ class DepthViews:
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
         self.seed = seed
-        if self.evaluation_renderer.sensor != renderer.sensor:
+        self._judges = dict(judges or {})
+        if psf_diffraction not in ("none", "limit"):
             raise InputError(
-                f"evaluation_renderer.sensor: {self.evaluation_renderer.sensor} is not that of "
-                f"the training renderer, {renderer.sensor}"
+                f"views.psf_diffraction '{psf_diffraction}' is unknown; allowed: none, limit"
             )
+        self.psf_diffraction = psf_diffraction
+        self._f_number: float | None = None
+        others = {f"judges.{name}": judge for name, judge in self._judges.items()}
+        for name, other in {"evaluation_renderer": self.evaluation_renderer, **others}.items():
+            if other.sensor != renderer.sensor:
+                raise InputError(
+                    f"{name}.sensor: {other.sensor} is not that of "
+                    f"the training renderer, {renderer.sensor}"
+                )
 
     @property
     def sensor(self) -> Sensor:
@@ -95,6 +112,11 @@ class DepthViews:
         self.scene.check(lens.system())
         self.scene = self.scene.fixed_for(lens.system())
 
+    def expose(self, lens: Lens) -> None:
+        """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
+        self.readout = exposed(self.readout, lens)
+        self._f_number = axial_f_number(lens)
+
     def prepare(
         self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
     ) -> None:
@@ -115,10 +137,17 @@ class DepthViews:
         return GradientMeasure(comparison.variables, comparison.values, loss)
 
     def take(
-        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
     ) -> Views:
         """Image textures at every depth."""
         renderer = self.renderer if stage == "train" else self.evaluation_renderer
+        renderer = renderer if judge is None else self._judges[judge]
         seed = seed_of(self.seed, stage, index)
         image = renderer.render(lens, self.scene, textures, seed, values)
         generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
@@ -135,14 +164,28 @@ class DepthViews:
         planes = [looked_up(colours, r, c, centre) for r, c in zip(rows, columns, strict=True)]
         return linear_to_srgb(torch.stack(planes, 1))
 
+    def judges(self) -> list[str]:
+        """Those that were given."""
+        return list(self._judges)
+
     def point_spread_functions(
-        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
     ) -> Tensor:
         """(depths, 3, K, K), on the axis."""
         samples = pupil_samples or self.psf_pupil_samples
-        return axial_point_spread_functions(
-            lens, self.scene, self.sensor, self.psf_size, samples, values
+        scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
+        functions = axial_point_spread_functions(
+            lens, scene, self.sensor, self.psf_size, samples, values
         )
+        if self.psf_diffraction == "none":
+            return functions
+        f_number = self._f_number or axial_f_number(lens)
+        pitch = self.sensor.pixel_pitch
+        return with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Of each depth: on the axis, and towards the sensor's edges."""

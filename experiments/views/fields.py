@@ -23,7 +23,7 @@ from dolens.imaging.sensor import Sensor
 from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
-from experiments.views.base import NOISE_OFFSET, Comparison, Views, seed_of
+from experiments.views.base import NOISE_OFFSET, Comparison, Views, exposed, seed_of
 from experiments.views.field_windows import FieldWindows
 from experiments.views.truth import check_truth, chief_ray_looks, looked_up, nearest_texel
 
@@ -129,6 +129,10 @@ class FieldViews:
         self.scene.check(lens.system())
         self.scene = self.scene.fixed_for(lens.system())
 
+    def expose(self, lens: Lens) -> None:
+        """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
+        self.readout = exposed(self.readout, lens)
+
     def prepare(
         self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
     ) -> None:
@@ -160,7 +164,13 @@ class FieldViews:
         return GradientMeasure(comparison.variables, comparison.values, loss)
 
     def take(
-        self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor, stage: str, index: int
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
     ) -> Views:
         """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
         seed, count = seed_of(self.seed, stage, index), len(textures)
@@ -231,10 +241,19 @@ class FieldViews:
         looks, _ = self._looked_at(lens, values, windows)
         return _seen(textures, looks, windows, centres)
 
+    def judges(self) -> list[str]:
+        """None: windows are judged by the evaluation renderer alone."""
+        return []
+
     def point_spread_functions(
-        self, lens: Lens, values: Mapping[str, Tensor], pupil_samples: int | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
     ) -> Tensor:
         """(zones, 3, K, K), at the middles of the zones' windows."""
+        scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
         found = []
         for share in self.zones.values():
             window = self.windows.zone(share, 0)
@@ -243,8 +262,8 @@ class FieldViews:
             )
             system = lens.system(values)
             backend = choose_backend(system, lens.backend)
-            pupil = sampled_exit_pupil(system, self.scene.wavelengths, window, backend)
-            functions = renderer.point_spread_functions(system, self.scene, pupil, 0, backend)
+            pupil = sampled_exit_pupil(system, scene.wavelengths, window, backend)
+            functions = renderer.point_spread_functions(system, scene, pupil, 0, backend)
             found.append(functions.functions[0, 0])
         return torch.stack(found)
 

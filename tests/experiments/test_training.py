@@ -134,7 +134,7 @@ def test_the_baseline_keeps_its_plate_flat(composed, tmp_path):
 def test_bounds_hold_by_projection(composed, tmp_path):
     run(composed(*WAVEFRONT_CODING, *UNTESTED, *UNPICTURED, "learning_rates.optics=100.0"))
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    plate = [v for name, v in metrics.items() if name.startswith("variables/")]
+    plate = [v for name, v in metrics.items() if name.startswith("variables/surfaces.5")]
     assert max(abs(v) for v in plate) == pytest.approx(4e-5, rel=1e-6)
 
 
@@ -222,9 +222,17 @@ def test_read_noise_is_one_key_for_every_readout(composed, name):
     assert instantiate(cfg.views).readout.read_noise == 0.005
 
 
-def test_the_default_readout_is_its_read_noise_alone(composed):
-    cfg = composed("experiment=wavefront_coding")
+def test_the_gaussian_readout_is_its_read_noise_alone(composed):
+    overrides = ["readout=gaussian", "readout.reference_f_number=null"]
+    cfg = composed("experiment=wavefront_coding", *overrides)
     assert instantiate(cfg.views).readout == Readout(read_noise=0.003)
+
+
+def test_the_default_readout_counts_the_electrons_of_its_light(composed):
+    cfg = composed("experiment=wavefront_coding", "light=250.0")
+    readout = instantiate(cfg.views).readout
+    assert readout.exposure * readout.full_well == pytest.approx(250.0, rel=1e-12)
+    assert readout.read_noise * readout.full_well == pytest.approx(3.0, rel=0.02)
 
 
 def test_a_camera_behind_colour_filters_trains_too(composed, tmp_path):

@@ -1,0 +1,76 @@
+"""Where a coded aperture's image beats a plain lens's: gain against light, for each depth range."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+
+
+@dataclass(frozen=True)
+class GainRange:
+    """Gains (dB) of one depth range.
+
+    Attributes:
+        label: of the range, as `4.5 to 8 m`.
+        lights: of the bound, electrons of a white pixel at full aperture.
+        shared: the bound's gain with one linear filter for all depths.
+        own: the bound's gain with a linear filter for each depth.
+        trained: light, gain, and the lower and upper end of its interval, of trained cameras.
+    """
+
+    label: str
+    lights: Sequence[float] = ()
+    shared: Sequence[float] = ()
+    own: Sequence[float] = ()
+    trained: Sequence[tuple[float, float, float, float]] = ()
+
+
+def coding_gain_figure(
+    ranges: Sequence[GainRange], title: str | None = "Gain over the best plain lens"
+) -> Figure:
+    """Gain against light: axes for each depth range.
+
+    Lines are bounds of linear restoration; points with bars are trained cameras with their
+    intervals.
+
+    Args:
+        ranges: one or more.
+        title: above all.
+    """
+    figure = Figure(figsize=(3.6 * len(ranges) + 0.6, 3.6), layout="constrained")
+    grid = figure.subplots(1, len(ranges), squeeze=False, sharey=True, sharex=True)
+    blue, orange, green = colours(3)
+    for axes, found in zip(grid[0], ranges, strict=True):
+        axes.axhline(0.0, color="0.3", linewidth=0.8)
+        if len(found.lights):
+            axes.plot(found.lights, found.shared, color=blue, label="one linear filter")
+            axes.plot(found.lights, found.own, color=green, ls="--", label="a filter each depth")
+        if found.trained:
+            light, gain, low, high = zip(*found.trained, strict=True)
+            below = [g - bottom for g, bottom in zip(gain, low, strict=True)]
+            above = [top - g for g, top in zip(gain, high, strict=True)]
+            axes.errorbar(
+                light, gain, (below, above), fmt="o", color=orange, capsize=3, label="trained"
+            )
+        axes.set_xscale("log")
+        axes.set_title(found.label, fontsize=SMALL + 1)
+        axes.set_xlabel("electrons in white, full aperture", fontsize=SMALL)
+        ruled_axes(axes)
+    grid[0, 0].set_ylabel("gain at the worst depth (dB)", fontsize=SMALL)
+    handles = {}
+    for axes in grid[0]:
+        handles |= {label: h for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if handles:
+        figure.legend(
+            handles.values(),
+            handles.keys(),
+            loc="outside lower center",
+            ncols=len(handles),
+            frameon=False,
+            fontsize=SMALL,
+        )
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure

@@ -1,0 +1,85 @@
+"""How well any linear filter can restore: the least mean squared error, from transfer functions.
+
+A cross-check of trained cameras that takes milliseconds and no photographs.  Where the depth of a
+pixel is unknown one filter serves all depths; where it is known each depth has its own.  A network
+that guesses depths from what it sees lies in between.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class LinearError(NamedTuple):
+    """Mean squared errors of D depths, in the image's units squared, each (..., D).
+
+    Attributes:
+        shared: one filter for all depths, of least mean error over them.
+        own: each depth has the filter that is best for it.
+    """
+
+    shared: Tensor
+    own: Tensor
+
+
+def natural_spectrum(
+    rows: int, columns: int, variance: float, outer_scale: float, like: Tensor
+) -> Tensor:
+    """The power spectrum of natural images, S ∝ 1/(f² + f₀²) without its mean.
+
+    Field (J. Opt. Soc. Am. A 4, 2379, 1987) has 1/f²; f₀ keeps low frequencies finite.
+
+    Args:
+        rows: of the transform.
+        columns: of the image; the transform has columns // 2 + 1.
+        variance: of the image, which S averages to over all frequencies.
+        outer_scale: pixels; f₀ = 1/outer_scale cycles a pixel.
+        like: gives dtype and device.
+
+    Returns:
+        (rows, columns // 2 + 1), zero at the origin.
+    """
+    options = {"dtype": like.dtype, "device": like.device}
+    down = torch.fft.fftfreq(rows, **options)[:, None]
+    across = torch.fft.rfftfreq(columns, **options)[None]
+    power = 1.0 / (down.square() + across.square() + outer_scale**-2)
+    power[0, 0] = 0.0
+    return power * (variance / _mean(power, columns))
+
+
+def linear_error(functions: Tensor, spectrum: Tensor, noise: float) -> LinearError:
+    """The least errors of restoring an image of spectrum S that was blurred and got white noise.
+
+    With transfer functions H_d and noise of variance N a pixel, a filter W leaves at depth d the
+    error e_d = ⟨|1 - W·H_d|²·S + |W|²·N⟩, ⟨⟩ the mean over frequencies.  The mean of e_d over d is
+    least for W = S·mean(H_d*)/(S·mean|H_d|² + N), Wiener's filter where there is one depth.
+
+    Args:
+        functions: (..., D, K, K), point spread functions, K odd.
+        spectrum: (R, C // 2 + 1) with C = R even and at least K.
+        noise: N.
+
+    Returns:
+        errors of D depths.
+    """
+    rows = spectrum.shape[-2]
+    # The place of the origin changes the phase of all depths alike, and no error.
+    transfer = torch.fft.rfft2(functions, s=(rows, rows))
+    power = transfer.real.square() + transfer.imag.square()
+    shared = spectrum * transfer.mean(-3, keepdim=True).conj()
+    shared = shared / (spectrum * power.mean(-3, keepdim=True) + noise)
+    residual = 1.0 - shared * transfer
+    left = spectrum * (residual.real.square() + residual.imag.square())
+    left = left + noise * (shared.real.square() + shared.imag.square())
+    own = spectrum * noise / (spectrum * power + noise)
+    return LinearError(_mean(left, rows), _mean(own, rows))
+
+
+def _mean(values: Tensor, columns: int) -> Tensor:
+    """Over all frequencies of a real image, of which the transform has one half."""
+    weight = values.new_full(values.shape[-1:], 2.0)
+    weight[0] = 1.0
+    if columns % 2 == 0:
+        weight[-1] = 1.0
+    return (values * weight).sum((-2, -1)) / (values.shape[-2] * columns)

@@ -1,0 +1,1 @@
+"""Where wavefront coding wins: the parts of scripts/coding_gain.py."""
