@@ -337,19 +337,12 @@ class CameraModule(lightning.LightningModule):
         self._log_evaluations()
 
     def _log_evaluations(self) -> None:
-        found = self.evaluation.scores(self._photographs_of_crops, self.views.labels())
+        found = self.evaluation.scores(self.trainer, self.views.labels())
         for stage, scores in found.items():
             for name, value in means_of(scores).items():
                 headline = stage in ("val", "test") and name in ("loss", "psnr_db")
                 self.log(f"{stage}/{name}", value, prog_bar=headline)
         self.test_scores.update({s: without_loss(v) for s, v in found.items() if "test" in s})
-
-    def _photographs_of_crops(self, stage: str, count: int) -> list[str]:
-        """The photograph of each of the first crops; a crop of its own where the data tell none."""
-        data = getattr(self.trainer, "datamodule", None)
-        if not hasattr(data, "evaluation_photographs"):
-            return [str(number) for number in range(count)]
-        return data.evaluation_photographs({"val": "validation", "test": "test"}[stage])[:count]
 
     def summary(self) -> dict[str, float]:
         """Numbers about the whole run, for metrics.json."""

@@ -2,7 +2,7 @@
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -93,20 +93,18 @@ class Evaluation:
         for name, values in row.items():
             kept.setdefault(name, []).append(values)
 
-    def scores(
-        self, photographs: Callable[[str, int], Sequence[str]], labels: Sequence[str]
-    ) -> dict[str, PhotographScores]:
+    def scores(self, trainer: object, labels: Sequence[str]) -> dict[str, PhotographScores]:
         """Scores by photograph of every stage that was measured; the rows are forgotten.
 
         Args:
-            photographs: stage, `val` or `test`, and number of crops → the photograph of each.
+            trainer: whose data module may know the photographs.
             labels: of the views.
         """
         rows, self._rows = self._rows, {}
         found: dict[str, PhotographScores] = {}
         for stage, columns in rows.items():
             crops = {name: torch.cat(values).float().cpu() for name, values in columns.items()}
-            of_crops = photographs(stage.partition("_")[0], len(crops["psnr_db"]))
+            of_crops = _photographs(trainer, stage.partition("_")[0], len(crops["psnr_db"]))
             found[stage] = scores_by_photograph(crops, of_crops, labels)
         return found
 
@@ -139,6 +137,14 @@ def without_loss(scores: PhotographScores) -> PhotographScores:
     """What a table of photographs keeps."""
     kept = {name: values for name, values in scores.metrics.items() if name != "loss"}
     return replace(scores, metrics=kept)
+
+
+def _photographs(trainer: object, stage: str, count: int) -> Sequence[str]:
+    """The photograph of each of the first crops; a crop of its own where the data tell none."""
+    data = getattr(trainer, "datamodule", None)
+    if not hasattr(data, "evaluation_photographs"):
+        return [str(number) for number in range(count)]
+    return data.evaluation_photographs({"val": "validation", "test": "test"}[stage])[:count]
 
 
 def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:

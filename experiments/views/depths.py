@@ -115,7 +115,8 @@ class DepthViews:
     def expose(self, lens: Lens) -> None:
         """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
         self.readout = exposed(self.readout, lens)
-        self._f_number = axial_f_number(lens)
+        if self.psf_diffraction != "none":
+            self._f_number = axial_f_number(lens)
 
     def prepare(
         self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None

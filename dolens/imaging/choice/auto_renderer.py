@@ -26,6 +26,9 @@ from dolens.optics.lens import Lens
 
 logger = logging.getLogger(__name__)
 
+# Times the cost of functions that rays may take where only the gradients of functions are off.
+_WORTH = 4.0
+
 
 class AutoRenderer:
     """Renders by the cheapest model whose error stays within a tolerance.
@@ -204,7 +207,10 @@ class AutoRenderer:
             f"{samples**2} rays a pixel and colour would err by {of_rays:.2g} at {times:.2g} times "
             f"the cost"
         )
-        if of_rays <= self.tolerance and (times < 1.0 or worst > self.tolerance):
+        wanted = times < 1.0 or error > self.tolerance
+        # For gradients alone rays are worth some times the cost, not any.
+        wanted |= worst > self.tolerance and times < _WORTH
+        if of_rays <= self.tolerance and wanted:
             because = f"functions err by {error:.2g}" + (f", {agreed}" if agreed else "")
             findings = [
                 Finding("model", "rays", of_rays, f"{because}; {verdict}"),

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-_ROUNDS = 3
+_ROUNDS = 4
 
 Found = TypeVar("Found")
 
@@ -11,7 +11,7 @@ Found = TypeVar("Found")
 def tightened(
     attempt: Callable[[float], tuple[float, Found]], tolerance: float
 ) -> tuple[float, Found]:
-    """The first plan whose measured error is within a tolerance, or else the best of three.
+    """The first plan whose measured error is within a tolerance, or else the best of four.
 
     What a plan errs by is not quite what it expects: each round asks for less, in proportion to
     what the last one erred by.
