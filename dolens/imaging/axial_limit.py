@@ -11,7 +11,7 @@ from dolens.imaging.aim import aim
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.rays import Components, Rays
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
 from dolens.optics.trace import trace_surfaces
 
 _AZIMUTHS = 16
@@ -41,19 +41,22 @@ def axial_limit(
         radius: of the disc, mm, that axial rays fill.
     """
     options = {"dtype": system.dtype, "device": system.device}
-    angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
+    count = 1 if is_rotationally_symmetric(system) else _AZIMUTHS
+    angle = torch.arange(count, **options) * (2.0 * math.pi / _AZIMUTHS)
     origin, sensor_z = torch.zeros((), **options), system.vertices[-1]
     across, up = radius * torch.cos(angle), radius * torch.sin(angle)
-    ray = aim(origin, origin, sensor_z, across, up, z)
+    every = torch.tensor(wavelengths, **options)[:, None]
+    one = torch.ones_like(every)
+    ray = aim(origin, origin, sensor_z, across * one, up * one, z)
+    trace = trace_surfaces(system, ray, every, sense=-1.0, record=True)
     nearest, limit = _LIMITED, None
-    for wavelength in wavelengths:
-        trace = trace_surfaces(system, ray, wavelength, sense=-1.0, record=True)
-        for margins, point in zip(trace.margins, trace.points, strict=True):
-            depth = _edge_distance(system, margins.number, point)
-            share, place = (depth / system.surfaces[margins.number - 1].semi_diameter).min(0)
-            if float(share) < nearest:
-                nearest = float(share)
-                limit = AxialLimit(margins.number, float(angle[place]), wavelength)
+    for margins, point in zip(trace.margins, trace.points, strict=True):
+        depth = _edge_distance(system, margins.number, point)
+        share, place = (depth / system.surfaces[margins.number - 1].semi_diameter).flatten().min(0)
+        if float(share) < nearest:
+            nearest = float(share)
+            colour, azimuth = divmod(int(place), count)
+            limit = AxialLimit(margins.number, float(angle[azimuth]), wavelengths[colour])
     return limit
 
 

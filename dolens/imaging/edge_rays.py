@@ -23,10 +23,11 @@ from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
 
-# Newton's iterations towards the edge, and the share of the radius that differences are taken over.
-_ITERATIONS, _STEP = 3, 1e-3
-# Rays inside and outside by this share of the radius, for each precision, tell whether this is the
-# edge of the light: where two edges nearly coincide the farther one must not pass for it.
+# The share of the radius that differences are taken over, and for each precision the steps towards
+# the edge by one slope.
+_STEP, _ITERATIONS = 1e-3, {torch.float64: 3, torch.float32: 2}
+# A ray inside by this share of the radius tells whether this is the edge of the light: where two
+# edges nearly coincide the farther one must not pass for it.
 _BESIDE = {torch.float64: 1e-6, torch.float32: 3e-4}
 # How often another edge is tried where the first is not the light's.
 _ROUNDS = 3
@@ -162,13 +163,14 @@ class _Beam:
     @torch.no_grad()
     def refined(self, radius: Tensor, pupil: ExitPupil) -> tuple[Tensor, Tensor]:
         """The radius where the edge is, and how the distance from it falls with the radius."""
-        slope = torch.ones_like(radius)
-        for _ in range(_ITERATIONS):
-            step = _STEP * radius
-            here, further = self.distance(radius, pupil), self.distance(radius + step, pupil)
-            slope = (further - here) / step
-            change = -here / torch.where(slope < 0.0, slope, 1.0)
-            radius = radius + torch.where(slope < 0.0, change, 0.0).clamp(-0.1, 0.1)
+        step = _STEP * radius
+        distance = self.distance(radius, pupil)
+        slope = (self.distance(radius + step, pupil) - distance) / step
+        falling = torch.where(slope < 0.0, slope, -torch.inf)
+        for _ in range(_ITERATIONS[self.system.dtype] - 1):
+            radius = radius - (distance / falling).clamp(-0.1, 0.1)
+            distance = self.distance(radius, pupil)
+        radius = radius - (distance / falling).clamp(-0.1, 0.1)
         return radius, slope
 
     def at_edge(self, radius: Tensor) -> _Found:
@@ -179,9 +181,8 @@ class _Beam:
         with torch.no_grad():
             beside = _BESIDE[self.system.dtype]
             inside, passes, other = self._through(radius * (1.0 - beside), still)
-            _, beyond, _ = self._through(radius * (1.0 + beside), still)
             place = (self.middle + radius[..., None] * self.arms).norm(dim=-1)
-            counts = passes & ~beyond & (place < 1.0) & (slope < 0.0) & (radius > 0.0)
+            counts = passes & (place < 1.0) & (slope < 0.0) & (radius > 0.0)
             safe = torch.where(slope < 0.0, slope, -1.0)
             share = (still.radius / still.axial_radius) ** 2
             share = share / still.axial_mean(float(self.system.vertices[-1].detach()))

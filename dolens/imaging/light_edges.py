@@ -40,11 +40,6 @@ class LightEdges:
     radius: Tensor
     surface: Tensor
 
-    @property
-    def any(self) -> bool:
-        """Whether an aperture's edge cuts the disc anywhere."""
-        return bool((self.surface > 0).any())
-
 
 @torch.no_grad()
 def light_edges(
@@ -53,8 +48,10 @@ def light_edges(
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     backend: str,
-) -> LightEdges:
+) -> LightEdges | None:
     """Search for the edges of the light of points of the sensor, at one wavelength.
+
+    One trace tells where nothing cuts the disc; the answer is then None.
 
     Args:
         system: the lens.
@@ -67,6 +64,8 @@ def light_edges(
     options = {"dtype": system.dtype, "device": system.device}
     angle = torch.arange(AZIMUTHS, **options) * (2.0 * math.pi / AZIMUTHS)
     arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    if bool(probe.passes((UNCUT * arms).expand(len(points[0]), -1, 2))[0].all()):
+        return None
     middle = probe.middles()
     along = middle @ arms.mT
     reach = -along + (along.square() + 1.0 - middle.square().sum(-1, keepdim=True)).sqrt()
@@ -83,7 +82,10 @@ def light_edges(
         low, high = torch.where(inside, halfway, low), torch.where(inside, high, halfway)
     _, surface = probe.passes(tried(high))
     cut = ~passes & (low > 0.0)
-    return LightEdges(middle, 0.5 * (low + high), torch.where(cut, surface, 0))
+    surface = torch.where(cut, surface, 0)
+    if not bool((surface > 0).any()):
+        return None
+    return LightEdges(middle, 0.5 * (low + high), surface)
 
 
 class _Probe:
@@ -240,28 +242,11 @@ def edge_map(
             corner[1] + grid * step[1], corner[0] + grid * step[0], indexing="ij"
         )
         points = (across.reshape(-1), up.reshape(-1))
-    if not _any_cut(system, wavelength, points, pupil, backend):
-        return None
     edges = light_edges(system, wavelength, points, pupil, backend)
-    return EdgeMap(edges, symmetric, corner, step) if edges.any else None
+    return None if edges is None else EdgeMap(edges, symmetric, corner, step)
 
 
 def _distances(x: Tensor, y: Tensor) -> tuple[float, float]:
     """The least and the largest distance from the axis of a rectangle's points, by its corners."""
     least = [0.0 if float(p.min()) < 0.0 < float(p.max()) else float(p.abs().min()) for p in (x, y)]
     return math.hypot(*least), float(torch.hypot(x, y).max())
-
-
-def _any_cut(
-    system: OpticalSystem,
-    wavelength: float,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    backend: str,
-) -> bool:
-    """Whether some ray near the disc's rim does not pass: one trace tells."""
-    options = {"dtype": system.dtype, "device": system.device}
-    angle = torch.arange(AZIMUTHS, **options) * (2.0 * math.pi / AZIMUTHS)
-    rim = UNCUT * torch.stack((torch.cos(angle), torch.sin(angle)), -1)
-    probe = _Probe(system, wavelength, points, pupil, backend)
-    return not bool(probe.passes(rim.expand(len(points[0]), -1, 2))[0].all())

@@ -127,7 +127,7 @@ def pupil_rays(
         return there, weight
     middle = wavelengths[len(wavelengths) // 2]
     found = light_edges(system, middle, points, pupil.numbers(), backend)
-    if not found.any:
+    if found is None:
         return there, weight
     angle = torch.arange(AZIMUTHS, dtype=weight.dtype, device=weight.device)
     angle = (angle * (2.0 * math.pi / AZIMUTHS)).expand(len(x), -1)
