@@ -4,19 +4,19 @@ Two implementations of one computation, with the same samples: fused kernels, fo
 images of their own, and PyTorch's operations, the reference that they must equal.
 """
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.aim import aim
-from dolens.imaging.edge_rays import EdgeRays, edge_rays
+from dolens.imaging.edge_rays import EdgeRays
 from dolens.imaging.light_edges import EdgeMap, edge_map
-from dolens.imaging.moving_pupil import depends_on_parameters, moving_exit_pupil
+from dolens.imaging.moving_pupil import depends_on_parameters
+from dolens.imaging.moving_view import MovingView, moving_view, sample_share
+from dolens.imaging.pixel_edges import edge_samples, of_channel, pixel_edge_rays
 from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.renderer import Unprepared
@@ -34,9 +34,6 @@ from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane, trace_surfaces
 
 _SEED_RANGE = 2**63 - 1
-# Rays along the edges of apertures, a pixel and wavelength, where these cut light: as many as half
-# the strata along a side of the pupil, since an edge is a line.
-_FEWEST_EDGE_RAYS = 2
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,7 @@ class RayRenderer(Unprepared):
         now = lens.system({n: p.detach() for n, p in parameters.items()})
         scene.check(now)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, backend)
-        moving = _moving(system, scene, view, backend)
+        moving = moving_view(system, scene, view, backend)
         edges = None
         if depends_on_parameters(system):
             still = moving.pupil.numbers()
@@ -154,7 +151,9 @@ class RayRenderer(Unprepared):
             start, end = self._chunk(i)
             now = moving.of(tensors[-1])
             ray, weight = self._samples(system, view, now.pupil, start, end)
-            rim = self._edge_rays(system, scene, view, now.pupil, edges, start, end, backend)
+            rim = pixel_edge_rays(
+                system, scene, self.sensor, view, now.pupil, edges, start, end, backend
+            )
             shown = tensors[:planes]
             return self._shade(system, scene, view, now, shown, ray, weight, rim, backend)
 
@@ -218,7 +217,7 @@ class RayRenderer(Unprepared):
         scene: Scene,
         textures: Tensor,
         view: View,
-        moving: "_Moving",
+        moving: MovingView,
     ) -> Tensor:
         """The render in one kernel."""
         wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64)
@@ -259,42 +258,7 @@ class RayRenderer(Unprepared):
         sensor_z = system.vertices[-1]
         radius = pupil.radius
         ray = aim(x, y, sensor_z, disc_x * radius, disc_y * radius, pupil.z)
-        return ray, (ray.n * ray.n) ** 2 * _share(system, view, pupil)
-
-    @property
-    def _edge_samples(self) -> int:
-        """Rays along edges, for each pixel and wavelength."""
-        return max(_FEWEST_EDGE_RAYS, self.pupil_samples // 2)
-
-    def _edge_rays(
-        self,
-        system: OpticalSystem,
-        scene: Scene,
-        view: View,
-        pupil: ExitPupil,
-        edges: EdgeMap | None,
-        start: int,
-        end: int,
-        backend: str,
-    ) -> EdgeRays | None:
-        """Rays of pixels at the edges of apertures; None where no gradient asks for them."""
-        if edges is None or not depends_on_parameters(system):
-            return None
-        pixel = torch.arange(start, end, device=system.device)[:, None]
-        # Beyond the numbers of the pupil's samples.
-        stratum = torch.arange(self._edge_samples, device=system.device)
-        number = stratum + view.pupil_samples**2
-        words = random_words(view.seed, pixel, number)
-        jitter, _, *area = (uniform(word, system.dtype) for word in words)
-        angle = (stratum + jitter) * (2.0 * math.pi / self._edge_samples)
-        rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)[:, 0]
-        columns = (pixel % view.width).to(system.dtype)[:, 0]
-        if view.pixel_area:
-            # One place serves all azimuths of a pixel.
-            rows, columns = rows + (area[0][:, 0] - 0.5), columns + (area[1][:, 0] - 0.5)
-        points = self.sensor.positions(rows, columns)
-        edge = edges.at(*points, angle)
-        return edge_rays(system, scene.wavelengths, points, pupil, edge, backend)
+        return ray, (ray.n * ray.n) ** 2 * sample_share(system, view, pupil)
 
     def _edge_light(
         self,
@@ -303,13 +267,13 @@ class RayRenderer(Unprepared):
         scene: Scene,
         shown: tuple[Tensor, ...],
         view: View,
-        moving: "_Moving",
+        moving: MovingView,
         edges: EdgeMap,
     ) -> Tensor:
         """A black image, whose gradient is that of the light at the edges of apertures."""
         names, planes = list(parameters), len(shown)
         images = shown[0].shape[0]
-        per_piece = max(1, self.chunk_rays // self._edge_samples)
+        per_piece = max(1, self.chunk_rays // edge_samples(self.pupil_samples))
         pixels = view.height * view.width
         starts = range(0, pixels, per_piece)
         sizes = [min(per_piece, pixels - start) for start in starts]
@@ -318,8 +282,8 @@ class RayRenderer(Unprepared):
             shape = (images, len(scene.depths), len(scene.wavelengths), sizes[i])
             system = lens.system(dict(zip(names, tensors[planes:-1], strict=True)))
             now, start = moving.of(tensors[-1]), starts[i]
-            rim = self._edge_rays(
-                system, scene, view, now.pupil, edges, start, start + sizes[i], "cpu"
+            rim = pixel_edge_rays(
+                system, scene, self.sensor, view, now.pupil, edges, start, start + sizes[i], "cpu"
             )
             if rim is None:
                 return shown[0].new_zeros(shape)
@@ -327,7 +291,7 @@ class RayRenderer(Unprepared):
                 scene.gather(
                     tensors[:planes],
                     channel,
-                    _texture_places(view, moving.still, _channel(rim.ray, channel)),
+                    _texture_places(view, moving.still, of_channel(rim.ray, channel)),
                     rim.weight[channel],
                 )
                 for channel in range(len(scene.wavelengths))
@@ -343,7 +307,7 @@ class RayRenderer(Unprepared):
         system: OpticalSystem,
         scene: Scene,
         view: View,
-        moving: "_Moving",
+        moving: MovingView,
         shown: tuple[Tensor, ...],
         ray: Components,
         weight: Tensor,
@@ -359,7 +323,7 @@ class RayRenderer(Unprepared):
             there, valid = _trace(system, ray, wavelength, backend)
             arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
             if rim is not None:
-                beside = _channel(rim.ray, channel)
+                beside = of_channel(rim.ray, channel)
                 there = Components(
                     *(torch.cat(pair, -1) for pair in zip(there, beside, strict=True))
                 )
@@ -367,56 +331,6 @@ class RayRenderer(Unprepared):
             places = _texture_places(view, moving.magnifications, there)
             channels.append(scene.gather(shown, channel, places, arriving))
         return torch.stack(channels, dim=2)
-
-
-class _Moving(NamedTuple):
-    """What of a view moves with the lens: numbers, or tensors with gradients."""
-
-    pupil: ExitPupil
-    magnifications: Sequence[float | Tensor]
-
-    @property
-    def still(self) -> list[float]:
-        """The magnifications without gradients."""
-        return [float(m.detach() if isinstance(m, Tensor) else m) for m in self.magnifications]
-
-    def joined(self, system: OpticalSystem) -> Tensor:
-        """All of it in one tensor, (3 + planes,), in the lens's precision."""
-        return _stacked([*self.pupil, *self.magnifications], system)
-
-    def seen_by_kernel(self, system: OpticalSystem, view: View) -> Tensor:
-        """As `kernels.rendering.render` takes it: a sample's share for the axial radius."""
-        share = _share(system, view, self.pupil)
-        return _stacked([*self.pupil[:2], share, *self.magnifications], system)
-
-    def of(self, joined: Tensor) -> "_Moving":
-        """The inverse of `joined`; the numbers themselves where nothing moves."""
-        if not joined.requires_grad:
-            return self
-        values = joined.unbind()
-        return _Moving(ExitPupil(*values[:3]), values[3:])
-
-
-def _stacked(values: Sequence[float | Tensor], system: OpticalSystem) -> Tensor:
-    options = {"dtype": system.dtype, "device": system.device}
-    return torch.stack([torch.as_tensor(v, **options) for v in values])
-
-
-def _channel(ray: Components, channel: int) -> Components:
-    """Rays of one wavelength."""
-    return Components(*(component[channel] for component in ray))
-
-
-def _moving(system: OpticalSystem, scene: Scene, view: View, backend: str) -> _Moving:
-    pupil = ExitPupil(view.pupil_z, view.pupil_radius, view.axial_radius)
-    pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
-    return _Moving(pupil, scene.moving_magnifications(system))
-
-
-def _share(system: OpticalSystem, view: View, pupil: ExitPupil) -> Tensor:
-    """Weight of a sample over cos⁴ of its ray's angle, so that they sum to one on the axis."""
-    larger = (pupil.radius / pupil.axial_radius) ** 2
-    return larger / (pupil.axial_mean(system.vertices[-1]) * view.pupil_samples**2)
 
 
 def _texture_places(

@@ -6,8 +6,9 @@ from torch.nn import functional
 
 from dolens import load_lens
 from dolens.errors import InputError
+from dolens.imaging.moving_view import moving_view
 from dolens.imaging.pupil import ExitPupil
-from dolens.imaging.ray_renderer import RayRenderer, _moving
+from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
 from dolens.kernels import rendering
@@ -218,7 +219,7 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
     view = renderer._view(system, scene, (40, 43), 0, "reference")
-    moving = _moving(system, scene, view, "reference")
+    moving = moving_view(system, scene, view, "reference")
     ray, weight = renderer._samples(system, view, moving.pupil, 0, 180)
     shown = scene.on_planes(texture(40))
     images = [renderer._shade(system, scene, view, moving, shown, ray, weight, None, backend)
