@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 from torch import Tensor
@@ -64,6 +64,16 @@ class Agreement:
             f"gradients have a cosine of {self.cosine:.3f} with those of rays and "
             f"{self.norm_ratio:.3f} times their norm (rays' own noise {100 * self.noise:.2g} %)"
         )
+
+
+def plain(agreement: Agreement | None) -> list[float] | None:
+    """Plain values for a checkpoint; `from_plain` is the inverse."""
+    return None if agreement is None else list(astuple(agreement))
+
+
+def from_plain(values: Sequence[float] | None) -> Agreement | None:
+    """The agreement of `plain`."""
+    return None if values is None else Agreement(*values)
 
 
 def judging_samples(height: int, width: int, wavelengths: int) -> int:

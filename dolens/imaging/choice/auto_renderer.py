@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.choice.agreement import Agreement, GradientMeasure
+from dolens.imaging.choice.agreement import Agreement, GradientMeasure, from_plain, plain
 from dolens.imaging.choice.chosen import Choice, settings_of
 from dolens.imaging.choice.finding import Finding
 from dolens.imaging.choice.plan import Plan
@@ -164,6 +164,7 @@ class AutoRenderer:
             "bits": torch.finfo(self.choice.dtype).bits,
             "error": self.choice.error,
             "uncertainty": self.choice.uncertainty,
+            "agreement": plain(self.choice.agreement),
         }
 
     def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
@@ -175,7 +176,14 @@ class AutoRenderer:
         renderer = model(sensor=self.sensor, **state["settings"])
         self._other = copy.deepcopy(lens).requires_grad_(False).to(dtype)
         self.choice = Choice(
-            renderer, dtype, (), state["error"], state["uncertainty"], self.tolerance, 0.0
+            renderer,
+            dtype,
+            (),
+            state["error"],
+            state["uncertainty"],
+            self.tolerance,
+            0.0,
+            from_plain(state.get("agreement")),
         )
         logger.info("renderer auto: the plan of the checkpoint is taken up")
 

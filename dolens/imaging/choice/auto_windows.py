@@ -14,9 +14,11 @@ from dolens.imaging.choice.agreement import (
     GradientMeasure,
     Render,
     agreement,
+    from_plain,
     gradient,
     gradients_of_rays,
     judging_samples,
+    plain,
 )
 from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.chosen import gradient_numbers, settings_of
@@ -191,13 +193,15 @@ class AutoWindows:
             "settings": settings_of(self.choice.renderer),
             "errors": dict(self.choice.errors),
             "uncertainty": self.choice.uncertainty,
+            "agreement": plain(self.choice.agreement),
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on with a choice that was made before."""
         if state:
             renderer = PsfRenderer(sensor=self.sensor, **state["settings"])
-            self.choice = WindowChoice(renderer, state["errors"], state["uncertainty"], 0.0)
+            agreed = from_plain(state.get("agreement"))
+            self.choice = WindowChoice(renderer, state["errors"], state["uncertainty"], 0.0, agreed)
 
 
 class _Trial:

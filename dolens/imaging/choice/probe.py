@@ -38,8 +38,8 @@ def probe_image(height: int, width: int, seed: int = 0) -> Tensor:
 def fine_detail(height: int, width: int, seed: int = 0) -> Tensor:
     """(1, 3, height, width), float64, linear light: squares of two texels, bright or dark.
 
-    What photographs have at their sharpest edges and textures all over: a third of its power lies
-    beyond a quarter of the sampling frequency along rows or columns, where 1/f noise has hardly any.
+    What photographs have at their sharpest edges, and textures all over: a third of its power lies
+    beyond a quarter of the sampling frequency along rows or columns, where 1/f noise has little.
     """
     generator = torch.Generator().manual_seed(seed)
     squares = torch.rand(1, 3, -(-height // 2), -(-width // 2), generator=generator)

@@ -25,7 +25,7 @@ class _Root(torch.autograd.Function):
         start, *ray = tensors[:6]
         values = dict(zip(names, tensors[6:], strict=True))
         epsilon = torch.finfo(start.dtype).eps
-        t = start.clone()
+        t, change = start.clone(), torch.zeros_like(start)
         for _ in range(MAX_STEPS):
             change = step(values, tuple(ray), t).clamp(-scale, scale)
             t = t - change
