@@ -96,6 +96,7 @@ class CameraModule(lightning.LightningModule):
         self.evaluation = Evaluation(calibrations)
         self.test_scores: dict[str, PhotographScores] = {}
         self._step_started = self._optics_started = 0.0
+        self._looked_in_epoch: int | None = None
         # Of the lens as it begins, so that a resumed run measures steps as an uninterrupted one.
         views.check(lens)
         steps = self.lens_steps if len(self.variables) else None
@@ -191,8 +192,10 @@ class CameraModule(lightning.LightningModule):
         """Let the renderer look at the lens as it is now.
 
         Lightning does not come here when it resumes within an epoch: what was found at its start is
-        in the checkpoint.
+        in the checkpoint.  Nor does it when it resumes behind an epoch's last step, where the next
+        epoch's first step comes here instead.
         """
+        self._looked_in_epoch = self.current_epoch
         self.views.prepare(self.lens, self.variables(), self._comparison())
 
     def _comparison(self) -> Comparison | None:
@@ -213,6 +216,8 @@ class CameraModule(lightning.LightningModule):
 
     def on_train_batch_start(self, batch: Tensor, batch_idx: int) -> None:
         """Start the step's clock."""
+        if batch_idx == 0 and self._looked_in_epoch != self.current_epoch:
+            self.on_train_epoch_start()
         self._step_started = time.perf_counter()
 
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:

@@ -75,7 +75,8 @@ def _resolved(cfg: DictConfig, taken: Sequence[str]) -> list[Any]:
 
 def _set_by_command_line() -> Iterator[str]:
     """Paths of what the job's overrides set."""
-    task = list(HydraConfig.get().overrides.task)
+    # As they were typed: an interpolation in one of them is not for here.
+    task = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
     for override in OverridesParser.create().parse_overrides(task):
         path = _path_of(override)
         if path is not None and path != "experiment":
