@@ -34,8 +34,8 @@ def main() -> None:
     parser.add_argument(
         "--step",
         type=float,
-        help="of the differences, in units of the scale: 1e-5 where no edge cuts the light; default: "
-        "one that changes the loss by some thousandths",
+        help="of the differences, in units of the scale (1e-5 where no edge cuts the light); "
+        "default: one that changes the loss by some thousandths",
     )
     options = parser.parse_args()
     torch.manual_seed(0)
