@@ -86,10 +86,12 @@ def render_contenders(
         tolerances: grey levels.
     """
     sensor, plans = subject.sensor, []
+    stored = subject.lens.variables(list(subject.variables))
+    values = {n: p.detach().clone().requires_grad_() for n, p in stored.items()}
     for model, diffraction in (("auto", False), ("auto with diffraction", True)):
         for tolerance in tolerances:
             auto = AutoRenderer(sensor, tolerance, diffraction=diffraction)
-            auto.make_plan(subject.lens, subject.scene)
+            auto.make_plan(subject.lens, subject.scene, values)
             plans.append(Contender(model, f"{model}, {tolerance:g} grey levels", auto))
     found = [Contender("rays", f"{n * n} rays", RayRenderer(sensor, n)) for n in samples]
     size = max(
