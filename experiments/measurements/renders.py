@@ -18,6 +18,7 @@ from dolens.imaging.choice.agreement import (
 from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.probe import probe_image
 from dolens.imaging.choice.reference import Reference, reference
+from dolens.imaging.choice.trial import without_diffraction
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.renderer import Renderer
@@ -207,9 +208,7 @@ def _without_diffraction(renderer: Renderer) -> Renderer:
     """What a renderer makes of rays alone, as the reference is of rays."""
     if isinstance(renderer, AutoRenderer):
         renderer = renderer.choice.renderer
-    if isinstance(renderer, PsfRenderer):
-        return replace(renderer, diffraction="none")
-    return renderer
+    return without_diffraction(renderer)
 
 
 def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> dict[str, Agreement]:

@@ -132,7 +132,9 @@ class AutoRenderer:
         error = trial.error(choice.renderer, choice.dtype)
         agreed = trial.agreement(choice.renderer, choice.dtype)
         seconds = choice.seconds + time.perf_counter() - started
-        if error <= max(self.tolerance, choice.error) and not self._much_worse(choice, agreed):
+        if error <= max(self.tolerance, choice.error) and self.serves_still(
+            choice.agreement, agreed
+        ):
             renderer = choice.renderer.with_pupil(lens, scene, values)
             self.choice = replace(
                 choice, renderer=renderer, error=error, agreement=agreed, seconds=seconds
@@ -270,9 +272,9 @@ class AutoRenderer:
         """How many times their tolerance gradients err by; 0 where they do not matter."""
         return agreed.excess(self.gradient_cosine, self.gradient_norm) if agreed else 0.0
 
-    def _much_worse(self, choice: Choice, agreed: Agreement | None) -> bool:
-        """Whether gradients that were as good as asked for no longer are."""
-        return self.excess(agreed) > max(1.0, 1.5 * self.excess(choice.agreement))
+    def serves_still(self, before: Agreement | None, now: Agreement | None) -> bool:
+        """Whether gradients are within their tolerance, or hardly worse than they were."""
+        return self.excess(now) <= max(1.0, 1.5 * self.excess(before))
 
     def _trial(
         self,

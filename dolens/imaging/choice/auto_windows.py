@@ -126,7 +126,7 @@ class AutoWindows:
             renderer = before.renderer.with_pupil(lens, scene, values)
             errors, agreed = trial.errors(renderer), trial.agreement(renderer)
             seconds = before.seconds + time.perf_counter() - started
-            well = auto.excess(agreed) <= max(1.0, 1.5 * auto.excess(before.agreement))
+            well = auto.serves_still(before.agreement, agreed)
             if max(errors.values()) <= max(auto.tolerance, before.worst) and well:
                 self.choice = WindowChoice(renderer, errors, trial.uncertainty, seconds, agreed)
                 logger.info("renderer auto, windows: still serves, %s", self.choice)
