@@ -285,7 +285,7 @@ class PsfRenderer(Unprepared):
         )
         if self.diffraction == "none":
             return found
-        f_number = working_f_number(pupil.numbers(), float(system.vertices[-1].detach()))
+        f_number = working_f_number(pupil, system.vertices[-1])
         blurred = with_diffraction_limit(found.functions, pitch, shared.wavelengths, f_number)
         return found._replace(functions=blurred)
 

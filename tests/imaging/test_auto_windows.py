@@ -120,6 +120,6 @@ def test_a_choice_outlives_a_checkpoint(doublet):
 
 def test_a_tolerance_that_cannot_be_met_is_said(doublet, caplog):
     with caplog.at_level(logging.WARNING):
-        windows = chosen(doublet, 0.02)
-    assert "the tolerance of 0.02 grey levels is not met" in caplog.text
-    assert windows.choice.worst > 0.02
+        windows = chosen(doublet, 0.05, shares=(0.5,))
+    assert "the tolerance of 0.05 grey levels is not met" in caplog.text
+    assert windows.choice.worst > 0.05

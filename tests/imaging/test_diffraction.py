@@ -222,7 +222,7 @@ def test_both_ways_agree_for_any_sphere(triplet, radius):
     rays = pupil_wavefront(triplet.system(), points, 550.0, centre, 160, radius)
     added = direct_field(rays, columns.flatten(), rows.flatten()).abs().square()
     rays = pupil_wavefront(triplet.system(), points, 550.0, centre, 32, radius)
-    assert len(rays.apertures) == 2
+    assert len(rays.clipping) == 2
     pupil = regular_pupil(fit_pupil(rays, 12), 224)
     transformed = fourier_field(pupil, x, y).abs().square()[0]
     wrong = (transformed - added.reshape(transformed.shape)).abs().max() / added.max()

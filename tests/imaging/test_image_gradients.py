@@ -13,6 +13,7 @@ from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene, pinhole_image
 from dolens.imaging.sensor import Sensor
+from dolens.imaging.wave.wave_psf import wave_kernels
 from dolens.prescriptions import lens_from_prescription
 from dolens.prescriptions.build import prescription_of
 
@@ -108,6 +109,41 @@ def test_functions_follow_distortion_and_magnification(root, registration):
     names = ["surfaces.1.curvature", "thicknesses.2"]
     for row in rows_of(triplet(root), renderer, 1000.0, names, (0,), SMALL_STEP).values():
         assert row.error < 1e-3, row
+
+
+@pytest.mark.parametrize("diffraction", ["limit", "wave"])
+def test_diffraction_follows_the_aperture(root, diffraction):
+    """A wider stop: a smaller Airy disc, and more of the aberrations."""
+    lens = load_lens(root / "conf/lens/wavefront_coding.yaml", dtype=torch.float64)
+    with torch.no_grad():
+        lens.sensor_distance.fill_(95.86)
+    # Pixels of 2 µm show it.
+    renderer = PsfRenderer(
+        Sensor(8, 8, 0.002), (1, 1), 12, 31, "pinhole", "functions", diffraction=diffraction
+    )
+    names = ["surfaces.1.semi_diameter", "sensor_distance", "surfaces.5.x2y"]
+    for row in rows_of(lens, renderer, 6000.0, names, (0,), 1e-5).values():
+        assert row.difference != 0.0
+        assert row.error < 2e-3, row
+
+
+@pytest.mark.parametrize("number", [3, 4])
+def test_a_vignetted_pupil_s_light_follows_both_of_its_edges(root, number):
+    """By waves, of the triplet at 19 degrees, relative to an axial point's: a wider stop lets more
+    light through on the axis, a wider surface 3 more at the edge of the field.
+    """
+    lens, name = triplet(root), f"surfaces.{number}.semi_diameter"
+    point = torch.tensor([[0.0, 340.0, -1000.0]])
+    radius = torch.tensor(lens.surfaces[str(number)].semi_diameter).double().requires_grad_()
+
+    def light(radius):
+        return wave_kernels(lens.system({name: radius}), point, LINES[1], None, 0.012, 41).sum()
+
+    (slope,) = torch.autograd.grad(light(radius), radius)
+    with torch.no_grad():
+        difference = (light(radius + 0.05) - light(radius - 0.05)) / 0.1
+    assert abs(float(difference)) > 0.05
+    assert float(slope) == pytest.approx(float(difference), rel=0.01)
 
 
 def test_the_reference_s_gradients_are_those_of_the_kernels(root):

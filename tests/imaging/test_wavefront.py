@@ -225,7 +225,7 @@ def test_two_holes_pass_what_both_pass():
     area = 2.0 * a * a * math.acos(d / (2 * a)) - 0.5 * d * math.sqrt(4 * a * a - d * d)
     cos4 = math.cos(math.radians(field)) ** 4
     assert float(found.flux) == pytest.approx(cos4 * area / (math.pi * a * a), rel=3e-4)
-    assert sorted(found.apertures) == [1, 2]
+    assert sorted(found.clipping) == [1, 2]
 
 
 def test_a_moved_stop_moves_its_light():

@@ -15,7 +15,7 @@ from dolens.imaging.pupil import ExitPupil
 
 
 def diffraction_transfer(
-    height: int, width: int, pitch: float, wavelength: float, f_number: float
+    height: int, width: int, pitch: float, wavelength: float, f_number: float | Tensor
 ) -> Tensor:
     """The incoherent transfer function of a perfect, round pupil.
 
@@ -30,22 +30,28 @@ def diffraction_transfer(
         f_number: N, that the light works with: 1/(2·sin u').
 
     Returns:
-        (height, width/2 + 1), float64, at the frequencies of `rfft2`.
+        (height, width/2 + 1), float64, at the frequencies of `rfft2`; differentiable in N once.
     """
-    down = torch.fft.fftfreq(height, dtype=torch.float64)
-    across = torch.fft.rfftfreq(width, dtype=torch.float64)
+    device = f_number.device if isinstance(f_number, Tensor) else torch.device("cpu")
+    down = torch.fft.fftfreq(height, dtype=torch.float64, device=device)
+    across = torch.fft.rfftfreq(width, dtype=torch.float64, device=device)
     cutoff = pitch / (wavelength * 1e-6 * f_number)
-    s = (torch.hypot(down[:, None], across[None]) / cutoff).clamp(max=1.0)
-    return (torch.arccos(s) - s * (1.0 - s * s).sqrt()) * (2.0 / math.pi)
+    moved = torch.hypot(down[:, None], across[None]) / cutoff
+    s = moved.detach().clamp(max=1.0)
+    root = (1.0 - s * s).sqrt()
+    found = (torch.arccos(s) - s * root) * (2.0 / math.pi)
+    # The slope, -(4/π)·√(1 - s²), is zero at the cutoff, where arccos's own is infinite.
+    return found - (4.0 / math.pi) * root * (moved - moved.detach())
 
 
-def working_f_number(pupil: ExitPupil, sensor_z: float) -> float:
-    """1/(2·sin u') of the axial beam, u' the angle of its edge in air."""
-    return 0.5 * math.hypot(sensor_z - pupil.z, pupil.axial_radius) / pupil.axial_radius
+def working_f_number(pupil: ExitPupil, sensor_z: float | Tensor) -> float | Tensor:
+    """1/(2·sin u') of the axial beam, u' the angle of its edge in air; a tensor where any is."""
+    square = ((sensor_z - pupil.z) / pupil.axial_radius) ** 2 + 1.0
+    return 0.5 * square**0.5
 
 
 def with_diffraction_limit(
-    functions: Tensor, pitch: float, wavelengths: Sequence[float], f_number: float
+    functions: Tensor, pitch: float, wavelengths: Sequence[float], f_number: float | Tensor
 ) -> Tensor:
     """Functions (..., C, K, K) blurred by the perfect pupil's diffraction at C wavelengths.
 

@@ -3,27 +3,30 @@
 import torch
 from torch import Tensor
 
-from dolens.optics.surfaces.clear_aperture import ClearAperture, Unlimited
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Unlimited
 
 # Smallest slope along one axis of a grid over that along the other: an edge along the grid.
 _ALONG = 1e-3
 _TINY = 1e-100
 
 
-def coverage(aperture: ClearAperture, x: Tensor, y: Tensor) -> Tensor:
+def coverage(aperture: ClearAperture, x: Tensor, y: Tensor, radius: Tensor | None = None) -> Tensor:
     """The share of every cell of a grid that an aperture passes.
 
     Args:
         aperture: of a surface.
         x: (..., S, S), mm, where the ray of the cell's centre crosses the surface, in its axes.
         y: (..., S, S), mm.
+        radius: of a circular edge, mm, where a gradient with respect to it is wanted.
 
     Returns:
-        (..., S, S), from 0 to 1; its derivative by x and y is that of the area, as far as an edge
-        is straight across a cell.
+        (..., S, S), from 0 to 1; its derivative with respect to x, y and the radius is that
+        of the area, as far as an edge is straight across a cell.
     """
     share = torch.ones_like(x)
-    if not isinstance(aperture.edge, Unlimited):
+    if isinstance(aperture.edge, Circle) and radius is not None:
+        share = covered(radius.to(x).square() - torch.addcmul(x * x, y, y))
+    elif not isinstance(aperture.edge, Unlimited):
         share = covered(aperture.edge.margin(x, y))
     if aperture.obscuration is not None:
         share = torch.minimum(share, covered(-aperture.obscuration.margin(x, y)))

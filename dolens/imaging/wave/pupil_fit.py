@@ -32,7 +32,8 @@ class PupilFit:
             `wavefront.crossings` in turn.
         centre: (N, 2), of the box, no gradient.
         half_width: (N, 2).
-        low: (N, 2), direction cosines that bound the light, no gradient.
+        low: (N, 2), direction cosines that bound the light; no gradient, unless
+            `with_moving_bounds` gave them one.
         high: (N, 2).
         residual: (N,), waves: the largest error of the fitted OPD at a ray inside the pupil, no
             gradient.
@@ -56,7 +57,7 @@ class RegularPupil:
         amplitude: (N, G, G), root of flux per area in direction cosines, times the share of the
             cell that light passes; the last dimension runs along x.
         opd: (N, G, G), mm.
-        cosines: (N, 2, G), x and y at the centres of the cells, no gradient.
+        cosines: (N, 2, G), x and y at the centres of the cells.
         flux: (N,), as `Wavefront.flux`.
         wavelength: (N,), nm.
         index: (N,), before the sensor.
@@ -104,12 +105,12 @@ def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
         found = _table(values.detach() @ inverse, rows, columns)
         slopes = torch.stack(
             (
-                _at_points(found, dx, y) / half_width[:, None, :1],
-                _at_points(found, x, dy) / half_width[:, None, 1:],
+                at_points(found, dx, y) / half_width[:, None, :1],
+                at_points(found, x, dy) / half_width[:, None, 1:],
             ),
             -1,
         )
-        missed = (_at_points(found, x, y)[:, 0] - wavefront.opd.flatten(1)).abs()
+        missed = (at_points(found, x, y)[:, 0] - wavefront.opd.flatten(1)).abs()
         missed = (missed * passing.flatten(1)).amax(-1)
     moved = (slopes * (alpha - alpha.detach())[:, None]).sum(-1)
     table = _table((values - moved) @ inverse, rows, columns)
@@ -144,9 +145,9 @@ def regular_pupil(fit: PupilFit, samples: int, which: Tensor | None = None) -> R
     opd, whole, *crossings = (y.mT @ coefficients @ x).unbind(1)
     lit = (wavefront.coverage[which] > 0.0).flatten(1).any(-1)
     passed = lit[:, None, None].to(opd.dtype).expand(opd.shape)
-    apertures = wavefront.apertures.values()
-    for aperture, x, y in zip(apertures, crossings[::2], crossings[1::2], strict=True):
-        passed = torch.minimum(passed, coverage(aperture, x, y))
+    surfaces = wavefront.clipping.values()
+    for surface, x, y in zip(surfaces, crossings[::2], crossings[1::2], strict=True):
+        passed = torch.minimum(passed, coverage(surface.aperture, x, y, surface.edge))
     amplitude = whole * passed
     cell = ((high - low) / samples).prod(-1)
     # A cell that passes a share c has amplitude c, but flux c and not c².
@@ -187,8 +188,8 @@ def _table(coefficients: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     return flat.unflatten(-1, (size, size))
 
 
-def _at_points(table: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """(N, F, M): Σ table[j, i]·x[i]·y[j], of x and y (N, degree + 1, M)."""
+def at_points(table: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Functions at points: (N, F, M), Σ table[j, i]·x[i]·y[j], of x and y (N, degree + 1, M)."""
     return ((table @ x[:, None]) * y[:, None]).sum(2)
 
 

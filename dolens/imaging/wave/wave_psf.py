@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.imaging.replay import replay
 from dolens.imaging.wave.diffraction import direct_field, fourier_field
+from dolens.imaging.wave.moving_bounds import with_moving_bounds
 from dolens.imaging.wave.object_points import ObjectPoints
 from dolens.imaging.wave.pixel_integration import fine_grid, pixel_matrix
 from dolens.imaging.wave.propagation import (
@@ -174,7 +175,7 @@ def _prepare(
     if not isinstance(points, ObjectPoints):
         points = ObjectPoints.at(points)
     rays = pupil_wavefront(system, points, wavelength, centres, settings.rays, backend=backend)
-    fit = _fitted(rays, settings)
+    fit = with_moving_bounds(_fitted(rays, settings))
     half_width = pitch * (0.5 * size + 1.0)
     points = points.to(rays.opd.dtype, rays.opd.device)
     found = _Prepared(points, fit, fourier_samples(fit, half_width, settings))
@@ -208,11 +209,18 @@ def _by_fourier(found: _Prepared, window: _Window) -> Tensor:
     if found.pupil is not None and len(parts) == 1:
         return kernels(found.pupil)
 
-    def piece(i: int, coefficients: Tensor) -> Tensor:
-        fit = replace(found.fit, coefficients=coefficients)
+    clipping = found.fit.wavefront.clipping
+    moving = [number for number, surface in clipping.items() if surface.edge is not None]
+
+    def piece(i: int, coefficients: Tensor, low: Tensor, high: Tensor, *edges: Tensor) -> Tensor:
+        moved = {n: replace(clipping[n], edge=e) for n, e in zip(moving, edges, strict=True)}
+        wavefront = replace(found.fit.wavefront, clipping={**clipping, **moved})
+        fit = replace(found.fit, coefficients=coefficients, low=low, high=high, wavefront=wavefront)
         return kernels(regular_pupil(fit, found.samples, parts[i])).movedim(0, -1)
 
-    return replay(piece, [len(part) for part in parts], (found.fit.coefficients,)).movedim(-1, 0)
+    fit = found.fit
+    tensors = (fit.coefficients, fit.low, fit.high, *(clipping[number].edge for number in moving))
+    return replay(piece, [len(part) for part in parts], tensors).movedim(-1, 0)
 
 
 def _by_integration(wavefront: Wavefront, window: _Window) -> Tensor:

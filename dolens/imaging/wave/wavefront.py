@@ -15,7 +15,7 @@ from dolens.imaging.wave.reference_sphere import chief_ray_landings, sphere_curv
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.rays import Components, Rays
-from dolens.optics.surfaces.clear_aperture import ClearAperture
+from dolens.optics.surfaces.base import SurfaceState
 from dolens.optics.system import OpticalSystem
 
 MM_PER_NM = 1e-6
@@ -49,7 +49,7 @@ class Wavefront:
             neighbours.  The others have finite numbers, no coverage and no gradient.
         crossings: number of a surface whose aperture bounds a pupil → (N, S, S, 2), mm, where the
             rays cross it, in its axes.
-        apertures: number → that aperture.
+        clipping: number → that surface.
         ended: (N,), bool: part of the pupil's edge is made by rays that miss a surface or are
             totally reflected; coverage is 0 or 1 there.
         centre: (N, 2), mm on the sensor, of the reference sphere.
@@ -66,7 +66,7 @@ class Wavefront:
     coverage: Tensor
     valid: Tensor
     crossings: Mapping[int, Tensor]
-    apertures: Mapping[int, ClearAperture]
+    clipping: Mapping[int, SurfaceState]
     ended: Tensor
     centre: Tensor
     curvature: Tensor
@@ -179,7 +179,8 @@ def pupil_wavefront(
     for number in beam.apertures:
         x, y = _crossing(opened, inside, number, backend)
         crossings[number] = torch.stack((x, y), -1)
-        share = torch.minimum(share, coverage(system.surfaces[number - 1].aperture, x, y))
+        surface = system.surfaces[number - 1]
+        share = torch.minimum(share, coverage(surface.aperture, x, y, surface.edge))
     piston = (_share((amplitude * area * share).detach()).nan_to_num(0.0) * opd).sum((-2, -1))
     return Wavefront(
         opd=torch.where(valid, opd - piston[:, None, None], 0.0),
@@ -190,7 +191,7 @@ def pupil_wavefront(
         coverage=share,
         valid=valid,
         crossings=crossings,
-        apertures={number: system.surfaces[number - 1].aperture for number in crossings},
+        clipping={number: system.surfaces[number - 1] for number in crossings},
         ended=beam.ended,
         centre=centre,
         curvature=curvature,
