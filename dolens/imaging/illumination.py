@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.imaging.plane_points import pupil_rays
+from dolens.imaging.plane_points import pupil_rays, rim_rays
 from dolens.imaging.pupil import ExitPupil
 from dolens.imaging.sensor import Sensor
 from dolens.imaging.stop_rays import even_points
@@ -14,6 +14,8 @@ from dolens.optics.system import OpticalSystem
 
 # Points along the radius of a symmetric lens, or along each side of the sensor.
 RADII, _SIDE = 65, 13
+# Every so many of them has rays along the edges of apertures, for the derivative.
+_RIM_RADII, _RIM_SIDE = 4, 3
 # Through the pupil, for each of them and each wavelength.
 RAYS = 2048
 
@@ -61,6 +63,12 @@ def relative_illumination(
         points = (radius, torch.zeros_like(radius))
         _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
         light = weight.sum(-1)
+        few = tuple(p[::_RIM_RADII] for p in points)
+        rim = rim_rays(system, wavelengths, few, pupil, backend)
+        if rim is not None:
+            light = light + functional.interpolate(
+                rim.weight.sum(-1)[None], size=RADII, mode="linear", align_corners=True
+            ).squeeze(0)
         place = (distance - low) * ((RADII - 1) / max(high - low, 1e-300))
         first = place.long().clamp(max=RADII - 2)
         between = (place - first).to(light)
@@ -71,6 +79,15 @@ def relative_illumination(
     points = sensor.positions(row.reshape(-1), column.reshape(-1))
     _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
     light = weight.sum(-1).unflatten(-1, (_SIDE, _SIDE))
+    few = tuple(
+        p.unflatten(0, (_SIDE, _SIDE))[::_RIM_SIDE, ::_RIM_SIDE].reshape(-1) for p in points
+    )
+    rim = rim_rays(system, wavelengths, few, pupil, backend)
+    if rim is not None:
+        coarse = rim.weight.sum(-1).unflatten(-1, (-1, 1 + (_SIDE - 1) // _RIM_SIDE))
+        light = light + functional.interpolate(
+            coarse[None], size=(_SIDE, _SIDE), mode="bilinear", align_corners=True
+        ).squeeze(0)
     return functional.interpolate(
         light[None], size=(height, width), mode="bicubic", align_corners=True
     )[0]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.imaging.aim import aim
-from dolens.imaging.edge_rays import edge_rays
+from dolens.imaging.edge_rays import EdgeRays, edge_rays
 from dolens.imaging.light_edges import AZIMUTHS, light_edges
 from dolens.imaging.moving_pupil import depends_on_parameters
 from dolens.imaging.pupil import ExitPupil
@@ -75,6 +75,10 @@ def plane_points(
         radius, again = torch.unique(_rounded(torch.hypot(x, y)), return_inverse=True)
         x, y = radius, torch.zeros_like(radius)
     ray, weight = pupil_rays(system, scene.wavelengths, (x, y), pupil, disc, backend)
+    rim = rim_rays(system, scene.wavelengths, (x, y), pupil, backend)
+    if rim is not None:
+        ray = Components(*(torch.cat(pair, -1) for pair in zip(ray, rim.ray, strict=True)))
+        weight = torch.cat((weight, rim.weight), -1)
     rows, columns = [], []
     for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
         t, _ = distance_to_plane(ray, -depth, -1.0)
@@ -113,7 +117,6 @@ def pupil_rays(
     Returns:
         The rays in front of the lens, (C, N, S), and their shares in the irradiance relative to
         that of an axial pixel: cos⁴ over its mean over the axial disc; zero where one is lost.
-        Rays along the edges of apertures may follow, S then counts them as well.
     """
     sensor_z = system.vertices[-1]
     x, y = (p.to(sensor_z.dtype)[:, None] for p in points)
@@ -122,20 +125,32 @@ def pupil_rays(
     there, valid = _before_the_lens(system, ray, wavelengths, backend)
     share = (pupil.radius / pupil.axial_radius) ** 2
     share = share / (pupil.axial_mean(sensor_z) * disc_x.shape[-1])
-    weight = torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
+    return there, torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
+
+
+def rim_rays(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    backend: str,
+) -> EdgeRays | None:
+    """Rays (C, N, AZIMUTHS) along the edges that end the light of sensor points.
+
+    None where no edge cuts the disc, or no gradient of the lens is wanted.  Arguments as of
+    `pupil_rays`, whose weights those of these rays complement: they are zero and have gradients.
+    """
     if not depends_on_parameters(system):
-        return there, weight
+        return None
     middle = wavelengths[len(wavelengths) // 2]
     found = light_edges(system, middle, points, pupil.numbers(), backend)
     if found is None:
-        return there, weight
-    angle = torch.arange(AZIMUTHS, dtype=weight.dtype, device=weight.device)
-    angle = (angle * (2.0 * math.pi / AZIMUTHS)).expand(len(x), -1)
+        return None
+    angle = torch.arange(AZIMUTHS, dtype=system.dtype, device=system.device)
+    angle = (angle * (2.0 * math.pi / AZIMUTHS)).expand(len(points[0]), -1)
     arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
     edge = (found.middle[:, None], arms, found.radius, found.surface)
-    rim = edge_rays(system, wavelengths, points, pupil, edge, backend)
-    there = Components(*(torch.cat(pair, -1) for pair in zip(there, rim.ray, strict=True)))
-    return there, torch.cat((weight, rim.weight), -1)
+    return edge_rays(system, wavelengths, points, pupil, edge, backend)
 
 
 def chief_ray_points(
