@@ -196,7 +196,14 @@ class CameraModule(lightning.LightningModule):
         epoch's first step comes here instead.
         """
         self._looked_in_epoch = self.current_epoch
-        self.views.prepare(self.lens, self.variables(), self._comparison())
+        self.views.prepare(self.lens, self.variables(), self._comparison(), self._photographs())
+
+    def _photographs(self) -> Tensor | None:
+        """What a renderer that chooses its model is tried on besides its own images, where the data
+        have some.
+        """
+        found = getattr(self.trainer.datamodule, "most_detailed", None)
+        return None if found is None else found()
 
     def _comparison(self) -> Comparison | None:
         """What the renderer's gradients are for; None where the lens is not varied."""

@@ -36,10 +36,12 @@ class Renderer(Protocol):
         scene: Scene,
         values: Mapping[str, Tensor] | None = None,
         measure: Any = None,
+        photographs: Tensor | None = None,
     ) -> None:
         """Look at the lens as it is now; `render` need not be called with the same one.
 
-        `measure`, a `choice.agreement.GradientMeasure`, says which gradients matter.
+        `measure`, a `choice.agreement.GradientMeasure`, says which gradients matter, and
+        `photographs` (P, 3, h, w), linear light, what scenes look like.
         """
 
     def numbers(self) -> dict[str, float]:
@@ -61,6 +63,7 @@ class Unprepared:
         scene: Scene,
         values: Mapping[str, Tensor] | None = None,
         measure: Any = None,
+        photographs: Tensor | None = None,
     ) -> None:
         """Nothing depends on the lens."""
 

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 import lightning
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dolens.errors import InputError
@@ -21,6 +22,9 @@ _SPLITS_OF_STAGE: dict[str | None, tuple[Split, ...]] = {
     "predict": (),
     None: ("train", "validation", "test"),
 }
+
+# Validation crops among which the most detailed one is looked for.
+_LOOKED_AT = 16
 
 
 class CropDataModule(lightning.LightningDataModule):
@@ -97,6 +101,7 @@ class CropDataModule(lightning.LightningDataModule):
         self.seed = _count("data.seed", seed, 0)
         self._photographs: dict[Split, Sequence[Photograph]] = {}
         self._evaluation: dict[Split, EvaluationCrops] = {}
+        self._detailed: Tensor | None = None
 
     @property
     def item_size(self) -> tuple[int, int]:
@@ -175,6 +180,17 @@ class CropDataModule(lightning.LightningDataModule):
     def evaluation_photographs(self, split: Split) -> list[str]:
         """The name of the photograph that each evaluation crop of a split is cut from, in order."""
         return self._evaluation_crops(split).names()
+
+    def most_detailed(self) -> Tensor:
+        """(1, 3, height, width): the validation crop, of some, whose neighbouring texels differ
+        most.
+        """
+        if self._detailed is None:
+            crops = self._evaluation_crops("validation")
+            some = [crops[number] for number in range(min(_LOOKED_AT, len(crops)))]
+            detail = [sum(c.diff(dim=d).square().mean() for d in (-1, -2)) for c in some]
+            self._detailed = some[int(torch.stack(detail).argmax())][None]
+        return self._detailed
 
     def first_sample(self) -> tuple[int, int]:
         """(Global number of the next training sample, samples that remain in the epoch).

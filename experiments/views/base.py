@@ -80,11 +80,16 @@ class Imaging(Protocol):
         """
 
     def prepare(
-        self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        comparison: Comparison | None = None,
+        photographs: Tensor | None = None,
     ) -> None:
         """Look at the lens as it is now, at the start of an epoch.
 
-        `comparison` says which gradients a renderer that chooses its model has to get right.
+        `comparison` says which gradients a renderer that chooses its model has to get right,
+        `photographs` (P, 3, h, w), linear light, on which images beside its own.
         """
 
     def take(

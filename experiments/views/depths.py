@@ -119,10 +119,15 @@ class DepthViews:
             self._f_number = axial_f_number(lens)
 
     def prepare(
-        self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        comparison: Comparison | None = None,
+        photographs: Tensor | None = None,
     ) -> None:
         """Let the training renderer look at the lens as it is now."""
-        self.renderer.prepare(lens, self.scene, values, self._measure(lens, comparison))
+        measure = self._measure(lens, comparison)
+        self.renderer.prepare(lens, self.scene, values, measure, photographs)
 
     def _measure(self, lens: Lens, comparison: Comparison | None) -> GradientMeasure | None:
         """The training's loss as a function of images of textures; of planes of their own."""

@@ -134,12 +134,16 @@ class FieldViews:
         self.readout = exposed(self.readout, lens)
 
     def prepare(
-        self, lens: Lens, values: Mapping[str, Tensor], comparison: Comparison | None = None
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        comparison: Comparison | None = None,
+        photographs: Tensor | None = None,
     ) -> None:
         """Find what training windows share until the next time: the renderer, and the pupil."""
         if self._auto is not None:
             measure = partial(self._measure, lens, comparison) if comparison else None
-            self._auto.prepare(lens, self.scene, values, measure)
+            self._auto.prepare(lens, self.scene, values, measure, photographs)
         elif isinstance(self.renderer, PsfRenderer):
             whole = replace(self.renderer, sensor=self.whole)
             self._pupil = whole.with_pupil(lens, self.scene, values).pupil

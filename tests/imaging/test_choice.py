@@ -11,7 +11,13 @@ from dolens import load_lens
 from dolens.errors import InputError
 from dolens.imaging.choice.auto_renderer import AutoRenderer
 from dolens.imaging.choice.cost import psf_cost
-from dolens.imaging.choice.probe import GREY_LEVEL, grey_levels, probe_image, probe_power
+from dolens.imaging.choice.probe import (
+    GREY_LEVEL,
+    grey_levels,
+    probe_image,
+    probe_power,
+    probe_texture,
+)
 from dolens.imaging.choice.reference import reference
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
@@ -218,6 +224,37 @@ def test_the_reference_says_how_well_it_knows(root):
     # An image that is as noisy as one of the renders errs by that noise.
     image = RayRenderer(sensor, 4).render(lens, scene, texture, 99)
     assert fine.error(image) == pytest.approx(math.sqrt(2.0) * coarse.noise, rel=0.1)
+
+
+def test_a_photograph_of_the_user_s_is_a_probe_as_well(root):
+    """Black and white stripes have more contrast than the built-in probes: the plan errs more, by
+    what an independent render says.
+    """
+    lens, sensor = coded(root), Sensor(32, 32, 0.0069)
+    scene = PlanarScene((6000.0,), LINES)
+    stripes = (torch.arange(96) // 8 % 2).double().expand(1, 3, 96, 96)
+    errors = []
+    for photographs in (None, stripes):
+        auto = AutoRenderer(sensor, 4.0, gradients=False, diffraction=False)
+        auto.prepare(lens, scene, photographs=photographs)
+        errors.append(auto.choice.error)
+    assert errors[1] > 1.05 * errors[0]
+    # Functions of the seed that they were tried with: few samples make others err otherwise.
+    image = auto.choice.renderer.render(lens, scene, stripes, 1)
+    pair = [RayRenderer(sensor, 40).render(lens, scene, stripes, 31 + i) for i in range(2)]
+    assert errors[1] == pytest.approx(measured(image, pair), rel=0.15)
+
+
+def test_photographs_of_any_size_fit_the_probe():
+    sensor = Sensor(10, 20, 0.01)
+    for height, width in ((5, 200), (200, 5)):
+        image = torch.linspace(0.0, 1.0, height * width).reshape(1, 1, height, width)
+        found = probe_texture(sensor, 3, 0, image.expand(1, 3, -1, -1))
+        assert found.shape == (3, 3, 74, 84)
+        assert torch.equal(found[:2], probe_texture(sensor, 3, 0))
+        # Its middle lies in the middle.
+        middle = image[0, 0, height // 2, width // 2].double()
+        assert float(found[2, 0, 37, 42]) == pytest.approx(float(middle))
 
 
 def test_a_tolerance_must_be_positive():

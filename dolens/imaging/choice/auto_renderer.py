@@ -38,9 +38,9 @@ class AutoRenderer:
 
     Args:
         sensor: the pixels.
-        tolerance: RMS error on the worse of two probe images, one like a photograph and one of fine
-            detail, in grey levels: 1/255 of full scale in linear light, before the sensor's own
-            noise.
+        tolerance: RMS error on the worst probe image, in grey levels: 1/255 of full scale in linear
+            light, before the sensor's own noise.  One probe is like a photograph, one is of fine
+            detail, and others are those that `prepare` is given.
         gradients: whether the lens's gradients matter too, and not only the image.
         gradient_cosine: the least cosine of the angle between a plan's gradient and that of rays.
         gradient_norm: by how much the ratio of their norms may differ from 1.
@@ -76,6 +76,7 @@ class AutoRenderer:
         self.choice: Choice | None = None
         self.plans = 0
         self._other: Lens | None = None
+        self._photographs: Tensor | None = None
 
     def rays_per_image(self, scene: Scene) -> int:
         """Rays traced for one render; 0 before there is a plan."""
@@ -112,6 +113,7 @@ class AutoRenderer:
         scene: Scene,
         values: Mapping[str, Tensor] | None = None,
         measure: GradientMeasure | None = None,
+        photographs: Tensor | None = None,
     ) -> None:
         """Measure what the plan errs by for the lens as it is now; plan anew where it is too much,
         and where there is none.
@@ -122,7 +124,11 @@ class AutoRenderer:
             values: parameters of the lens as it is now.
             measure: the variables and the loss whose gradients are to be those of rays; None: the
                 squared error to the truth, with respect to those values that require gradients.
+            photographs: (P, 3, h, w), linear light: what the scene may look like, beside the two
+                probe images; those of a later call replace them.
         """
+        if photographs is not None:
+            self._photographs = photographs
         if self.choice is None:
             self.make_plan(lens, scene, values, measure)
             return
@@ -294,4 +300,5 @@ class AutoRenderer:
             self.diffraction,
             self.tolerance,
             self.seed,
+            self._photographs,
         )

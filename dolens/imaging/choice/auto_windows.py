@@ -101,6 +101,7 @@ class AutoWindows:
         self.windows = dict(windows)
         self.choice: WindowChoice | None = None
         self.plans = 0
+        self._photographs: Tensor | None = None
 
     @torch.no_grad()
     def prepare(
@@ -109,6 +110,7 @@ class AutoWindows:
         scene: PlanarScene,
         values: Mapping[str, Tensor] | None = None,
         measure: WindowMeasure | None = None,
+        photographs: Tensor | None = None,
     ) -> None:
         """Measure the choice for the lens as it is now; choose where there is none, or where it
         errs too much.
@@ -118,10 +120,15 @@ class AutoWindows:
             scene: one depth, and wavelengths.
             values: its parameters as they are now.
             measure: of gradients, of windows and their textures' centres; None: only images count.
+            photographs: (P, 3, h, w), linear light, that windows look at beside the probe images;
+                those of a later call replace them.
         """
+        if photographs is not None:
+            self._photographs = photographs
         started, before = time.perf_counter(), self.choice
         auto = self.auto
-        trial = _Trial(self, with_values(lens, values), scene, measure if auto.gradients else None)
+        measure = measure if auto.gradients else None
+        trial = _Trial(self, with_values(lens, values), scene, measure, self._photographs)
         if before is not None:
             renderer = before.renderer.with_pupil(lens, scene, values)
             errors, agreed = trial.errors(renderer), trial.agreement(renderer)
@@ -213,6 +220,7 @@ class _Trial:
         lens: Lens,
         scene: PlanarScene,
         measure: WindowMeasure | None,
+        photographs: Tensor | None,
     ) -> None:
         self.lens, self.scene, self.auto, self.sensor = lens, scene, owner.auto, owner.sensor
         self.names, self.windows = list(owner.windows), list(owner.windows.values())
@@ -220,7 +228,9 @@ class _Trial:
         self.backend = choose_backend(self.double.system(), lens.backend)
         self.centres = self._centres(owner.sensor)
         channels = len(scene.wavelengths)
-        self.textures = [probe_texture(w, channels, self.auto.seed) for w in self.windows]
+        self.textures = [
+            probe_texture(w, channels, self.auto.seed, photographs) for w in self.windows
+        ]
         self.judges: Sequence[Reference] = [
             reference(
                 self.single,

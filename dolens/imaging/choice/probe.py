@@ -48,13 +48,36 @@ def fine_detail(height: int, width: int, seed: int = 0) -> Tensor:
     return image[..., :height, :width]
 
 
-def probe_texture(sensor: Sensor, channels: int, seed: int) -> Tensor:
-    """(2, channels, H, W), float64: probe images wider than a sensor all around, their colours in
-    turn: one like a photograph, and one of fine detail.
+def probe_texture(
+    sensor: Sensor, channels: int, seed: int, photographs: Tensor | None = None
+) -> Tensor:
+    """Probe images wider than a sensor all around, their colours in turn: one like a photograph,
+    one of fine detail, and photographs that were given.
+
+    Args:
+        sensor: the pixels.
+        channels: of the images.
+        seed: of the two that are drawn.
+        photographs: (P, 3, h, w), linear light in [0, 1]; larger ones are cropped to their middle,
+            smaller ones repeat their edges.
+
+    Returns:
+        (2 + P, channels, H, W), float64.
     """
     size = (sensor.height + 2 * _MARGIN, sensor.width + 2 * _MARGIN)
-    images = torch.cat((probe_image(*size, seed), fine_detail(*size, seed)))
-    return images[:, [i % 3 for i in range(channels)]]
+    images = [probe_image(*size, seed), fine_detail(*size, seed)]
+    if photographs is not None:
+        images.append(_fitted(photographs.double().cpu(), size))
+    return torch.cat(images)[:, [i % 3 for i in range(channels)]]
+
+
+def _fitted(images: Tensor, size: tuple[int, int]) -> Tensor:
+    """The middle of images (P, C, h, w), with edges repeated where they are too small."""
+    for dim, wanted in ((-2, size[0]), (-1, size[1])):
+        given = images.shape[dim]
+        place = torch.arange(wanted) + (given - wanted) // 2
+        images = images.index_select(dim, place.clamp(0, given - 1))
+    return images
 
 
 def probe_power(side: int) -> Tensor:

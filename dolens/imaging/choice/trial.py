@@ -44,6 +44,7 @@ class Trial:
         diffraction: whether it may be modelled.
         tolerance: grey levels.
         seed: of the probes and of rays.
+        photographs: probes besides, of `probe_texture`.
     """
 
     def __init__(
@@ -57,12 +58,13 @@ class Trial:
         diffraction: bool,
         tolerance: float,
         seed: int,
+        photographs: Tensor | None = None,
     ) -> None:
         self.sensor, self.tolerance, self.seed = sensor, tolerance, seed
         self.gradients, self.diffraction = gradients, diffraction
         self._single, self._double = in_both_precisions(current)
         self._backend = choose_backend(self._double.system(), current.backend)
-        self.texture = probe_texture(sensor, len(scene.wavelengths), seed)
+        self.texture = probe_texture(sensor, len(scene.wavelengths), seed, photographs)
         centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
         self.scene = scene.as_planes(texture_centre=centre)
         self._planned = scene.as_planes()

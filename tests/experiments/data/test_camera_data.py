@@ -33,6 +33,19 @@ def test_evaluation_batches_are_always_the_same():
     assert not torch.equal(torch.cat(list(data.test_dataloader())), first)
 
 
+def test_the_most_detailed_crop_is_the_one_whose_texels_differ_most():
+    class Striped(_Data):
+        def load_split(self, split):
+            flat = torch.full((3, 12, 12), 90, dtype=torch.uint8)
+            striped = flat.clone()
+            striped[..., ::2] = 200
+            return [Photograph("flat", flat), Photograph("striped", striped)]
+
+    found = Striped(crop_size=8, margin=2).most_detailed()
+    assert found.shape == (1, 3, 12, 12)
+    assert float(found.diff(dim=-1).abs().mean()) > 0.1
+
+
 def test_a_stage_loads_only_what_it_needs():
     class Recording(_Data):
         loaded: list[str]
