@@ -9,7 +9,6 @@ validation at equal exposure time; the coded one has learned plate and focus at 
 """
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from dolens.plotting.coding_gain import GainRange, coding_gain_figure
 from experiments.photograph_scores import format_interval
 from scripts.coding.bound import BoundGain, bound_gains
 from scripts.coding.trained import TrainedGain, trained_gains
+from scripts.finished_runs import train_unless_finished
 
 DEPTHS = {
     "4.5 to 8 m": (8000.0, 6000.0, 4500.0),
@@ -31,7 +31,6 @@ LIGHTS = (30.0, 100.0, 300.0, 1000.0, 3000.0, 8000.0)
 # Semi-diameters of the stop, mm: F/8 to F/22 in whole stops.
 STOPS = (6.35, 4.5, 3.18, 2.25)
 _READ_NOISE = 3.0  # electrons, as conf/readout/electrons.yaml has it
-_ROOT = Path(__file__).parents[1]
 
 
 def bounds(lights: Sequence[float]) -> dict[str, list[BoundGain]]:
@@ -110,19 +109,13 @@ def train(folder: Path, lights: Sequence[float], seeds: int, others: Sequence[st
             for camera, overrides in cameras.items():
                 for seed in range(seeds):
                     run = folder / f"{name.replace(' ', '_')}_{light:g}" / f"{camera}_seed{seed}"
-                    if (run / "metrics.json").is_file():
-                        continue
-                    command = [
-                        sys.executable,
-                        str(_ROOT / "train.py"),
+                    own = [
                         *overrides,
                         f"light={light:g}",
                         f"scene.depths={list(depths)}",
                         f"seed={seed}",
-                        f"hydra.run.dir={run.resolve()}",
-                        *others,
                     ]
-                    subprocess.run(command, check=True)
+                    train_unless_finished(run, [*own, *others])
 
 
 def main(arguments: Sequence[str]) -> int:

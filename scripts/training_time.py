@@ -9,7 +9,6 @@ median step's and the plans', without validation, so that a busy machine does no
 """
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,10 +23,10 @@ from dolens.errors import InputError
 from dolens.plotting import save_figure
 from dolens.plotting.style import SMALL, ruled_axes
 from experiments.compared_runs import read_run
+from scripts.finished_runs import train_unless_finished
 
 MODELS = ("auto", "auto_geometric", "psf", "rays", "wave")
 _TAG = "val/psnr_db/worst"
-_ROOT = Path(__file__).parents[1]
 # Short epochs, for a validation every few seconds of training.
 _EPOCHS, _STEPS = 12, 40
 
@@ -100,8 +99,8 @@ def table(found: Sequence[Training], psnr: float | None) -> list[str]:
     if psnr is None:
         psnr = min(max(training.curve.values()) for training in found) - 0.05
     lines = [
-        f"| model | step, s | of which optics, s | plans, s | to {psnr:.2f} dB, s | steps | test, dB "
-        "| by waves, dB |",
+        f"| model | step, s | of which optics, s | plans, s | to {psnr:.2f} dB, s | steps "
+        "| test, dB | by waves, dB |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for t in found:
@@ -132,22 +131,15 @@ def figure_of(found: Sequence[Training]) -> Figure:
 def train(folder: Path, models: Sequence[str], overrides: Sequence[str]) -> None:
     """Train the default camera by each model; finished ones are left."""
     for model in models:
-        run = folder / model
-        if (run / "metrics.json").is_file():
-            continue
-        command = [
-            sys.executable,
-            str(_ROOT / "train.py"),
+        own = [
             "experiment=wavefront_coding",
             f"renderer={model}",
             f"data.steps_per_epoch={_STEPS}",
             f"trainer.max_epochs={_EPOCHS}",
             f"callbacks.pictures.every_n_epochs={_EPOCHS}",
             "calibrations=none",
-            f"hydra.run.dir={run.resolve()}",
-            *overrides,
         ]
-        subprocess.run(command, check=True)
+        train_unless_finished(folder / model, [*own, *overrides])
 
 
 def main(arguments: Sequence[str]) -> int:
