@@ -10,7 +10,7 @@ from dolens import Rays, Status
 from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.hard_cases import GLASS, surface
-from tests.optics.ray_facts import BACKENDS, PRECISIONS, cases, send, violations
+from tests.optics.ray_facts import BACKENDS, PRECISIONS, cases, chosen, send, violations
 
 DTYPES = pytest.mark.parametrize("dtype", PRECISIONS, ids=["f32", "f64"])
 # Ordinary and wild by turns; each of these broke a rule once.
@@ -24,6 +24,14 @@ def test_invalid_rays_are_finite_without_gradient_and_backends_agree(number):
             found = violations(lens, rays, sense, dtype, ("cpu",))
             broken = {rule for rule in found if "within rounding" not in rule}
             assert not broken, found
+
+
+def test_a_ray_far_off_a_steep_asphere_has_no_gradient():
+    """Its slopes there are finite, and their derivatives are not: one ray of 2000."""
+    way, lens, rays, sense = next(cases(595 // 2, True, 2000))
+    assert way == "forward"
+    found = violations(lens, chosen(rays, torch.arange(1400, 1600)), sense, torch.float32)
+    assert not {rule for rule in found if "gradient" in rule}, found
 
 
 def asphere(**more):

@@ -294,6 +294,10 @@ class Surface(nn.Module):
             margin = torch.minimum(rounding - (sag - z).abs(), crossing)
             if exists is not None:
                 margin = torch.minimum(margin, exists)
+            # So far from the surface that its slopes' derivatives may be beyond all numbers.
+            far = ~((sag - z).abs() <= FAR * scale)
+        t = t.masked_fill(far, 0.0)
+        ray = ray._replace(x=ray.x.masked_fill(far, 0.0), y=ray.y.masked_fill(far, 0.0))
         for _ in range(2 if torch.is_grad_enabled() else 1):
             t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
         return t, margin.masked_fill(lost, -1.0)
