@@ -182,12 +182,12 @@ class CropDataModule(lightning.LightningDataModule):
         return self._evaluation_crops(split).names()
 
     def most_detailed(self) -> Tensor:
-        """(1, 3, height, width): the validation crop, of some, whose neighbouring texels differ
-        most.
+        """(1, 3, height, width): the colours of the validation crop, of some, whose neighbouring
+        texels differ most.
         """
         if self._detailed is None:
             crops = self._evaluation_crops("validation")
-            some = [crops[number] for number in range(min(_LOOKED_AT, len(crops)))]
+            some = [crops[number][:3] for number in range(min(_LOOKED_AT, len(crops)))]
             detail = [sum(c.diff(dim=d).square().mean() for d in (-1, -2)) for c in some]
             self._detailed = some[int(torch.stack(detail).argmax())][None]
         return self._detailed

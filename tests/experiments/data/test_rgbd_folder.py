@@ -8,6 +8,8 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
+from dolens.imaging.choice.probe import probe_texture
+from dolens.imaging.sensor import Sensor
 from experiments.data.crops import centred_crop, random_crop
 from experiments.data.depth_maps import read_depth_map
 from experiments.data.photographs import Photograph
@@ -135,6 +137,16 @@ def test_a_map_of_another_size_is_named_and_passed_over(tmp_path, caplog):
 def test_settings_out_of_range_are_errors(tmp_path, settings, message):
     with pytest.raises(InputError, match=message):
         RgbdFolderDataModule(tmp_path, **settings)
+
+
+def test_a_renderer_that_chooses_is_tried_on_colours_alone(tmp_path):
+    for number in range(4):
+        write(tmp_path, f"scene{number}", ramp())
+    data = RgbdFolderDataModule(tmp_path, crop_size=24)
+    data.setup()
+    assert data.most_detailed().shape == (1, 3, 24, 24)
+    sensor = Sensor(10, 10, 0.01)
+    assert probe_texture(sensor, 3, 0, data.most_detailed()).shape == (3, 3, 74, 74)
 
 
 def test_a_camera_is_trained_on_a_folder(composed, tmp_path):
