@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Unlimited
+from dolens.optics.surfaces.clear_aperture import ClearAperture, Unlimited
 
 # Smallest slope along one axis of a grid over that along the other: an edge along the grid.
 _ALONG = 1e-3
@@ -17,17 +17,20 @@ def coverage(aperture: ClearAperture, x: Tensor, y: Tensor, radius: Tensor | Non
         aperture: of a surface.
         x: (..., S, S), mm, where the ray of the cell's centre crosses the surface, in its axes.
         y: (..., S, S), mm.
-        radius: of a circular edge, mm, where a gradient with respect to it is wanted.
+        radius: of the edge, a circle, mm, where a gradient with respect to it is wanted.
 
     Returns:
         (..., S, S), from 0 to 1; its derivative with respect to x, y and the radius is that
         of the area, as far as an edge is straight across a cell.
     """
     share = torch.ones_like(x)
-    if isinstance(aperture.edge, Circle) and radius is not None:
-        share = covered(radius.to(x).square() - torch.addcmul(x * x, y, y))
-    elif not isinstance(aperture.edge, Unlimited):
-        share = covered(aperture.edge.margin(x, y))
+    if not isinstance(aperture.edge, Unlimited):
+        margin = aperture.edge.margin(x, y)
+        if radius is not None:
+            # A circle's margin is r² - ρ².
+            squared = radius.to(x).square()
+            margin = margin + (squared - squared.detach())
+        share = covered(margin)
     if aperture.obscuration is not None:
         share = torch.minimum(share, covered(-aperture.obscuration.margin(x, y)))
     return share
