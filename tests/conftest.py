@@ -1,14 +1,24 @@
 import copy
 import json
 import os
+import random
 from pathlib import Path
 
+import numpy
 import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 # One thread in each of pytest-xdist's processes, two where there is only one process.
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else min(2, os.cpu_count() or 1))
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    """A test draws the same numbers alone and behind any other in its process."""
+    random.seed(0)
+    numpy.random.seed(0)
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")
