@@ -73,6 +73,7 @@ def sampled_exit_pupil(
     wavelengths: Sequence[float],
     sensor: Sensor,
     backend: str = "reference",
+    axial: ExitPupil | None = None,
 ) -> ExitPupil:
     """The disc to be sampled from all pixels of a sensor.
 
@@ -85,11 +86,12 @@ def sampled_exit_pupil(
         wavelengths: nm.
         sensor: the pixels.
         backend: what traces.
+        axial: what `axial_exit_pupil` found for this lens; None: it is asked here.
 
     Raises:
         InputError: no ray from the sensor's centre gets through.
     """
-    axial = axial_exit_pupil(system, wavelengths, backend)
+    axial = axial or axial_exit_pupil(system, wavelengths, backend)
     options = {"dtype": system.dtype, "device": system.device}
     places = torch.tensor([0.0, 0.25, 0.75, 1.0], **options)
     rows = torch.stack((places, places)).flatten() * sensor.height - 0.5

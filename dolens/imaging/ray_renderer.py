@@ -17,7 +17,7 @@ from dolens.imaging.light_edges import EdgeMap, edge_map
 from dolens.imaging.moving_pupil import depends_on_parameters
 from dolens.imaging.moving_view import MovingView, moving_view, sample_share
 from dolens.imaging.pixel_edges import edge_samples, of_channel, pixel_edge_rays
-from dolens.imaging.pupil import ExitPupil, sampled_exit_pupil
+from dolens.imaging.pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
 from dolens.imaging.random_numbers import random_words, uniform
 from dolens.imaging.renderer import Unprepared
 from dolens.imaging.replay import replay
@@ -91,11 +91,25 @@ class RayRenderer(Unprepared):
         Returns:
             (W, images, C, height, width).
         """
-        images = []
+        axial, images = self.axial_pupil(lens, scene, values), []
         for i, (window, centre) in enumerate(zip(windows, centres, strict=True)):
             renderer, placed = replace(self, sensor=window), replace(scene, texture_centre=centre)
-            images.append(renderer.render(lens, placed, textures[i : i + 1], seed + i, values))
+            texture = textures[i : i + 1]
+            images.append(renderer.render(lens, placed, texture, seed + i, values, axial))
         return torch.cat(images)
+
+    def axial_pupil(
+        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
+    ) -> ExitPupil:
+        """What `render` finds of a lens before anything else, for many renders of the same lens.
+
+        Raises:
+            InputError: no ray from the sensor's centre gets through.
+        """
+        still = {name: value.detach() for name, value in (values or {}).items()}
+        system = lens.system(still)
+        backend = choose_backend(system, lens.backend)
+        return axial_exit_pupil(system, scene.wavelengths, backend)
 
     def render(
         self,
@@ -104,6 +118,7 @@ class RayRenderer(Unprepared):
         textures: Tensor,
         seed: int,
         values: Mapping[str, Tensor] | None = None,
+        axial: ExitPupil | None = None,
     ) -> Tensor:
         """Image textures as a scene shows them.
 
@@ -113,6 +128,7 @@ class RayRenderer(Unprepared):
             textures: (B, channels, H, W), linear light, as the scene takes them.
             seed: the same seed gives the same samples, whatever ran before.
             values: lens parameters to use instead of the stored ones.
+            axial: what `axial_pupil` found for this lens and these values; None: it is asked here.
 
         Returns:
             (B, images, C, height, width), linear light, in the lens's precision; of a planar scene
@@ -130,7 +146,8 @@ class RayRenderer(Unprepared):
         backend = choose_backend(system, lens.backend, others=[textures])
         now = lens.system({n: p.detach() for n, p in parameters.items()})
         scene.check(now)
-        view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, backend)
+        pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, backend, axial)
+        view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, pupil)
         moving = moving_view(system, scene, view, backend)
         edges = None
         if depends_on_parameters(system):
@@ -171,11 +188,10 @@ class RayRenderer(Unprepared):
         scene: Scene,
         texture_size: tuple[int, int],
         seed: int,
-        backend: str,
+        pupil: ExitPupil,
     ) -> View:
         """What does not depend on the lens's gradient: pixels, samples, pupil and planes."""
         sensor = self.sensor
-        pupil = sampled_exit_pupil(system, scene.wavelengths, sensor, backend)
         return View(
             sensor.height,
             sensor.width,

@@ -25,7 +25,9 @@ def rows_of(path):
 
 
 def test_planes_part_what_one_image_cannot_and_a_common_shift_is_never_seen(composed, tmp_path):
-    run(composed(*TINY, "monte_carlo=25"))
+    others = ["~five", "~arrangements.five_sources", "~arrangements.five_sources_three_planes"]
+    objective = "objective=knowledge/three_planes/worst"
+    run(composed(*TINY, *others, objective, "monte_carlo=25"))
     folder = tmp_path / "run"
     metrics = json.loads((folder / "metrics.json").read_text())
     bounds = {(r["arrangement"], r["variable"]): r for r in rows_of(folder / "bounds.csv")}

@@ -139,47 +139,31 @@ def test_bounds_hold_by_projection(composed, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("stop_after", "settings"),
+    ("stops", "settings"),
     [
-        (1, WAVEFRONT_CODING),
-        (2, WAVEFRONT_CODING),
-        (3, WAVEFRONT_CODING),
-        (1, BY_PLAN),
-        (2, BY_PLAN),
-        (3, BY_PLAN),
-        (3, BY_LEAST_SQUARES),
-        (2, TINY_DOUBLET),
-        (3, TINY_DOUBLET),
+        ((1, 2, 3), WAVEFRONT_CODING),
+        ((1, 2, 3), BY_PLAN),
+        ((3,), BY_LEAST_SQUARES),
+        ((2, 3), TINY_DOUBLET),
     ],
+    ids=["rays", "plan", "least_squares", "doublet"],
 )
-def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(
-    composed, tmp_path, stop_after, settings
-):
-    # `stop_after` 1 and 3 are in the middle of an epoch of two steps, 2 is the end of the first; a
-    # plan is made at an epoch's start.
+def test_a_resumed_run_ends_with_the_same_weights_to_the_bit(composed, tmp_path, stops, settings):
+    # Stops 1 and 3 are in the middle of an epoch of two steps, 2 is the end of the first; a plan is
+    # made at an epoch's start.
     # Least squares, every two steps, has gathered the gradient of one.
-    steps = f"+callbacks.last.every_n_train_steps={stop_after}"
     run(composed(*settings, *UNTESTED, folder="whole"))
-    # Stopped by hand after some steps: the schedule is the whole run's.
-    part = composed(
-        *settings,
-        *UNTESTED,
-        steps,
-        f"+trainer.max_steps={stop_after}",
-        folder="part",
-    )
-    run(part)
-    resumed = composed(
-        *settings,
-        *UNTESTED,
-        f"ckpt_path={tmp_path / 'part' / 'checkpoints' / 'last.ckpt'}",
-        folder="resumed",
-    )
-    run(resumed)
-    whole, again = last_state(tmp_path / "whole"), last_state(tmp_path / "resumed")
-    assert whole.keys() == again.keys()
-    for name, value in whole.items():
-        assert torch.equal(value, again[name]), name
+    whole = last_state(tmp_path / "whole")
+    for stop in stops:
+        # Stopped by hand after some steps: the schedule is the whole run's.
+        steps = [f"+callbacks.last.every_n_train_steps={stop}", f"+trainer.max_steps={stop}"]
+        run(composed(*settings, *UNTESTED, *steps, folder=f"part_{stop}"))
+        last = f"ckpt_path={tmp_path / f'part_{stop}' / 'checkpoints' / 'last.ckpt'}"
+        run(composed(*settings, *UNTESTED, last, folder=f"resumed_{stop}"))
+        again = last_state(tmp_path / f"resumed_{stop}")
+        assert whole.keys() == again.keys()
+        for name, value in whole.items():
+            assert torch.equal(value, again[name]), (stop, name)
 
 
 def test_the_plan_of_the_renderer_is_among_the_metrics(composed, tmp_path):

@@ -7,7 +7,7 @@ from torch.nn import functional
 from dolens import load_lens
 from dolens.errors import InputError
 from dolens.imaging.moving_view import moving_view
-from dolens.imaging.pupil import ExitPupil
+from dolens.imaging.pupil import sampled_exit_pupil
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
 from dolens.imaging.sensor import Sensor
@@ -97,8 +97,8 @@ def test_wavelengths_part_at_the_first_surface_they_meet(last):
     if last == "total reflection":
         ended = []
         system, renderer = lens.system(), RayRenderer(Sensor(9, 20, 0.6), 5)
-        view = renderer._view(system, scene, (40, 43), 5, "reference")
-        pupil = ExitPupil(view.pupil_z, view.pupil_radius, view.axial_radius)
+        pupil = sampled_exit_pupil(system, LINES, renderer.sensor)
+        view = renderer._view(system, scene, (40, 43), 5, pupil)
         ray, _ = renderer._samples(system, view, pupil, 0, 180)
         for wavelength in LINES:
             hit = lens.sensor_to_scene(Rays.from_components(ray, wavelength), first=3)
@@ -218,7 +218,7 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     # What a GPU does: the reference's samples and lookup about a fused trace.
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
-    view = renderer._view(system, scene, (40, 43), 0, "reference")
+    view = renderer._view(system, scene, (40, 43), 0, sampled_exit_pupil(system, LINES, SMALL))
     moving = moving_view(system, scene, view, "reference")
     ray, weight = renderer._samples(system, view, moving.pupil, 0, 180)
     shown = scene.on_planes(texture(40))

@@ -73,10 +73,10 @@ def reference(
         for side, part in ((sensor.height, height), (sensor.width, width))
     )
     windows = tuple((top, left, height, width) for top in rows for left in columns)
-    images = []
+    axial, images = RayRenderer(sensor, pupil_samples).axial_pupil(lens, scene), []
     for window in windows:
         renderer = RayRenderer(sensor.window(*window), pupil_samples)
-        pair = [renderer.render(lens, scene, texture, 2 * seed + i) for i in range(2)]
+        pair = [renderer.render(lens, scene, texture, 2 * seed + i, axial=axial) for i in range(2)]
         images.append(torch.stack(pair))
     return Reference(windows, tuple(images))
 
