@@ -2,13 +2,14 @@
 
 import copy
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 
 from dolens import Lens, Rays
+from dolens.optics.backend import trace_rays
 from dolens.optics.jacobian import OUTPUTS, normal_equations, ray_jacobian
-from dolens.optics.rays import TracedRays
+from dolens.optics.rays import Status, TracedRays
 from tests.optics.random_lenses import random_lens, random_rays, returning
 
 BACKENDS = ("reference", "cpu")
@@ -56,36 +57,76 @@ def undecided(
     tries: int = 64,
     roundings: float = 4.0,
 ) -> torch.Tensor:
-    """Which rays have another fate by one and the same backend when the inputs are rounded anew.
+    """Which rays have another fate by one and the same backend when its numbers are rounded anew:
+    those of the lens and of the rays, and the rays between one surface and the next.
 
     Args:
         lens: in the precision `dtype`.
         rays: (N, 3), whose fates differ between backends.
         sense: +1 or -1.
         dtype: the precision.
-        tries: how often every number of the lens and of the rays is moved.
-        roundings: by up to so many units in its last place.
+        tries: how often every number is moved.
+        roundings: by up to so many units in its last place; points and directions by as many of
+            their lengths.
     """
     generator = torch.Generator().manual_seed(0)
     epsilon = roundings * torch.finfo(dtype).eps
 
+    def noise(values: torch.Tensor) -> torch.Tensor:
+        drawn = torch.rand(values.shape, generator=generator, dtype=torch.float64)
+        return epsilon * (2.0 * drawn - 1.0)
+
     def rounded(values: torch.Tensor) -> torch.Tensor:
-        noise = 2.0 * torch.rand(values.shape, generator=generator, dtype=torch.float64) - 1.0
-        return (values.detach().double() * (1.0 + epsilon * noise)).to(dtype)
+        return (values.detach().double() * (1.0 + noise(values))).to(dtype)
+
+    def vectors(values: torch.Tensor) -> torch.Tensor:
+        exact = values.detach().double()
+        return (exact + noise(exact) * exact.norm(dim=-1, keepdim=True)).to(dtype)
 
     fates = {backend: [] for backend in BACKENDS}
     with torch.no_grad():
         for attempt in range(tries):
             moved, given = copy.deepcopy(lens), held(rays, dtype)
+            between = None
             if attempt:
                 for parameter in moved.parameters():
                     parameter.copy_(rounded(parameter))
-                given = Rays(rounded(given.position), rounded(given.direction), rays.wavelength)
+                given = Rays(vectors(given.position), vectors(given.direction), rays.wavelength)
+                between = vectors
             for backend in BACKENDS:
-                hit = send(moved, given, sense, backend)
-                fates[backend].append(4 * hit.surface.long() + hit.status)
+                fates[backend].append(_fate(moved, given, sense, backend, between))
     reference, cpu = (torch.stack(fates[backend]) for backend in BACKENDS)
     return ((reference == cpu[0]).any(0)) | ((cpu == reference[0]).any(0))
+
+
+def _fate(
+    lens: Lens,
+    rays: Rays,
+    sense: float,
+    backend: str,
+    between: Callable[[torch.Tensor], torch.Tensor] | None,
+) -> torch.Tensor:
+    """4·surface + status of each ray, (N,); `between` moves points and directions behind each
+    surface.
+    """
+    if between is None:
+        hit = send(lens, rays, sense, backend)
+        return 4 * hit.surface.long() + hit.status
+    system, ended, vignetted = lens.system(), None, None
+    count = len(system.surfaces)
+    for number in range(1, count + 1) if sense > 0.0 else range(count, 0, -1):
+        # The sensor's plane belongs to the last surface's step.
+        last = None if sense > 0.0 and number == count else number
+        hit = trace_rays(system, rays, backend, sense, False, number, last)
+        fate = 4 * hit.surface.long() + hit.status
+        edge = hit.status == Status.VIGNETTED
+        stops, dims = torch.where(edge, 0, fate), torch.where(edge, fate, 0)
+        stops = torch.where(hit.valid, 0, stops)
+        # A miss or a total reflection ends a ray; an edge in front of it is passed over.
+        ended = stops if ended is None else torch.where(ended > 0, ended, stops)
+        vignetted = dims if vignetted is None else torch.where(vignetted > 0, vignetted, dims)
+        rays = Rays(between(hit.position), between(hit.direction), rays.wavelength)
+    return torch.where(ended > 0, ended, vignetted)
 
 
 def _broken(values: torch.Tensor) -> torch.Tensor:

@@ -26,7 +26,7 @@ class Arithmetic(NamedTuple):
 def arithmetic(real: types.Type) -> Arithmetic:
     """The functions for a real type; every constant in them has it, so that none is promoted."""
     grazing, tiny = real(1e-9), real(1e-18)
-    one, two = real(1.0), real(2.0)
+    zero, one, two = real(0.0), real(1.0), real(2.0)
 
     @njit(**OPTIONS)
     def clamp(value, limit):  # noqa: ANN001, ANN202
@@ -42,10 +42,14 @@ def arithmetic(real: types.Type) -> Arithmetic:
 
     @njit(**OPTIONS)
     def arrive(x, y, z, l, m, n, sense, limit):  # noqa: ANN001, ANN202, E741
-        """x, y on the vertex plane, the distance there, and the cosine in the sense of travel."""
+        """x, y on the vertex plane, the distance there, and the cosine in the sense of travel, zero
+        where x or y is held at the limit.
+        """
         towards = sense * n
         t = -sense * z / (towards if towards > grazing else grazing)
-        return clamp(x + t * l, limit), clamp(y + t * m, limit), t, towards
+        x, y = clamp(x + t * l, limit), clamp(y + t * m, limit)
+        towards = towards if math.fabs(x) < limit else zero
+        return x, y, t, towards if math.fabs(y) < limit else zero
 
     @njit(**OPTIONS)
     def refract(l, m, n, nx, ny, nz, ratio, sense):  # noqa: ANN001, ANN202, E741

@@ -59,6 +59,7 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
             branch = one - bent * z
             # Compared one by one: a minimum would lose a NaN.
             met = one if met > grazing else zero
+            met = met if math.fabs(t) < limit else zero
             met = met if squared > zero else zero
             met = met if branch > zero else zero
             gx, gy = -c * x, -c * y

@@ -97,6 +97,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                 residual / math.copysign(size if size > grazing else grazing, slope), scale
             )
             t = clamp(t, limit)
+            met = met if math.fabs(t) < limit else zero
             dst[i], dst[128 + i], dst[256 + i] = dst[i] + t * l, dst[128 + i] + t * m, t * n
             dst[1152 + i] += t
             dst[896 + i] = met

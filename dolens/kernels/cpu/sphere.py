@@ -3,6 +3,7 @@
 F = z - c(x² + y² + z²)/2 has the gradient N = (-cx, -cy, 1 - cz), a unit vector on the sphere.
 """
 
+import math
 from collections.abc import Callable
 
 from numba import carray, types
@@ -23,14 +24,14 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
         # Three loops: a processor looks only so far ahead, and this way finds several iterations'
         # divisions and roots to work on at once.
         for i in range(128):
-            x, y, t, _ = arrive(
+            x, y, t, met = arrive(
                 src[i], src[128 + i], src[256 + i] + shift,
                 src[384 + i], src[512 + i], src[640 + i], sense, limit,
             )  # fmt: skip
-            dst[i], dst[128 + i], dst[1152 + i] = x, y, t
+            dst[i], dst[128 + i], dst[1152 + i], dst[896 + i] = x, y, t, met
         for i in range(128):
             l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            x, y, met = dst[i], dst[128 + i], sense * n
+            x, y, met = dst[i], dst[128 + i], dst[896 + i]
             f = c * (x * x + y * y)
             g = n - c * (l * x + m * y)
             squared = g * g - c * f
@@ -38,6 +39,7 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
             t = clamp(sense * f / (near if near > grazing else grazing), limit)
             dst[i], dst[128 + i], dst[256 + i] = x + t * l, y + t * m, t * n
             dst[1152 + i] += t
+            met = met if math.fabs(t) < limit else zero
             dst[896 + i] = squared if met > grazing else zero
         for i in range(128):
             x, y, z, met = dst[i], dst[128 + i], dst[256 + i], dst[896 + i]

@@ -124,7 +124,9 @@ def step(
         t0, towards = distance_to_plane(z + tl.load(record + SHIFT), n, sense)
         limit = tl.load(record + LIMIT)
         x, y = clamp(x + t0 * l, limit), clamp(y + t0 * m, limit)
+        towards &= (tl.abs(x) < limit) & (tl.abs(y) < limit)
         t, nx, ny, nz, met = intersect(record, codes, extras, kind, x, y, l, m, n, sense, KINDS)
+        towards &= tl.abs(t) < limit
         x, y, z = x + t * l, y + t * m, t * n
         travelled = t0 + t
         ended = tl.where((ended > 0) | (met & towards), ended, tag + MISSED)
