@@ -306,11 +306,14 @@ class MisalignmentModule(lightning.LightningModule):
                 *list(row.values())[:_LOGGED],
             )
 
+    def _slopes(self, number: int) -> tuple[SpotImager, float]:
+        """What makes derivatives of a fit's images, and their blur, pixels."""
+        return slopes_of(self.stages[-1], self.measurement(number), self.wavelength, self.imager)
+
     def _knowledge(self, number: int) -> Knowledge:
         """Of a fit's pose, with the uncertainty of what it holds from an earlier one."""
         fit, pose, measurement = self.fits[number], self.poses[number], self.measurement(number)
-        own = slopes_of(self.stages[-1], measurement, self.wavelength, self.imager)
-        finest = self.finest(number)
+        own, finest = self._slopes(number), self.finest(number)
         if fit.held_from is None:
             return knowledge(pose, finest, measurement, *own)
         both = pose.varying({**pose.settings, **dict.fromkeys(fit.held)})
@@ -349,6 +352,7 @@ class MisalignmentModule(lightning.LightningModule):
             draws,
             self.truth(number),
             held,
+            self._slopes(number)[0],
         )
 
     def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:

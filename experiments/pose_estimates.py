@@ -9,14 +9,18 @@ from torch import Tensor
 
 from dolens.alignment.information import Knowledge
 from dolens.alignment.measurement import Measurement
+from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
+from dolens.alignment.spot_loss import SpotMerit
 from dolens.errors import InputError
 from dolens.imaging.spot_image import SpotImager
+from dolens.optimize.damped_least_squares import DampedLeastSquares
 
 # One linear step is exact enough within so many bounds; longer ones are followed by others.
 _NEAR = 5.0
-# Steps that are tried then, at most, and which of them is the last: a part of a bound.
-_IMAGES, _SMALL = 16, 0.1
+# Iterations then, at most, their first damping, and which of them is the last: one by a part of a
+# bound, or by a part of the way from the pose.
+_ITERATIONS, _DAMPING, _SMALL, _PART = 12, 1e-6, 0.1, 0.02
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Estimates:
             covariance: of the χ² distribution with P degrees of freedom where the model holds, and
             independent of what is held; NaN where no truth is known.
         settled: (M,), bool: the first step went a few bounds at most, or the last was a small part
-            of one.  The others are no estimates: steps ended before they were small.
+            of one, or of the whole way.  The others are no estimates: iterations ended before.
     """
 
     values: Tensor
@@ -70,6 +74,7 @@ def estimates(
     draws: Sequence[int],
     truth: Mapping[str, float],
     held: Held | None = None,
+    slopes: SpotImager | None = None,
 ) -> Estimates:
     """Find the pose of each of M measurements, from one pose that is near all of them.
 
@@ -81,11 +86,12 @@ def estimates(
         draws: M numbers.
         truth: by name, degrees and mm.
         held: what the fit takes from an earlier one; None: nothing.
+        slopes: makes the images' derivatives where one step does not do; None: `imager`.
     """
     true = torch.tensor([truth.get(name, torch.nan) for name in pose.names], dtype=torch.float64)
     values, chi, settled = [], [], []
     for place, draw in enumerate(draws):
-        theta, done = _estimate(pose, known, imager, measured(draw), held, place)
+        theta, done = _estimate(pose, known, imager, slopes, measured(draw), held, place)
         error = theta - true * pose.units
         if held is not None:
             error = error - known.inheritance @ (held.found[place] - held.true)
@@ -99,15 +105,16 @@ def _estimate(
     pose: Pose,
     known: Knowledge,
     imager: SpotImager,
+    slopes: SpotImager | None,
     measurement: Measurement,
     held: Held | None,
     place: int,
 ) -> tuple[Tensor, bool]:
-    """θ (P,) by Gauss-Newton steps with the derivatives of the pose, and whether it has settled.
+    """θ (P,), and whether it has settled.
 
-    A step is A⁺ of what the images lack, in units of their noise, with A as it is at the pose.  The
-    first is all that an error of some bounds needs.  Where it is longer images are made anew after
-    each, a step that makes them worse is halved, and the last is small.
+    One step of weighted least squares with the derivatives of the pose is all that an error of some
+    bounds needs.  Where it is longer, the measurement is fitted: by damped least squares, with
+    weights and derivatives of every iteration's own, until a step is small.
     """
     at = pose.scale * pose.scaled.detach()
     moved = torch.zeros_like(at)
@@ -119,29 +126,25 @@ def _estimate(
     there = copy.deepcopy(pose)
     if held is not None:
         there.put(held.values(place))
-
-    def lacking(theta: Tensor) -> Tensor | None:
+    there.scaled.copy_((at + moved) / pose.scale)
+    loss = NoiseWeightedLoss(measurement, imager, slopes, known.blur)
+    optimizer = DampedLeastSquares([there.scaled], initial_damping=_DAMPING)
+    every = torch.ones(len(pose.names), dtype=torch.bool)
+    theta = at + moved
+    for _ in range(_ITERATIONS):
+        before = theta
         try:
-            found = there.images(imager, theta / pose.scale)
+            optimizer.step(SpotMerit(loss.weighted_at(there), there, every))
         except InputError:
             # No light reaches the sensor from there.
-            return None
-        return known.lacking(measurement, torch.stack([one.image for one in found]))
-
-    left = lacking(at + moved)
-    if left is None:
-        return at + moved, False
-    step, share = known.correction_of(left), 1.0
-    for _ in range(_IMAGES):
-        if float((step.abs() / known.bounds).max()) < _SMALL:
-            return at + moved + step, True
-        tried = lacking(at + moved + share * step)
-        if tried is not None and float(tried @ tried) < float(left @ left):
-            moved, left = moved + share * step, tried
-            step, share = known.correction_of(left), 1.0
-        else:
-            share = 0.5 * share
-    return at + moved, False
+            return before, False
+        theta = pose.scale * there.scaled.detach()
+        last, way = ((d / known.bounds).abs().max() for d in (theta - before, theta - at))
+        if float(last) < max(_SMALL, _PART * float(way)):
+            return theta, True
+        # Weights are new in the next one.
+        optimizer.restart()
+    return theta, False
 
 
 def probability(chi_squared: Tensor, freedom: int) -> Tensor:

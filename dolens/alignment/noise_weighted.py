@@ -64,13 +64,12 @@ class NoiseWeightedLoss:
             return self.weighted_at(pose).residuals(pose, scaled)
         mask, parts = self.measurement.mask, []
         for number, found in enumerate(pose.images(self.slopes or self.imager, scaled)):
-            sigma = self.deviation[number][mask[number]]
-            own = (found.image + self.defect[number])[mask[number]] / sigma
-            measured = self.measurement.images[number][mask[number]] / sigma
+            sigma, trusted = self.deviation[number], mask[number]
+            own = torch.where(trusted, (found.image + self.defect[number]) / sigma, 0.0)
+            measured = torch.where(trusted, self.measurement.images[number] / sigma, 0.0)
             # Where no light falls on the pixels, no exposure explains what they saw.
-            power = (own @ own).clamp(min=torch.finfo(own.dtype).tiny)
-            apart = torch.zeros_like(self.deviation[number])
-            apart[mask[number]] = (own @ measured) / power * own - measured
+            power = own.square().sum().clamp(min=torch.finfo(own.dtype).tiny)
+            apart = (own * measured).sum() / power * own - measured
             parts.append(blurred(apart, self.blur).flatten())
         return torch.cat(parts) / (float(mask.sum()) * noise_left(self.blur)) ** 0.5
 

@@ -247,32 +247,38 @@ def posed(lens, **initial):
     return Pose(copy.deepcopy(lens), SOURCE.tolist(), settings)
 
 
-def test_estimates_end_where_a_fit_of_a_lens_with_errors_does(singlet):
-    """Many bounds from the truth: steps with the truth's derivatives, and a fit with its own."""
+@pytest.mark.parametrize(
+    "effects",
+    [Unmodelled(radius=0.004), Unmodelled(source_diameter=0.2, diffraction=True)],
+    ids=["radius", "source and diffraction"],
+)
+def test_estimates_end_where_a_fit_from_afar_does(singlet, effects):
+    """Many bounds from the truth, with effects that the model lacks."""
     truth = {"tilt_x": 10.0, "tilt_y": 2.0, "decenter_x": 0.2, "decenter_y": 0.3}
     imager = SpotImager(SENSOR, WAVELENGTH, 30_000, rim=0.02, subpixels=1)
     one = posed(singlet, **truth)
     true = posed(singlet, **truth)
     true.store()
-    made = Unmodelled(radius=0.001).made(true.lens, seeded(3))
-    measured = seen(made, photons=300_000, read_noise=2.0)
+    made = effects.made(true.lens, seeded(3)) if effects.of_the_lens else true.lens
+    measured = seen(made, effects, photons=300_000, read_noise=2.0)
     known = knowledge(one, imager, seen(true.lens, photons=300_000, read_noise=2.0))
     names = {f"elements.lens.{n}": v for n, v in truth.items()}
     found = estimates(one, known, imager, lambda _: measured, [0], names)
-    fit = posed(singlet, **truth)
+    assert bool(found.settled)
+    fit = posed(singlet, tilt_x=10.5, tilt_y=1.8, decenter_x=0.15, decenter_y=0.33)
     optimizer = DampedLeastSquares([fit.scaled], initial_damping=1e-6)
     chosen = torch.ones(4, dtype=torch.bool)
-    for _ in range(3):
+    for _ in range(6):
         loss = NoiseWeightedLoss(measured, imager).weighted_at(fit)
         optimizer.restart()
         optimizer.step(SpotMerit(loss, fit, chosen))
     bounds = known.bounds / one.units
     by_fit = torch.tensor(list(fit.found().values()), dtype=torch.float64)
     off = (by_fit - torch.tensor(list(names.values()), dtype=torch.float64)) / bounds
-    assert float(off.abs().max()) > 5.0
-    # Weights differ: a fit's are those of its own images.
-    assert float(((found.values[0] - by_fit) / bounds).abs().max()) < 0.15 * float(off.abs().max())
-    assert float(found.chi_squared) > 50.0
+    far = float(off.abs().max())
+    assert far > 5.0
+    assert float(((found.values[0] - by_fit) / bounds).abs().max()) < max(0.2, 0.04 * far)
+    assert float(found.chi_squared) > 20.0
 
 
 def test_errors_of_what_is_held_have_no_part_in_an_images_own_chi_squared(singlet):
