@@ -45,19 +45,28 @@ def main() -> None:
             rows = gradient_rows(loss, lens, names, range(options.seeds), options.step or 1e-5)
             report(title, rows, options.share)
         return
-    for title, lens, loss, names in cases(options):
-        rows = gradient_rows(loss, lens, names, range(options.seeds), options.step)
+    for title, lens, loss, names, other in cases(options):
+        rows = gradient_rows(loss, lens, names, range(options.seeds), options.step, other)
         report(title, rows, options.share)
 
 
-def cases(options: argparse.Namespace) -> Iterator[tuple[str, Lens, Loss, list[str]]]:
-    """Every lens by every renderer that was asked for."""
+def cases(
+    options: argparse.Namespace,
+) -> Iterator[tuple[str, Lens, Loss, list[str], Loss | None]]:
+    """Every lens by every renderer that was asked for.
+
+    A plan of `auto` holds its disc in the pupil until it is looked at again, so its derivatives are
+    compared with differences of renders by rays.
+    """
     for name in options.lens:
         case = CASES[name]
         lens = case.lens()
         for renderer in options.renderer:
             loss = image_loss(case, lens, renderer, options.pixels, options.rays)
-            yield f"{name}, {renderer}", lens, loss, names_of(lens)
+            rays = None
+            if renderer == "auto":
+                rays = image_loss(case, lens, "rays", options.pixels, options.rays)
+            yield f"{name}, {renderer}", lens, loss, names_of(lens), rays
 
 
 def report(title: str, rows: list[GradientRow], share: float) -> None:

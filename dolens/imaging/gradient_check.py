@@ -86,6 +86,7 @@ def gradient_rows(
     names: Sequence[str],
     seeds: Sequence[int],
     step: float | None = None,
+    other: Loss | None = None,
 ) -> list[GradientRow]:
     """Compare derivatives of a loss with differences of it, one parameter after the other.
 
@@ -97,6 +98,7 @@ def gradient_rows(
         seeds: of the samples; two at least for a noise.
         step: of the differences in units of the scale; None: one that changes the loss by some
             thousandths, which drowns the noise of samples that cross an edge.
+        other: whose differences they are compared with; None: the loss's own.
     """
     stored = {n: p.detach() for n, p in lens.named_parameters()}
     for name in names:
@@ -115,7 +117,8 @@ def gradient_rows(
                 for n, g in zip(names, gradients, strict=True)
             }
         )
-    return [_row(loss, lens, start, name, seeds, [f[name] for f in found], step) for name in names]
+    held = other or loss
+    return [_row(held, lens, start, name, seeds, [f[name] for f in found], step) for name in names]
 
 
 @torch.no_grad()

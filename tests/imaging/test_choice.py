@@ -19,6 +19,7 @@ from dolens.imaging.choice.probe import (
     probe_texture,
 )
 from dolens.imaging.choice.reference import reference
+from dolens.imaging.choice.trial import with_values
 from dolens.imaging.psf_renderer import PsfRenderer
 from dolens.imaging.ray_renderer import RayRenderer
 from dolens.imaging.scene import PlanarScene
@@ -243,6 +244,19 @@ def test_a_photograph_of_the_user_s_is_a_probe_as_well(root):
     image = auto.choice.renderer.render(lens, scene, stripes, 1)
     pair = [RayRenderer(sensor, 40).render(lens, scene, stripes, 31 + i) for i in range(2)]
     assert errors[1] == pytest.approx(measured(image, pair), rel=0.15)
+
+
+def test_a_plan_is_made_for_the_stop_as_it_is_varied(root):
+    """A semi-diameter is among the values of a lens, though no parameter of it."""
+    lens, scene = coded(root), PlanarScene((6000.0,), LINES)
+    radius = torch.tensor(0.5 * lens.surfaces["1"].semi_diameter, dtype=lens.dtype)
+    values = {"surfaces.1.semi_diameter": radius, "surfaces.5.x3": torch.zeros_like(radius)}
+    smaller = with_values(lens, values)
+    assert smaller.surfaces["1"].semi_diameter == float(radius)
+    assert lens.surfaces["1"].semi_diameter == pytest.approx(2.0 * float(radius))
+    auto = AutoRenderer(Sensor(16, 16, 0.0069), 4.0, gradients=False, diffraction=False)
+    auto.prepare(lens, scene, values)
+    assert auto.choice.error < 4.0
 
 
 def test_photographs_of_any_size_fit_the_probe():

@@ -151,11 +151,15 @@ def without_diffraction(renderer: PsfRenderer | RayRenderer) -> PsfRenderer | Ra
 
 
 def with_values(lens: Lens, values: Mapping[str, Tensor] | None) -> Lens:
-    """The lens with some of its parameters replaced."""
+    """The lens with some parameters, and semi-diameters, replaced as `Lens.system` does."""
     changed = copy.deepcopy(lens)
     parameters = dict(changed.named_parameters())
     for name, value in (values or {}).items():
-        parameters[name].copy_(value)
+        if name in parameters:
+            parameters[name].copy_(value)
+            continue
+        surface = changed.surfaces[name.split(".")[1]]
+        surface.aperture = surface.aperture.resized(float(value.detach()))
     return changed
 
 
