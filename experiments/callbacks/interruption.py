@@ -9,7 +9,8 @@ logger = logging.getLogger(__name__)
 
 
 class InterruptionNotice(lightning.Callback):
-    """Says where the last checkpoint is and how to resume, when a run is interrupted or fails.
+    """Says where the last checkpoint is, or else the best, and how to resume, when a run is
+    interrupted or fails.
 
     Args:
         folder: of the checkpoints.
@@ -27,14 +28,15 @@ class InterruptionNotice(lightning.Callback):
         exception: BaseException,
     ) -> None:
         """Log one line."""
-        last = self.folder / "last.ckpt"
-        if last.exists():
+        written = [self.folder / f"{name}.ckpt" for name in ("last", "best")]
+        newest = next((path for path in written if path.exists()), None)
+        if newest is not None:
             logger.warning(
                 "Stopped at step %d (%s). Resume with: %s ckpt_path=%s",
                 trainer.global_step,
                 type(exception).__name__,
                 self.command,
-                last,
+                newest,
             )
         else:
             logger.warning(
