@@ -34,6 +34,14 @@ def test_a_ray_far_off_a_steep_asphere_has_no_gradient():
     assert not {rule for rule in found if "gradient" in rule}, found
 
 
+def test_a_ray_where_slopes_overflow_is_missed_and_has_no_gradient():
+    """An infinite slope allowed for any residual, so that it counted as met: one ray of 2000."""
+    found = [c for c in cases(1703 // 2, True, 2000) if c[0] == "backward"]
+    _, lens, rays, sense = found[0]
+    broken = violations(lens, chosen(rays, torch.arange(500, 700)), sense, torch.float32)
+    assert not {rule for rule in broken if "gradient" in rule}, broken
+
+
 def asphere(**more):
     """A weak lens in glass whose far sag overflows single precision."""
     back = surface("even_asphere", curvature=0.01, conic=0.0, a20=1e-22, material="air")

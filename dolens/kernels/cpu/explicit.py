@@ -26,6 +26,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
     zero, one, two, three, grazing = real(0.0), real(1.0), real(2.0), real(3.0), real(1e-9)
     epsilon = real(2.0**-23 if real is types.float32 else 2.0**-52)
     close, rounding = real(math.sqrt(float(epsilon))), real(64.0) * epsilon
+    uncertain = real(1e-2)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, 1280), carray(after, 1280)
@@ -93,10 +94,12 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             met = met if w[896 + i] > zero else zero
             met = met if allowed > zero else zero
             # One step more, too short to matter for the slopes.
-            t = t - clamp(
+            change = clamp(
                 residual / math.copysign(size if size > grazing else grazing, slope), scale
             )
-            t = clamp(t, limit)
+            met = met if math.fabs(change) <= uncertain * (math.fabs(t) + scale) else zero
+            met = met if math.fabs(residual) <= limit else zero
+            t = clamp(t - change, limit)
             met = met if math.fabs(t) < limit else zero
             dst[i], dst[128 + i], dst[256 + i] = dst[i] + t * l, dst[128 + i] + t * m, t * n
             dst[1152 + i] += t

@@ -88,6 +88,8 @@ def explicit_intersect(
     allowed = rounding * (tl.abs(sag) + (tl.abs(t) + scale) * steep)
     met = (sense * slope < 0.0) & (margin > 0.0) & (tl.abs(residual) < allowed)
     # One step more, too short to matter for the slopes.
-    t = clamp(t - clamp(divide(residual, away_from_zero(slope)), scale), limit)
+    change = clamp(divide(residual, away_from_zero(slope)), scale)
+    met &= (tl.abs(change) <= 1e-2 * (tl.abs(t) + scale)) & (tl.abs(residual) <= limit)
+    t = clamp(t - change, limit)
     nz = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
     return t, -sx * nz, -sy * nz, nz, met

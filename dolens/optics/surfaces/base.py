@@ -25,6 +25,8 @@ Parameters = Mapping[str, Tensor]
 GRAZING = 1e-9
 # A ray this many semi-diameters off the axis is invalid, and stays there.
 FAR = 1e3
+# A ray whose crossing rounding moves by this share of its distance and semi-diameter is invalid.
+_UNCERTAIN = 1e-2
 
 
 class PlaneRay(NamedTuple):
@@ -256,9 +258,9 @@ class Surface(nn.Module):
         """Meet the surface.
 
         Here: Newton's iteration for F = sag(x + l·t, y + m·t) - n·t = 0, outside any graph.  Each
-        further step, inside the graph, leaves the value where it is and doubles the order of the
-        derivatives that are those of the implicit function: one step gives ∂t = -∂F/F_t, the
-        second makes second derivatives right.
+        further step, inside the graph, doubles the order of the derivatives that are those of the
+        implicit function: one step gives ∂t = -∂F/F_t, the second, which leaves the value alone,
+        makes second derivatives right.
 
         Args:
             p: parameters.
@@ -294,13 +296,18 @@ class Surface(nn.Module):
             margin = torch.minimum(rounding - (sag - z).abs(), crossing)
             if exists is not None:
                 margin = torch.minimum(margin, exists)
+            # Along a tangent rounding decides where the surface is met: one step more goes far.
+            change = ((sag - z) / crossing.abs().clamp(min=GRAZING)).abs()
+            uncertain = ~(change <= _UNCERTAIN * (t.abs() + scale))
             # So far from the surface that its slopes' derivatives may be beyond all numbers.
-            far = ~((sag - z).abs() <= FAR * scale)
+            far = uncertain | ~((sag - z).abs() <= FAR * scale)
         t = t.masked_fill(far, 0.0)
         ray = ray._replace(x=ray.x.masked_fill(far, 0.0), y=ray.y.masked_fill(far, 0.0))
-        for _ in range(2 if torch.is_grad_enabled() else 1):
-            t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
-        return t, margin.masked_fill(lost, -1.0)
+        t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
+        if torch.is_grad_enabled():
+            step = _newton_step(cls, p, ray, t).clamp(-scale, scale)
+            t = t - (step - step.detach())
+        return t, margin.masked_fill(lost | far, -1.0)
 
     @classmethod
     def normal(
