@@ -97,32 +97,16 @@ class Knowledge:
             inheritance=slope,
         )
 
-    def correction(self, measurement: Measurement, expected: Tensor | None = None) -> Tensor:
+    def correction(self, measurement: Measurement) -> Tensor:
         """(P,), by which θ moves to another measurement of the same mask: one step of weighted
         least squares, efficient where the pose is right to a few bounds.
 
-        Args:
-            measurement: what it moves to.
-            expected: (S, height, width), shares or electrons, of another pose that it moves from,
-                near this one; None: this one.
+        What the expected images lack of those measured, over the noise and convolved with G, is
+        explained; pixels that are not trusted lack nothing.
         """
-        return self.correction_of(self.lacking(measurement, expected))
-
-    def lacking(self, measurement: Measurement, expected: Tensor | None = None) -> Tensor:
-        """(S·height·width,): what expected images lack of those measured, over the noise, convolved
-        with G; zero where pixels are not trusted.
-
-        Args:
-            measurement: of the same mask.
-            expected: as for `correction`.
-        """
-        own = self.expected if expected is None else expected
+        own = self.expected
         missing = (measurement.images - exposure_of(own, measurement) * own) / self.noise
-        return self._blurred(torch.where(measurement.mask, missing, 0.0).flatten())
-
-    def correction_of(self, lacking: Tensor) -> Tensor:
-        """(P,), by which θ moves to explain what images lack."""
-        return self._inverse @ lacking
+        return self._inverse @ self._blurred(torch.where(measurement.mask, missing, 0.0).flatten())
 
     @property
     def bounds(self) -> Tensor:

@@ -124,10 +124,8 @@ def trace_surfaces(
         met = towards if met is None else torch.minimum(towards, met)
         t = t.clamp(-limit, limit)
         # What was held at the limit is not where the ray goes.
-        farthest = torch.maximum(
-            torch.maximum(x.detach().abs(), y.detach().abs()), t.detach().abs()
-        )
-        met = torch.minimum(met, limit - farthest)
+        across = torch.maximum(x.detach().abs(), y.detach().abs())
+        met = torch.minimum(met, limit - torch.maximum(across, t.detach().abs()))
         x, y = torch.addcmul(x, t, l), torch.addcmul(y, t, m)
         if not shape.closed_form:
             # There is no point of the surface to refract at, and a sag far off may overflow.
