@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError
-from experiments.training import run
+from experiments.running.training import run
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")

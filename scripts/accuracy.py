@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 
 from dolens import Rays, Status, load_lens
-from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.scene import PlanarScene, pinhole_image
-from dolens.imaging.sensor import Sensor
 from dolens.optics.elements import POSE
 from dolens.prescriptions import lens_from_prescription, load_prescription
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene, pinhole_image
+from dolens.sensor.pixels import Sensor
 
 ROOT = Path(__file__).resolve().parents[1]
 LENSES = {

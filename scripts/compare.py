@@ -17,8 +17,8 @@ import torch
 
 from dolens.errors import InputError
 from dolens.reconstruction.intervals import Interval, gain_interval
-from experiments.compared_runs import Run, grouped, read_run
-from experiments.photograph_scores import format_interval, statistics_of
+from experiments.camera.photograph_scores import format_interval, statistics_of
+from experiments.running.compared_runs import Run, grouped, read_run
 
 METRICS = ("psnr_db", "ssim", "raw_psnr_db")
 

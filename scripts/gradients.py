@@ -17,8 +17,8 @@ import torch
 from benchmarks.gradient_cases import CASES, RENDERERS, image_loss, names_of
 from benchmarks.training_losses import training_losses
 
-from dolens.imaging.gradient_check import GradientRow, Loss, gradient_rows
 from dolens.optics.lens import Lens
+from dolens.rendering.gradient_check import GradientRow, Loss, gradient_rows
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ import yaml
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens import load_lens
-from dolens.imaging.spot_rays import SpotRays
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.lens import Lens
 from dolens.optimize import MeritSettings
 from tests.optics import exact

@@ -14,12 +14,16 @@ ALLOWED = {
     "kernels": {"errors"},
     "optics": {"errors", "kernels"},
     "prescriptions": {"errors", "optics"},
-    "imaging": {"errors", "optics", "kernels"},
-    "optimize": {"errors", "optics", "imaging"},
-    "tolerancing": {"errors", "optics", "imaging"},
-    "alignment": {"errors", "optics", "imaging", "optimize"},
-    "reconstruction": {"errors", "optics", "imaging"},
-    "plotting": {"errors", "optics", "imaging"},
+    "sensor": {"errors", "optics"},
+    "scene": {"errors", "optics", "sensor"},
+    "analysis": {"errors", "optics", "scene", "sensor"},
+    "diffraction": {"errors", "optics", "scene", "sensor"},
+    "rendering": {"errors", "optics", "kernels", "scene", "sensor", "analysis", "diffraction"},
+    "optimize": {"errors", "optics", "analysis", "rendering"},
+    "tolerancing": {"errors", "optics", "analysis"},
+    "alignment": {"errors", "optics", "sensor", "rendering", "analysis", "diffraction", "optimize"},
+    "reconstruction": {"errors", "optics", "sensor"},
+    "plotting": {"errors", "optics", "analysis", "sensor", "rendering"},
 }
 
 

@@ -8,8 +8,8 @@ import torch
 import yaml
 
 from dolens.errors import InputError
-from experiments.compared_runs import grouped, read_run
-from experiments.photograph_scores import TABLE, scores_by_photograph
+from experiments.camera.photograph_scores import TABLE, scores_by_photograph
+from experiments.running.compared_runs import grouped, read_run
 from experiments.tables import write_table
 from scripts.compare import gain, main
 

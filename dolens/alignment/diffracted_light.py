@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.diffraction.field import fourier_field
+from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.pupil_fit import fit_pupil, regular_pupil
+from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.errors import InputError
-from dolens.imaging.sensor import Sensor
-from dolens.imaging.wave.diffraction import fourier_field
-from dolens.imaging.wave.object_points import ObjectPoints
-from dolens.imaging.wave.pupil_fit import fit_pupil, regular_pupil
-from dolens.imaging.wave.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.optics.lens import Lens
+from dolens.sensor.pixels import Sensor
 
 _RAYS, _DEGREE = 48, 16
 # Light that diffraction spreads farther beyond the rays' landing points is lost: widths of the

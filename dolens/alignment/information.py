@@ -10,8 +10,8 @@ from dolens.alignment.blur import blurred
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import deviation, exposure_of
 from dolens.alignment.pose import Pose
-from dolens.imaging.spot_image import SpotImager
 from dolens.optics.row_jacobian import forward_columns
+from dolens.rendering.spot_image import SpotImager
 
 
 @dataclass(frozen=True)

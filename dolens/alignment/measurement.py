@@ -12,11 +12,11 @@ from torch import Tensor
 from dolens.alignment.diffracted_light import diffracted_light, on_disc
 from dolens.alignment.unmodelled import Unmodelled
 from dolens.errors import InputError
-from dolens.imaging.sensor import Sensor
-from dolens.imaging.spot_image import SpotImage
 from dolens.optics.elements import Axes, from_lens_axes, to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays
+from dolens.rendering.spot_image import SpotImage
+from dolens.sensor.pixels import Sensor
 
 _AT_A_TIME = 1 << 20
 _IN_CACHE = 1 << 14

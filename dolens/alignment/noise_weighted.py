@@ -8,8 +8,8 @@ from torch import Tensor
 from dolens.alignment.blur import blurred, noise_left
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
-from dolens.imaging.spot_image import SpotImager
 from dolens.optics.row_jacobian import forward_columns
+from dolens.rendering.spot_image import SpotImager
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
-from dolens.imaging.sensor import Sensor
+from dolens.sensor.pixels import Sensor
 
 
 def read_measurements(

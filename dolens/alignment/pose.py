@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.imaging.spot_image import SpotImage, SpotImager
 from dolens.optics.elements import TILTS
 from dolens.optics.lens import Lens
+from dolens.rendering.spot_image import SpotImage, SpotImager
 
 _COORDINATES = ("x", "y", "z")
 _KEYS = ("scale", "initial")

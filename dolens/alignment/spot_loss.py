@@ -10,9 +10,9 @@ from dolens.alignment.blur import blurred
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
-from dolens.imaging.spot_image import SpotImager
 from dolens.optics.row_jacobian import forward_columns
 from dolens.optimize.linear_model import LinearModel
+from dolens.rendering.spot_image import SpotImager
 
 
 class ImageLoss(Protocol):

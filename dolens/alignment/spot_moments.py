@@ -10,8 +10,8 @@ from torch.func import jacfwd, jvp, vmap
 
 from dolens.alignment.moments import POWERS, shift_derivatives, weighted_sums
 from dolens.alignment.pixel_moments import Pixels, convolved, pixel_convolution
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
 from dolens.optics.trace import trace_surfaces, trace_to_plane

@@ -14,8 +14,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Status, TracedRays

@@ -7,8 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.analysis.pupil_quadrature import (
+    SpotRays,
+    gaussian_quadrature,
+    square_grid,
+    with_chief_rays,
+)
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import SpotRays, gaussian_quadrature, square_grid, with_chief_rays
 from dolens.optics.lens import Lens
 from dolens.optimize.image_quality import ImageQuality
 from dolens.optimize.landing_losses import EncircledEnergy, Modulation, SpotSize

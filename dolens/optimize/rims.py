@@ -2,7 +2,7 @@
 
 import torch
 
-from dolens.imaging.spot_rays import SpotRays
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays

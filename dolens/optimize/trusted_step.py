@@ -21,7 +21,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dolens.imaging.spot_rays import SpotRays
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.optimize.bounded_step import bounded_step

@@ -4,7 +4,7 @@ import math
 
 from matplotlib.figure import Figure
 
-from dolens.imaging.modulation import Modulation
+from dolens.analysis.modulation_transfer import Modulation
 from dolens.plotting.style import SMALL, TITLE, colours, field_label, ruled_axes
 
 

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.color import linear_to_srgb
 from dolens.plotting.style import SMALL, TITLE
+from dolens.sensor.colour import linear_to_srgb
 
 _ENERGY = 0.995
 _COLUMNS = 6

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from dolens.imaging.ray_fans import RayFans
+from dolens.analysis.ray_fans import RayFans
 from dolens.plotting.style import (
     SMALL,
     TITLE,

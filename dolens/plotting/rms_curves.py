@@ -4,8 +4,8 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from dolens.analysis.rms_curves import RMSCurves
 from dolens.errors import InputError
-from dolens.imaging.field_curves import RMSCurves
 from dolens.plotting.style import (
     SMALL,
     TITLE,

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
-from dolens.imaging.spots import SpotDiagram
+from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.plotting.style import (
     SMALL,
     TITLE,

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.imaging.color import linear_to_srgb
 from dolens.reconstruction.backbones import load_backbone
 from dolens.reconstruction.feature_pyramid import FeaturePyramid
 from dolens.reconstruction.field_coordinates import FIELD_CHANNELS, with_field_channels
 from dolens.reconstruction.unet import UNet
 from dolens.reconstruction.wiener import wiener_deconvolve
+from dolens.sensor.colour import linear_to_srgb
 
 COLORS = 3
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.imaging.spot_rays import SpotRays
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.lens import Lens
 from dolens.tolerancing.linear_spots import linear_spots
 from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.tolerancing.through_focus import FocusCurves

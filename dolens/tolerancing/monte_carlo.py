@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.func import vmap
 
+from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import SpotRays
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_plane

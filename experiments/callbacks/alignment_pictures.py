@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-from experiments.alignment_result import COLUMNS
 from experiments.callbacks.figures import keep_figures
-from experiments.triplet_alignment import TripletAlignmentModule
+from experiments.poses.alignment_result import COLUMNS
+from experiments.poses.triplet_alignment import TripletAlignmentModule
 
 _PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
 

@@ -8,8 +8,8 @@ import lightning
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, prescription_of, save_lens
-from experiments.design import DesignModule
-from experiments.design_tables import operand_table
+from experiments.design.design import DesignModule
+from experiments.design.tables import operand_table
 from experiments.tables import write_table
 
 logger = logging.getLogger(__name__)

@@ -8,11 +8,11 @@ import lightning
 import torch
 from matplotlib.figure import Figure
 
+from dolens.analysis.modulation_transfer import modulation
+from dolens.analysis.ray_fans import ray_fans
+from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
+from dolens.analysis.spot_diagram import spot_diagram, working_f_numbers
 from dolens.errors import InputError
-from dolens.imaging.field_curves import rms_against_field, rms_against_wavelength
-from dolens.imaging.modulation import modulation
-from dolens.imaging.ray_fans import ray_fans
-from dolens.imaging.spots import spot_diagram, working_f_numbers
 from dolens.optics.lens import Lens
 from dolens.optimize import MeritSettings
 from dolens.plotting import (
@@ -25,8 +25,8 @@ from dolens.plotting import (
     spots_figure,
 )
 from experiments.callbacks.figures import log_figure
-from experiments.design import DesignModule
-from experiments.design_tables import SQUARE_GRID_COUNT, spot_table
+from experiments.design.design import DesignModule
+from experiments.design.tables import SQUARE_GRID_COUNT, spot_table
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from dolens.plotting.convergence import convergence_figure
 from dolens.plotting.corner import corner_figure
 from dolens.plotting.spot_fit import spot_fit_figure
 from experiments.callbacks.figures import keep_figures
-from experiments.misalignment import MisalignmentModule
+from experiments.poses.misalignment import MisalignmentModule
 
 
 class MisalignmentPictures(lightning.Callback):

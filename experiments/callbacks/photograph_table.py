@@ -4,7 +4,7 @@ from pathlib import Path
 
 import lightning
 
-from experiments.photograph_scores import table_name
+from experiments.camera.photograph_scores import table_name
 from experiments.tables import write_table
 
 

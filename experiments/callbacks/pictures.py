@@ -16,7 +16,7 @@ from dolens.plotting import (
 )
 from dolens.reconstruction import psnr_db
 from experiments.callbacks.figures import log_figure
-from experiments.camera import CameraModule
+from experiments.camera.camera import CameraModule
 
 
 class CameraPictures(lightning.Callback):

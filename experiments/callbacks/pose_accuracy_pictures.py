@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
 from experiments.callbacks.figures import keep_figures
 from experiments.callbacks.misalignment_pictures import variable_label
-from experiments.pose_accuracy import ESTIMATORS, PoseAccuracyModule
+from experiments.poses.accuracy import ESTIMATORS, PoseAccuracyModule
 
 _LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}
 _MARKERS = {"noise_weighted": "o", "s21": "s"}

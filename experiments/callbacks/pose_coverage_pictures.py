@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from dolens.plotting.style import SMALL, TITLE, colours, open_axes
 from experiments.callbacks.figures import keep_figures
-from experiments.pose_coverage import PoseCoverageModule
+from experiments.poses.coverage import PoseCoverageModule
 
 
 class PoseCoveragePictures(lightning.Callback):

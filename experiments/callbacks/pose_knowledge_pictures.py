@@ -12,7 +12,7 @@ from dolens.plotting.corner import corner_figure
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
 from experiments.callbacks.figures import keep_figures
 from experiments.callbacks.misalignment_pictures import variable_label
-from experiments.pose_knowledge import UNSEEN, Arrangement, PoseKnowledgeModule
+from experiments.poses.knowledge import UNSEEN, Arrangement, PoseKnowledgeModule
 
 _MARKERS = "osD^vP*X"
 

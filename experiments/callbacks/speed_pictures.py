@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from dolens.plotting import pareto_figure
 from experiments.callbacks.figures import keep_figures
-from experiments.speed_vs_error import SpeedVsErrorModule
+from experiments.speed.speed_vs_error import SpeedVsErrorModule
 
 # Part → cost's and error's columns, and their labels.
 _AXES = {

@@ -14,8 +14,8 @@ from dolens.plotting.tolerances import (
     yield_figure,
 )
 from experiments.callbacks.figures import keep_figures
-from experiments.tolerance_tables import per_unit
-from experiments.tolerances import TolerancesModule
+from experiments.tolerances.tables import per_unit
+from experiments.tolerances.tolerances import TolerancesModule
 
 _MOST_OFFENDERS = 20
 _UNIT_WORDS = {"deg": "µm per degree", "mm": "µm per mm", "%": "µm per %", "1/mm": "µm per 1/mm"}

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dolens.errors import InputError
-from dolens.imaging.color import srgb_to_linear
+from dolens.sensor.colour import srgb_to_linear
 from experiments.data.photographs import Photograph
 
 _log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from dolens.errors import InputError
-from dolens.imaging.color import linear_to_srgb
+from dolens.sensor.colour import linear_to_srgb
 from experiments.data.camera_data import CropDataModule, Split
 from experiments.data.crops import linear_light
 from experiments.data.photographs import Photograph, read_photograph

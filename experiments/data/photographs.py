@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.imaging.color import linear_to_srgb, srgb_to_linear
+from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
 
 EXTENSIONS: tuple[str, ...] = (
     ".bmp",

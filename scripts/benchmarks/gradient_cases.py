@@ -9,16 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.imaging.choice.auto_renderer import AutoRenderer
-from dolens.imaging.choice.probe import probe_texture
-from dolens.imaging.gradient_check import Loss
-from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.renderer import Renderer
-from dolens.imaging.scene import PlanarScene, pinhole_image
-from dolens.imaging.sensor import Sensor
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
+from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.auto.probe import probe_texture
+from dolens.rendering.gradient_check import Loss
+from dolens.rendering.protocol import Renderer
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene, pinhole_image
+from dolens.sensor.pixels import Sensor
 
 ROOT = Path(__file__).resolve().parents[2]
 LINES = (656.2725, 587.5618, 486.1327)

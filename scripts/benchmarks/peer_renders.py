@@ -19,9 +19,9 @@ from benchmarks.results import Results, Row
 from benchmarks.timing import Contender, by_turns
 from benchmarks.tracing import beside
 from dolens import Lens
-from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.scene import PlanarScene
-from dolens.imaging.sensor import Sensor
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
 
 PIXELS, SIDE, EXACT_SIDE = 64, 4, 24
 DEPTH, WAVELENGTHS = 6000.0, (656.2725, 587.5618, 486.1327)

@@ -8,9 +8,9 @@ from benchmarks.results import Results, Row
 from benchmarks.timing import Contender, by_turns
 from benchmarks.tracing import Plan, ratio_to
 from dolens import Lens
-from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.scene import PlanarScene
-from dolens.imaging.sensor import Sensor
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
 
 RENDER, RENDER_GRADIENT = "render", "render and gradient"
 LENS = "wavefront_coding"

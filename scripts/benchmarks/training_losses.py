@@ -9,9 +9,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from torch import Tensor
 
-from dolens.imaging.gradient_check import Loss
 from dolens.optics.lens import Lens
-from experiments.training import build_lens
+from dolens.rendering.gradient_check import Loss
+from experiments.running.training import build_lens
 
 ROOT = Path(__file__).resolve().parents[2]
 _SMALL = (

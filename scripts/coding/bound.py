@@ -9,14 +9,14 @@ import torch
 import yaml
 from torch import Tensor
 
-from dolens.imaging.aperture import axial_f_number
-from dolens.imaging.psf import axial_point_spread_functions
-from dolens.imaging.scene import PlanarScene
-from dolens.imaging.sensor import Sensor
-from dolens.imaging.wave.diffraction_limit import with_diffraction_limit
+from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
 from dolens.reconstruction.linear_bound import linear_error, natural_spectrum
+from dolens.rendering.psf import axial_point_spread_functions
+from dolens.rendering.pupil.f_number import axial_f_number
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
 
 _LENS = Path(__file__).parents[2] / "conf/lens/wavefront_coding.yaml"
 _SENSOR = Sensor(128, 128, 0.0069)

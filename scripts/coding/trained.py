@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dolens.errors import InputError
 from dolens.reconstruction.intervals import Interval
-from experiments.compared_runs import Run, read_run
+from experiments.running.compared_runs import Run, read_run
 from scripts.compare import gain
 
 CODED = "wavefront_coding"

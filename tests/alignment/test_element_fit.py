@@ -19,7 +19,7 @@ from dolens.alignment.moment_noise import moment_covariance, simulated_moments
 from dolens.alignment.moments import POWERS
 from dolens.alignment.pixel_moments import Pixels
 from dolens.alignment.spot_moments import SENSOR, moment_model
-from dolens.imaging.spot_rays import gaussian_quadrature
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.prescriptions import lens_from_prescription
 
 FIELDS = ((0.0, 0.0), (0.0, 14.0), (-14.0, 0.0), (14.0, -6.0))

@@ -16,10 +16,10 @@ from dolens.alignment.photograph import read_measurement, read_measurements
 from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import SpotLoss, SpotMerit, SpotResiduals
 from dolens.errors import InputError
-from dolens.imaging.sensor import Sensor
-from dolens.imaging.spot_image import SpotImager
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.prescriptions import lens_from_prescription
+from dolens.rendering.spot_image import SpotImager
+from dolens.sensor.pixels import Sensor
 
 SENSOR = Sensor(48, 48, 0.1)
 SOURCE = [[0.0, 0.0, -864.0]]

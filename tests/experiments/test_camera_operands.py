@@ -10,8 +10,8 @@ from hydra.utils import instantiate
 from dolens.optics.aiming import aim
 from dolens.optimize import operand_model
 from dolens.prescriptions import lens_from_prescription
-from experiments.camera_operands import CameraOperands
-from experiments.training import build_lens, run
+from experiments.camera.operands import CameraOperands
+from experiments.running.training import build_lens, run
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET
 
 DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=1"]

@@ -6,8 +6,8 @@ import shutil
 import pytest
 import torch
 
-from experiments.checkpoints import SETTINGS
-from experiments.training import run
+from experiments.running.checkpoints import SETTINGS
+from experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 TINY_CAMERA = [

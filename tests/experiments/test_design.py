@@ -9,9 +9,9 @@ import torch
 from omegaconf import open_dict
 
 from dolens import load_lens
+from dolens.analysis.pupil_quadrature import square_grid
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import square_grid
-from experiments.training import run
+from experiments.running.training import run
 
 QUIET = ["+trainer.enable_progress_bar=false"]
 UNPICTURED = ["callbacks.pictures=null", *QUIET]

@@ -6,7 +6,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dolens.optimize import MeritSettings
 from experiments.callbacks.design_pictures import design_drawings, pupil_note
-from experiments.training import build_lens
+from experiments.running.training import build_lens
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import torch
 from hydra.utils import instantiate
 from tiny_experiment import TINY, TINY_NETWORK
 
-from dolens.imaging.psf import axial_point_spread_functions
-from experiments.calibration import NoisyMeasurement, OtherDepth, OtherSample
-from experiments.training import build_lens, run
+from dolens.rendering.psf import axial_point_spread_functions
+from experiments.camera.calibration import NoisyMeasurement, OtherDepth, OtherSample
+from experiments.running.training import build_lens, run
 
 QUICK = ["trainer.max_epochs=1", "callbacks.pictures=null"]
 JUDGED = ["judges=wave", "calibrations=wrong"]
@@ -52,7 +52,7 @@ def test_a_run_is_judged_by_waves_and_with_wrong_calibrations_too(composed, tmp_
 
 def test_a_judge_that_is_the_evaluation_renderer_says_the_same_to_the_bit(composed, tmp_path):
     same = (
-        "judges={again: {_target_: dolens.imaging.ray_renderer.RayRenderer, "
+        "judges={again: {_target_: dolens.rendering.ray_renderer.RayRenderer, "
         "sensor: '${renderer.sensor}', pupil_samples: 2}}"
     )
     run(composed(*WAVEFRONT_CODING, "judges=none", f"++{same}"))

@@ -8,16 +8,16 @@ import torch
 import yaml
 
 from dolens.errors import InputError
-from dolens.imaging.choice.probe import probe_image
-from dolens.imaging.color import srgb_to_linear
-from dolens.imaging.psf_renderer import PsfRenderer
-from dolens.imaging.ray_renderer import RayRenderer
-from dolens.imaging.readout import Readout
-from dolens.imaging.scene import PlanarScene
-from dolens.imaging.sensor import Sensor
 from dolens.prescriptions import lens_from_prescription
-from experiments.training import run
-from experiments.views.fields import FieldViews
+from dolens.rendering.auto.probe import probe_image
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.colour import srgb_to_linear
+from dolens.sensor.pixels import Sensor
+from dolens.sensor.readout import Readout
+from experiments.camera.views.fields import FieldViews
+from experiments.running.training import run
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET
 
 LINES = (656.2725, 587.5618, 486.1327)

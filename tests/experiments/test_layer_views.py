@@ -9,7 +9,7 @@ from hydra.errors import InstantiationException
 
 from dolens.errors import InputError
 from experiments.data.occluders import with_occluders
-from experiments.training import run
+from experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 

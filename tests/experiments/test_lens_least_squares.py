@@ -7,12 +7,12 @@ import pytest
 import torch
 import yaml
 
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import gaussian_quadrature
 from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import lens_from_prescription
-from experiments.lens_least_squares import CameraOptimizer, LensLeastSquares
-from experiments.training import run
+from experiments.camera.lens_least_squares import CameraOptimizer, LensLeastSquares
+from experiments.running.training import run
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY, TINY_DOUBLET, TINY_NETWORK
 
 DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=2"]

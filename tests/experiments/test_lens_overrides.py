@@ -5,7 +5,7 @@ import math
 import pytest
 
 from dolens import InputError
-from experiments.training import build_lens
+from experiments.running.training import build_lens
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from hydra.errors import InstantiationException
 
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
-from dolens.imaging.sensor import Sensor
-from experiments.pose_settings import blur_for, spot_imager
-from experiments.training import run
+from dolens.sensor.pixels import Sensor
+from experiments.poses.settings import blur_for, spot_imager
+from experiments.running.training import run
 
 TINY = [
     "experiment=misalignment",

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from experiments.training import run
+from experiments.running.training import run
 
 TINY = [
     "experiment=pose_accuracy",

@@ -7,7 +7,7 @@ import pytest
 from hydra.errors import InstantiationException
 
 from dolens.errors import InputError
-from experiments.training import run
+from experiments.running.training import run
 
 SMALL = [
     "~fits.10",

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from experiments.training import run
+from experiments.running.training import run
 
 TINY = [
     "experiment=pose_knowledge",

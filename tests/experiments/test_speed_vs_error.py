@@ -10,8 +10,8 @@ import torch
 
 from dolens.errors import InputError
 from dolens.plotting import Point, pareto_front
-from experiments.measurements.timing import by_turns, peak_megabytes
-from experiments.training import run
+from experiments.running.training import run
+from experiments.speed.timing import by_turns, peak_megabytes
 
 SMALL = [
     "experiment=speed_vs_error",

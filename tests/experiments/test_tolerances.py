@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from dolens import InputError, load_lens
-from dolens.imaging.spot_rays import gaussian_quadrature
-from experiments.training import run
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
+from experiments.running.training import run
 
 # The whole path, with few rays; the fields are aimed one by one, which takes most of the time.
 SMALL = [

@@ -20,9 +20,9 @@ from tiny_experiment import TINY, TINY_DOUBLET, TINY_NETWORK
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.imaging.readout import Readout
-from experiments.training import TAKEN, run
-from experiments.unread_settings import refuse_unread
+from dolens.sensor.readout import Readout
+from experiments.running.training import TAKEN, run
+from experiments.running.unread_settings import refuse_unread
 
 EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experiment").glob("*.yaml"))
 UNTESTED = ["test=false", "objective=train/loss"]
@@ -175,7 +175,7 @@ def test_the_plan_of_the_renderer_is_among_the_metrics(composed, tmp_path):
 
 def test_every_epoch_looks_at_the_lens_anew(composed, tmp_path, caplog):
     """A plan for the lens that training began with would err unnoticed."""
-    with caplog.at_level("INFO", "dolens.imaging.choice"):
+    with caplog.at_level("INFO", "dolens.rendering.auto"):
         run(composed(*BY_PLAN, *UNPICTURED, *UNTESTED, "trainer.max_epochs=3"))
     looked = [r for r in caplog.messages if "still serves" in r or "the lens has changed" in r]
     assert len(looked) == 2

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from experiments.training import run
+from experiments.running.training import run
 
 SMALL = [
     "experiment=triplet_alignment",

@@ -3,8 +3,8 @@
 import pytest
 
 from dolens.errors import InputError
-from experiments.training import TAKEN
-from experiments.unread_settings import refuse_unread
+from experiments.running.training import TAKEN
+from experiments.running.unread_settings import refuse_unread
 
 UNREAD = {
     "a group": (["experiment=wavefront_coding", "discriminator=double_scale"], "discriminator="),

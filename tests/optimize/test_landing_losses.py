@@ -7,8 +7,8 @@ import torch
 from scipy.special import j1
 
 from dolens import load_lens
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
-from dolens.imaging.spot_rays import gaussian_quadrature
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
 from dolens.optimize.choice import by_number_of_variables
 from dolens.optimize.landing_losses import EncircledEnergy, Modulation

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from dolens import Rays, load_lens
-from dolens.errors import InputError
-from dolens.imaging.spot_rays import (
+from dolens.analysis.pupil_quadrature import (
     gaussian_quadrature,
     square_grid,
     with_chief_rays,
 )
+from dolens.errors import InputError
 from dolens.optics.system import is_rotationally_symmetric
 from dolens.optimize import DesignVariables, MeritSettings
 from dolens.optimize.bounded_step import damped_step

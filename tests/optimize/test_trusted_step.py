@@ -6,7 +6,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dolens.imaging.spot_rays import gaussian_quadrature
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.optimize.operand_model import OperandModel
 from dolens.optimize.operands import Operand, View, operand
 from dolens.optimize.trusted_step import ray_moves, trusted_step

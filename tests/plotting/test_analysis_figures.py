@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from dolens import load_lens
+from dolens.analysis.modulation_transfer import Modulation
+from dolens.analysis.ray_fans import RayFans
+from dolens.analysis.rms_curves import RMSCurves
+from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
-from dolens.imaging.field_curves import RMSCurves
-from dolens.imaging.modulation import Modulation
-from dolens.imaging.ray_fans import RayFans
-from dolens.imaging.spots import SpotDiagram, spot_diagram
 from dolens.plotting import (
     before_after_figure,
     figure_to_image,

@@ -2,9 +2,9 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.imaging.sensor import Sensor
 from dolens.reconstruction import field_channels
 from dolens.reconstruction.field_coordinates import with_field_channels
+from dolens.sensor.pixels import Sensor
 
 
 def sensor_field(height, width):

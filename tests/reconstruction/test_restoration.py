@@ -4,13 +4,13 @@ from torch.nn import functional
 from torchvision.models import mobilenet_v2
 
 from dolens.errors import InputError
-from dolens.imaging.color import linear_to_srgb
 from dolens.reconstruction import (
     FeaturePyramidRestoration,
     UNetRestoration,
     WienerUNetRestoration,
     wiener_deconvolve,
 )
+from dolens.sensor.colour import linear_to_srgb
 
 SMALL = {"weights": "none", "stages": 2, "width_multiplier": 0.25, "pyramid_channels": 8}
 

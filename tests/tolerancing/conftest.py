@@ -2,7 +2,7 @@ import pytest
 import torch
 import yaml
 
-from dolens.imaging.spot_rays import gaussian_quadrature
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.prescriptions import lens_from_prescription
 
 LINES = (656.2725, 587.5618, 486.1327)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens import InputError, load_lens
-from dolens.imaging.spot_rays import gaussian_quadrature
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.tolerancing import (
     Outcome,
     Yield,

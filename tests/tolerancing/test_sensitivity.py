@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.imaging.spot_rays import gaussian_quadrature
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.prescriptions import lens_from_prescription
 from dolens.tolerancing import linear_spots, sensitivities, spot_weights
 

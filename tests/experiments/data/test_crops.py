@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.imaging.color import linear_to_srgb, srgb_to_linear
+from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
 from experiments.data.crops import (
     _grid,
     centred_crop,

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
-from dolens.imaging.color import linear_to_srgb
+from dolens.sensor.colour import linear_to_srgb
 from experiments.data.package_photographs import (
     MANIFEST,
     PackagePhotographsDataModule,

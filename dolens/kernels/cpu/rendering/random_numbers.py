@@ -1,4 +1,4 @@
-"""Counter-based random numbers, the same bits as `dolens.imaging.random_numbers`."""
+"""Counter-based random numbers, the same bits as `dolens.rendering.random_numbers`."""
 
 from numba import njit, types
 

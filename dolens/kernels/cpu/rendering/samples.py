@@ -1,6 +1,6 @@
 """Rays from the sensor, made in place: jittered points of pixels towards strata of the exit pupil.
 
-It mirrors `RayRenderer._samples`, `sampling.square_to_disc` and `pupil.aim` of `dolens.imaging`.
+It mirrors `RayRenderer._samples`, `sampling.square_to_disc` and `pupil.aim` of `dolens.rendering`.
 """
 
 import math

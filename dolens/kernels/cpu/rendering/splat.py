@@ -1,4 +1,4 @@
-"""Splatting points onto pixels as quadratic B-splines, and its adjoint; see `dolens.imaging.psf`.
+"""Splatting points onto pixels as quadratic B-splines, and its adjoint; see `dolens.rendering.psf`.
 
 Chunks of a grid's points have a grid each, which are then added in their order: the result depends
 neither on the number of threads nor on their timing.

@@ -1,0 +1,1 @@
+"""What a lens designer looks at: spot diagrams, ray fans, modulation transfer, RMS curves."""

@@ -1,0 +1,177 @@
+"""Modulation transfer: how much contrast of a sine pattern is left in the image.
+
+The geometric transfer function is the Fourier transform of the spot, and so of its rays
+(Goodman, Introduction to Fourier Optics, section 6.4; Smith, Modern Optical Engineering, ch. 15).
+It says what aberrations leave where they are far larger than the Airy disc; a lens near the
+diffraction limit has less contrast than its rays.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.ray_intercepts import even_points, in_double_precision, land
+from dolens.analysis.spot_diagram import spectral_shares, working_f_numbers
+from dolens.errors import InputError
+from dolens.optics.aiming import field_tangents
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import vergence
+
+DIRECTIONS = {"sagittal": (1.0, 0.0), "tangential": (0.0, 1.0)}
+# Keeps the modulus's slope finite where the transfer function is zero, and changes nothing else.
+_TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class Modulation:
+    """Polychromatic geometric MTF of F fields at Q frequencies; double precision, on the CPU.
+
+    Attributes:
+        fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
+        frequencies: (Q,), cycles/mm on the sensor.
+        tangential: (F, Q), of a pattern that varies along the field's own direction, y for one in
+            the y-z plane and on the axis; NaN where no light passes.
+        sagittal: (F, Q), of one that varies across it.
+        diffraction_limit: (Q,), of the paraxial circular pupil, the mean over the wavelengths.
+    """
+
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
+    frequencies: Tensor
+    tangential: Tensor
+    sagittal: Tensor
+    diffraction_limit: Tensor
+
+
+def modulation_transfer(
+    points: Tensor, weights: Tensor, frequencies: Tensor, direction: str | Tensor
+) -> Tensor:
+    """|Σ w·exp(-2πi·ν·(p - p̄))| / Σ w: the geometric MTF of spots.
+
+    Differentiable any number of times in points and weights, but for the kink of the modulus where
+    the transfer function is zero.  At ν = 0 its second derivative is -(2π)² times the variance of
+    the points along the direction.
+
+    Args:
+        points: (..., N, 2), mm on the sensor.
+        weights: (N,) or (..., N), of any sum; zero leaves out a ray, wherever it lands.
+        frequencies: (Q,), cycles/mm.
+        direction: of the change of the pattern: `sagittal` is x and `tangential` y, as for a field
+            in the y-z plane; or unit vectors (..., 2).
+
+    Returns:
+        (..., Q).
+
+    Raises:
+        InputError: shapes do not fit, or another name of a direction.
+    """
+    if points.ndim < 2 or points.shape[-1] != 2 or weights.shape[-1:] != points.shape[-2:-1]:
+        raise InputError(
+            f"points must be (..., N, 2) and weights (..., N), not {tuple(points.shape)} and "
+            f"{tuple(weights.shape)}"
+        )
+    if isinstance(direction, str):
+        if direction not in DIRECTIONS:
+            raise InputError(f"direction must be one of {', '.join(DIRECTIONS)}, not '{direction}'")
+        direction = points.new_tensor(DIRECTIONS[direction])
+    share = weights / weights.sum(-1, keepdim=True)
+    height = (points * direction[..., None, :]).sum(-1)
+    height = torch.where(weights > 0.0, height, torch.zeros_like(height))
+    # The modulus does not know the centroid; small phases are more accurate.
+    height = height - (share * height).sum(-1, keepdim=True)
+    phase = (2.0 * math.pi) * height[..., None, :] * frequencies[:, None]
+    share = share[..., None, :]
+    real, imaginary = (share * phase.cos()).sum(-1), (share * phase.sin()).sum(-1)
+    return (real.square() + imaginary.square() + _TINY).sqrt()
+
+
+def diffraction_limited_transfer(
+    frequencies: Tensor, wavelength: float | Tensor, f_number: float | Tensor
+) -> Tensor:
+    """MTF of a circular pupil without aberrations: (2/π)·(arccos s - s·√(1 - s²)), s = ν·λ·N.
+
+    Goodman, Introduction to Fourier Optics, equation 6-31; zero from s = 1 on.
+
+    Args:
+        frequencies: cycles/mm.
+        wavelength: nm.
+        f_number: the working F-number N.
+    """
+    s = (frequencies * wavelength * 1e-6 * f_number).abs().clamp(max=1.0)
+    return (2.0 / math.pi) * (torch.arccos(s) - s * (1.0 - s * s).sqrt())
+
+
+@torch.no_grad()
+def modulation(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    frequencies: Sequence[float] | Tensor,
+    rays: int = 6000,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> Modulation:
+    """The polychromatic geometric MTF of a lens, by rays spread evenly over the stop.
+
+    All wavelengths of a field make one spot, so that lateral colour counts.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        frequencies: (Q,), cycles/mm.
+        rays: of each field and wavelength, a multiple of four, before apertures clip any.  What is
+            left of contrast far beyond the first zero is noise of 1/√rays or less.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+
+    Raises:
+        InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
+    """
+    lens = in_double_precision(lens)
+    pupil, weight = even_points(rays)
+    # The rim weighs nothing.
+    pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
+    landings = land(lens, fields, wavelengths, pupil, object_distance)
+    field, waves = landings.fields, landings.wavelengths
+    spectrum = spectral_shares(wavelength_weights, len(waves))
+    light = (weight * landings.valid * spectrum[:, None]).flatten(1, 2)
+    points = landings.points.flatten(1, 2)
+    frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
+    along = _radial(field, object_distance)
+    across = torch.stack((along[:, 1], -along[:, 0]), -1)
+    curves = []
+    for spot, share, tangential, sagittal in zip(points, light, along, across, strict=True):
+        lit = share > 0.0
+        passing = (spot[lit], share[lit], frequency)
+        curves.append(
+            torch.stack([modulation_transfer(*passing, way) for way in (tangential, sagittal)])
+            if bool(lit.any())
+            else frequency.new_full((2, len(frequency)), math.nan)
+        )
+    tangential, sagittal = torch.stack(curves, 1)
+    numbers = working_f_numbers(lens, waves, object_distance)
+    limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
+    return Modulation(
+        field,
+        landings.field_unit,
+        waves,
+        frequency,
+        tangential,
+        sagittal,
+        spectrum @ limits,
+    )
+
+
+def _radial(field: Tensor, object_distance: float | None) -> Tensor:
+    """(F, 2), unit vectors along the fields; +y on the axis."""
+    angles = torch.deg2rad(field) if vergence(object_distance) == 0.0 else field
+    slopes, _ = field_tangents(angles, object_distance)
+    length = slopes.norm(dim=-1, keepdim=True)
+    return torch.where(length > 0.0, slopes / length, slopes.new_tensor([0.0, 1.0]))

@@ -1,0 +1,267 @@
+"""Rays of the spots that a lens is judged by: which, and how much each counts.
+
+A spot is the light of one field and one wavelength.  Only rays that pass the lens are kept, so that
+whoever traces them again and again spends nothing on the others.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.analysis.vignetting import Beams
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.rays import Rays
+from dolens.optics.system import is_rotationally_symmetric
+
+
+@dataclass(frozen=True)
+class SpotRays:
+    """Rays of S spots, all of them passing the lens.
+
+    Attributes:
+        rays: N rays, (N, 3), with wavelengths (N,), spot after spot.
+        spot: (N,), int64, from 0 to S - 1.
+        weight: (N,), float64, the share of a ray in its spot; they sum to one over each spot.
+        fields: (S, 2), degrees or mm, float64.
+        wavelengths: (S,), nm, float64.
+        centred: (S, 2), bool: the spot's mean in x, or in y, is zero by symmetry, because the rays
+            stand for their mirror images too; it must not be taken from these rays.
+        launched: rays that were tried to find these.
+        light: (S,), float64, how much of a spot's beam passes: area over that of the whole stop, as
+            the quadrature measures it, or rays over those of the whole grid.
+        chief: (S,), int64, which of the rays is the spot's chief ray; they weigh nothing.  None
+            where there are none.
+    """
+
+    rays: Rays
+    spot: Tensor
+    weight: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+    centred: Tensor
+    launched: int
+    light: Tensor
+    chief: Tensor | None = None
+
+    @property
+    def count(self) -> int:
+        """Spots."""
+        return len(self.wavelengths)
+
+
+def square_grid(
+    lens: Lens,
+    fields: Sequence[Sequence[float]],
+    wavelengths: Sequence[float],
+    count: int = 31,
+    half_width: float | None = None,
+) -> SpotRays:
+    """Parallel rays through a square grid in the plane of the first vertex, equally weighted.
+
+    Every wavelength has the rays that pass at its own index.
+
+    Args:
+        lens: an object at infinity.
+        fields: (x, y), degrees.
+        wavelengths: nm.
+        count: points along each side.
+        half_width: mm; None: the first surface's semi-diameter r₁, plus what its rim's sag moves
+            the beam of a field aside, tan(field)·sag(r₁).
+
+    Raises:
+        InputError: a spot without rays.
+    """
+    axis = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
+    unit = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+
+    def launch(field: tuple[float, float]) -> Launched:
+        tangents = [math.tan(math.radians(angle)) for angle in field]
+        tangent = torch.tensor(tangents, dtype=torch.float64)
+        width = half_width
+        if width is None:
+            width = first_semi_diameter(lens, float(tangent.norm()))
+        position = torch.cat([unit * width, torch.zeros_like(unit[:, :1])], 1)
+        direction = torch.cat([tangent, torch.ones(1, dtype=torch.float64)])
+        direction = (direction / direction.norm()).expand(position.shape)
+        return Launched(position, direction, torch.ones(len(unit), dtype=torch.float64), len(unit))
+
+    return _passing(lens, fields, wavelengths, launch)
+
+
+def first_semi_diameter(lens: Lens, tangent: float) -> float:
+    """Half-width (mm) of a beam that fills the first surface, in the plane of its vertex."""
+    surface = lens.system().surfaces[0]
+    return surface.semi_diameter + tangent * float(surface.rim_sag(lens.sensor_distance.detach()))
+
+
+def gaussian_quadrature(
+    lens: Lens,
+    fields: Sequence[Sequence[float]],
+    wavelengths: Sequence[float],
+    rings: int = 6,
+    arms: int = 12,
+    object_distance: float | None = None,
+    symmetry: bool = True,
+) -> SpotRays:
+    """Rays on rings and arms across the part of the stop that a field fills, by Gauss's weights.
+
+    The means over these rays are those over the light that passes, up to high order: aberrations of
+    degree 4·rings - 1 along a radius are integrated exactly where nothing but the stop clips
+    (Forbes, J. Opt. Soc. Am. A 5, 1943, 1988).  Where other apertures clip, every arm ends where
+    the light does.  In a lens of rotational symmetry a field on the axis needs one arm, and one in
+    the y-z plane half of them.
+
+    All wavelengths take the rays aimed at the lens's reference wavelength.
+
+    Args:
+        lens: the lens.
+        fields: (x, y), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: nm.
+        rings: radii.
+        arms: azimuths of the whole pupil, an even number.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        symmetry: whether a part of the pupil may stand for its mirror images, where the lens has
+            the symmetry.
+
+    Raises:
+        InputError: a field whose light does not pass, or rings and arms out of range.
+    """
+    if rings < 1 or arms < 2 or arms % 2:
+        raise InputError(f"rings must be at least 1 and arms even, not {rings} and {arms}")
+    nodes, shares = np.polynomial.legendre.leggauss(rings)
+    # Gauss and Legendre's nodes in ρ², on which an area's element is even.
+    radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))
+    shares = torch.from_numpy(0.5 * shares)
+    symmetric = symmetry and is_rotationally_symmetric(lens.system())
+
+    distinct = list(dict.fromkeys(map(tuple, fields)))
+    points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)
+    azimuths = [_azimuths(field, arms, symmetric) for field in distinct]
+    most = max(map(len, azimuths), default=0)
+    # Fields with fewer arms repeat theirs, to be traced with the others.
+    angles = torch.stack([angle.repeat(-(-most // len(angle)))[:most] for angle in azimuths])
+    arm = torch.stack((angles.cos(), angles.sin()), -1)
+    beams = Beams(lens, points, object_distance)
+    centres = beams.centres((points[:, 0] == 0.0) & symmetric)
+    reach = beams.reach(centres, arm)
+    along = (radii[:, None] * reach[:, None])[..., None] * arm[:, None]
+    aimed = beams.aim((centres[:, None, None] + along).flatten(1, 2))
+    launched = {}
+    for at, (field, angle) in enumerate(zip(distinct, azimuths, strict=True)):
+        own = torch.arange(rings * most).reshape(rings, most)[:, : len(angle)].flatten()
+        weight = shares[:, None] * reach[at, : len(angle)].square()
+        launched[field] = Launched(
+            aimed.position[at, own], aimed.direction[at, own], weight.reshape(-1), len(angle)
+        )
+    return _passing(lens, fields, wavelengths, launched.__getitem__, symmetric)
+
+
+def _azimuths(field: tuple[float, float], arms: int, symmetric: bool) -> Tensor:
+    """Of the arms that stand for the whole pupil, radians."""
+    x, y = field
+    if symmetric and x == 0.0 and y == 0.0:
+        return torch.tensor([0.25 * math.pi], dtype=torch.float64)
+    if symmetric and x == 0.0:
+        half = arms // 2
+        return (torch.arange(half).double() + 0.5) * (math.pi / half) - 0.5 * math.pi
+    return (torch.arange(arms).double() + 0.5) * (2.0 * math.pi / arms)
+
+
+class Launched(NamedTuple):
+    """Rays of a field before the lens: positions, directions, weights, and what these would sum up
+    to if all of the beam passed.
+    """
+
+    position: Tensor
+    direction: Tensor
+    weight: Tensor
+    whole: float
+
+
+Launch = Callable[[tuple[float, float]], Launched]
+
+
+@torch.no_grad()
+def _passing(
+    lens: Lens,
+    fields: Sequence[Sequence[float]],
+    wavelengths: Sequence[float],
+    launch: Launch,
+    symmetric: bool = False,
+) -> SpotRays:
+    """The rays that pass, of every field and wavelength, in the lens's precision."""
+    options = {"dtype": lens.dtype, "device": lens.device}
+    pieces, launched, launches, light = [], 0, {}, []
+    for spot, (field, wavelength) in enumerate(product(map(tuple, fields), wavelengths)):
+        if field not in launches:
+            launches[field] = launch(field)
+        position, direction, weight, whole = launches[field]
+        position, direction = position.to(**options), direction.to(**options)
+        valid = lens.trace(Rays(position, direction, wavelength)).valid
+        launched += valid.numel()
+        if not bool(valid.any()):
+            raise InputError(f"no ray of field {field} and {wavelength:g} nm passes the lens")
+        weight = weight.to(valid.device)[valid]
+        light.append(float(weight.sum()) / whole)
+        pieces.append(
+            (
+                position[valid],
+                direction[valid],
+                torch.full((len(weight),), wavelength, dtype=torch.float64, device=valid.device),
+                torch.full((len(weight),), spot, device=valid.device),
+                weight / weight.sum(),
+            )
+        )
+    position, direction, wavelength, spot, weight = (
+        torch.cat(part) for part in zip(*pieces, strict=True)
+    )
+    points = torch.tensor(
+        [(*field, wave) for field, wave in product(fields, wavelengths)], dtype=torch.float64
+    )
+    on_axis = (points[:, :2] == 0.0).all(-1)
+    meridional = points[:, 0] == 0.0
+    centred = torch.stack((meridional, on_axis), -1) & symmetric
+    return SpotRays(
+        Rays(position, direction, wavelength),
+        spot,
+        weight,
+        points[:, :2],
+        points[:, 2],
+        centred.to(spot.device),
+        launched,
+        torch.tensor(light, dtype=torch.float64),
+    )
+
+
+@torch.no_grad()
+def with_chief_rays(lens: Lens, spots: SpotRays, object_distance: float | None = None) -> SpotRays:
+    """The same spots with their chief rays, which weigh nothing, after all others.
+
+    Raises:
+        InputError: a chief ray does not reach the stop.
+    """
+    chief = lens.chief_ray(spots.fields.to(lens.dtype), lens.primary_wavelength, object_distance)
+    if not bool(chief.converged.all()):
+        at = int(torch.nonzero(~chief.converged)[0])
+        raise InputError(f"the chief ray of field {spots.fields[at].tolist()} misses the stop")
+    rays = spots.rays
+    count = len(spots.weight)
+    device = spots.spot.device
+    return replace(
+        spots,
+        rays=Rays(
+            torch.cat([rays.position, chief.position]),
+            torch.cat([rays.direction, chief.direction]),
+            torch.cat([rays.wavelength, spots.wavelengths.to(device)]),
+        ),
+        spot=torch.cat([spots.spot, torch.arange(spots.count, device=device)]),
+        weight=torch.cat([spots.weight, spots.weight.new_zeros(spots.count)]),
+        chief=count + torch.arange(spots.count, device=device),
+    )

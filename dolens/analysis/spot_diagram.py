@@ -1,0 +1,165 @@
+"""Spot diagrams: where a point's light lands, and how far it spreads."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.ray_intercepts import even_points, in_double_precision, land
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import first_order
+
+# First zero of Bessel's J₁ over π; Airy's radius is 1.22·λ·N.
+AIRY = 1.2196698912665045
+
+
+@dataclass(frozen=True)
+class SpotDiagram:
+    """Spots of F fields and W wavelengths by N points of the stop; double precision, on the CPU.
+
+    What no light reaches is NaN.
+
+    Attributes:
+        fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
+        reference_wavelength: nm, of the chief rays.
+        landing: (F, W, N, 2), mm on the sensor; NaN for rays that do not pass.
+        valid: (F, W, N), bool.
+        weight: (N,), share of a ray in the light through the stop; zero for rays on its rim.
+        wavelength_weight: (W,), shares of the wavelengths in polychromatic values.
+        chief: (F, 2), mm, where the chief ray of the reference wavelength lands.
+        centroid: (F, W, 2), mm.
+        rms: (F, W), mm, √(Σ w·|p - p̄|²) about the spot's own centroid.
+        geo: (F, W), mm, the largest |p - p̄|; over the rim of the stop too, but no nearer to an edge
+            that another aperture makes than the rays are apart.
+        polychromatic_centroid: (F, 2), mm, of all wavelengths together.
+        polychromatic_rms: (F,), mm, about that.
+        airy_radius: (W,), mm, 1.22·λ·N with the paraxial working F-number of the stop.
+    """
+
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
+    reference_wavelength: float
+    landing: Tensor
+    valid: Tensor
+    weight: Tensor
+    wavelength_weight: Tensor
+    chief: Tensor
+    centroid: Tensor
+    rms: Tensor
+    geo: Tensor
+    polychromatic_centroid: Tensor
+    polychromatic_rms: Tensor
+    airy_radius: Tensor
+
+    @property
+    def from_chief(self) -> Tensor:
+        """(F, W, N, 2), mm, landing points from where the field's chief ray lands."""
+        return self.landing - self.chief[:, None, None]
+
+    @property
+    def from_centroid(self) -> Tensor:
+        """(F, W, N, 2), mm, landing points from their spot's centroid."""
+        return self.landing - self.centroid[:, :, None]
+
+
+@torch.no_grad()
+def spot_diagram(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    rays: int = 2000,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> SpotDiagram:
+    """Rays spread evenly over the stop, at every field and wavelength.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        rays: of each spot, a multiple of four, before apertures clip any.  RMS radii of two
+            thousand err by some 1e-4 of themselves where only the stop clips, and by a few
+            hundredths at the edge of a field that has lost most of its light.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+
+    Raises:
+        InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
+    """
+    lens = in_double_precision(lens)
+    pupil, weight = even_points(rays)
+    landings = land(lens, fields, wavelengths, pupil, object_distance)
+    points, valid = landings.points, landings.valid
+    spectrum = spectral_shares(wavelength_weights, points.shape[1])
+
+    light = weight * valid
+    centroid, mean_square = moments(points, light)
+    extent = (points - centroid[:, :, None]).norm(dim=-1).nan_to_num(-math.inf).amax(-1)
+    every = (light * spectrum[:, None]).flatten(1, 2)
+    common, common_square = moments(points.flatten(1, 2), every)
+    waves = landings.wavelengths
+    return SpotDiagram(
+        fields=landings.fields,
+        field_unit=landings.field_unit,
+        wavelengths=waves,
+        reference_wavelength=lens.primary_wavelength,
+        landing=points,
+        valid=valid,
+        weight=weight,
+        wavelength_weight=spectrum,
+        chief=landings.chief,
+        centroid=centroid,
+        rms=mean_square.sqrt(),
+        geo=extent.where(extent >= 0.0, math.nan),
+        polychromatic_centroid=common,
+        polychromatic_rms=common_square.sqrt(),
+        airy_radius=AIRY * waves * 1e-6 * working_f_numbers(lens, waves, object_distance),
+    )
+
+
+def moments(points: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
+    """Centroid (..., 2) and mean square distance from it (...), of points (..., N, 2).
+
+    Args:
+        points: NaN where there is no light.
+        light: (..., N), of any sum; both results are NaN where it is zero.
+    """
+    share = (light / light.sum(-1, keepdim=True))[..., None]
+    there = light[..., None] > 0.0
+    # Without light every share is 0/0, and so is the sum.
+    dark = torch.where(torch.isnan(share), share, 0.0)
+    centroid = torch.where(there, share * points, dark).sum(-2)
+    square = share * (points - centroid[..., None, :]).square()
+    return centroid, torch.where(there, square, dark).sum((-2, -1))
+
+
+def spectral_shares(weights: Sequence[float] | None, count: int) -> Tensor:
+    """(count,), float64, shares of wavelengths, of sum one; equal where none are given.
+
+    Raises:
+        InputError: another number of weights, a negative one, or none that is positive.
+    """
+    if weights is None:
+        return torch.full((count,), 1.0 / count, dtype=torch.float64)
+    shares = torch.as_tensor(weights, dtype=torch.float64)
+    if shares.shape != (count,) or bool((shares < 0.0).any()) or not float(shares.sum()) > 0.0:
+        raise InputError(
+            f"wavelength_weights must be {count} weights, none negative, not {weights}"
+        )
+    return shares / shares.sum()
+
+
+def working_f_numbers(lens: Lens, wavelengths: Tensor, object_distance: float | None) -> Tensor:
+    """(W,), paraxial working F-number of the stop, positive, at each wavelength in nm."""
+    system = lens.system()
+    numbers = [
+        first_order(system, float(wavelength), object_distance).working_f_number.abs()
+        for wavelength in wavelengths
+    ]
+    return torch.stack(numbers).detach().double().cpu()

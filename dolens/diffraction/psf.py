@@ -1,0 +1,230 @@
+"""Point spread functions with diffraction, as pixels collect them; differentiable in the lens."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.field import direct_field, fourier_field
+from dolens.diffraction.moving_bounds import with_moving_bounds
+from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.pixel_integration import fine_grid, pixel_matrix
+from dolens.diffraction.propagation import (
+    DiffractionSettings,
+    Propagation,
+    choose_propagation,
+    direct_samples,
+    fourier_samples,
+    subsamples,
+)
+from dolens.diffraction.pupil_fit import PupilFit, RegularPupil, fit_pupil, regular_pupil
+from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
+from dolens.errors import InputError
+from dolens.optics.backend import say_once
+from dolens.optics.replay import replay
+from dolens.optics.system import OpticalSystem
+
+Points = ObjectPoints | Tensor | Sequence[Sequence[float]]
+Centres = Tensor | Sequence[Sequence[float]] | None
+Wavelengths = float | Sequence[float] | Tensor
+
+# Degrees of the fit that are tried, and the share of the phase error that the first may leave.
+_DEGREES, _SHARE = (10, 16), 0.01
+# Numbers of a piece of work; more pupils than fit are done in pieces, and again for the gradient.
+_PIECE = 1 << 24
+# Functions that are evaluated for a pupil: path difference, amplitude, what passes, and crossings.
+_FUNCTIONS = 8
+
+
+def wave_kernels(
+    system: OpticalSystem,
+    points: Points,
+    wavelength: Wavelengths,
+    centres: Centres,
+    pitch: float,
+    size: int,
+    settings: DiffractionSettings | None = None,
+    backend: str = "auto",
+) -> Tensor:
+    """What pixels collect of object points' light, with diffraction.
+
+    Each kernel is the irradiance convolved with a quadratic B-spline, a pixel's box by a texel's
+    tent, as in `axial_point_spread_functions`: the discrete convolution of a texture with it is the
+    image, wherever the field is small enough for one kernel.
+
+    Where the Fourier transform does not hold, the integral is done directly, which takes a thousand
+    times as long; the log says so and why, and so does `propagation`.
+
+    Args:
+        system: `lens.system(values)`.
+        points: N object points, or their positions (N, 3) in mm in the lens's axes (z < 0).
+        wavelength: nm, one or N.
+        centres: (N, 2), mm on the sensor, of the windows; None: where the chief rays land.
+        pitch: of the pixels, mm.
+        size: pixels along each side of a window.
+        settings: how finely; None: the default.
+        backend: what traces; see `choose_backend`.
+
+    Returns:
+        (N, size, size), in the lens's precision, upright as in `Sensor`: the point (x, y) from the
+        centre is at column (size - 1)/2 - x/pitch and row (size - 1)/2 + y/pitch.  The sum over an
+        infinite window is the flux that passes, over that of the axial point of the same object
+        plane through the paraxial entrance pupil; zero where none passes.  Differentiable in the
+        lens, the movement of the pupil's edges included; windows are held constant.
+
+    Raises:
+        InputError: numbers that do not fit, or a wavefront too steep for diffraction.
+    """
+    settings = settings or DiffractionSettings()
+    found = _prepare(system, points, wavelength, centres, pitch, size, settings, backend)
+    window = _Window(pitch, size, settings.subsamples or subsamples(found.fit, pitch), system.dtype)
+    fourier = found.chosen.fourier
+    if settings.method != "auto":
+        fourier = torch.full_like(fourier, settings.method == "fourier")
+    if bool(fourier.all()):
+        return _by_fourier(found, window)
+    which = torch.nonzero(~fourier).flatten()
+    if settings.method == "auto":
+        for n in which.tolist():
+            say_once(f"diffraction: {found.chosen.reasons[n]}")
+    front = found.fit.wavefront
+    rays = pupil_wavefront(
+        system,
+        found.points[which],
+        front.wavelength[which],
+        front.centre[which],
+        direct_samples(front, window.half_width, settings),
+        1.0 / front.curvature[which],
+        backend,
+    )
+    direct = _by_integration(rays, window)
+    if len(which) == len(found.points):
+        return direct
+    return _by_fourier(found, window).index_copy(0, which, direct)
+
+
+@torch.no_grad()
+def propagation(
+    system: OpticalSystem,
+    points: Points,
+    wavelength: Wavelengths,
+    centres: Centres,
+    pitch: float,
+    size: int,
+    settings: DiffractionSettings | None = None,
+    backend: str = "auto",
+) -> Propagation:
+    """How `wave_kernels` of the same arguments propagates light by itself, and why."""
+    settings = settings or DiffractionSettings()
+    return _prepare(system, points, wavelength, centres, pitch, size, settings, backend).chosen
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    points: ObjectPoints
+    fit: PupilFit
+    samples: int
+    chosen: Propagation | None = None
+    # Of all pupils, where they are one piece of work.
+    pupil: RegularPupil | None = None
+
+    def pieces(self, beside: int = 0) -> Sequence[Tensor]:
+        """Numbers of the pupils, as many at a time as memory is meant for, beside a window."""
+        size = _FUNCTIONS * self.samples**2 + (self.samples + beside) ** 2
+        return torch.arange(len(self.fit.low)).split(max(1, _PIECE // size))
+
+
+@dataclass(frozen=True)
+class _Window:
+    pitch: float
+    size: int
+    subsamples: int
+    dtype: torch.dtype
+
+    @property
+    def half_width(self) -> float:
+        """mm, of what `fine_grid` covers."""
+        return self.pitch * (0.5 * self.size + 1.0)
+
+    def grid(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """x and y (mm) of the irradiance's columns and rows, ordered as pixels are stored."""
+        fine = self.pitch * fine_grid(self.size, self.subsamples, like)
+        return -fine, fine
+
+    def integrated(self, field: Tensor) -> Tensor:
+        """(N, size, size): the flux of |field|² in every pixel."""
+        irradiance = field.real.square() + field.imag.square()
+        step = self.pitch / self.subsamples
+        matrix = step * pixel_matrix(self.size, self.subsamples, irradiance)
+        return matrix @ irradiance @ matrix.mT
+
+
+def _prepare(
+    system: OpticalSystem,
+    points: Points,
+    wavelength: Wavelengths,
+    centres: Centres,
+    pitch: float,
+    size: int,
+    settings: DiffractionSettings,
+    backend: str,
+) -> _Prepared:
+    if not pitch > 0.0 or size < 1:
+        raise InputError(f"pitch must be positive and size at least 1, not {pitch} and {size}")
+    if not isinstance(points, ObjectPoints):
+        points = ObjectPoints.at(points)
+    rays = pupil_wavefront(system, points, wavelength, centres, settings.rays, backend=backend)
+    fit = with_moving_bounds(_fitted(rays, settings))
+    half_width = pitch * (0.5 * size + 1.0)
+    points = points.to(rays.opd.dtype, rays.opd.device)
+    found = _Prepared(points, fit, fourier_samples(fit, half_width, settings))
+    parts = found.pieces()
+    if len(parts) == 1:
+        found = replace(found, pupil=regular_pupil(fit, found.samples))
+        flux = found.pupil.flux
+    else:
+        with torch.no_grad():
+            flux = torch.cat([regular_pupil(fit, found.samples, part).flux for part in parts])
+    chosen = choose_propagation(fit, flux, half_width, settings)
+    return replace(found, chosen=replace(chosen, samples=found.samples))
+
+
+def _fitted(wavefront: Wavefront, settings: DiffractionSettings) -> PupilFit:
+    if settings.degree is not None:
+        return fit_pupil(wavefront, settings.degree)
+    fit = fit_pupil(wavefront, _DEGREES[0])
+    if bool((fit.residual <= _SHARE * settings.phase_error).all()):
+        return fit
+    return fit_pupil(wavefront, _DEGREES[1])
+
+
+def _by_fourier(found: _Prepared, window: _Window) -> Tensor:
+    x, y = window.grid(found.fit.low)
+    parts = found.pieces(len(x))
+
+    def kernels(pupil: RegularPupil) -> Tensor:
+        return window.integrated(fourier_field(pupil, x, y, window.dtype))
+
+    if found.pupil is not None and len(parts) == 1:
+        return kernels(found.pupil)
+
+    clipping = found.fit.wavefront.clipping
+    moving = [number for number, surface in clipping.items() if surface.edge is not None]
+
+    def piece(i: int, coefficients: Tensor, low: Tensor, high: Tensor, *edges: Tensor) -> Tensor:
+        moved = {n: replace(clipping[n], edge=e) for n, e in zip(moving, edges, strict=True)}
+        wavefront = replace(found.fit.wavefront, clipping={**clipping, **moved})
+        fit = replace(found.fit, coefficients=coefficients, low=low, high=high, wavefront=wavefront)
+        return kernels(regular_pupil(fit, found.samples, parts[i])).movedim(0, -1)
+
+    fit = found.fit
+    tensors = (fit.coefficients, fit.low, fit.high, *(clipping[number].edge for number in moving))
+    return replay(piece, [len(part) for part in parts], tensors).movedim(-1, 0)
+
+
+def _by_integration(wavefront: Wavefront, window: _Window) -> Tensor:
+    x, y = window.grid(wavefront.opd)
+    rows, columns = torch.meshgrid(y, x, indexing="ij")
+    field = direct_field(wavefront, columns.flatten(), rows.flatten(), window.dtype)
+    return window.integrated(field.unflatten(-1, (len(y), len(x))))

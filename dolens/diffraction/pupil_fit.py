@@ -1,0 +1,236 @@
+"""Smooth functions over a pupil, by polynomials in the direction cosines.
+
+Rays that are regular where they enter a lens are nearly, but not exactly, regular in the direction
+cosines at the image, which a Fourier transform wants.  A few hundred of them determine polynomials
+that give path difference, amplitude and crossings of apertures anywhere in the pupil.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.pupil_edges import coverage
+from dolens.diffraction.wavefront import Wavefront
+from dolens.errors import InputError
+
+# Rays so many cells outside the pupil take part, so that nothing is extrapolated at its edge.
+_AROUND = 1
+# Relative floor of the Gram matrix's diagonal, against a singular one.
+_RIDGE = 1e-13
+
+
+@dataclass(frozen=True)
+class PupilFit:
+    """Functions over N pupils as products T_i(u)·T_j(v) of Chebyshev's polynomials.
+
+    u and v run from -1 to 1 over a box in the direction cosines that holds the rays.
+
+    Attributes:
+        coefficients: (N, F, degree + 1, degree + 1), j first, then i, zero where i + j is above the
+            degree; of F functions: OPD (mm), amplitude, and x and y (mm) on the surfaces of
+            `wavefront.crossings` in turn.
+        centre: (N, 2), of the box, no gradient.
+        half_width: (N, 2).
+        low: (N, 2), direction cosines that bound the light; no gradient, unless
+            `with_moving_bounds` gave them one.
+        high: (N, 2).
+        residual: (N,), waves: the largest error of the fitted OPD at a ray inside the pupil, no
+            gradient.
+        wavefront: what was fitted.
+    """
+
+    coefficients: Tensor
+    centre: Tensor
+    half_width: Tensor
+    low: Tensor
+    high: Tensor
+    residual: Tensor
+    wavefront: Wavefront
+
+
+@dataclass(frozen=True)
+class RegularPupil:
+    """Pupil functions on grids regular in the direction cosines.
+
+    Attributes:
+        amplitude: (N, G, G), root of flux per area in direction cosines, times the share of the
+            cell that light passes; the last dimension runs along x.
+        opd: (N, G, G), mm.
+        cosines: (N, 2, G), x and y at the centres of the cells.
+        flux: (N,), as `Wavefront.flux`.
+        wavelength: (N,), nm.
+        index: (N,), before the sensor.
+    """
+
+    amplitude: Tensor
+    opd: Tensor
+    cosines: Tensor
+    flux: Tensor
+    wavelength: Tensor
+    index: Tensor
+
+
+def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
+    """Fit a wavefront's rays by least squares.
+
+    The derivative by the lens is that of the functions at fixed direction cosines: a ray that
+    moves by δα counts with δf - ∇f·δα.
+
+    Args:
+        wavefront: of at least as many samples along each side as 1.5·degree.
+        degree: of the polynomials.
+
+    Raises:
+        InputError: a degree that the rays do not determine.
+    """
+    samples = wavefront.opd.shape[-1]
+    if not 1 <= degree <= samples / 1.5:
+        raise InputError(f"a fit's degree must be from 1 to {samples / 1.5:g}, not {degree}")
+    functions = [wavefront.opd, wavefront.amplitude]
+    for crossing in wavefront.crossings.values():
+        functions += crossing.unbind(-1)
+    values = torch.stack(functions, 1).flatten(2)
+    alpha = wavefront.direction.flatten(1, 2)
+    with torch.no_grad():
+        passing = wavefront.coverage > 0.0
+        used = (dilated(passing, _AROUND) & wavefront.valid).flatten(1)
+        centre, half_width = _middle(*_bounds(alpha, used))
+        low, high = _bounds(*_cells(wavefront.direction, passing, wavefront.valid))
+        unit = ((alpha - centre[:, None]) / half_width[:, None]).clamp(-1.0, 1.0)
+        (x, dx), (y, dy) = (chebyshev(unit[..., axis], degree) for axis in (0, 1))
+        rows, columns = _terms(degree, x.device)
+        basis = x[:, columns] * y[:, rows] * used.to(x.dtype)[:, None]
+        inverse = _pseudo_inverse(basis)
+        found = _table(values.detach() @ inverse, rows, columns)
+        slopes = torch.stack(
+            (
+                at_points(found, dx, y) / half_width[:, None, :1],
+                at_points(found, x, dy) / half_width[:, None, 1:],
+            ),
+            -1,
+        )
+        missed = (at_points(found, x, y)[:, 0] - wavefront.opd.flatten(1)).abs()
+        missed = (missed * passing.flatten(1)).amax(-1)
+    moved = (slopes * (alpha - alpha.detach())[:, None]).sum(-1)
+    table = _table((values - moved) @ inverse, rows, columns)
+    return PupilFit(
+        coefficients=table,
+        centre=centre,
+        half_width=half_width,
+        low=low,
+        high=high,
+        residual=missed / (1e-6 * wavefront.wavelength),
+        wavefront=wavefront,
+    )
+
+
+def regular_pupil(fit: PupilFit, samples: int, which: Tensor | None = None) -> RegularPupil:
+    """Evaluate a fit at the centres of G × G cells that cover the light.
+
+    Args:
+        fit: of N pupils.
+        samples: G.
+        which: their numbers; None: all.
+    """
+    which = slice(None) if which is None else which.to(fit.low.device)
+    wavefront, coefficients = fit.wavefront, fit.coefficients[which]
+    low, high = fit.low[which], fit.high[which]
+    degree = coefficients.shape[-1] - 1
+    step = torch.arange(samples, dtype=low.dtype, device=low.device)
+    share = (step + 0.5) / samples
+    cosines = low[..., None] + (high - low)[..., None] * share
+    unit = (cosines - fit.centre[which][..., None]) / fit.half_width[which][..., None]
+    x, y = (chebyshev(unit[:, axis].clamp(-1.0, 1.0), degree)[0][:, None] for axis in (0, 1))
+    opd, whole, *crossings = (y.mT @ coefficients @ x).unbind(1)
+    lit = (wavefront.coverage[which] > 0.0).flatten(1).any(-1)
+    passed = lit[:, None, None].to(opd.dtype).expand(opd.shape)
+    surfaces = wavefront.clipping.values()
+    for surface, x, y in zip(surfaces, crossings[::2], crossings[1::2], strict=True):
+        passed = torch.minimum(passed, coverage(surface.aperture, x, y, surface.edge))
+    amplitude = whole * passed
+    cell = ((high - low) / samples).prod(-1)
+    # A cell that passes a share c has amplitude c, but flux c and not c².
+    flux = (whole * amplitude).sum((-2, -1)) * cell
+    return RegularPupil(
+        amplitude, opd, cosines, flux, wavefront.wavelength[which], wavefront.index[which]
+    )
+
+
+def chebyshev(u: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """T_0(u) to T_degree(u) and their derivatives, each (N, degree + 1, M) of u (N, M)."""
+    values, slopes = [torch.ones_like(u), u], [torch.zeros_like(u), torch.ones_like(u)]
+    for _ in range(degree - 1):
+        values.append(2.0 * u * values[-1] - values[-2])
+        slopes.append(2.0 * values[-2] + 2.0 * u * slopes[-1] - slopes[-2])
+    return torch.stack(values, 1), torch.stack(slopes, 1)
+
+
+def dilated(mask: Tensor, cells: int) -> Tensor:
+    """(N, S, S), bool: where a mask is true, and so many cells around."""
+    size = 2 * cells + 1
+    grown = torch.nn.functional.max_pool2d(mask[:, None].float(), size, stride=1, padding=cells)
+    return grown[:, 0] > 0.5
+
+
+def _terms(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Degrees along y and x of the products, (terms,) each."""
+    rows, columns = torch.meshgrid(*2 * (torch.arange(degree + 1, device=device),), indexing="ij")
+    kept = rows + columns <= degree
+    return rows[kept], columns[kept]
+
+
+def _table(coefficients: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """(N, F, degree + 1, degree + 1) of (N, F, terms); zero beyond the degree."""
+    size = int(rows.amax()) + 1
+    flat = coefficients.new_zeros(*coefficients.shape[:2], size * size)
+    flat = flat.index_copy(2, rows * size + columns, coefficients)
+    return flat.unflatten(-1, (size, size))
+
+
+def at_points(table: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Functions at points: (N, F, M), Σ table[j, i]·x[i]·y[j], of x and y (N, degree + 1, M)."""
+    return ((table @ x[:, None]) * y[:, None]).sum(2)
+
+
+def _pseudo_inverse(basis: Tensor) -> Tensor:
+    """(N, M, terms) of (N, terms, M), by the normal equations: good to some 1e-7 of the values'
+    part that is no polynomial, since products of Chebyshev's are nearly orthogonal over a pupil.
+    """
+    gram = basis @ basis.mT
+    ridge = _RIDGE * gram.diagonal(dim1=-2, dim2=-1).amax(-1).clamp(min=1e-30)
+    gram = gram + torch.diag_embed(ridge[:, None].expand(gram.shape[:-1]))
+    return basis.mT @ torch.cholesky_inverse(torch.linalg.cholesky_ex(gram)[0])
+
+
+def _bounds(alpha: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest x and y (N, 2) of those points (N, M, 2) that are used; else ±1."""
+    there = used[..., None]
+    low = torch.where(there, alpha, torch.inf).amin(1)
+    high = torch.where(there, alpha, -torch.inf).amax(1)
+    some = (low < high).all(-1, keepdim=True)
+    return torch.where(some, low, -1.0), torch.where(some, high, 1.0)
+
+
+def _middle(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    # A little more, so that no point lies outside by rounding.
+    return 0.5 * (low + high), 0.5 * (high - low) * (1.0 + 1e-9)
+
+
+def _cells(direction: Tensor, passing: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Points half-way from rays that pass to their neighbours, and whether they count: the centre
+    of a cell that light passes in part lies up to half a cell outside.
+    """
+    points, counts = [], []
+    for dim in (1, 2):
+        size = passing.shape[dim] - 1
+        (a, b), (lit, beside), (there, known) = (
+            [values.narrow(dim, at, size) for at in (0, 1)]
+            for values in (direction, passing, valid)
+        )
+        middle = torch.where(
+            (there & known)[..., None], 0.5 * (a + b), torch.where(lit[..., None], a, b)
+        )
+        points.append(middle.flatten(1, 2))
+        counts.append((lit | beside).flatten(1))
+    return torch.cat(points, 1), torch.cat(counts, 1)

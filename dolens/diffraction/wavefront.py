@@ -1,0 +1,254 @@
+"""The wavefront in the exit pupil: exact paths to a sphere about a point of the sensor."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.entrance_beam import EntranceBeam, box_grid, find_beam, launched
+from dolens.diffraction.object_flux import axial_flux, flux_density, path_before
+from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.pupil_edges import coverage
+from dolens.diffraction.reference_sphere import chief_ray_landings, sphere_curvature, to_sphere
+from dolens.errors import InputError
+from dolens.optics.backend import trace_rays
+from dolens.optics.elements import from_lens_axes
+from dolens.optics.rays import Components, Rays
+from dolens.optics.surfaces.base import SurfaceState
+from dolens.optics.system import OpticalSystem
+
+MM_PER_NM = 1e-6
+# Rays around the box, for differences of fourth order.
+_RIM = 2
+_FEWEST = 8
+_SMALLEST = 1e-30
+
+
+@dataclass(frozen=True)
+class Wavefront:
+    """Wavefronts of N object points and wavelengths, by S × S rays each; double precision.
+
+    The rays are regular where they enter the lens: cells of equal area of the plane through the
+    first vertex that faces the point.  Of the two dimensions S the second runs along +x there.
+
+    The phase of the light on the reference sphere is exp(+2πi·OPD/λ), time going as exp(-iωt).
+
+    Attributes:
+        opd: (N, S, S), mm: optical path to the reference sphere less its mean over the pupil.
+            Positive where light arrives late; Welford's W has the other sign.
+        direction: (N, S, S, 2), x and y of the unit vector from the ray's point of the sphere
+            towards its centre.
+        landing: (N, S, S, 2), mm, where the rays meet the sensor, from the sphere's centre.
+        area: (N, S, S), of the ray's cell, in direction cosines.
+        amplitude: (N, S, S), root of the flux per area in direction cosines: amplitude²·area is the
+            flux of a whole cell over that of the axial point of the same object plane through the
+            paraxial entrance pupil (see `dolens.diffraction.object_flux`).
+        coverage: (N, S, S), from 0 to 1: the share of the cell that all apertures pass.
+        valid: (N, S, S), bool: the ray reaches the sensor, clipped or not, and so do its
+            neighbours.  The others have finite numbers, no coverage and no gradient.
+        crossings: number of a surface whose aperture bounds a pupil → (N, S, S, 2), mm, where the
+            rays cross it, in its axes.
+        clipping: number → that surface.
+        ended: (N,), bool: part of the pupil's edge is made by rays that miss a surface or are
+            totally reflected; coverage is 0 or 1 there.
+        centre: (N, 2), mm on the sensor, of the reference sphere.
+        curvature: (N,), 1/mm, of the reference sphere.
+        wavelength: (N,), nm.
+        index: (N,), before the sensor.
+    """
+
+    opd: Tensor
+    direction: Tensor
+    landing: Tensor
+    area: Tensor
+    amplitude: Tensor
+    coverage: Tensor
+    valid: Tensor
+    crossings: Mapping[int, Tensor]
+    clipping: Mapping[int, SurfaceState]
+    ended: Tensor
+    centre: Tensor
+    curvature: Tensor
+    wavelength: Tensor
+    index: Tensor
+
+    @property
+    def waves(self) -> Tensor:
+        """(N, S, S), the OPD in wavelengths."""
+        return self.opd / (MM_PER_NM * self.wavelength[:, None, None])
+
+    @property
+    def weight(self) -> Tensor:
+        """(N, S, S), amplitude·area·coverage: a ray's share in sums over the pupil function."""
+        return self.amplitude * self.area * self.coverage
+
+    @property
+    def flux(self) -> Tensor:
+        """(N,), what passes of a point's light, over an axial one's; see `amplitude`."""
+        return (self.amplitude * self.weight).sum((-2, -1))
+
+    @property
+    def rms(self) -> Tensor:
+        """(N,), mm, root mean square of the OPD, weighted by amplitude; NaN without light."""
+        return (_share(self.weight) * self.opd.square()).sum((-2, -1)).sqrt()
+
+    @property
+    def strehl_ratio(self) -> Tensor:
+        """(N,), |∫A·exp(ik·OPD)|²/(∫A)²: irradiance at the sphere's centre over the unaberrated.
+
+        For small aberrations it is exp(-(k·σ)²), σ the `rms` (Maréchal).  NaN without light.
+        """
+        phase, share = (2.0 * torch.pi) * self.waves, _share(self.weight)
+        real, imaginary = (share * phase.cos()).sum((-2, -1)), (share * phase.sin()).sum((-2, -1))
+        return real.square() + imaginary.square()
+
+
+def pupil_wavefront(
+    system: OpticalSystem,
+    points: ObjectPoints,
+    wavelength: float | Sequence[float] | Tensor,
+    centres: Sequence[Sequence[float]] | Tensor | None = None,
+    samples: int = 32,
+    radius: float | Tensor | None = None,
+    backend: str = "auto",
+    beam: EntranceBeam | None = None,
+) -> Wavefront:
+    """Trace the wavefronts of object points to reference spheres about points of the sensor.
+
+    Paths start on a wavefront through the first vertex, so that an object's distance enters no
+    number; all is in double precision.
+
+    Args:
+        system: `lens.system(values)`, of any precision.
+        points: N of them.
+        wavelength: nm, one or N.
+        centres: (N, 2), mm on the sensor; None: where the chief rays land.
+        samples: S, rays along each side of a box about the beam; the outermost lie outside of it.
+        radius: mm, of the reference spheres, one or N; infinite ones are planes far away.  None: to
+            the paraxial exit pupil at the first wavelength (see `sphere_curvature`).
+        backend: what traces; see `choose_backend`.
+        beam: of the same points through this lens; None: it is searched.
+
+    Returns:
+        Wavefronts, differentiable in the lens; the spheres are held constant.  A point whose light
+        does not pass has no coverage.
+
+    Raises:
+        InputError: numbers of points, wavelengths, centres and radii that do not fit, fewer than 8
+            samples, or a sphere that cannot be placed.
+    """
+    if samples < _FEWEST:
+        raise InputError(f"a wavefront needs at least {_FEWEST} samples a side, not {samples}")
+    system = system.double()
+    options = {"dtype": torch.float64, "device": system.device}
+    points = points.to(**options)
+    waves = _one_each("wavelengths", wavelength, len(points), options)
+    if beam is None:
+        beam = find_beam(system, points, waves, backend)
+    if centres is None:
+        centre = chief_ray_landings(system, points, waves, backend)
+    else:
+        centre = torch.as_tensor(centres, **options).detach()
+        if centre.shape != (len(points), 2):
+            raise InputError(f"centres must be ({len(points)}, 2) in mm, not {tuple(centre.shape)}")
+    if radius is not None:
+        radius = _one_each("radii", radius, len(points), options)
+    curvature = sphere_curvature(system, centre, float(waves[0]), radius)
+
+    # A cell around the beam, so that its edge lies inside the grid.
+    half_width = beam.half_width * (samples / (samples - 2.0))
+    q = box_grid(beam.centre, half_width, samples, _RIM)
+    ray, every, opened = launched(points, q), waves[:, None, None], system.opened()
+    rays = Rays.from_components(ray, every)
+    hit = trace_rays(opened, rays, backend, 1.0, False, 1, None)
+    away = hit.position[..., :2] - centre[:, None, None]
+    excess, direction, meets = to_sphere(away, hit.direction, curvature[:, None, None])
+    valid = _with_neighbours(hit.valid & meets)
+    index = system.materials[-1].index(waves) * torch.ones_like(waves)
+    start = system.materials[0].index(every) * path_before(points, q)
+    opd = _inner(start + hit.path_length - index[:, None, None] * excess)
+
+    # Light that is parallel at an infinite sphere has no area there.
+    area = torch.where(valid, _cell_areas(direction).clamp(min=_SMALLEST), 1.0)
+    cell = (2.0 / samples) ** 2 * half_width.prod(-1) / axial_flux(system, points, waves)
+    amplitude = (flux_density(points, _inner(q), _inner(ray.n)) * cell[:, None, None] / area).sqrt()
+
+    inside = Rays(_inner(rays.position), _inner(rays.direction), every)
+    crossings, share = {}, (valid & beam.lit[:, None, None]).to(opd.dtype)
+    for number in beam.apertures:
+        x, y = _crossing(opened, inside, number, backend)
+        crossings[number] = torch.stack((x, y), -1)
+        surface = system.surfaces[number - 1]
+        share = torch.minimum(share, coverage(surface.aperture, x, y, surface.edge))
+    piston = (_share((amplitude * area * share).detach()).nan_to_num(0.0) * opd).sum((-2, -1))
+    return Wavefront(
+        opd=torch.where(valid, opd - piston[:, None, None], 0.0),
+        direction=_inner(direction),
+        landing=_inner(away),
+        area=area,
+        amplitude=torch.where(valid, amplitude, 0.0),
+        coverage=share,
+        valid=valid,
+        crossings=crossings,
+        clipping={number: system.surfaces[number - 1] for number in crossings},
+        ended=beam.ended,
+        centre=centre,
+        curvature=curvature,
+        wavelength=waves,
+        index=index,
+    )
+
+
+def _crossing(
+    system: OpticalSystem, rays: Rays, number: int, backend: str
+) -> tuple[Tensor, Tensor]:
+    """Where rays cross a surface, x and y in its axes, mm."""
+    hit = trace_rays(system, rays, backend, 1.0, False, 1, number)
+    there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
+    there = from_lens_axes(there, system.axes[number - 1])
+    return there.x, there.y
+
+
+def _cell_areas(direction: Tensor) -> Tensor:
+    """(N, S, S): |∂(α_x, α_y)/∂(row, column)| by central differences of fourth order."""
+    up, along = _slope(direction, 1), _slope(direction, 2)
+    return (along[..., 0] * up[..., 1] - along[..., 1] * up[..., 0]).abs()
+
+
+def _slope(values: Tensor, dim: int) -> Tensor:
+    """(N, S, S, 2), per cell, of (N, S + 4, S + 4, 2)."""
+    other = 3 - dim
+    values = values.narrow(other, _RIM, values.shape[other] - 2 * _RIM)
+    size = values.shape[dim] - 2 * _RIM
+    far_before, before, behind, far_behind = (values.narrow(dim, at, size) for at in (0, 1, 3, 4))
+    return (8.0 * (behind - before) - (far_behind - far_before)) / 12.0
+
+
+def _with_neighbours(valid: Tensor) -> Tensor:
+    """(N, S, S), bool: where all rays are valid that the differences take."""
+    size = valid.shape[1] - 2 * _RIM
+    kept = torch.ones_like(_inner(valid))
+    for at in range(2 * _RIM + 1):
+        kept = kept & valid[:, at : at + size, _RIM:-_RIM] & valid[:, _RIM:-_RIM, at : at + size]
+    return kept
+
+
+def _inner(values: Tensor) -> Tensor:
+    return values[:, _RIM:-_RIM, _RIM:-_RIM]
+
+
+def _share(weight: Tensor) -> Tensor:
+    return weight / weight.sum((-2, -1), keepdim=True)
+
+
+def _one_each(
+    what: str,
+    values: float | Sequence[float] | Tensor,
+    count: int,
+    options: Mapping[str, torch.dtype | torch.device],
+) -> Tensor:
+    tensor = torch.as_tensor(values, **options).detach()
+    if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) not in (1, count)):
+        raise InputError(f"{what} must be one or {count} numbers, not {tuple(tensor.shape)}")
+    return tensor.expand(count)

@@ -1,1 +1,0 @@
-"""What a sensor sees: pupil and pixel sampling, point spread functions, renderers, the sensor."""

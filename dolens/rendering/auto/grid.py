@@ -1,0 +1,183 @@
+"""How many point spread functions a sensor needs, and where they are centred."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.system import OpticalSystem
+from dolens.rendering.auto.cost import psf_cost
+from dolens.rendering.auto.finding import Finding
+from dolens.rendering.auto.probe import MEAN, grey_levels
+from dolens.rendering.auto.survey import Survey, survey
+from dolens.rendering.patch_convolution import node_positions
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
+
+# Strata of the pupil along each side, for functions that are compared.
+SAMPLES = 48
+# The share of the tolerance that interpolation between fields, and light beyond windows, may take.
+FIELDS_SHARE, WINDOW_SHARE = 0.6, 0.25
+REGISTRATIONS = ("pinhole", "chief_rays")
+_GRIDS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25)
+_LARGEST = 511  # window, pixels
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A renderer with its fields, registration, illumination and window, and why these."""
+
+    renderer: PsfRenderer
+    finding: Finding
+
+
+def choose_fields(
+    system: OpticalSystem,
+    scene: PlanarScene,
+    sensor: Sensor,
+    rows: Tensor,
+    columns: Tensor,
+    truth: Survey,
+    tolerance: float,
+    backend: str,
+    registrations: Sequence[str] = REGISTRATIONS,
+) -> Layout:
+    """The cheapest grid whose interpolated functions are those of the points in between."""
+    surfaces = len(system.surfaces)
+    candidates = sorted(
+        _candidates(truth, sensor, tolerance, registrations),
+        key=lambda r: psf_cost(r, scene, surfaces),
+    )
+    if not candidates:
+        raise InputError(
+            f"renderer auto: point spread functions are wider than {_LARGEST} pixels; "
+            "use renderer=rays"
+        )
+    nodes: dict[tuple[int, int], Survey] = {}
+    best: tuple[float, PsfRenderer] | None = None
+    for renderer in candidates:
+        if renderer.fields not in nodes:
+            nodes[renderer.fields] = _node_survey(system, scene, sensor, renderer, backend)
+        error = _interpolation_error(renderer, sensor, rows, columns, truth, nodes[renderer.fields])
+        if best is None or error < best[0]:
+            best = error, renderer
+        if error <= FIELDS_SHARE * tolerance:
+            break
+    error, renderer = best
+    well = error <= FIELDS_SHARE * tolerance
+    why = "the least that interpolates well" if well else "the best there is"
+    chosen = (
+        f"{renderer.fields[0]}×{renderer.fields[1]}, registration {renderer.registration}, "
+        f"illumination in {'a map' if renderer.illumination == 'map' else 'the functions'}, "
+        f"{renderer.size} pixels"
+    )
+    return Layout(renderer, Finding("fields", chosen, error, why))
+
+
+def _candidates(
+    truth: Survey, sensor: Sensor, tolerance: float, registrations: Sequence[str]
+) -> Iterator[PsfRenderer]:
+    longer = max(sensor.height, sensor.width)
+    for registration in registrations:
+        distortion = registration == "chief_rays"
+        if distortion and truth.chief is None:
+            continue
+        size = _window(truth, distortion, WINDOW_SHARE * tolerance)
+        if size is None:
+            continue
+        for count in _GRIDS:
+            fields = tuple(
+                1 if count == 1 else max(2, math.ceil(count * side / longer))
+                for side in (sensor.height, sensor.width)
+            )
+            if count > 1 and (fields[0] > sensor.height // 4 or fields[1] > sensor.width // 4):
+                continue
+            for illumination in ("functions", "map"):
+                yield PsfRenderer(
+                    sensor,
+                    fields,
+                    size=size,
+                    registration=registration,
+                    illumination=illumination,
+                )
+
+
+def _lost(truth: Survey, distortion: bool, size: int) -> float:
+    """The mean share of light beyond a window."""
+    seen = truth.offsets(distortion)
+    # A ray's spline reaches a pixel and a half.
+    far = torch.maximum(seen.rows.abs(), seen.columns.abs()) > size / 2 - 1.5
+    light = seen.weight.expand(far.shape)
+    return float((light * far).sum() / light.sum())
+
+
+def _window(truth: Survey, distortion: bool, tolerance: float) -> int | None:
+    """The smallest window that leaves out no more than `tolerance` grey levels of mean light."""
+    share = tolerance / (255.0 * MEAN)
+    low, high = 2, (_LARGEST - 1) // 2
+    if _lost(truth, distortion, 2 * high + 1) > share:
+        return None
+    while low < high:
+        middle = (low + high) // 2
+        if _lost(truth, distortion, 2 * middle + 1) <= share:
+            high = middle
+        else:
+            low = middle + 1
+    return 2 * high + 1
+
+
+def window_finding(truth: Survey, size: int, distortion: bool) -> Finding:
+    """What a window of `size` pixels leaves out."""
+    error = 255.0 * MEAN * _lost(truth, distortion, size)
+    return Finding("window", f"{size} pixels", error, "light beyond it is lost")
+
+
+def _node_survey(
+    system: OpticalSystem, scene: PlanarScene, sensor: Sensor, renderer: PsfRenderer, backend: str
+) -> Survey:
+    down, across = (
+        torch.tensor(node_positions(side, count), dtype=torch.float64)
+        for side, count in zip((sensor.height, sensor.width), renderer.fields, strict=True)
+    )
+    rows, columns = torch.meshgrid(down, across, indexing="ij")
+    return survey(system, scene, sensor, rows.reshape(-1), columns.reshape(-1), SAMPLES, backend)
+
+
+def _interpolation_error(
+    renderer: PsfRenderer,
+    sensor: Sensor,
+    rows: Tensor,
+    columns: Tensor,
+    truth: Survey,
+    nodes: Survey,
+) -> float:
+    """RMS over the points of the error of functions interpolated from the nodes, grey levels."""
+    distortion = renderer.registration == "chief_rays"
+    if distortion and nodes.chief is None:
+        return math.inf
+    functions, wanted = (s.functions(renderer.size, distortion) for s in (nodes, truth))
+    if renderer.illumination == "map":
+        light = nodes.light()[..., None, None]
+        functions = functions / light.clamp(min=torch.finfo(light.dtype).tiny)
+    weights = torch.einsum(
+        "nr,nc->nrc",
+        _hats(rows, sensor.height, renderer.fields[0]),
+        _hats(columns, sensor.width, renderer.fields[1]),
+    ).flatten(1)
+    found = torch.einsum("nm,mdcij->ndcij", weights.to(functions), functions)
+    if renderer.illumination == "map":
+        found = found * truth.light()[..., None, None]
+    return float(grey_levels(found - wanted).square().mean().sqrt())
+
+
+def _hats(places: Tensor, length: int, count: int) -> Tensor:
+    """(N, count): bilinear weights of nodes at places along a side."""
+    if count == 1:
+        return torch.ones(len(places), 1, dtype=places.dtype)
+    spacing = (length - 1) / (count - 1)
+    node = torch.arange(count, dtype=places.dtype) * spacing
+    return (1.0 - (places[:, None] - node).abs() / spacing).clamp(min=0.0)

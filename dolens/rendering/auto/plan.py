@@ -1,0 +1,277 @@
+"""What a scene needs of a renderer, found from a few probe rays, in grey levels."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diffraction_limit
+from dolens.optics.system import OpticalSystem
+from dolens.rendering.auto.finding import Finding
+from dolens.rendering.auto.grid import (
+    REGISTRATIONS,
+    SAMPLES,
+    WINDOW_SHARE,
+    choose_fields,
+    window_finding,
+)
+from dolens.rendering.auto.probe import blurred_grey_levels, grey_levels
+from dolens.rendering.auto.survey import Survey, spread_pixels, survey
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
+
+# Points of the sensor where functions are compared.
+_POINTS = 24
+_PUPIL_SAMPLES = (6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64)
+# The share of the tolerance that each simplification may take; with those of
+# `grid` their squares add up to less than 1.
+_SAMPLING, _SHARING, _DIFFRACTION, _PRECISION = 0.5, 0.25, 0.3, 0.1
+# Near an optimum the gradients of colours, and of depths, cancel; one in place of all turns their
+# sum: a cosine of 0.3 with the rays' gradient was measured, in images a quarter grey level off.
+_SHARING_OF_GRADIENTS = 0.005
+# Points where wavefronts are asked.
+_WAVES = 4
+# Of all pupils whose waves a render may take: some ten seconds.
+_MOST_SAMPLES = 1 << 28
+# Pixels by which windows grow, for diffraction; the last is for comparison.
+_MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A renderer by point spread functions, what it is expected to err by, and why.
+
+    Attributes:
+        renderer: the settings.
+        dtype: precision of rays and image.
+        findings: the decisions.
+        without_diffraction: grey levels that leaving diffraction out costs, or would cost.
+    """
+
+    renderer: PsfRenderer
+    dtype: torch.dtype
+    findings: tuple[Finding, ...]
+    without_diffraction: float
+
+    @property
+    def expected_error(self) -> float:
+        """Grey levels, as if the decisions' errors were independent."""
+        return math.sqrt(sum(finding.error**2 for finding in self.findings))
+
+
+@torch.no_grad()
+def plan(
+    system: OpticalSystem,
+    precise: OpticalSystem,
+    scene: PlanarScene,
+    sensor: Sensor,
+    tolerance: float,
+    gradients: bool,
+    diffraction: bool,
+    backend: str,
+    registrations: Sequence[str] = REGISTRATIONS,
+) -> Plan:
+    """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
+
+    Args:
+        system: the lens in single precision.
+        precise: the same in double precision.
+        scene: depths and wavelengths.
+        sensor: the pixels.
+        tolerance: RMS grey levels (1/255 of full scale, linear light) on the probe.
+        gradients: whether the lens's gradients matter too.
+        diffraction: whether it may be modelled.
+        backend: what traces.
+        registrations: that may be chosen, of `PsfRenderer`.
+
+    Raises:
+        InputError: functions are too wide for any window.
+    """
+    rows, columns = spread_pixels(sensor, _POINTS)
+    truth = survey(precise, scene, sensor, rows, columns, SAMPLES, backend)
+    layout = choose_fields(
+        precise, scene, sensor, rows, columns, truth, tolerance, backend, registrations
+    )
+    renderer, distortion = layout.renderer, layout.renderer.registration == "chief_rays"
+    functions = truth.functions(renderer.size, distortion)
+    findings = [layout.finding, window_finding(truth, renderer.size, distortion)]
+    shared = (_SHARING_OF_GRADIENTS if gradients else _SHARING) * tolerance
+    for name, finding in (
+        ("depths", _shared_depths(functions, scene, shared)),
+        ("colours", _shared_colours(functions, scene, shared)),
+    ):
+        renderer = replace(renderer, **{name: finding.chosen})
+        findings.append(finding)
+    finding, without = _diffraction(functions, truth, precise, scene, renderer, tolerance, backend)
+    if not diffraction:
+        finding = Finding(
+            "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
+        )
+    renderer = replace(renderer, diffraction=finding.chosen)
+    findings.append(finding)
+    if finding.chosen != "none":
+        finding = _wider_window(truth, scene, renderer, tolerance)
+        renderer = replace(renderer, size=int(finding.chosen))
+        findings.append(finding)
+        functions = truth.functions(renderer.size, distortion)
+    few = slice(0, 8)
+    part = rows[few], columns[few]
+    finding = _sampling(precise, scene, sensor, part, functions[few], renderer, tolerance, backend)
+    renderer = replace(renderer, pupil_samples=int(finding.chosen))
+    findings.append(finding)
+    finding = _precision(system, precise, scene, sensor, part, renderer, tolerance, backend)
+    findings.append(finding)
+    dtype = torch.float32 if finding.chosen == "single" else torch.float64
+    return Plan(renderer, dtype, tuple(findings), without)
+
+
+def _shared_depths(functions: Tensor, scene: PlanarScene, tolerance: float) -> Finding:
+    middle = functions[:, scene.depths.index(scene.middle_depth)][:, None]
+    return _sharing("depths", functions - middle, len(scene.depths), tolerance)
+
+
+def _shared_colours(functions: Tensor, scene: PlanarScene, tolerance: float) -> Finding:
+    middle = functions[:, :, scene.wavelengths.index(scene.middle_wavelength)][:, :, None]
+    return _sharing("colours", functions - middle, len(scene.wavelengths), tolerance)
+
+
+def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Finding:
+    error = float(grey_levels(difference).square().mean().sqrt())
+    if count == 1:
+        return Finding(what, "each", 0.0, "there is one")
+    if error <= tolerance:
+        return Finding(what, "one", error, "they hardly differ")
+    return Finding(what, "each", 0.0, f"one for all would cost {error:.2g}")
+
+
+def _diffraction(
+    functions: Tensor,
+    truth: Survey,
+    system: OpticalSystem,
+    scene: PlanarScene,
+    renderer: PsfRenderer,
+    tolerance: float,
+    backend: str,
+) -> tuple[Finding, float]:
+    """What model of diffraction is enough, and what leaving it out would cost.
+
+    A perfect pupil's says whether it can matter at all; where it can, wavefronts are asked.
+    """
+    pitch = renderer.sensor.pixel_pitch
+    airy = 1.22 * max(scene.wavelengths) * 1e-6 * truth.f_number / pitch
+    seen = f"the Airy disc's radius is {airy:.2g} pixels"
+    side = max(128, functions.shape[-1] + 1)
+    errors = [
+        blurred_grey_levels(
+            functions[:, :, channel],
+            diffraction_transfer(side, side, pitch, wavelength, truth.f_number),
+        )
+        for channel, wavelength in enumerate(scene.wavelengths)
+    ]
+    error = float(torch.stack(errors).square().mean().sqrt())
+    if error <= _DIFFRACTION * tolerance:
+        return Finding("diffraction", "none", error, seen), error
+    sensor, distortion = renderer.sensor, renderer.registration == "chief_rays"
+    # From the middle to a corner: what diffracts there may be beyond Fourier transforms.
+    share = torch.linspace(0.5, 1.0, _WAVES, dtype=torch.float64)
+    places = share * (sensor.height - 1), share * (sensor.width - 1)
+    found, again = (
+        survey(system, scene, sensor, *places, SAMPLES, backend, seed) for seed in (0, 1)
+    )
+    # As wide as diffraction spreads light, within reason.
+    size = renderer.size + 2 * min(math.ceil(8.0 * airy) + 2, _MARGINS[-1])
+    at = (system, scene, sensor, *places, size, distortion)
+    samples, against = found.wave_cost(*at)
+    pupils = math.prod(renderer.fields) * len(scene.depths) * len(scene.wavelengths)
+    if against is None and pupils * samples**2 > _MOST_SAMPLES:
+        against = f"{pupils} pupils of {samples}² samples are too many"
+    if against is not None:
+        # A perfect pupil's effect is then all that is known of it, and its size.
+        because = f"{seen}; not by waves: {against}"
+        return Finding("diffraction", "limit", error, because), error
+    waves = found.waves(*at)
+    pair = [s.functions(size, distortion).double() for s in (found, again)]
+    rays, noise = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
+    limited = with_diffraction_limit(rays, pitch, scene.wavelengths, truth.f_number)
+    # Wavefronts have no noise of sampling: that of the rays is not diffraction.
+    noise = float(grey_levels(noise).square().mean())
+    without, with_limit = (
+        math.sqrt(max(float(grey_levels(f - waves).square().mean()) - noise, 0.0))
+        for f in (rays, limited)
+    )
+    if without <= _DIFFRACTION * tolerance:
+        return Finding("diffraction", "none", without, f"{seen}; measured by waves"), without
+    if with_limit <= _DIFFRACTION * tolerance:
+        because = f"{seen}; measured by waves; without it {without:.2g}"
+        return Finding("diffraction", "limit", with_limit, because), without
+    because = f"{seen}; without it {without:.2g}, with a perfect pupil's {with_limit:.2g}"
+    return Finding("diffraction", "wave", 0.0, because), without
+
+
+def _wider_window(
+    truth: Survey, scene: PlanarScene, renderer: PsfRenderer, tolerance: float
+) -> Finding:
+    """A window that holds what diffraction spreads."""
+    pitch, distortion = renderer.sensor.pixel_pitch, renderer.registration == "chief_rays"
+
+    def blurred(size: int) -> Tensor:
+        functions = truth.functions(size, distortion)[:4].double()
+        return with_diffraction_limit(functions, pitch, scene.wavelengths, truth.f_number)
+
+    widest = renderer.size + 2 * _MARGINS[-1]
+    whole, error, size = blurred(widest), math.inf, renderer.size
+    for margin in _MARGINS[:-1]:
+        size = renderer.size + 2 * margin
+        edge = (widest - size) // 2
+        difference = torch.nn.functional.pad(blurred(size), (edge,) * 4) - whole
+        error = float(grey_levels(difference).square().mean().sqrt())
+        if error <= WINDOW_SHARE * tolerance:
+            break
+    return Finding("window with diffraction", str(size), error, "the Airy disc is wide")
+
+
+def _sampling(
+    system: OpticalSystem,
+    scene: PlanarScene,
+    sensor: Sensor,
+    places: tuple[Tensor, Tensor],
+    functions: Tensor,
+    renderer: PsfRenderer,
+    tolerance: float,
+    backend: str,
+) -> Finding:
+    """The fewest rays whose functions are those of many."""
+    distortion = renderer.registration == "chief_rays"
+    error, samples = math.inf, _PUPIL_SAMPLES[-1]
+    for samples in _PUPIL_SAMPLES:
+        found = survey(system, scene, sensor, *places, samples, backend, seed=1)
+        coarse = found.functions(renderer.size, distortion)
+        error = float(grey_levels(coarse - functions).square().mean().sqrt())
+        if error <= _SAMPLING * tolerance:
+            break
+    because = "the fewest whose noise is small" if error <= _SAMPLING * tolerance else "the most"
+    return Finding("pupil samples", str(samples), error, because)
+
+
+def _precision(
+    system: OpticalSystem,
+    precise: OpticalSystem,
+    scene: PlanarScene,
+    sensor: Sensor,
+    places: tuple[Tensor, Tensor],
+    renderer: PsfRenderer,
+    tolerance: float,
+    backend: str,
+) -> Finding:
+    distortion = renderer.registration == "chief_rays"
+    found = [
+        survey(lens, scene, sensor, *places, 16, backend).functions(renderer.size, distortion)
+        for lens in (system, precise)
+    ]
+    error = float(grey_levels(found[0].double() - found[1]).square().mean().sqrt())
+    if error <= _PRECISION * tolerance:
+        return Finding("precision", "single", error, "rounding does not show")
+    return Finding("precision", "double", 0.0, f"single would cost {error:.2g}")

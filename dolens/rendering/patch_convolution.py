@@ -1,0 +1,361 @@
+"""Convolution with a kernel that changes over the image: overlapping patches, by FFT."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.rendering.psf import splat
+from dolens.rendering.spline_lookup import spline_lookup
+
+# Pixels after which the inverse of the quadratic spline's filter has faded: (3 - √8)^10 = 2e-8.
+_FADED = 10
+# Pixels over which a lookup's derivative is taken.
+_NUDGE = 2.0**-6
+
+
+class Patch(NamedTuple):
+    """A rectangle of the image around a node.
+
+    Attributes:
+        top, bottom, left, right: rows and columns of the image, half open.
+        weight: (bottom - top, right - left), or one for each channel in front of these: how much of
+            each pixel the node's kernel makes.
+    """
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+    weight: Tensor
+
+
+class Coordinates(NamedTuple):
+    """Where in the texture each pixel of the image looks, fractional rows and columns.
+
+    Attributes:
+        rows: (D, C, height, width).
+        columns: (D, C, height, width).
+    """
+
+    rows: Tensor
+    columns: Tensor
+
+
+def node_positions(length: int, count: int) -> list[float]:
+    """Coordinates of `count` nodes along `length` pixels: the ends included, or the middle."""
+    if count == 1:
+        return [0.5 * (length - 1)]
+    return [i * (length - 1) / (count - 1) for i in range(count)]
+
+
+def patches(height: int, width: int, rows: int, columns: int, like: Tensor) -> list[Patch]:
+    """The patches of a grid of nodes, row after row; at each pixel their weights sum to one.
+
+    Weights are bilinear between the nodes.
+
+    Raises:
+        InputError: more nodes than pixels.
+    """
+    if rows < 1 or columns < 1 or rows > height or columns > width:
+        raise InputError(
+            f"renderer: fields must be from 1 to {height} rows and 1 to {width} columns, "
+            f"not {rows}, {columns}"
+        )
+    vertical, horizontal = (
+        [_hat(length, count, i, like) for i in range(count)]
+        for length, count in ((height, rows), (width, columns))
+    )
+    return [
+        Patch(top, bottom, left, right, down[:, None] * across)
+        for top, bottom, down in vertical
+        for left, right, across in horizontal
+    ]
+
+
+def _hat(length: int, count: int, node: int, like: Tensor) -> tuple[int, int, Tensor]:
+    """First pixel, end and weights of a node along one side."""
+    place = torch.arange(length, dtype=torch.float64)
+    if count == 1:
+        return 0, length, torch.ones_like(place).to(like)
+    spacing = (length - 1) / (count - 1)
+    weight = (1.0 - (place - node * spacing).abs() / spacing).clamp(min=0.0)
+    if count == 2:
+        # All patches are then the whole, and share what is done to the texture.
+        return 0, length, weight.to(like)
+    inside = torch.nonzero(weight > 0.0).flatten()
+    first, end = int(inside[0]), int(inside[-1]) + 1
+    return first, end, weight[first:end].to(like)
+
+
+def convolve_patches(
+    textures: Tensor,
+    kernels: Tensor,
+    layout: Sequence[Patch],
+    origin: tuple[int, int],
+    image_size: tuple[int, int],
+    coordinates: Coordinates | None,
+    backend: str,
+) -> Tensor:
+    """Σ over nodes of weight · (texture ∗ kernel), at the image's pixels.
+
+    A texture's edge goes on beyond it.  Memory is that of one patch at a time: the backward pass
+    transforms again what several patches see.
+
+    Differentiable in the textures, the kernels and the coordinates.
+
+    Args:
+        textures: (B, D or 1, C or 1, H, W).
+        kernels: (N, D or 1, C or 1, K, K), K odd, sums of quadratic B-splines.
+        layout: N patches.
+        origin: row and column of the texture that pixel (0, 0) looks at, where there are no
+            `coordinates`.
+        image_size: height and width.
+        coordinates: where the pixels look, if that is not simply every pixel a texel further.
+        backend: `cpu`, `cuda` or `reference`, for lookups.
+
+    Returns:
+        (B, D, C, height, width).
+    """
+    sizes = [textures.shape[1:3], kernels.shape[1:3]]
+    if coordinates is not None:
+        sizes.append(coordinates.rows.shape[:2])
+    shape = (*torch.broadcast_shapes(*sizes), *image_size)
+    settings = (tuple(layout), origin, shape, backend)
+    return _Convolution.apply(textures, kernels, *(coordinates or (None, None)), settings)
+
+
+class _Convolution(torch.autograd.Function):
+    @staticmethod
+    def forward(  # noqa: ANN205
+        ctx: Any,
+        textures: Tensor,
+        kernels: Tensor,
+        rows: Tensor | None,
+        columns: Tensor | None,
+        settings: tuple[Any, ...],
+    ):
+        ctx.settings = settings
+        layout, _, shape, _ = settings
+        looks = None if rows is None else Coordinates(rows, columns)
+        image = textures.new_zeros((textures.shape[0], *shape))
+        tile = None
+        for node, patch in enumerate(layout):
+            tile = _tile(tile, textures, kernels.shape[-1], patch, settings, looks)
+            seen = tile.see(tile.texture_spectrum() * tile.kernel_spectrum(kernels[node]))
+            image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
+        # Where all patches see the same texels, their spectrum is kept for the way back.
+        spectrum = tile.texture_spectrum() if len({p[:4] for p in layout}) == 1 else None
+        ctx.save_for_backward(textures, kernels, rows, columns, spectrum)
+        return image
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        textures, kernels, rows, columns, spectrum = ctx.saved_tensors
+        looks = None if rows is None else Coordinates(rows, columns)
+        of_textures, of_kernels, of_rows, of_columns = (
+            torch.zeros_like(t) if needed else None
+            for t, needed in zip(
+                (textures, kernels, rows, columns), ctx.needs_input_grad[:4], strict=True
+            )
+        )
+        tile = None
+        for node, patch in enumerate(ctx.settings[0]):
+            tile = _tile(tile, textures, kernels.shape[-1], patch, ctx.settings, looks, spectrum)
+            area = (..., slice(patch.top, patch.bottom), slice(patch.left, patch.right))
+            part = patch.weight * gradient[area]
+            if of_kernels is not None or of_textures is not None:
+                seen = tile.of_seen(part)
+            if of_kernels is not None:
+                product = (tile.texture_spectrum().conj() * seen).sum(0)
+                of_kernels[node] = tile.of_kernel(product, kernels[node].shape)
+            if of_textures is not None:
+                product = tile.kernel_spectrum(kernels[node]).conj() * seen
+                tile.add_to_texture(product, of_textures)
+            if of_rows is not None or of_columns is not None:
+                product = tile.texture_spectrum() * tile.kernel_spectrum(kernels[node])
+                for of, found in zip(
+                    (of_rows, of_columns), tile.of_coordinates(product, part), strict=True
+                ):
+                    if of is not None:
+                        of[area] += found.sum_to_size(of[area].shape)
+        return of_textures, of_kernels, of_rows, of_columns, None
+
+
+def _tile(
+    last: "_Tile | None",
+    textures: Tensor,
+    size: int,
+    patch: Patch,
+    settings: tuple[Any, ...],
+    coordinates: Coordinates | None,
+    spectrum: Tensor | None = None,
+) -> "_Tile":
+    """The tile of a patch: the last one where that has the same area, as two nodes a side do."""
+    if last is not None and last.area == patch[:4]:
+        return last
+    return _Tile(textures, size, patch, settings, coordinates, spectrum)
+
+
+class _Tile:
+    """The part of the texture that a patch sees, and the transforms between the two."""
+
+    def __init__(
+        self,
+        textures: Tensor,
+        size: int,
+        patch: Patch,
+        settings: tuple[Any, ...],
+        coordinates: Coordinates | None,
+        spectrum: Tensor | None,
+    ) -> None:
+        _, origin, self.shape, self.backend = settings
+        self.textures, self.size, self.area = textures, size, patch[:4]
+        self._spectrum = spectrum
+        self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
+        self.coordinates = None
+        if coordinates is None:
+            top, left = origin[0] + patch.top, origin[1] + patch.left
+            height, width = self.height, self.width
+        else:
+            area = (..., slice(patch.top, patch.bottom), slice(patch.left, patch.right))
+            rows, columns = coordinates.rows[area], coordinates.columns[area]
+            top, bottom = _bounds(rows)
+            left, right = _bounds(columns)
+            # Lookups read square images.
+            height = width = max(bottom - top, right - left)
+            self.coordinates = Coordinates(rows - top, columns - left)
+        self.seen_size = (height, width)
+        reach = size // 2
+        self.first = (top - reach, left - reach)
+        # Texels up to a length that transforms are fast at cost less than zeros in their place;
+        # what they do to the image lies outside of what is seen.
+        self.transform = (fast_length(height + size - 1), fast_length(width + size - 1))
+        self.rows = _clamped(top - reach, self.transform[0], textures.shape[-2], textures)
+        self.columns = _clamped(left - reach, self.transform[1], textures.shape[-1], textures)
+
+    def texture_spectrum(self) -> Tensor:
+        """(B, D or 1, C or 1, ...)."""
+        if self._spectrum is None:
+            self._spectrum = torch.fft.rfft2(self._part(), s=self.transform)
+        return self._spectrum
+
+    def _part(self) -> Tensor:
+        """The texels that are seen; a view where none lies beyond the texture's edge."""
+        (top, left), (height, width) = self.first, (len(self.rows), len(self.columns))
+        rows, columns = self.textures.shape[-2:]
+        if min(top, left) >= 0 and top + height <= rows and left + width <= columns:
+            return self.textures[..., top : top + height, left : left + width]
+        return self.textures.index_select(-2, self.rows).index_select(-1, self.columns)
+
+    def kernel_spectrum(self, kernel: Tensor) -> Tensor:
+        """(D or 1, C or 1, ...), with what a lookup's splines do undone."""
+        # Rows that are padded with are not transformed.
+        height, width = self.transform
+        rows = torch.fft.rfft(kernel, n=width)
+        return self._sharpened(torch.fft.fft(rows, n=height, dim=-2))
+
+    def _sharpened(self, spectrum: Tensor) -> Tensor:
+        if self.coordinates is None:
+            return spectrum
+        height, width = self.transform
+        # β²'s values at the pixels, 1/8, 6/8 and 1/8, have this spectrum.
+        down, across = (
+            0.75 + 0.25 * torch.cos(2.0 * torch.pi * frequency.to(self.textures))
+            for frequency in (torch.fft.fftfreq(height), torch.fft.rfftfreq(width))
+        )
+        return spectrum / (down[:, None] * across)
+
+    def _blurred(self, spectrum: Tensor) -> Tensor:
+        """The blurred texels that are seen, from the product of the spectra."""
+        first, (height, width) = self.size - 1, self.seen_size
+        rows = torch.fft.ifft(spectrum, dim=-2)[..., first : first + height, :]
+        return torch.fft.irfft(rows, n=self.transform[1])[..., first : first + width]
+
+    def see(self, spectrum: Tensor) -> Tensor:
+        """(B, D, C, height, width) of the patch from the product of the spectra."""
+        image = self._blurred(spectrum)
+        if self.coordinates is None:
+            return image
+        image = image.expand(-1, *self.shape[:2], -1, -1)
+        flat, rows, columns = self._lookup_arguments(image)
+        seen = spline_lookup(flat, rows, columns, self.backend)
+        return seen.reshape(*image.shape[:3], self.height, self.width)
+
+    def of_seen(self, of_seen: Tensor) -> Tensor:
+        """The adjoint of `see`: a spectrum (B, D, C, ...)."""
+        first, (height, width) = self.size - 1, self.seen_size
+        if self.coordinates is not None:
+            images = self._batched(self.coordinates.rows, of_seen)
+            columns = self._batched(self.coordinates.columns, of_seen)
+            flat = of_seen.reshape(-1, self.height * self.width)
+            grids = splat(images, columns, flat, height, self.backend)
+            of_seen = grids.reshape(*of_seen.shape[:3], height, width)
+        image = of_seen.new_zeros((*of_seen.shape[:3], *self.transform))
+        image[..., first : first + height, first : first + width] = of_seen
+        return torch.fft.rfft2(image)
+
+    def of_coordinates(self, spectrum: Tensor, of_seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Cotangents (B, D, C, height, width) of rows and columns, from those of `see`.
+
+        What is looked up is a quadratic between knots, of which a difference is the derivative.
+        """
+        image = self._blurred(spectrum).expand(-1, *self.shape[:2], -1, -1)
+        flat, rows, columns = self._lookup_arguments(image)
+        found = []
+        for down, across in ((_NUDGE, 0.0), (0.0, _NUDGE)):
+            after = spline_lookup(flat, rows + down, columns + across, self.backend)
+            before = spline_lookup(flat, rows - down, columns - across, self.backend)
+            slope = (after - before) / (2.0 * _NUDGE)
+            found.append(slope.reshape(of_seen.shape) * of_seen)
+        return found[0], found[1]
+
+    def of_kernel(self, spectrum: Tensor, shape: torch.Size) -> Tensor:
+        """(D or 1, C or 1, K, K) of the sum over the batch."""
+        spectrum = self._sharpened(spectrum).sum_to_size(*shape[:2], *spectrum.shape[-2:])
+        rows = torch.fft.ifft(spectrum, dim=-2)[..., : self.size, :]
+        return torch.fft.irfft(rows, n=self.transform[1])[..., : self.size]
+
+    def add_to_texture(self, spectrum: Tensor, of_textures: Tensor) -> None:
+        """Add the gradient (B, D, C, ...) to the texture's; its edge takes what lies beyond."""
+        spectrum = spectrum.sum_to_size(*of_textures.shape[:3], *spectrum.shape[-2:])
+        part = torch.fft.irfft2(spectrum, s=self.transform)
+        gathered = part.new_zeros((*part.shape[:-1], of_textures.shape[-1]))
+        gathered.index_add_(-1, self.columns, part)
+        of_textures.index_add_(-2, self.rows, gathered)
+
+    def _lookup_arguments(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rows, columns = (self._batched(c, image) for c in self.coordinates)
+        return image.reshape(-1, *image.shape[-2:]), rows, columns
+
+    def _batched(self, coordinate: Tensor, image: Tensor) -> Tensor:
+        """(B · D · C, pixels) of coordinates (D, C, height, width)."""
+        flat = coordinate.flatten(-2).to(image.dtype)
+        return flat.expand(image.shape[0], *flat.shape).reshape(-1, flat.shape[-1])
+
+
+def _bounds(coordinate: Tensor) -> tuple[int, int]:
+    """First texel and end of what lookups at coordinates read, and where filters fade."""
+    low, high = int(coordinate.min().floor()), int(coordinate.max().ceil())
+    return low - 1 - _FADED, high + 2 + _FADED
+
+
+def _clamped(start: int, count: int, size: int, like: Tensor) -> Tensor:
+    """Indices of `count` texels from `start` on, those of the edge beyond it."""
+    return (torch.arange(count, device=like.device) + start).clamp(0, size - 1)
+
+
+def fast_length(length: int) -> int:
+    """The least even number of 2, 3 and 5 that is not below: FFTs of such lengths are fast."""
+    candidate = length + length % 2
+    while True:
+        rest = candidate
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return candidate
+        candidate += 2

@@ -1,0 +1,233 @@
+"""What points of the sensor see of a scene's planes, through every part of the pupil."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.backend import trace_rays
+from dolens.optics.rays import Components, Rays, Status
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import distance_to_plane
+from dolens.rendering.pupil.aim import aim
+from dolens.rendering.pupil.edge_rays import EdgeRays, edge_rays
+from dolens.rendering.pupil.exit_pupil import ExitPupil
+from dolens.rendering.pupil.light_edges import AZIMUTHS, light_edges
+from dolens.rendering.pupil.moving_pupil import depends_on_parameters
+from dolens.scene.planar import Scene
+
+# Radii of sensor points closer than this share of the largest are one radius.
+_SAME_RADIUS = 1e-7
+
+
+class PlanePoints(NamedTuple):
+    """Where rays of N sensor points meet D planes at C wavelengths, S rays each.
+
+    Attributes:
+        rows: (N, D, C, S), rows below the axis in the image of a pinhole, in pixels.
+        columns: (N, D, C, S), columns right of the axis.
+        weight: (N, 1, C, S), the share of each ray in the irradiance, relative to that of an axial
+            pixel that sees white; zero where a ray does not arrive.
+    """
+
+    rows: Tensor
+    columns: Tensor
+    weight: Tensor
+
+
+def plane_points(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    disc: tuple[Tensor, Tensor],
+    pitch: float,
+    symmetric: bool,
+    backend: str,
+) -> PlanePoints:
+    """Trace rays from points of the sensor through the exit pupil to the planes of a scene.
+
+    A pixel's irradiance is the mean of radiance · cos⁴ over the exit pupil's disc, as in
+    `RayRenderer`.  In a lens of rotational symmetry points of one radius share their rays, turned
+    about the axis.
+
+    Where gradients of the lens are wanted and apertures cut the disc, rays along their edges follow
+    the samples (`edge_rays`): their weights are zero and have gradients.
+
+    Args:
+        system: the lens.
+        scene: depths and wavelengths.
+        points: x and y on the sensor, mm, each (N,), double precision.
+        pupil: the disc.
+        disc: x and y of the rays in it, in units of its radius, each (N or 1, S), in the frame in
+            which a symmetric lens's point lies on the positive x axis.
+        pitch: of the pixels, mm.
+        symmetric: whether the lens has rotational symmetry.
+        backend: what traces.
+    """
+    x, y = points
+    again = None
+    if symmetric:
+        # Sorted radii, and which of them each point has.
+        radius, again = torch.unique(_rounded(torch.hypot(x, y)), return_inverse=True)
+        x, y = radius, torch.zeros_like(radius)
+    ray, weight = pupil_rays(system, scene.wavelengths, (x, y), pupil, disc, backend)
+    rim = rim_rays(system, scene.wavelengths, (x, y), pupil, backend)
+    if rim is not None:
+        ray = Components(*(torch.cat(pair, -1) for pair in zip(ray, rim.ray, strict=True)))
+        weight = torch.cat((weight, rim.weight), -1)
+    rows, columns = [], []
+    for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
+        t, _ = distance_to_plane(ray, -depth, -1.0)
+        scale = magnification / pitch
+        columns.append(torch.addcmul(ray.x, t, ray.l) * scale)
+        rows.append(torch.addcmul(ray.y, t, ray.m) * -scale)
+    row, column = (torch.stack(each).permute(2, 0, 1, 3) for each in (rows, columns))
+    weight = weight.permute(1, 0, 2)[:, None]
+    if again is None:
+        return PlanePoints(row, column, weight)
+    # Turned from the positive x axis to where each point lies; rows grow against y.
+    angle = torch.atan2(points[1], points[0])
+    cosine, sine = (f(angle).reshape(-1, 1, 1, 1).to(row) for f in (torch.cos, torch.sin))
+    row, column, weight = (t.index_select(0, again) for t in (row, column, weight))
+    return PlanePoints(cosine * row - sine * column, cosine * column + sine * row, weight)
+
+
+def pupil_rays(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    disc: tuple[Tensor, Tensor],
+    backend: str,
+) -> tuple[Components, Tensor]:
+    """Rays from sensor points through the exit pupil, traced into object space.
+
+    Args:
+        system: the lens.
+        wavelengths: nm, C of them.
+        points: x and y, mm, each (N,).
+        pupil: the disc.
+        disc: x and y in it, in units of its radius, each (N, S).
+        backend: what traces.
+
+    Returns:
+        The rays in front of the lens, (C, N, S), and their shares in the irradiance relative to
+        that of an axial pixel: cos⁴ over its mean over the axial disc; zero where one is lost.
+    """
+    sensor_z = system.vertices[-1]
+    x, y = (p.to(sensor_z.dtype)[:, None] for p in points)
+    disc_x, disc_y = (d[: len(x)] * pupil.radius for d in disc)
+    ray = aim(x, y, sensor_z, disc_x, disc_y, pupil.z)
+    there, valid = _before_the_lens(system, ray, wavelengths, backend)
+    share = (pupil.radius / pupil.axial_radius) ** 2
+    share = share / (pupil.axial_mean(sensor_z) * disc_x.shape[-1])
+    return there, torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
+
+
+def rim_rays(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    backend: str,
+) -> EdgeRays | None:
+    """Rays (C, N, AZIMUTHS) along the edges that end the light of sensor points.
+
+    None where no edge cuts the disc, or no gradient of the lens is wanted.  Arguments as of
+    `pupil_rays`, whose weights those of these rays complement: they are zero and have gradients.
+    """
+    if not depends_on_parameters(system):
+        return None
+    middle = wavelengths[len(wavelengths) // 2]
+    found = light_edges(system, middle, points, pupil.numbers(), backend)
+    if found is None:
+        return None
+    angle = torch.arange(AZIMUTHS, dtype=system.dtype, device=system.device)
+    angle = (angle * (2.0 * math.pi / AZIMUTHS)).expand(len(points[0]), -1)
+    arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    edge = (found.middle[:, None], arms, found.radius, found.surface)
+    return edge_rays(system, wavelengths, points, pupil, edge, backend)
+
+
+def chief_ray_points(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    backend: str,
+) -> tuple[Tensor, Tensor]:
+    """Where the rays from sensor points through the exit pupil's centre meet the planes.
+
+    This is the image's geometry: distortion and, between wavelengths, lateral colour.
+
+    Args:
+        system: as in `plane_points`, and the others.
+        scene: depths and wavelengths.
+        points: x and y, mm, each (N,).
+        pupil: the disc.
+        pitch: mm.
+        backend: what traces.
+
+    Returns:
+        Rows and columns from the axis in the image of a pinhole, each (N, D, C).
+
+    Raises:
+        InputError: such a ray misses a surface or is totally reflected, so that it says nothing.
+    """
+    x, y = (p.to(system.dtype) for p in points)
+    zero = torch.zeros_like(x)
+    ray = aim(x, y, system.vertices[-1], zero, zero, pupil.z)
+    wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64, device=system.device)
+    rays = Rays.from_components(ray, wavelengths[:, None])
+    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
+    if bool(((hit.status == Status.TIR) | (hit.status == Status.MISSED)).any()):
+        raise InputError(
+            "renderer: chief rays of the sensor's outer pixels do not pass the lens, which leaves "
+            "its distortion undefined; use registration=pinhole, renderer=rays or a smaller sensor"
+        )
+    there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
+    rows, columns = [], []
+    for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
+        t, _ = distance_to_plane(there, -depth, -1.0)
+        scale = magnification / pitch
+        columns.append(torch.addcmul(there.x, t, there.l) * scale)
+        rows.append(torch.addcmul(there.y, t, there.m) * -scale)
+    return torch.stack(rows).permute(2, 0, 1), torch.stack(columns).permute(2, 0, 1)
+
+
+def distinct_radii(points: tuple[Tensor, Tensor]) -> int:
+    """How many distances from the axis there are among points."""
+    return len(torch.unique(_rounded(torch.hypot(*points))))
+
+
+def pinhole_points(
+    points: tuple[Tensor, Tensor], pitch: float, planes: int, channels: int
+) -> tuple[Tensor, Tensor]:
+    """Where a pinhole sees sensor points, as `chief_ray_points`: (N, planes, channels) each."""
+    x, y = points
+    rows, columns = y / pitch, -x / pitch
+    shape = (len(x), planes, channels)
+    return rows[:, None, None].expand(shape), columns[:, None, None].expand(shape)
+
+
+def _rounded(radius: Tensor) -> Tensor:
+    """Radii, equal where they differ by rounding only."""
+    unit = float(radius.max()) * _SAME_RADIUS
+    if not unit > 0.0 or not math.isfinite(unit):
+        return radius
+    return torch.round(radius / unit) * unit
+
+
+def _before_the_lens(
+    system: OpticalSystem, ray: Components, wavelengths: Sequence[float], backend: str
+) -> tuple[Components, Tensor]:
+    """Rays (C, N, S) in object space, and which of them got there."""
+    every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
+    rays = Rays.from_components(ray, every[:, None, None])
+    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
+    return Components(*hit.position.unbind(-1), *hit.direction.unbind(-1)), hit.valid

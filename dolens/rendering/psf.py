@@ -1,0 +1,116 @@
+"""Geometric point spread functions, differentiable in the lens."""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.kernels import splatting
+from dolens.optics.backend import choose_backend, trace_rays
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import entrance_pupil
+from dolens.optics.rays import Components, Rays
+from dolens.optics.system import OpticalSystem
+from dolens.rendering.binning import bin_rays
+from dolens.rendering.sampling import regular_square, square_to_disc
+from dolens.scene.planar import Scene
+from dolens.sensor.pixels import Sensor
+
+# The paraxial pupil is widened a little, so that the real one lies within it.
+_PUPIL_MARGIN = 1.02
+
+
+def axial_point_spread_functions(
+    lens: Lens,
+    scene: Scene,
+    sensor: Sensor,
+    size: int = 65,
+    pupil_samples: int = 64,
+    values: Mapping[str, Tensor] | None = None,
+) -> Tensor:
+    """Point spread functions on the axis, at every depth and wavelength of a scene.
+
+    Rays from the axial point fill the entrance pupil and are traced to the sensor, where each
+    lands as a quadratic B-spline.  That spline is a pixel's box convolved with a texel's tent, so
+    the discrete convolution of a texture with the result is what `RayRenderer` renders, wherever
+    the field is small enough for one PSF.
+
+    Args:
+        lens: the lens.
+        scene: depths and wavelengths.
+        sensor: its pixel pitch.
+        size: pixels along each side, odd; the axis falls on the central pixel.
+        pupil_samples: strata along each side of the pupil.
+        values: lens parameters to use instead of the stored ones.
+
+    Returns:
+        (depths, wavelengths, size, size), upright like an image, each of unit sum less what lands
+        outside the window.  Differentiable in the lens's parameters and `values`.
+    """
+    if size < 3 or size % 2 == 0:
+        raise InputError(f"psf size must be odd and at least 3, not {size}")
+    system = lens.system(values)
+    backend = choose_backend(system, lens.backend)
+    scene.check(system)
+    u, v = regular_square(pupil_samples, system.dtype, system.device)
+    disc_x, disc_y = square_to_disc(u, v)
+    rays, wavelengths = [], torch.tensor(scene.wavelengths, dtype=torch.float64)
+    for depth in scene.depths:
+        for wavelength in scene.wavelengths:
+            with torch.no_grad():
+                pupil = entrance_pupil(system, wavelength)
+                radius = 0.5 * _PUPIL_MARGIN * pupil.diameter
+            dx, dy = disc_x * radius, disc_y * radius
+            dz = (pupil.z + depth).expand(dx.shape)
+            n = dz / torch.sqrt(dx * dx + dy * dy + dz * dz)
+            zero = torch.zeros_like(n)
+            rays.append(Components(zero, zero, zero - depth, dx / dz * n, dy / dz * n, n))
+    shape = (len(scene.depths), len(scene.wavelengths), disc_x.numel())
+    ray = Components(*(torch.stack(each).reshape(shape) for each in zip(*rays, strict=True)))
+    x, y, valid = _on_sensor(system, ray, wavelengths.to(system.device)[:, None], backend)
+    # A Lambertian point sends cos⁴ over the pupil plane, like a pixel does backwards.
+    weight = torch.where(valid, ray.n**4, 0.0)
+    total = weight.sum(-1)
+    if not bool((total > 0.0).all()):
+        dark = scene.depths[int(torch.nonzero(total <= 0.0)[0, 0])]
+        raise InputError(f"no light from the axis at {dark:g} mm reaches the sensor")
+    columns = size // 2 - x / sensor.pixel_pitch
+    rows = size // 2 + y / sensor.pixel_pitch
+    return splat(rows, columns, weight / total[..., None], size, backend)
+
+
+def _on_sensor(
+    system: OpticalSystem, ray: Components, wavelength: Tensor, backend: str
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Where rays meet the sensor, x and y in mm, and which of them got there."""
+    rays = Rays.from_components(ray, wavelength)
+    hit = trace_rays(system, rays, backend, 1.0, record=False, first=1, last=None)
+    return hit.position[..., 0], hit.position[..., 1], hit.valid
+
+
+def splat(
+    rows: Tensor, columns: Tensor, weight: Tensor, size: int, backend: str = "reference"
+) -> Tensor:
+    """Sum weighted quadratic B-splines, centred on points, onto a grid of pixels.
+
+    Args:
+        rows: (..., N), fractional pixels; leading dimensions have a grid each.
+        columns: (..., N).
+        weight: (..., N); zero leaves a point out, wherever it lies.
+        size: pixels along each side of the grid.
+        backend: `cpu` takes the fused kernel, whose result is always the same to the bit.  The
+            others take PyTorch's operations; on a GPU these are so on request only, by
+            `torch.use_deterministic_algorithms`.
+
+    Returns:
+        (..., size, size).  Once continuously differentiable in rows and columns.  Points within a
+        pixel and a half of the edge lose what falls outside.
+    """
+    if backend != "cpu":
+        return bin_rays(rows, columns, weight, size, size)
+    shape, points = rows.shape[:-1], rows.shape[-1]
+    count = math.prod(shape)
+    rows, columns, weight = (t.reshape(count, points) for t in (rows, columns, weight))
+    return splatting.splat(rows, columns, weight, size).reshape(*shape, size, size)

@@ -1,0 +1,210 @@
+"""Point spread functions all over a sensor, as its pixels see the scene."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.propagation import DiffractionSettings
+from dolens.diffraction.psf import propagation, wave_kernels
+from dolens.optics.system import OpticalSystem
+from dolens.rendering.plane_points import (
+    PlanePoints,
+    chief_ray_points,
+    distinct_radii,
+    pinhole_points,
+    plane_points,
+)
+from dolens.rendering.psf import splat
+from dolens.rendering.pupil.exit_pupil import ExitPupil
+from dolens.rendering.random_numbers import random_words, uniform
+from dolens.rendering.sampling import square_to_disc, stratified_square
+from dolens.scene.planar import Scene
+
+# Strata of the pupil along each side, for the light of a function that rays do not make.
+_LIGHT_SAMPLES = 32
+
+
+class FieldFunctions(NamedTuple):
+    """Point spread functions at N points of the sensor.
+
+    Attributes:
+        functions: (N, D, C, K, K), upright, of the points' light about the central pixel; their
+            sums are relative illuminations, less what falls beyond the window.
+        light: (N, C), relative illumination by the same rays.
+        lost: (), the largest share of a function's light that falls beyond its window.
+    """
+
+    functions: Tensor
+    light: Tensor
+    lost: Tensor
+
+
+def field_point_spread_functions(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    size: int,
+    pupil_samples: int,
+    seed: int | None,
+    distortion: bool,
+    symmetric: bool,
+    backend: str,
+) -> FieldFunctions:
+    """Geometric point spread functions at points of the sensor.
+
+    A function says how much of the light of the scene's point (row, column), counted from the
+    function's own centre, a pixel gets: I(p) = Σ PSF(e) · T(c(p) - e), with c(p) the centre.  Each
+    ray lands as a quadratic B-spline, the pixel's box convolved with the texel's tent.
+
+    Args:
+        system: the lens.
+        scene: D depths and C wavelengths.
+        points: x and y, mm, each (N,), double precision.
+        pupil: what is sampled.
+        pitch: of the pixels, mm.
+        size: K, odd.
+        pupil_samples: strata along each side of the pupil.
+        seed: of the points in the strata; None: their centres.
+        distortion: whether a function's centre is where the chief ray meets the plane, else where
+            a pinhole sees it.
+        symmetric: whether the lens has rotational symmetry.
+        backend: what traces and splats.
+
+    Centres move with the lens, and so do the functions about them: gradients are of both, and where
+    pixels look has to carry its own (`convolve_patches`).
+    """
+    count = distinct_radii(points) if symmetric else len(points[0])
+    disc = sampled_disc(count, pupil_samples, seed, system)
+    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    planes, channels = len(scene.depths), len(scene.wavelengths)
+    if distortion:
+        centre = chief_ray_points(system, scene, points, pupil, pitch, backend)
+    else:
+        centre = pinhole_points(points, pitch, planes, channels)
+    rows, columns = (c[..., None].to(system.dtype) for c in centre)
+    return splatted(
+        PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight), size, backend
+    )
+
+
+def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
+    """Functions (N, D, C, size, size) of rays by where they meet the planes, from their centre."""
+    middle = size // 2
+    # A pixel sees the point at +e: seen from there, the pixel is at -e.
+    rows, columns = middle - seen.rows, middle - seen.columns
+    weight = seen.weight.expand(rows.shape)
+    functions = splat(rows, columns, weight, size, backend)
+    total = weight.sum(-1)
+    with torch.no_grad():
+        kept = functions.sum((-2, -1)) / total.clamp(min=torch.finfo(total.dtype).tiny)
+        lost = torch.where(total > 0.0, 1.0 - kept, 0.0).max()
+    return FieldFunctions(functions, total[:, 0], lost)
+
+
+def wave_point_spread_functions(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    size: int,
+    distortion: bool,
+    symmetric: bool,
+    backend: str,
+    settings: DiffractionSettings | None = None,
+) -> FieldFunctions:
+    """The same with diffraction: of the wavefronts of the points that functions are centred on.
+
+    Each function keeps the share of light that rays give it; what diffraction spreads beyond the
+    window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
+    finely diffraction is computed.
+    """
+    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
+    shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
+    kernels = wave_kernels(system, *places, pitch, size, settings, backend)
+    kernels = kernels.reshape(*shape, size, size)
+    disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
+    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    light = seen.weight.sum(-1)
+    total = kernels.sum((-2, -1))
+    share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
+    lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
+    return FieldFunctions(kernels * share[..., None, None], light[:, 0], lost)
+
+
+def wave_cost(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    size: int,
+    distortion: bool,
+    backend: str,
+) -> tuple[int, str | None]:
+    """What functions of `wave_point_spread_functions` take.
+
+    Arguments as there.
+
+    Returns:
+        Samples along each side of a pupil by Fourier transform, and why one of them needs direct
+        integration, which takes a thousand times as long; None where none does.
+    """
+    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
+    found = propagation(system, *places, pitch, size, None, backend)
+    direct = (reason for reason in found.reasons if reason.startswith("direct"))
+    return found.samples, next(direct, None)
+
+
+def _object_points(
+    system: OpticalSystem,
+    scene: Scene,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    pitch: float,
+    distortion: bool,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Object points (N·D·C, 3), mm, their wavelengths, nm, and the windows' centres, mm."""
+    planes, channels = len(scene.depths), len(scene.wavelengths)
+    if distortion:
+        rows, columns = chief_ray_points(system, scene, points, pupil, pitch, backend)
+    else:
+        rows, columns = pinhole_points(points, pitch, planes, channels)
+    options = {"dtype": torch.float64, "device": system.device}
+    depth = torch.tensor(scene.depths, **options)[:, None]
+    magnifications = scene.moving_magnifications(system)
+    scale = pitch / torch.stack([torch.as_tensor(m, **options) for m in magnifications])[:, None]
+    shape = (len(points[0]), planes, channels)
+    positions = torch.stack(
+        [
+            (columns.double() * scale).expand(shape),
+            (-rows.double() * scale).expand(shape),
+            (-depth).expand(shape),
+        ],
+        -1,
+    )
+    wavelengths = torch.tensor(scene.wavelengths, **options).expand(shape)
+    centres = torch.stack(points, -1)[:, None, None].expand(*shape, 2)
+    return positions.reshape(-1, 3), wavelengths.reshape(-1), centres.reshape(-1, 2)
+
+
+def sampled_disc(
+    count: int, side: int, seed: int | None, system: OpticalSystem
+) -> tuple[Tensor, Tensor]:
+    """Points of the unit disc, one in each of side² strata: x and y, each (count, side²).
+
+    Every one of the `count` has samples of its own; `seed` None takes the strata's centres.
+    """
+    shape = (count, side * side)
+    if seed is None:
+        u = v = torch.full(shape, 0.5, dtype=system.dtype, device=system.device)
+    else:
+        place = torch.arange(count, device=system.device)[:, None]
+        sample = torch.arange(side * side, device=system.device)
+        words = random_words(seed, place, sample)
+        u, v = (uniform(word, system.dtype).expand(shape) for word in words[:2])
+    return square_to_disc(*stratified_square(side, u, v))

@@ -1,0 +1,366 @@
+"""Rendering by point spread functions on a grid of fields, convolved in overlapping patches."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.diffraction_limit import with_diffraction_limit
+from dolens.errors import InputError
+from dolens.optics.backend import choose_backend, say_once
+from dolens.optics.lens import Lens
+from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.patch_convolution import (
+    Coordinates,
+    Patch,
+    node_positions,
+    patches,
+)
+from dolens.rendering.plane_blur import PlaneBlur
+from dolens.rendering.protocol import Unprepared
+from dolens.rendering.psf_grid import (
+    FieldFunctions,
+    field_point_spread_functions,
+    wave_point_spread_functions,
+)
+from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil, working_f_number
+from dolens.rendering.pupil.moving_pupil import moving_exit_pupil
+from dolens.rendering.relative_illumination import relative_illumination
+from dolens.scene.planar import PlanarScene, Scene, texture_origin
+from dolens.sensor.pixels import Sensor
+
+logger = logging.getLogger(__name__)
+
+# A window that loses more of a function's light than this is worth a warning.
+_NOTABLE_LOSS = 0.01
+
+
+class _View(NamedTuple):
+    """Textures (B, channels, H, W) on a window of a sensor, and where their centre lies."""
+
+    sensor: Sensor
+    texture_centre: tuple[float, float]
+    textures: Tensor
+
+
+@dataclass(frozen=True)
+class PsfRenderer(Unprepared):
+    """Point spread functions at a grid of sensor points, linear in between, convolved by FFT.
+
+    It renders what `RayRenderer` does, with distortion, lateral colour and relative illumination.
+    Three things are approximate: between the grid's points functions are interpolated; the pupil is
+    sampled once for all pixels that share a function; and where distortion moves pixels by
+    fractions of a texel, functions a few pixels wide are resampled by splines, which costs up to
+    0.4 grey levels (of 255) on photographs, and nothing where the lens is sharp or very blurred.
+
+    Attributes:
+        sensor: the pixels.
+        fields: rows and columns of the grid; (1, 1) is one function for all pixels.
+        pupil_samples: strata along each side of the pupil, for each function.
+        size: pixels along each side of a function, odd; light beyond is lost, and warned of.
+        registration: `chief_rays`: functions are centred on the lens's own, distorted image points,
+            and pixels look there; `pinhole`: on the undistorted ones, and shifts are part of the
+            functions, which is cheaper, and exact where shifts change little between fields.
+        illumination: `map`: relative illumination is found on a finer grid than the functions, so
+            that only their shape is interpolated; `functions`: it is as they have it.
+        depths: `each` has functions of its own, or `one`, the middle in vergence, serves all.
+        colours: `each` wavelength has functions of its own, or `one`, the middle, serves all.
+        diffraction: `none`: geometric functions; `limit`: these blurred by a perfect pupil's
+            diffraction; `wave`: functions of the pupil's wavefront.
+        pupil: the disc that is sampled; None looks for it at each render, for the lens as it is.
+        jitter: draw points in the pupil's strata anew for each seed, or take their centres.
+    """
+
+    sensor: Sensor
+    fields: tuple[int, int] = (3, 3)
+    pupil_samples: int = 32
+    size: int = 65
+    registration: Literal["chief_rays", "pinhole"] = "chief_rays"
+    illumination: Literal["map", "functions"] = "map"
+    depths: Literal["each", "one"] = "each"
+    colours: Literal["each", "one"] = "each"
+    jitter: bool = True
+    diffraction: Literal["none", "limit", "wave"] = "none"
+    pupil: ExitPupil | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "fields", tuple(int(n) for n in self.fields))
+        if self.pupil is not None:
+            object.__setattr__(self, "pupil", ExitPupil(*map(float, self.pupil)))
+        if len(self.fields) != 2 or min(self.fields) < 1:
+            raise InputError(f"renderer: fields must be rows and columns, not {self.fields}")
+        if self.size < 3 or self.size % 2 == 0:
+            raise InputError(f"renderer: size must be odd and at least 3, not {self.size}")
+        if self.pupil_samples < 1:
+            raise InputError("renderer: pupil_samples must be at least 1")
+        for key, allowed in (
+            ("registration", ("chief_rays", "pinhole")),
+            ("illumination", ("map", "functions")),
+            ("depths", ("each", "one")),
+            ("colours", ("each", "one")),
+            ("diffraction", ("none", "limit", "wave")),
+        ):
+            if getattr(self, key) not in allowed:
+                raise InputError(
+                    f"renderer: {key} '{getattr(self, key)}' is unknown; "
+                    f"allowed: {', '.join(allowed)}"
+                )
+
+    def rays_per_image(self, scene: Scene) -> int:
+        """Rays traced for the functions of one render, where the lens has no symmetry."""
+        channels = len(scene.wavelengths) if self.colours == "each" else 1
+        return self.fields[0] * self.fields[1] * self.pupil_samples**2 * channels
+
+    def render(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        seed: int,
+        values: Mapping[str, Tensor] | None = None,
+    ) -> Tensor:
+        """Image textures as a scene shows them; as `RayRenderer.render`.
+
+        Args:
+            lens: the lens; its precision is that of rays and image.
+            scene: planes, wavelengths, and what textures mean.
+            textures: (B, channels, H, W), linear light, as the scene takes them.
+            seed: of the points in the pupil's strata.
+            values: lens parameters to use instead of the stored ones.
+
+        Returns:
+            (B, images, C, height, width), linear light; of a planar scene an image for each depth.
+            Differentiable in the lens's parameters, `values` and the textures.
+
+        Raises:
+            InputError: a depth inside the lens, or channels that are not the scene's.
+        """
+        views = [_View(self.sensor, scene.texture_centre, textures)]
+        (image,) = self._render(lens, scene, views, seed, values)
+        return image
+
+    def render_windows(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        windows: Sequence[Sensor],
+        centres: Sequence[tuple[float, float]],
+        seed: int,
+        values: Mapping[str, Tensor] | None = None,
+    ) -> Tensor:
+        """Image each texture on a window of its own of the renderer's sensor, all at once.
+
+        Rays of all windows are traced together, through a pupil that serves the whole sensor, and
+        one set of polynomials says where the windows look.
+
+        Args:
+            lens: as of `render`, and the others.
+            scene: of all windows.
+            textures: (W, channels, h, w).
+            windows: W of one size.
+            centres: where each texture's centre lies; see `Scene`.
+            seed: of the points in the pupil's strata.
+            values: lens parameters.
+
+        Returns:
+            (W, images, C, height, width).
+        """
+        views = [
+            _View(window, centre, texture[None])
+            for window, centre, texture in zip(windows, centres, textures, strict=True)
+        ]
+        return torch.cat(self._render(lens, scene, views, seed, values))
+
+    def _render(
+        self,
+        lens: Lens,
+        scene: Scene,
+        views: Sequence[_View],
+        seed: int,
+        values: Mapping[str, Tensor] | None,
+    ) -> list[Tensor]:
+        """Images (B, images, C, height, width) of views of the sensor, all rays traced at once."""
+        options = {"device": lens.device, "dtype": lens.dtype}
+        textures = [view.textures.to(**options) for view in views]
+        system = lens.system(values)
+        backend = choose_backend(system, lens.backend, others=textures)
+        with torch.no_grad():
+            scene.check(system)
+            pupil = self.pupil
+            if pupil is None:
+                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
+        parts = [replace(self, sensor=view.sensor) for view in views]
+        x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
+        found = self.point_spread_functions(system, scene, pupil, seed, backend, (x, y))
+        self._warn_of_loss(found)
+        looks = [None] * len(views)
+        if self.registration == "chief_rays":
+            windows = [view.sensor for view in views]
+            looks = chief_ray_maps(system, scene, self.sensor, windows, pupil, backend)
+        nodes, images = self.fields[0] * self.fields[1], []
+        for i, (part, view, look) in enumerate(zip(parts, views, looks, strict=True)):
+            own = slice(i * nodes, (i + 1) * nodes)
+            functions = found._replace(functions=found.functions[own], light=found.light[own])
+            placed = replace(scene, texture_centre=view.texture_centre)
+            coordinates, origin = part._coordinates(placed, textures[i], look)
+            images.append(
+                part._blurred(
+                    system, placed, textures[i], functions, coordinates, origin, pupil, backend
+                )
+            )
+        return images
+
+    def _blurred(
+        self,
+        system: OpticalSystem,
+        scene: Scene,
+        textures: Tensor,
+        found: FieldFunctions,
+        coordinates: Coordinates | None,
+        origin: tuple[int, int],
+        pupil: ExitPupil,
+        backend: str,
+    ) -> Tensor:
+        """The image by functions that are known, of pixels that look where coordinates say."""
+        area = (self.sensor.height, self.sensor.width)
+        layout, functions, lit = patches(*area, *self.fields, textures), found.functions, None
+        if self.illumination == "map":
+            functions, layout, lit = self._illuminated(found, layout, system, scene, pupil, backend)
+        blur = PlaneBlur(functions, layout, origin, area, coordinates, backend, lit)
+        return scene.blend(scene.on_planes(textures), blur)
+
+    def _warn_of_loss(self, found: FieldFunctions) -> None:
+        if float(found.lost) > _NOTABLE_LOSS:
+            say_once(
+                f"renderer psf: {100 * float(found.lost):.0f} % of a function's light falls beyond "
+                f"its {self.size} pixels; a larger renderer.size keeps it"
+            )
+
+    def point_spread_functions(
+        self,
+        system: OpticalSystem,
+        scene: Scene,
+        pupil: ExitPupil,
+        seed: int,
+        backend: str,
+        points: tuple[Tensor, Tensor] | None = None,
+    ) -> FieldFunctions:
+        """The functions at the grid's points, row after row, or at others.
+
+        Differentiable in the system.
+        """
+        shared, pitch = self.shared(scene), self.sensor.pixel_pitch
+        points = points or self.points()
+        centred, symmetric = self.registration == "chief_rays", is_rotationally_symmetric(system)
+        if self.diffraction == "wave":
+            return wave_point_spread_functions(
+                system,
+                shared,
+                points,
+                pupil,
+                pitch,
+                self.size,
+                centred,
+                symmetric,
+                backend,
+            )
+        found = field_point_spread_functions(
+            system,
+            shared,
+            points,
+            pupil,
+            pitch,
+            self.size,
+            self.pupil_samples,
+            seed if self.jitter else None,
+            centred,
+            symmetric,
+            backend,
+        )
+        if self.diffraction == "none":
+            return found
+        f_number = working_f_number(pupil, system.vertices[-1])
+        blurred = with_diffraction_limit(found.functions, pitch, shared.wavelengths, f_number)
+        return found._replace(functions=blurred)
+
+    def with_pupil(
+        self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
+    ) -> "PsfRenderer":
+        """The renderer with the pupil of the lens as it is, for a lens that hardly changes."""
+        system = lens.system(values)
+        backend = choose_backend(system, lens.backend)
+        pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        return replace(self, pupil=pupil)
+
+    def points(self) -> tuple[Tensor, Tensor]:
+        """x and y of the grid on the sensor, mm, each (fields,), double precision."""
+        rows = node_positions(self.sensor.height, self.fields[0])
+        columns = node_positions(self.sensor.width, self.fields[1])
+        row, column = torch.meshgrid(
+            torch.tensor(rows, dtype=torch.float64),
+            torch.tensor(columns, dtype=torch.float64),
+            indexing="ij",
+        )
+        return self.sensor.positions(row.reshape(-1), column.reshape(-1))
+
+    def shared(self, scene: Scene) -> PlanarScene:
+        """The scene of the depths and wavelengths that have functions of their own."""
+        depths = (scene.middle_depth,) if self.depths == "one" else scene.depths
+        wavelengths = (scene.middle_wavelength,) if self.colours == "one" else scene.wavelengths
+        return scene.as_planes(depths, wavelengths)
+
+    def _illuminated(
+        self,
+        found: FieldFunctions,
+        layout: list[Patch],
+        system: OpticalSystem,
+        scene: Scene,
+        pupil: ExitPupil,
+        backend: str,
+    ) -> tuple[Tensor, list[Patch], Tensor]:
+        """Functions of unit light, patches of those that have any, and each pixel's illumination.
+
+        Pixels whose functions are partly dark get their light from the others.
+        """
+        wavelengths, symmetric = self.shared(scene).wavelengths, is_rotationally_symmetric(system)
+        wanted = relative_illumination(system, wavelengths, self.sensor, pupil, symmetric, backend)
+        bright = found.light.detach() > 0.0
+        light = torch.where(bright, found.light, 1.0)
+        covered, lit = torch.zeros_like(wanted), []
+        for patch, some in zip(layout, bright[..., None, None], strict=True):
+            share = torch.where(some, patch.weight, 0.0)
+            covered[:, patch.top : patch.bottom, patch.left : patch.right] += share
+            lit.append(patch._replace(weight=share))
+        scale = wanted / torch.where(covered > 0.0, covered, 1.0)
+        return found.functions / light[:, None, :, None, None], lit, scale
+
+    def _coordinates(
+        self, scene: Scene, textures: Tensor, look: tuple[Tensor, Tensor] | None
+    ) -> tuple[Coordinates | None, tuple[int, int]]:
+        """Where pixels look in the texture, or where the first does if the others follow on.
+
+        `look` is where chief rays meet the scene, None for a pinhole's.
+        """
+        sensor = self.sensor
+        row, column = texture_origin((textures.shape[-2], textures.shape[-1]), scene.texture_centre)
+        if look is not None:
+            down, across = look
+            return Coordinates(down + row, across + column), (0, 0)
+        top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
+        left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
+        if top.is_integer() and left.is_integer():
+            return None, (int(top), int(left))
+        options = {"dtype": torch.float64, "device": textures.device}
+        rows, columns = torch.meshgrid(
+            torch.arange(sensor.height, **options),
+            torch.arange(sensor.width, **options),
+            indexing="ij",
+        )
+        shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
+        return Coordinates((rows + top).expand(shape), (columns + left).expand(shape)), (0, 0)

@@ -1,0 +1,137 @@
+"""Which aperture's edge ends the axial beam, and how far rays meet such edges from the inside."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.optics.backend import trace_rays
+from dolens.optics.elements import from_lens_axes
+from dolens.optics.rays import Components, Rays
+from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.optics.trace import trace_surfaces
+from dolens.rendering.pupil.aim import aim
+
+_AZIMUTHS = 16
+# An axial ray that passes every edge at this share of its semi-diameter is limited by none.
+_LIMITED = 1e-2
+_ITERATIONS = 4
+
+
+class AxialLimit(NamedTuple):
+    """What ends the axial beam: a surface's number, the azimuth of the ray, and its wavelength."""
+
+    surface: int
+    azimuth: float
+    wavelength: float
+
+
+@torch.no_grad()
+def axial_limit(
+    system: OpticalSystem, wavelengths: Sequence[float], z: float, radius: float
+) -> AxialLimit | None:
+    """The edge that the rim of a disc of the exit pupil is nearest to; None where none is near.
+
+    Args:
+        system: the lens.
+        wavelengths: nm.
+        z: of the disc, mm from the first vertex.
+        radius: of the disc, mm, that axial rays fill.
+    """
+    options = {"dtype": system.dtype, "device": system.device}
+    count = 1 if is_rotationally_symmetric(system) else _AZIMUTHS
+    angle = torch.arange(count, **options) * (2.0 * math.pi / _AZIMUTHS)
+    origin, sensor_z = torch.zeros((), **options), system.vertices[-1]
+    across, up = radius * torch.cos(angle), radius * torch.sin(angle)
+    every = torch.tensor(wavelengths, **options)[:, None]
+    one = torch.ones_like(every)
+    ray = aim(origin, origin, sensor_z, across * one, up * one, z)
+    trace = trace_surfaces(system, ray, every, sense=-1.0, record=True)
+    nearest, limit = _LIMITED, None
+    for margins, point in zip(trace.margins, trace.points, strict=True):
+        depth = _edge_distance(system, margins.number, point)
+        share, place = (depth / system.surfaces[margins.number - 1].semi_diameter).flatten().min(0)
+        if float(share) < nearest:
+            nearest = float(share)
+            colour, azimuth = divmod(int(place), count)
+            limit = AxialLimit(margins.number, float(angle[azimuth]), wavelengths[colour])
+    return limit
+
+
+def limit_distance(
+    system: OpticalSystem,
+    limit: AxialLimit,
+    radius: Tensor,
+    z: float | Tensor,
+    backend: str,
+) -> Tensor:
+    """How far inside the limiting edge the axial ray towards a radius of the disc passes, mm.
+
+    Differentiable in the radius (), in z and in the lens.
+    """
+    zero = torch.zeros_like(radius)[None]
+    across, up = math.cos(limit.azimuth) * radius[None], math.sin(limit.azimuth) * radius[None]
+    ray = aim(zero, zero, system.vertices[-1], across, up, z)
+    return edge_distances(system, ray, limit.surface, limit.wavelength, backend)[0]
+
+
+@torch.no_grad()
+def limiting_radius(
+    system: OpticalSystem,
+    limit: AxialLimit,
+    z: float,
+    low: float,
+    high: float,
+    backend: str,
+) -> float:
+    """The radius between two whose axial ray grazes the limiting edge: regula falsi.
+
+    The lower one itself where the edge is not between the two.
+    """
+
+    def distance(radius: float) -> float:
+        reach = torch.tensor(radius, dtype=system.dtype, device=system.device)
+        return float(limit_distance(system, limit, reach, z, backend))
+
+    start, inside, outside = low, distance(low), distance(high)
+    if not inside >= 0.0 > outside:
+        return start
+    for _ in range(_ITERATIONS):
+        middle = low + (high - low) * inside / (inside - outside)
+        found = distance(middle)
+        if found >= 0.0:
+            low, inside = middle, found
+        else:
+            high, outside = middle, found
+    return low + (high - low) * inside / (inside - outside)
+
+
+def edge_distances(
+    system: OpticalSystem,
+    ray: Components,
+    surface: int,
+    wavelength: float | Tensor,
+    backend: str,
+) -> Tensor:
+    """How far inside a surface's edge rays from the sensor meet it, mm; negative outside.
+
+    Differentiable in the rays and the lens, for rays that other edges would stop as well.
+
+    Args:
+        system: the lens.
+        ray: from the sensor, travelling towards -z.
+        surface: the number of the surface.
+        wavelength: nm, a number or a tensor that broadcasts with the rays.
+        backend: what traces.
+    """
+    rays = Rays.from_components(ray, wavelength)
+    hit = trace_rays(system.opened(), rays, backend, -1.0, record=False, first=surface, last=None)
+    return _edge_distance(system, surface, hit.position.unbind(-1))
+
+
+def _edge_distance(system: OpticalSystem, surface: int, point: Sequence[Tensor]) -> Tensor:
+    zero = torch.zeros_like(point[0])
+    here = from_lens_axes(Components(*point, zero, zero, zero), system.axes[surface - 1])
+    return system.surfaces[surface - 1].edge_distance(here.x, here.y)

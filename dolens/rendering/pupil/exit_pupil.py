@@ -1,0 +1,181 @@
+"""The exit pupil that the renderer aims at."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.backend import trace_rays
+from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.rays import Components, Rays
+from dolens.optics.system import OpticalSystem
+from dolens.optics.trace import trace_surfaces
+from dolens.rendering.pupil.aim import aim
+from dolens.rendering.pupil.axial_limit import axial_limit, limiting_radius
+from dolens.sensor.pixels import Sensor
+
+_AZIMUTHS = 16
+_RADII = 64
+
+
+# A larger disc is sampled only for more light than this share of what a corner gets.
+_NEGLIGIBLE = 2e-3
+# Radii, over the axial one, at which that light is looked for: the crescent may be a thin one.
+_LARGEST, _FINE_RADII = 2.0, 256
+# A larger disc is wider than what was found by this factor, and by whole shares 1/_STEPS.
+_ROOM, _STEPS = 1.01, 32
+
+
+class ExitPupil(NamedTuple):
+    """A disc through which light reaches the sensor: z from the first vertex and radii, mm.
+
+    Numbers, or tensors whose gradients follow the lens (`moving_pupil.moving_exit_pupil`).
+
+    Attributes:
+        z: of the paraxial exit pupil.
+        radius: of the disc that holds the light of every pixel.
+        axial_radius: of the disc that pixels on the axis see filled.
+    """
+
+    z: float | Tensor
+    radius: float | Tensor
+    axial_radius: float | Tensor
+
+    def numbers(self) -> "ExitPupil":
+        """The same without gradients."""
+        return ExitPupil(*(float(v.detach() if isinstance(v, Tensor) else v) for v in self))
+
+    def axial_mean(self, sensor_z: float | Tensor) -> float | Tensor:
+        """The mean of cos⁴ over the axial disc of radius a at distance L from a sensor plane, as
+        an axial pixel sees it: L²/(L² + a²).
+        """
+        squared = (sensor_z - self.z) ** 2
+        return squared / (squared + self.axial_radius**2)
+
+
+def paraxial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> ExitPupil:
+    """The pupil at the middle wavelength, its radius the least of all; no ray is traced.
+
+    Enough for chief rays, which are aimed at its centre.
+    """
+    first_order = ParaxialNumbers.of(system)
+    z, _ = first_order.exit_pupil(wavelengths[len(wavelengths) // 2])
+    radius = min(first_order.exit_pupil(w)[1] for w in wavelengths) / 2.0
+    return ExitPupil(z, radius, radius)
+
+
+@torch.no_grad()
+def sampled_exit_pupil(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    sensor: Sensor,
+    backend: str = "reference",
+    axial: ExitPupil | None = None,
+) -> ExitPupil:
+    """The disc to be sampled from all pixels of a sensor.
+
+    It is the axial pixels' own, unless the pupil's aberrations let light reach other pixels from
+    outside of it: then a larger one, of which axial pixels use a part.  The corners are asked, and
+    points halfway to them.
+
+    Args:
+        system: the lens.
+        wavelengths: nm.
+        sensor: the pixels.
+        backend: what traces.
+        axial: what `axial_exit_pupil` found for this lens; None: it is asked here.
+
+    Raises:
+        InputError: no ray from the sensor's centre gets through.
+    """
+    axial = axial or axial_exit_pupil(system, wavelengths, backend)
+    options = {"dtype": system.dtype, "device": system.device}
+    places = torch.tensor([0.0, 0.25, 0.75, 1.0], **options)
+    rows = torch.stack((places, places)).flatten() * sensor.height - 0.5
+    columns = torch.stack((places, 1.0 - places)).flatten() * sensor.width - 0.5
+    x, y = (p[:, None, None] for p in sensor.positions(rows, columns))
+    angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
+    share = (torch.arange(_FINE_RADII, **options)[:, None] + 0.5) * (_LARGEST / _FINE_RADII)
+    radii = share * axial.radius
+    ray = aim(
+        x, y, system.vertices[-1], radii * torch.cos(angle), radii * torch.sin(angle), axial.z
+    )
+    passes = _get_through(system, ray, wavelengths[len(wavelengths) // 2 :][:1], backend)
+    light = torch.where(passes, share, 0.0)
+    outside = torch.where(share > 1.0, light, 0.0)
+    lost = outside.sum((-2, -1)) / light.sum((-2, -1)).clamp(min=torch.finfo(light.dtype).tiny)
+    if float(lost.max()) <= _NEGLIGIBLE:
+        return axial
+    farthest = float(torch.where(passes, share, 0.0).max()) + 0.5 * _LARGEST / _FINE_RADII
+    # Room for other colours and azimuths, and steps that hardly any change of the lens passes.
+    larger = math.ceil(_ROOM * farthest * _STEPS) / _STEPS
+    return axial._replace(radius=larger * axial.radius)
+
+
+@torch.no_grad()
+def axial_exit_pupil(
+    system: OpticalSystem, wavelengths: Sequence[float], backend: str = "reference"
+) -> ExitPupil:
+    """The largest disc in the paraxial exit pupil's plane that real axial rays fill.
+
+    Rays from the sensor's centre are traced backwards at many radii and azimuths, and again in
+    between to narrow the first radius that fails, for every wavelength.  Where an aperture's edge
+    ends them, the radius is that of the ray that grazes it, so that it is a smooth function of the
+    lens.  Sampling this disc, and no larger one, lets every axial sample through, so that a white
+    scene renders white.
+
+    Args:
+        system: the lens.
+        wavelengths: nm.
+        backend: what traces: `reference`, `cpu` or `cuda`.
+
+    Raises:
+        InputError: no ray from the sensor's centre gets through.
+    """
+    z, paraxial, _ = paraxial_exit_pupil(system, wavelengths)
+    options = {"dtype": system.dtype, "device": system.device}
+    sensor_z = system.vertices[-1]
+    distance = abs(z - float(sensor_z))
+    angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
+    origin = torch.zeros((), **options)
+    # The stop's paraxial image may be far larger than what other apertures let through.
+    low, high = 0.0, min(2.0 * paraxial, 100.0 * distance)
+    for _ in range(3):
+        radii = torch.linspace(low, high, _RADII, **options)[:, None]
+        ray = aim(origin, origin, sensor_z, radii * torch.cos(angle), radii * torch.sin(angle), z)
+        passes = _get_through(system, ray, wavelengths, backend)
+        failing = torch.nonzero(~passes.all(dim=1)).flatten()
+        if len(failing) == 0:
+            return ExitPupil(z, high, high)
+        first = int(failing[0])
+        if first == 0:
+            raise InputError(
+                "no light reaches the centre of the sensor: every axial ray is stopped"
+            )
+        low, high = float(radii[first - 1]), float(radii[first])
+    limit = axial_limit(system, wavelengths, z, low)
+    if limit is not None:
+        low = limiting_radius(system, limit, z, low, high, backend)
+    return ExitPupil(z, low, low)
+
+
+def _get_through(
+    system: OpticalSystem, ray: Components, wavelengths: Sequence[float], backend: str
+) -> Tensor:
+    """Which rays get through the lens backwards, at every wavelength."""
+    if backend == "reference":
+        passes = [trace_surfaces(system, ray, w, sense=-1.0).valid for w in wavelengths]
+        return torch.stack(passes).all(dim=0)
+    every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
+    rays = Rays.from_components(ray, every.reshape(-1, *(1,) * ray.x.ndim))
+    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
+    return hit.valid.all(dim=0)
+
+
+def working_f_number(pupil: ExitPupil, sensor_z: float | Tensor) -> float | Tensor:
+    """1/(2·sin u') of the axial beam, u' the angle of its edge in air; a tensor where any is."""
+    square = ((sensor_z - pupil.z) / pupil.axial_radius) ** 2 + 1.0
+    return 0.5 * square**0.5

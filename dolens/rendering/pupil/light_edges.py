@@ -1,0 +1,252 @@
+"""Where on the exit pupil's disc the light of a sensor's points ends, and which surface ends it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.optics.backend import trace_rays
+from dolens.optics.rays import Rays, Status
+from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.rendering.pupil.aim import aim
+from dolens.rendering.pupil.exit_pupil import ExitPupil
+from dolens.sensor.pixels import Sensor
+
+# Azimuths of the edge, points along each side of the disc in the search for its middle, and
+# halvings of the interval that the edge lies in: Newton's iteration does the rest.
+AZIMUTHS, _SIDE, _HALVINGS = 48, 20, 10
+# Radii of a symmetric lens, or points along each side of the sensor of another.
+_RADII, _GRID = 17, 5
+# An edge as near to the disc's own cuts no light that counts.
+UNCUT = 0.999
+
+
+@dataclass(frozen=True)
+class LightEdges:
+    """The edge of the light of F points of the sensor, in polar coordinates about its middle.
+
+    Coordinates are those of the disc, in units of its radius.
+
+    Attributes:
+        middle: (F, 2), from where every ray to the edge lies in the light.
+        radius: (F, AZIMUTHS), distance of the edge from the middle, at azimuths 2πj/AZIMUTHS.
+        surface: (F, AZIMUTHS), number of the surface that ends the light there; 0 where the disc
+            itself does, or what is no edge of an aperture (a total reflection).
+    """
+
+    middle: Tensor
+    radius: Tensor
+    surface: Tensor
+
+
+@torch.no_grad()
+def light_edges(
+    system: OpticalSystem,
+    wavelength: float,
+    points: tuple[Tensor, Tensor],
+    pupil: ExitPupil,
+    backend: str,
+) -> LightEdges | None:
+    """Search for the edges of the light of points of the sensor, at one wavelength.
+
+    One trace tells where nothing cuts the disc; the answer is then None.
+
+    Args:
+        system: the lens.
+        wavelength: nm.
+        points: x and y, mm, each (F,).
+        pupil: the disc, numbers.
+        backend: what traces.
+    """
+    probe = _Probe(system, wavelength, points, pupil, backend)
+    options = {"dtype": system.dtype, "device": system.device}
+    angle = torch.arange(AZIMUTHS, **options) * (2.0 * math.pi / AZIMUTHS)
+    arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    if bool(probe.passes((UNCUT * arms).expand(len(points[0]), -1, 2))[0].all()):
+        return None
+    middle = probe.middles()
+    along = middle @ arms.mT
+    reach = -along + (along.square() + 1.0 - middle.square().sum(-1, keepdim=True)).sqrt()
+
+    def tried(radius: Tensor) -> Tensor:
+        return middle[:, None] + radius[..., None] * arms
+
+    passes, _ = probe.passes(tried(UNCUT * reach))
+    low, high = torch.where(passes, reach, torch.zeros_like(reach)), reach
+    for _ in range(_HALVINGS):
+        halfway = 0.5 * (low + high)
+        inside, _ = probe.passes(tried(halfway))
+        inside = inside | passes
+        low, high = torch.where(inside, halfway, low), torch.where(inside, high, halfway)
+    _, surface = probe.passes(tried(high))
+    cut = ~passes & (low > 0.0)
+    surface = torch.where(cut, surface, 0)
+    if not bool((surface > 0).any()):
+        return None
+    return LightEdges(middle, 0.5 * (low + high), surface)
+
+
+class _Probe:
+    """Asks which rays of F points through places (F, N, 2) of the disc pass."""
+
+    def __init__(
+        self,
+        system: OpticalSystem,
+        wavelength: float,
+        points: tuple[Tensor, Tensor],
+        pupil: ExitPupil,
+        backend: str,
+    ) -> None:
+        self.system, self.wavelength, self.pupil, self.backend = system, wavelength, pupil, backend
+        self.x, self.y = (p.to(device=system.device, dtype=system.dtype)[:, None] for p in points)
+
+    def passes(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Which pass, and the number of the surface whose edge stops a ray; 0 where none does."""
+        across, up = (self.pupil.radius * places).unbind(-1)
+        ray = aim(self.x, self.y, self.system.vertices[-1], across, up, self.pupil.z)
+        rays = Rays.from_components(ray, self.wavelength)
+        hit = trace_rays(self.system, rays, self.backend, -1.0, record=False, first=1, last=None)
+        clipped = hit.status == Status.VIGNETTED
+        valid = hit.valid & (hit.direction[..., 2] < 0.0)
+        return valid, torch.where(clipped, hit.surface.long(), 0)
+
+    def middles(self) -> Tensor:
+        """(F, 2): the mean of the places that pass; the disc's centre where all do."""
+        options = {"dtype": self.system.dtype, "device": self.system.device}
+        axis = (torch.arange(_SIDE, **options) + 0.5) * (2.0 / _SIDE) - 1.0
+        places = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+        places = places[places.norm(dim=-1) < 1.0]
+        passing, _ = self.passes(places.expand(len(self.x), -1, 2))
+        share = passing.to(places)
+        middle = share @ places / share.sum(1, keepdim=True).clamp(min=1.0)
+        middle[passing.all(1)] = 0.0
+        return middle
+
+
+@dataclass(frozen=True)
+class EdgeMap:
+    """Edges found at a few points of a sensor, for all of its pixels.
+
+    Attributes:
+        edges: at the points.
+        symmetric: the points lie on the positive x axis, and others are turned there.
+        low: distance of the first radius from the axis, mm; or x and y of the first corner.
+        step: mm between neighbouring points.
+    """
+
+    edges: LightEdges
+    symmetric: bool
+    low: tuple[float, float]
+    step: tuple[float, float]
+
+    def at(self, x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The edges of points' light at azimuths.
+
+        Args:
+            x: (P,), mm.
+            y: (P,), mm.
+            angle: (P, J), azimuths about the middle of the light, radians.
+
+        Returns:
+            The middles (P, 1, 2), the arms (P, J, 2), unit vectors, the radii (P, J) and the
+            numbers of the surfaces (P, J), all in the frame of the disc.
+        """
+        turn = torch.atan2(y, x) if self.symmetric else torch.zeros_like(x)
+        place = angle.remainder(2.0 * math.pi) * (AZIMUTHS / (2.0 * math.pi))
+        first = place.long().clamp(max=AZIMUTHS - 1)
+        after, part = (first + 1) % AZIMUTHS, place - first
+        nodes, shares = self._nodes(x, y)
+        middle = radius = 0.0
+        for node, share in zip(nodes, shares, strict=True):
+            rows = self.edges.radius[node]
+            found = torch.lerp(rows.gather(1, first), rows.gather(1, after), part)
+            middle = middle + share[:, None] * self.edges.middle[node]
+            radius = radius + share[:, None] * found
+        nearest = torch.stack(nodes).gather(0, torch.stack(shares).argmax(0, keepdim=True))[0]
+        closer = torch.where(part < 0.5, first, after)
+        surface = self.edges.surface[nearest].gather(1, closer)
+        arms = torch.stack((torch.cos(angle + turn[:, None]), torch.sin(angle + turn[:, None])), -1)
+        cosine, sine = torch.cos(turn), torch.sin(turn)
+        middle = torch.stack(
+            (
+                cosine * middle[:, 0] - sine * middle[:, 1],
+                sine * middle[:, 0] + cosine * middle[:, 1],
+            ),
+            -1,
+        )
+        return middle[:, None], arms, radius, surface
+
+    def _nodes(self, x: Tensor, y: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """Numbers of the points around others, and the shares of linear interpolation."""
+        if self.symmetric:
+            place = (torch.hypot(x, y) - self.low[0]) / self.step[0]
+            first = place.long().clamp(0, _RADII - 2)
+            part = (place - first).clamp(0.0, 1.0)
+            return [first, first + 1], [1.0 - part, part]
+        nodes, shares = [], []
+        down, across = (
+            (p - low) / step
+            for p, low, step in zip((y, x), self.low[::-1], self.step[::-1], strict=True)
+        )
+        for row, row_share in _neighbours(down):
+            for column, column_share in _neighbours(across):
+                nodes.append(row * _GRID + column)
+                shares.append(row_share * column_share)
+        return nodes, shares
+
+
+def _neighbours(place: Tensor) -> list[tuple[Tensor, Tensor]]:
+    first = place.long().clamp(0, _GRID - 2)
+    part = (place - first).clamp(0.0, 1.0)
+    return [(first, 1.0 - part), (first + 1, part)]
+
+
+@torch.no_grad()
+def edge_map(
+    system: OpticalSystem,
+    wavelengths: Sequence[float],
+    sensor: Sensor,
+    pupil: ExitPupil,
+    backend: str,
+) -> EdgeMap | None:
+    """The edges of the light all over a sensor; None where nothing cuts the disc.
+
+    Args:
+        system: the lens.
+        wavelengths: nm; the middle one's edges start the search for the others'.
+        sensor: the pixels.
+        pupil: the disc, numbers.
+        backend: what traces.
+    """
+    options = {"dtype": torch.float64, "device": system.device}
+    ends = torch.tensor([0.0, 1.0], **options)
+    rows, columns = (
+        (ends * side - 0.5).repeat_interleave(n).repeat(2 // n)
+        for side, n in ((sensor.height, 2), (sensor.width, 1))
+    )
+    x, y = sensor.positions(rows, columns)
+    wavelength = wavelengths[len(wavelengths) // 2]
+    symmetric = is_rotationally_symmetric(system)
+    if symmetric:
+        low, high = _distances(x, y)
+        radius = torch.linspace(low, high, _RADII, **options)
+        points = (radius, torch.zeros_like(radius))
+        corner, step = (low, 0.0), (max(high - low, 1e-12) / (_RADII - 1), 1.0)
+    else:
+        corner = (float(x.min()), float(y.min()))
+        step = tuple(float(p.max() - p.min()) / (_GRID - 1) for p in (x, y))
+        grid = torch.arange(_GRID, **options)
+        up, across = torch.meshgrid(
+            corner[1] + grid * step[1], corner[0] + grid * step[0], indexing="ij"
+        )
+        points = (across.reshape(-1), up.reshape(-1))
+    edges = light_edges(system, wavelength, points, pupil, backend)
+    return None if edges is None else EdgeMap(edges, symmetric, corner, step)
+
+
+def _distances(x: Tensor, y: Tensor) -> tuple[float, float]:
+    """The least and the largest distance from the axis of a rectangle's points, by its corners."""
+    least = [0.0 if float(p.min()) < 0.0 < float(p.max()) else float(p.abs().min()) for p in (x, y)]
+    return math.hypot(*least), float(torch.hypot(x, y).max())

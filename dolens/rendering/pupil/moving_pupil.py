@@ -1,0 +1,98 @@
+"""How the exit pupil moves with the lens: the derivative of the disc that renderers sample."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.system import OpticalSystem
+from dolens.rendering.pupil.axial_limit import AxialLimit, axial_limit, limit_distance
+from dolens.rendering.pupil.exit_pupil import ExitPupil
+
+
+def depends_on_parameters(system: OpticalSystem) -> bool:
+    """Whether gradients with respect to any of a lens's parameters are wanted."""
+    if not torch.is_grad_enabled():
+        return False
+    tensors = [system.sensor_distance, *system.thicknesses]
+    for surface in system.surfaces:
+        tensors += surface.parameters.values()
+        if surface.edge is not None:
+            tensors.append(surface.edge)
+    for element in system.elements:
+        tensors += element.parameters.values()
+    return any(tensor.requires_grad for tensor in tensors)
+
+
+def moving_exit_pupil(
+    system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil, backend: str
+) -> ExitPupil:
+    """The pupil's numbers, with gradients with respect to the lens's parameters.
+
+    z is that of the paraxial exit pupil.  The axial radius r is that of the axial ray that grazes
+    the limiting edge: with g(r; θ) its distance from the edge, g = 0 gives
+    ∂r/∂θ = -(∂g/∂θ)/(∂g/∂r), at constant z; z moves with the lens as well and is part of θ.  The
+    radius of a larger disc keeps its ratio to it.
+
+    Args:
+        system: the lens.
+        wavelengths: nm.
+        pupil: numbers, of this lens or of one that hardly differs.
+        backend: what traces.
+
+    Returns:
+        The pupil itself where the lens asks for no gradient, else tensors of the lens's precision.
+    """
+    pupil = pupil.numbers()
+    if not depends_on_parameters(system):
+        return pupil
+    options = {"dtype": system.dtype, "device": system.device}
+    z, ratio = _pupil_plane(system, wavelengths, pupil)
+    axial = torch.tensor(pupil.axial_radius, **options)
+    limit = axial_limit(system, wavelengths, pupil.z, pupil.axial_radius)
+    if limit is not None:
+        axial = _radius(system, limit, axial, z, backend)
+    elif ratio is not None:
+        # No edge ends the beam: the search for the disc ended at the paraxial pupil.
+        axial = axial * ratio
+    return ExitPupil(z, axial * (pupil.radius / pupil.axial_radius), axial)
+
+
+def moving_chief_pupil(
+    system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil
+) -> ExitPupil:
+    """The pupil with the gradient of its z alone: enough for chief rays, and no ray is traced."""
+    pupil = pupil.numbers()
+    if not depends_on_parameters(system):
+        return pupil
+    return pupil._replace(z=_pupil_plane(system, wavelengths, pupil)[0])
+
+
+def _pupil_plane(
+    system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil
+) -> tuple[Tensor, Tensor | None]:
+    """z with its gradient, and a one whose gradient is that of the paraxial diameter's logarithm;
+    None where that has none.
+    """
+    z, ratio = torch.tensor(pupil.z, dtype=system.dtype, device=system.device), None
+    paraxial = ParaxialNumbers.differentiable(system)
+    if paraxial is not None:
+        there, diameter = paraxial.exit_pupil(wavelengths[len(wavelengths) // 2])
+        if isinstance(there, Tensor):
+            z = z + (there - there.detach()).to(z)
+        if isinstance(diameter, Tensor):
+            ratio = (diameter / diameter.detach()).to(z)
+    return z, ratio
+
+
+def _radius(
+    system: OpticalSystem, limit: AxialLimit, radius: Tensor, z: Tensor, backend: str
+) -> Tensor:
+    """The axial radius as a function of the lens, by the implicit function theorem."""
+    reach = radius.detach().requires_grad_()
+    distance = limit_distance(system, limit, reach, z, backend)
+    (slope,) = torch.autograd.grad(distance, reach, retain_graph=True)
+    if not bool(slope != 0.0):
+        return radius
+    return radius - (distance - distance.detach()) / slope

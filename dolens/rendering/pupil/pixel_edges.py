@@ -1,0 +1,73 @@
+"""Rays of pixels along the edges of apertures, at azimuths that are drawn for each pixel."""
+
+import math
+
+import torch
+
+from dolens.kernels.view import View
+from dolens.optics.rays import Components
+from dolens.optics.system import OpticalSystem
+from dolens.rendering.pupil.edge_rays import EdgeRays, edge_rays
+from dolens.rendering.pupil.exit_pupil import ExitPupil
+from dolens.rendering.pupil.light_edges import EdgeMap
+from dolens.rendering.pupil.moving_pupil import depends_on_parameters
+from dolens.rendering.random_numbers import random_words, uniform
+from dolens.scene.planar import Scene
+from dolens.sensor.pixels import Sensor
+
+# Rays a pixel and wavelength, where edges cut light: as many as half the strata along a side of the
+# pupil, since an edge is a line.
+_FEWEST = 2
+
+
+def edge_samples(pupil_samples: int) -> int:
+    """Rays along edges for each pixel and wavelength, beside strata along a side of the pupil."""
+    return max(_FEWEST, pupil_samples // 2)
+
+
+def pixel_edge_rays(
+    system: OpticalSystem,
+    scene: Scene,
+    sensor: Sensor,
+    view: View,
+    pupil: ExitPupil,
+    edges: EdgeMap | None,
+    start: int,
+    end: int,
+    backend: str,
+) -> EdgeRays | None:
+    """Rays (C, pixels, samples) of pixels `start` to `end`; None where no gradient asks for them.
+
+    Args:
+        system: the lens.
+        scene: its wavelengths count.
+        sensor: the pixels.
+        view: of the render, for its seed.
+        pupil: the disc, as it moves with the lens.
+        edges: where edges are; None where they cut nothing.
+        start: number of the first pixel.
+        end: number behind the last.
+        backend: what traces.
+    """
+    if edges is None or not depends_on_parameters(system):
+        return None
+    pixel = torch.arange(start, end, device=system.device)[:, None]
+    count = edge_samples(view.pupil_samples)
+    stratum = torch.arange(count, device=system.device)
+    # Beyond the numbers of the pupil's samples.
+    words = random_words(view.seed, pixel, stratum + view.pupil_samples**2)
+    jitter, _, *area = (uniform(word, system.dtype) for word in words)
+    angle = (stratum + jitter) * (2.0 * math.pi / count)
+    rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)[:, 0]
+    columns = (pixel % view.width).to(system.dtype)[:, 0]
+    if view.pixel_area:
+        # One place serves all azimuths of a pixel.
+        rows, columns = rows + (area[0][:, 0] - 0.5), columns + (area[1][:, 0] - 0.5)
+    points = sensor.positions(rows, columns)
+    edge = edges.at(*points, angle)
+    return edge_rays(system, scene.wavelengths, points, pupil, edge, backend)
+
+
+def of_channel(ray: Components, channel: int) -> Components:
+    """Rays of one wavelength."""
+    return Components(*(component[channel] for component in ray))

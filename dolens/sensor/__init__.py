@@ -1,0 +1,1 @@
+"""The image sensor: pixels, noise, readout, colour filters and colour encoding."""

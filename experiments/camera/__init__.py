@@ -1,0 +1,1 @@
+"""A camera: a lens and a reconstruction network, trained together on photographs."""

@@ -1,0 +1,135 @@
+"""What a camera knows of its own blur: point spread functions that are not quite the true ones.
+
+A network that deconvolves is given the point spread functions of the very lens that made the image.
+A real one is given those of a calibration.  Each class here makes the functions of a calibration
+that went wrong in one way, for test metrics beside those of the exact functions.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.sensor.measured_psf import measured_functions
+from dolens.tolerancing import tolerances_from
+from experiments.camera.views.base import Imaging
+
+
+class Calibration(Protocol):
+    """Makes the functions that a network is given instead of the exact ones."""
+
+    def functions(
+        self,
+        views: Imaging,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        exact: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """(views, 3, K, K) for one batch.
+
+        Args:
+            views: as of the camera.
+            lens: which took the images.
+            values: its variables.
+            exact: (views, 3, K, K), its own functions.
+            generator: on the CPU, for this batch.
+        """
+
+
+class OtherDepth:
+    """The target of the calibration stood at one distance of its own.
+
+    Args:
+        depth: mm in front of the first vertex.
+    """
+
+    def __init__(self, depth: float) -> None:
+        if not (math.isfinite(depth) and depth > 0.0):
+            raise InputError(f"calibrations: depth must be positive (mm), not {depth}")
+        self.depth = float(depth)
+
+    def functions(
+        self,
+        views: Imaging,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        exact: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """Those of the one plane."""
+        return views.point_spread_functions(lens, values, depths=(self.depth,))
+
+
+class OtherSample:
+    """The calibration is of another lens of the series, off by its tolerances.
+
+    Every batch gets another sample.
+
+    Args:
+        tolerances: as of `dolens.tolerancing.tolerances_from`.
+        factor: multiplies all of them.
+    """
+
+    def __init__(self, tolerances: Mapping[str, Any], factor: float = 1.0) -> None:
+        self.tolerances = dict(tolerances)
+        self.factor = factor
+
+    def functions(
+        self,
+        views: Imaging,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        exact: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """Those of a lens whose errors are drawn."""
+        tolerances = tolerances_from(lens, self.tolerances, self.factor)
+        (errors,) = tolerances.draw(1, generator)
+        stored = {name: parameter.detach() for name, parameter in lens.named_parameters()}
+        made = dict(values)
+        for name, error in zip(tolerances.names, errors, strict=True):
+            nominal = values.get(name, stored[name])
+            made[name] = nominal + error.to(nominal)
+        return views.point_spread_functions(lens, made)
+
+
+class NoisyMeasurement:
+    """The functions were measured with a finite number of photons, once for all.
+
+    Args:
+        electrons: collected in the whole of each function and colour.
+        read_noise: electrons a pixel.
+        seed: of the one measurement.
+    """
+
+    def __init__(self, electrons: float, read_noise: float = 0.0, seed: int = 0) -> None:
+        if not electrons > 0.0 or not read_noise >= 0.0:
+            raise InputError(
+                "calibrations: electrons must be positive and read_noise at least 0, not "
+                f"{electrons} and {read_noise}"
+            )
+        self.electrons, self.read_noise, self.seed = electrons, read_noise, seed
+
+    def functions(
+        self,
+        views: Imaging,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        exact: Tensor,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """The exact ones with the noise of counting."""
+        same = torch.Generator().manual_seed(self.seed)
+        return measured_functions(exact, self.electrons, self.read_noise, same)
+
+
+def check(calibrations: Mapping[str, Calibration], lens: Lens) -> None:
+    """Raise `InputError` where a tolerance is none of the lens."""
+    for calibration in calibrations.values():
+        if isinstance(calibration, OtherSample):
+            tolerances_from(lens, calibration.tolerances, calibration.factor)

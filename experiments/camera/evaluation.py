@@ -1,0 +1,163 @@
+"""What a camera is worth on photographs: by rays, by other judges, with a wrong calibration."""
+
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from dolens.optics.lens import Lens
+from dolens.reconstruction import psnr_db, structural_similarity
+from dolens.sensor.colour import linear_to_srgb
+from experiments.camera.calibration import Calibration
+from experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
+from experiments.camera.views.base import Imaging, Views, seed_of
+
+
+class Camera(Protocol):
+    """What is measured."""
+
+    lens: Lens
+    views: Imaging
+
+    def variables(self) -> Mapping[str, Tensor]:
+        """The lens's variables as they are."""
+
+    def take(
+        self,
+        values: Mapping[str, Tensor],
+        batch: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> tuple[Views, Tensor | None]:
+        """Images of textures, and point spread functions where the network asks for them."""
+
+    def restore(self, taken: Views, functions: Tensor | None) -> Tensor:
+        """(B, V, 3, H, W), display-encoded."""
+
+    def loss_over_views(self, restored: Tensor, truth: Tensor) -> Mapping[str, Tensor]:
+        """The loss as `total`."""
+
+
+class Evaluation:
+    """Rows of numbers, one for each crop and view, and their means by name.
+
+    A stage is `val` or `test`; it is done again by every judge of the views, whose numbers are
+    called `test_<judge>/…`, and a test with every wrong calibration besides,
+    `test/psnr_db_miscalibrated/<kind>`.  All see the same textures and the same noise.
+
+    Args:
+        calibrations: name → the functions that a network is given instead of the exact ones.
+    """
+
+    def __init__(self, calibrations: Mapping[str, Calibration] | None = None) -> None:
+        self.calibrations = dict(calibrations or {})
+        self._rows: dict[str, dict[str, list[Tensor]]] = {}
+        self._seconds: dict[str, list[float]] = {}
+
+    @torch.no_grad()
+    def measure(self, camera: Camera, batch: Tensor, stage: str, index: int) -> None:
+        """Image, restore and compare textures (B, 3, h, w); see `Imaging.take` for the others."""
+        values = camera.variables()
+        for judge in (None, *camera.views.judges()):
+            started = time.perf_counter()
+            taken, functions = camera.take(values, batch, stage, index, judge)
+            if judge is not None:
+                self._seconds.setdefault(judge, []).append(time.perf_counter() - started)
+            name = stage if judge is None else f"{stage}_{judge}"
+            self._add(name, _row(camera, taken, camera.restore(taken, functions)))
+            if judge is None and stage == "test" and functions is not None:
+                self._miscalibrated(camera, values, taken, functions, index)
+
+    def _miscalibrated(
+        self,
+        camera: Camera,
+        values: Mapping[str, Tensor],
+        taken: Views,
+        exact: Tensor,
+        index: int,
+    ) -> None:
+        for kind, calibration in self.calibrations.items():
+            generator = torch.Generator().manual_seed(seed_of(0, "test", index))
+            wrong = calibration.functions(camera.views, camera.lens, values, exact, generator)
+            restored = camera.restore(taken, wrong).clamp(0.0, 1.0)
+            row = {f"psnr_db_miscalibrated/{kind}": _compared(psnr_db, restored, taken.truth)}
+            self._add("test", row)
+
+    def _add(self, stage: str, row: Mapping[str, Tensor]) -> None:
+        kept = self._rows.setdefault(stage, {})
+        for name, values in row.items():
+            kept.setdefault(name, []).append(values)
+
+    def scores(self, trainer: object, labels: Sequence[str]) -> dict[str, PhotographScores]:
+        """Scores by photograph of every stage that was measured; the rows are forgotten.
+
+        Args:
+            trainer: whose data module may know the photographs.
+            labels: of the views.
+        """
+        rows, self._rows = self._rows, {}
+        found: dict[str, PhotographScores] = {}
+        for stage, columns in rows.items():
+            crops = {name: torch.cat(values).float().cpu() for name, values in columns.items()}
+            of_crops = _photographs(trainer, stage.partition("_")[0], len(crops["psnr_db"]))
+            found[stage] = scores_by_photograph(crops, of_crops, labels)
+        return found
+
+    def costs(self) -> dict[str, float]:
+        """Seconds that a batch of images takes each judge: `cost/judge_<name>_s`."""
+        return {
+            f"cost/judge_{name}_s": statistics.median(values)
+            for name, values in self._seconds.items()
+        }
+
+
+def means_of(scores: PhotographScores) -> dict[str, Tensor]:
+    """Means over photographs, each of which counts once: of all views, of each, and of the worst.
+
+    The loss has no value of its own for each view.
+    """
+    found: dict[str, Tensor] = {}
+    for name, values in scores.metrics.items():
+        by_view = values.mean(dim=0)
+        found[name] = by_view.mean()
+        if name == "loss":
+            continue
+        for label, value in zip(scores.views, by_view, strict=True):
+            found[f"{name}/{label}"] = value
+        found[f"{name}/worst"] = by_view.min()
+    return found
+
+
+def without_loss(scores: PhotographScores) -> PhotographScores:
+    """What a table of photographs keeps."""
+    kept = {name: values for name, values in scores.metrics.items() if name != "loss"}
+    return replace(scores, metrics=kept)
+
+
+def _photographs(trainer: object, stage: str, count: int) -> Sequence[str]:
+    """The photograph of each of the first crops; a crop of its own where the data tell none."""
+    data = getattr(trainer, "datamodule", None)
+    if not hasattr(data, "evaluation_photographs"):
+        return [str(number) for number in range(count)]
+    return data.evaluation_photographs({"val": "validation", "test": "test"}[stage])[:count]
+
+
+def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:
+    """Numbers (B, V) by name."""
+    restored, truth = restored.clamp(0.0, 1.0), taken.truth
+    loss = camera.loss_over_views(restored, truth.to(restored.dtype))
+    row = {"loss": loss["total"].expand(truth.shape[:2])}
+    for name, image in (("", restored), ("raw_", linear_to_srgb(taken.raw))):
+        for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
+            row[f"{name}{metric}"] = _compared(measure, image, truth)
+    return row
+
+
+def _compared(measure: object, image: Tensor, truth: Tensor) -> Tensor:
+    found = measure(image.flatten(0, 1), truth.flatten(0, 1).to(image.dtype))
+    return found.unflatten(0, truth.shape[:2])

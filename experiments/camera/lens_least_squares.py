@@ -1,0 +1,196 @@
+"""Damped least squares for a camera's lens, in turns with its network's own optimizer."""
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optimize.operand_model import OperandModel
+from dolens.optimize.operands import Operand
+from dolens.optimize.trusted_step import ray_moves, trusted_step
+from dolens.optimize.variables import DesignVariables
+
+logger = logging.getLogger(__name__)
+
+# Where the slope along the last step has kept more than this part of itself, rays may move farther
+# the next time, and where it has turned round less far.
+_STEADY, _LONGER, _SHORTER = 0.5, 1.25, 0.7
+# Never less far than this part of the first step.
+_LEAST_REACH = 0.02
+
+
+class CameraOptimizer:
+    """How a camera's parameters move: its network's by `network`, its lens's by it too or apart.
+
+    Args:
+        network: parameter groups → optimizer.
+        lens: `adam`: the lens's variables are a group of the same optimizer (whichever it is);
+            `dls`: damped least squares, in turns with it.
+        least_squares: settings of `LensLeastSquares`.
+
+    Raises:
+        InputError: an unknown choice.
+    """
+
+    def __init__(
+        self,
+        network: Callable[..., torch.optim.Optimizer],
+        lens: str = "adam",
+        least_squares: Mapping[str, Any] | None = None,
+    ) -> None:
+        if lens not in ("adam", "dls"):
+            raise InputError(f"optimizer.lens: '{lens}' is unknown; allowed: adam, dls")
+        self.network = network
+        self.lens_steps = LensLeastSquares(**(least_squares or {})) if lens == "dls" else None
+
+    def __call__(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
+        """The optimizer of parameter groups."""
+        return self.network(groups)
+
+
+class LensLeastSquares:
+    """Moves a lens once for some steps of the network, by the gradient they have gathered.
+
+    The step minimises the loss's linear model and the operands while rays move no farther than
+    `reach`; see `trusted_step`.  Batches are small and differ, so that a trial on one of them would
+    tell little; the next gradient, of other batches, tells how the last step was: where the loss
+    still falls along it, rays may move farther, and where it rises less far.
+
+    Args:
+        every: steps of the network between two of the lens.
+        reach: how far rays may move in the first step, RMS over spots, pixels.
+        most: and in any later one.
+        damping: of variables that undo one another.
+        rings: of rays in a pupil.
+        arms: of rays in a pupil, even.
+
+    Raises:
+        InputError: a number that is out of range.
+    """
+
+    def __init__(
+        self,
+        every: int = 5,
+        reach: float = 0.1,
+        most: float = 0.5,
+        damping: float = 1e-3,
+        rings: int = 4,
+        arms: int = 8,
+    ) -> None:
+        for name, value in (("every", every), ("reach", reach), ("damping", damping)):
+            if not 0.0 < value < math.inf:
+                raise InputError(f"optimizer.least_squares.{name}: {value}; allowed: above 0")
+        if not most >= reach:
+            raise InputError(
+                f"optimizer.least_squares.most: {most}; allowed: from reach, {reach}, on"
+            )
+        self.every, self.most, self.damping = int(every), float(most), float(damping)
+        self.rings, self.arms = int(rings), int(arms)
+        self.least, self.reach = _LEAST_REACH * float(reach), float(reach)
+        self.taken = 0
+        self._gathered: Tensor | None = None
+        self._last: Tensor | None = None
+        self._slope = 0.0
+
+    def is_due(self, steps: int) -> bool:
+        """Whether the lens moves after so many steps of the network."""
+        return steps % self.every == 0
+
+    def gather(self, variables: DesignVariables) -> None:
+        """Add the gradient of a step of the network to those before, and take it away."""
+        gradient, variables.scaled.grad = variables.scaled.grad, None
+        if gradient is not None:
+            before = torch.zeros_like(gradient) if self._gathered is None else self._gathered
+            self._gathered = before + gradient / self.every
+
+    @torch.no_grad()
+    def step(
+        self,
+        lens: Lens,
+        variables: DesignVariables,
+        spots: list[SpotRays],
+        pitch: float,
+        operands: Sequence[Operand] = (),
+        share: float = 1.0,
+        object_distance: float | None = None,
+    ) -> dict[str, float]:
+        """One step, by the gradient that was gathered; it is used up.
+
+        Args:
+            lens: where the values are stored.
+            variables: u.
+            spots: rays of the lens.
+            pitch: of the pixels, mm.
+            operands: what the lens must be besides; the gradient is without them.
+            share: of the reach, as a schedule has it.
+            object_distance: of the operands, mm in front of the first vertex; None for infinity.
+
+        Returns:
+            Numbers to log: `reach` (pixels), `slope_kept` by the last step, `moved` (RMS, pixels).
+
+        Raises:
+            UnreachableField: a chief ray that operands ask for does not reach the stop.
+        """
+        gathered, self._gathered = self._gathered, None
+        if gathered is None or not share > 0.0:
+            return {}
+        gradient = gathered.double().cpu()
+        if not bool(torch.isfinite(gradient).all()):
+            logger.warning("the lens's gradient is not finite: it does not move this time")
+            return {}
+        numbers = {}
+        if self._last is not None and self._slope < 0.0:
+            kept = float(gradient @ self._last) / self._slope
+            if kept > _STEADY:
+                self.reach = min(_LONGER * self.reach, self.most)
+            elif kept < 0.0:
+                self.reach = max(_SHORTER * self.reach, self.least)
+            numbers["slope_kept"] = kept
+        scaled, point = variables.scaled, variables.scaled.detach().double().cpu()
+        moves = ray_moves(lens, variables, spots, self.damping)
+        lower, upper = (b.double().cpu() - point for b in (variables.lower, variables.upper))
+        step = trusted_step(
+            gradient,
+            moves,
+            self.reach * share * pitch,
+            lower.clamp(max=0.0),
+            upper.clamp(min=0.0),
+            OperandModel.of(lens, variables, operands, object_distance) if operands else None,
+        )
+        scaled.copy_(point + step)
+        variables.project()
+        variables.write_to(lens)
+        self.taken += 1
+        self._last, self._slope = step, float(gradient @ step)
+        return numbers | {"reach": self.reach, "moved": float((moves @ step).norm()) / pitch}
+
+    def reject(self) -> None:
+        """Move rays less far the next time: the lens cannot be judged after the last step."""
+        self.reach = max(_SHORTER * self.reach, self.least)
+        self._last, self._slope = None, 0.0
+
+    def numbers(self) -> dict[str, float]:
+        """How many steps were taken, and how far rays may move now (pixels)."""
+        return {"lens_steps/taken": float(self.taken), "lens_steps/reach": self.reach}
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps, the gradient gathered so far included."""
+        return {
+            "reach": self.reach,
+            "taken": self.taken,
+            "gathered": None if self._gathered is None else self._gathered.clone(),
+            "last": None if self._last is None else self._last.clone(),
+            "slope": self._slope,
+        }
+
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Go on with it."""
+        self.reach, self.taken = float(state["reach"]), int(state["taken"])
+        self._gathered, self._last = state["gathered"], state["last"]
+        self._slope = float(state["slope"])

@@ -1,0 +1,146 @@
+"""What every way of looking offers to the camera module."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.optics.lens import Lens
+from dolens.rendering.pupil.f_number import axial_f_number
+from dolens.sensor.pixels import Sensor
+from dolens.sensor.readout import Readout
+
+# Streams of random numbers that must not meet: an offset of the seed for each stage, and others for
+# the sensor's noise and for what is drawn into scenes.
+_STAGES = {"train": 0, "val": 1, "test": 2}
+_STRIDE, NOISE_OFFSET, SCENE_OFFSET = 1 << 40, 1 << 39, 1 << 38
+
+
+class Views(NamedTuple):
+    """B textures, each imaged in V ways.
+
+    Attributes:
+        truth: (B, V, 3, H, W), display-encoded: what an ideal camera would have taken.
+        raw: (B, V, 3, H, W), linear light, read out and developed.
+        field: (B, V, 2, H, W), where each pixel lies on the sensor, x and y over half its diagonal;
+            None where that is the same for all.
+    """
+
+    truth: Tensor
+    raw: Tensor
+    field: Tensor | None = None
+
+
+class Comparison(NamedTuple):
+    """The training's own loss and variables, for judging gradients.
+
+    Attributes:
+        variables: tensors that are varied.
+        values: the lens's parameters by name, as functions of them.
+        loss: of raw images and truths (B, V, 3, H, W), as of `Views`, and the lens's parameters.
+    """
+
+    variables: Sequence[Tensor]
+    values: Callable[[], Mapping[str, Tensor]]
+    loss: Callable[[Views, Mapping[str, Tensor]], Tensor]
+
+
+class Imaging(Protocol):
+    """A scene, renderers and a readout.
+
+    All random numbers are functions of the seed, the stage and the index.
+    """
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixels of one image."""
+
+    @property
+    def object_distance(self) -> float:
+        """Of the scene (the first of several depths), mm in front of the first vertex.
+
+        Operands and drawings of the lens take it.
+        """
+
+    def labels(self) -> Sequence[str]:
+        """Names of the evaluation's views, for metrics."""
+
+    def psf_labels(self) -> Sequence[str]:
+        """Names of the point spread functions."""
+
+    def check(self, lens: Lens) -> None:
+        """Raise `InputError` where the lens cannot look at the scene."""
+
+    def expose(self, lens: Lens) -> None:
+        """Set the sensor's exposure by the aperture of the lens as it begins.
+
+        It is held from then on: what variables change of the F-number is left out of value and
+        derivative alike.
+        """
+
+    def prepare(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        comparison: Comparison | None = None,
+        photographs: Tensor | None = None,
+    ) -> None:
+        """Look at the lens as it is now, at the start of an epoch.
+
+        `comparison` says which gradients a renderer that chooses its model has to get right,
+        `photographs` (P, 3, h, w), linear light, on which images beside its own.
+        """
+
+    def take(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> Views:
+        """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`.
+
+        With a judge, one of `judges`, it makes the images; the noise is the same.
+        """
+
+    def judges(self) -> Sequence[str]:
+        """Names of renderers that make the test images besides."""
+
+    def point_spread_functions(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
+    ) -> Tensor:
+        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's."""
+
+    def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
+        """Rays of spots that stand for what the views see, one entry for each object distance."""
+
+    def rays(self) -> int:
+        """Rays that a training image takes."""
+
+    def numbers(self) -> dict[str, float]:
+        """What it has to say of itself, as metrics."""
+
+    def state(self) -> dict[str, Any]:
+        """What it found, as plain values for a checkpoint."""
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
+        """Go on with what another one's `state` held."""
+
+
+def exposed(readout: Readout, lens: Lens) -> Readout:
+    """The readout behind a lens: as it is where it has no reference F-number."""
+    if readout.reference_f_number is None:
+        return readout
+    return readout.behind(axial_f_number(lens))
+
+
+def seed_of(seed: int, stage: str, index: int) -> int:
+    """A seed of its own for every batch of every stage."""
+    return (seed * len(_STAGES) + _STAGES[stage]) * _STRIDE + index

@@ -1,0 +1,225 @@
+"""Every texture at every depth of a scene: what an extended depth of field is about."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
+from dolens.diffraction.diffraction_limit import with_diffraction_limit
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.rendering.auto.agreement import GradientMeasure
+from dolens.rendering.protocol import Renderer
+from dolens.rendering.psf import axial_point_spread_functions
+from dolens.rendering.pupil.f_number import axial_f_number
+from dolens.scene.planar import Scene, pinhole_image
+from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.pixels import Sensor
+from dolens.sensor.readout import Readout
+from experiments.camera.views.base import NOISE_OFFSET, Comparison, Views, exposed, seed_of
+from experiments.camera.views.truth import check_truth, chief_ray_looks, looked_up
+
+
+class DepthViews:
+    """Textured planes at several depths, in front of the whole sensor.
+
+    With `truth` "pinhole" the truth is what a distortion-free pinhole sees; with "chief_rays" it is
+    the texture where the chief rays of the reference wavelength look, so that distortion is no
+    error, and image and truth move together with the lens.
+
+    Args:
+        scene: depths and wavelengths.
+        renderer: makes the training images.
+        readout: what the sensor makes of them.
+        evaluation_renderer: makes the validation and test images, of the same sensor; None: the
+            training renderer, which then judges its own approximations.
+        psf_size: pixels along each side of the point spread functions that networks ask for.
+        psf_pupil_samples: their strata along each side of the pupil.
+        truth: `pinhole` or `chief_rays`.
+        seed: of rendering and noise.
+        judges: make the test images besides, of the same sensor, by name.
+        psf_diffraction: of the functions that networks ask for: `none`, or `limit`, blurred by a
+            perfect pupil's diffraction, as a measurement would find them.
+
+    Raises:
+        InputError: the renderers' sensors differ, or an unknown word.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        renderer: Renderer,
+        readout: Readout,
+        evaluation_renderer: Renderer | None = None,
+        psf_size: int = 65,
+        psf_pupil_samples: int = 48,
+        truth: str = "pinhole",
+        seed: int = 0,
+        judges: Mapping[str, Renderer] | None = None,
+        psf_diffraction: str = "none",
+    ) -> None:
+        self.truth = check_truth(truth)
+        if self.truth != "pinhole" and not scene.separate_planes:
+            raise InputError(
+                f"views.truth: '{truth}' needs planes that make images of their own; allowed for "
+                "layers: pinhole"
+            )
+        self.scene = scene
+        self.renderer = renderer
+        self.readout = readout
+        self.evaluation_renderer = evaluation_renderer or renderer
+        self.psf_size = psf_size
+        self.psf_pupil_samples = psf_pupil_samples
+        self.seed = seed
+        self._judges = dict(judges or {})
+        if psf_diffraction not in ("none", "limit"):
+            raise InputError(
+                f"views.psf_diffraction '{psf_diffraction}' is unknown; allowed: none, limit"
+            )
+        self.psf_diffraction = psf_diffraction
+        self._f_number: float | None = None
+        others = {f"judges.{name}": judge for name, judge in self._judges.items()}
+        for name, other in {"evaluation_renderer": self.evaluation_renderer, **others}.items():
+            if other.sensor != renderer.sensor:
+                raise InputError(
+                    f"{name}.sensor: {other.sensor} is not that of "
+                    f"the training renderer, {renderer.sensor}"
+                )
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixels of one image."""
+        return self.renderer.sensor
+
+    @property
+    def object_distance(self) -> float:
+        """The first depth."""
+        return self.scene.depths[0]
+
+    def labels(self) -> list[str]:
+        """The depths."""
+        return self.scene.labels()
+
+    def psf_labels(self) -> list[str]:
+        """The planes' depths."""
+        return self.scene.plane_labels()
+
+    def check(self, lens: Lens) -> None:
+        """Raise `InputError` where a depth lies inside the lens; fix the scene's scale for it."""
+        self.scene.check(lens.system())
+        self.scene = self.scene.fixed_for(lens.system())
+
+    def expose(self, lens: Lens) -> None:
+        """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
+        self.readout = exposed(self.readout, lens)
+        if self.psf_diffraction != "none":
+            self._f_number = axial_f_number(lens)
+
+    def prepare(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        comparison: Comparison | None = None,
+        photographs: Tensor | None = None,
+    ) -> None:
+        """Let the training renderer look at the lens as it is now."""
+        measure = self._measure(lens, comparison)
+        self.renderer.prepare(lens, self.scene, values, measure, photographs)
+
+    def _measure(self, lens: Lens, comparison: Comparison | None) -> GradientMeasure | None:
+        """The training's loss as a function of images of textures; of planes of their own."""
+        if comparison is None or not self.scene.separate_planes:
+            return None
+
+        def loss(image: Tensor, textures: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+            generator = torch.Generator(image.device).manual_seed(self.seed + NOISE_OFFSET)
+            raw = self.readout.develop(self.readout(image.to(lens.dtype), generator))
+            truth = self._truth(lens, values, textures.to(raw)).expand_as(raw)
+            return comparison.loss(Views(truth, raw), values)
+
+        return GradientMeasure(comparison.variables, comparison.values, loss)
+
+    def take(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> Views:
+        """Image textures at every depth."""
+        renderer = self.renderer if stage == "train" else self.evaluation_renderer
+        renderer = renderer if judge is None else self._judges[judge]
+        seed = seed_of(self.seed, stage, index)
+        image = renderer.render(lens, self.scene, textures, seed, values)
+        generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
+        raw = self.readout.develop(self.readout(image, generator))
+        return Views(self._truth(lens, values, textures).expand_as(raw), raw)
+
+    def _truth(self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor) -> Tensor:
+        """(B, D or 1, 3, H, W), display-encoded."""
+        colours = self.scene.colours(textures)
+        if self.truth == "pinhole":
+            return linear_to_srgb(pinhole_image(colours, self.sensor))[:, None]
+        ((rows, columns),) = chief_ray_looks(lens, values, self.scene, self.sensor, [self.sensor])
+        centre = self.scene.texture_centre
+        planes = [looked_up(colours, r, c, centre) for r, c in zip(rows, columns, strict=True)]
+        return linear_to_srgb(torch.stack(planes, 1))
+
+    def judges(self) -> list[str]:
+        """Those that were given."""
+        return list(self._judges)
+
+    def point_spread_functions(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
+    ) -> Tensor:
+        """(depths, 3, K, K), on the axis."""
+        samples = pupil_samples or self.psf_pupil_samples
+        scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
+        functions = axial_point_spread_functions(
+            lens, scene, self.sensor, self.psf_size, samples, values
+        )
+        if self.psf_diffraction == "none":
+            return functions
+        f_number = self._f_number or axial_f_number(lens)
+        pitch = self.sensor.pixel_pitch
+        return with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
+
+    def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
+        """Of each depth: on the axis, and towards the sensor's edges."""
+        half = 0.35 * self.sensor.pixel_pitch * min(self.sensor.height, self.sensor.width)
+        found = []
+        scales = self.scene.magnifications(lens.system())
+        for depth, magnification in zip(self.scene.depths, scales, strict=True):
+            height = half / magnification
+            fields = [(0.0, 0.0), (0.0, height), (height, 0.0)]
+            found.append(
+                gaussian_quadrature(
+                    lens, fields, self.scene.wavelengths, rings, arms, depth, symmetry=False
+                )
+            )
+        return found
+
+    def rays(self) -> int:
+        """Rays that a training image takes."""
+        return self.renderer.rays_per_image(self.scene)
+
+    def numbers(self) -> dict[str, float]:
+        """The renderer's."""
+        return self.renderer.numbers()
+
+    def state(self) -> dict[str, Any]:
+        """The renderer's."""
+        return self.renderer.state()
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
+        """Give it back to the renderer."""
+        self.renderer.load_state(lens, state)

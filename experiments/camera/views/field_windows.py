@@ -1,0 +1,99 @@
+"""Where on a large sensor windows lie."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.sensor.pixels import Sensor
+
+# The golden angle, by which neighbouring textures' windows lie apart in azimuth.
+_GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+TRAINING = ("circle", "radius", "area")
+
+
+class FieldWindows:
+    """Windows of one size: drawn for training, in zones for tests.
+
+    Args:
+        whole: the sensor.
+        height: of a window, pixels.
+        width: likewise.
+        training_windows: how training windows are drawn; see `FieldViews`.
+
+    Raises:
+        InputError: an unknown way of drawing.
+    """
+
+    def __init__(self, whole: Sensor, height: int, width: int, training_windows: str) -> None:
+        if training_windows not in TRAINING:
+            raise InputError(
+                f"views.training_windows: '{training_windows}' is unknown; allowed: "
+                f"{', '.join(TRAINING)}"
+            )
+        self.whole = whole
+        self.height, self.width = height, width
+        self.training_windows = training_windows
+
+    def training(self, generator: torch.Generator) -> Sensor:
+        """A window to train on."""
+        if self.training_windows == "area":
+            return self.anywhere(generator)
+        free = self.whole.height - self.height, self.whole.width - self.width
+        drawn = torch.rand(1, generator=generator, dtype=torch.float64)
+        share = float(drawn) if self.training_windows == "radius" else math.sqrt(float(drawn))
+        radius = 0.5 * math.hypot(*free) * share
+        # Its distance from the middle is drawn, and then its direction.
+        while True:
+            drawn = torch.rand(1, generator=generator, dtype=torch.float64)
+            angle = 2.0 * math.pi * float(drawn)
+            down, across = radius * math.sin(angle), radius * math.cos(angle)
+            if abs(down) <= 0.5 * free[0] and abs(across) <= 0.5 * free[1]:
+                break
+        return self._about(down, across)
+
+    def anywhere(self, generator: torch.Generator) -> Sensor:
+        """A window drawn evenly from the sensor."""
+        top, left = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+        return self._at(top, left)
+
+    def zone(self, share: float, number: int) -> Sensor:
+        """The window about a point at a share of the half diagonal, or as far as windows reach.
+
+        Its azimuth goes around with the number.
+        """
+        height, width = self.whole.height, self.whole.width
+        radius = 0.5 * share * math.hypot(height, width)
+        angle = number * _GOLDEN_ANGLE
+        # Beyond the sides only the diagonals lead on.
+        if radius > 0.5 * min(height, width):
+            corner = math.atan2(height, width)
+            angle = (corner, math.pi - corner, math.pi + corner, -corner)[number % 4]
+        return self._about(radius * math.sin(angle), radius * math.cos(angle))
+
+    def coordinates(self, window: Sensor, like: Tensor) -> Tensor:
+        """(2, H, W): x and y of a window's pixels over half the whole sensor's diagonal."""
+        half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch
+        options = {"dtype": torch.float64, "device": like.device}
+        row, column = torch.meshgrid(
+            torch.arange(window.height, **options),
+            torch.arange(window.width, **options),
+            indexing="ij",
+        )
+        return torch.stack(window.positions(row, column)).to(like) / half
+
+    def _about(self, down: float, across: float) -> Sensor:
+        """The window about a point, pixels from the middle, or the nearest that fits."""
+        free = self.whole.height - self.height, self.whole.width - self.width
+        places = (
+            min(max(0.5 + offset / side, 0.0), 1.0) if side else 0.0
+            for offset, side in zip((down, across), free, strict=True)
+        )
+        return self._at(*places)
+
+    def _at(self, down: float, across: float) -> Sensor:
+        """The window at shares of the way down and across that it can go."""
+        top = round(down * (self.whole.height - self.height))
+        left = round(across * (self.whole.width - self.width))
+        return self.whole.window(top, left, self.height, self.width)

@@ -1,0 +1,53 @@
+"""Photographs given a depth, as one image each: extended depth of field where depths meet."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.scene.layered import LayeredScene
+from experiments.camera.views.base import SCENE_OFFSET, Views, seed_of
+from experiments.camera.views.depths import DepthViews
+from experiments.data.occluders import with_occluders
+
+
+class LayerViews(DepthViews):
+    """Scenes with a depth at every texel, in front of the whole sensor.
+
+    Textures that have a depth as their last channel are taken as they are; photographs are given
+    one, with edges where near things hide far ones, drawn from the seed, the stage and the index.
+
+    Args:
+        scene: the planes.
+        occluders: ellipses in front of each photograph.
+        **settings: those of `DepthViews`.
+
+    Raises:
+        InputError: the scene is not one of layers.
+    """
+
+    def __init__(self, scene: LayeredScene, occluders: int = 8, **settings: Any) -> None:
+        super().__init__(scene, **settings)
+        if not isinstance(scene, LayeredScene):
+            raise InputError("views: layers need a scene of layers; choose scene=layers")
+        self.occluders = occluders
+
+    def take(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> Views:
+        """One image of each texture."""
+        if textures.shape[1] == len(self.scene.wavelengths):
+            seed = seed_of(self.seed, stage, index) + SCENE_OFFSET
+            generator = torch.Generator().manual_seed(seed)
+            near, far = self.scene.depths[0], self.scene.depths[-1]
+            textures = with_occluders(textures, near, far, self.occluders, generator)
+        return super().take(lens, values, textures, stage, index, judge)

@@ -1,0 +1,74 @@
+"""What an ideal camera would have taken: the truth that images are compared with."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.backend import choose_backend
+from dolens.optics.lens import Lens
+from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
+from dolens.rendering.pupil.moving_pupil import moving_chief_pupil
+from dolens.scene.planar import Scene, texture_origin
+from dolens.scene.texture import bilinear
+from dolens.sensor.pixels import Sensor
+
+TRUTHS = ("pinhole", "chief_rays")
+
+
+def check_truth(name: str) -> str:
+    """The name itself; raises `InputError` naming the allowed ones."""
+    if name not in TRUTHS:
+        raise InputError(f"views.truth: '{name}' is unknown; allowed: {', '.join(TRUTHS)}")
+    return name
+
+
+def chief_ray_looks(
+    lens: Lens,
+    values: Mapping[str, Tensor],
+    scene: Scene,
+    whole: Sensor,
+    windows: Sequence[Sensor],
+) -> list[tuple[Tensor, Tensor]]:
+    """Where the reference wavelength's chief rays of windows' pixels meet the planes of a scene.
+
+    Differentiable in the values: the truth moves with the lens's distortion and magnification, as
+    the image does.
+
+    Returns:
+        Of each window rows and columns from the axis in the image of a pinhole, each
+        (D, height, width), in double precision.
+    """
+    system = lens.system(values)
+    backend = choose_backend(system, lens.backend)
+    wavelengths = (lens.primary_wavelength,)
+    planes = scene.as_planes(wavelengths=wavelengths)
+    pupil = moving_chief_pupil(system, wavelengths, paraxial_exit_pupil(system, wavelengths))
+    looks = chief_ray_maps(system, planes, whole, windows, pupil, backend)
+    return [(rows[:, 0], columns[:, 0]) for rows, columns in looks]
+
+
+def looked_up(
+    textures: Tensor, rows: Tensor, columns: Tensor, centre: tuple[float, float]
+) -> Tensor:
+    """Textures (..., h, w) at rows and columns (H, W) from the axis: (..., H, W).
+
+    Args:
+        textures: linear light.
+        rows: below the axis in the image of a pinhole, pixels.
+        columns: right of it.
+        centre: where the textures' centre lies, as `Scene.texture_centre`.
+    """
+    height, width = textures.shape[-2:]
+    row, column = texture_origin((height, width), centre)
+    flat = textures.reshape(-1, height, width)
+    found = bilinear(flat, (rows + row).to(textures), (columns + column).to(textures))
+    return found.reshape(*textures.shape[:-2], *rows.shape)
+
+
+def nearest_texel(rows: Tensor, columns: Tensor) -> tuple[float, float]:
+    """The middle of rows and columns, to a whole texel; no gradient."""
+    with torch.no_grad():
+        return float(rows.mean().round()), float(columns.mean().round())

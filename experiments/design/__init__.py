@@ -1,0 +1,1 @@
+"""Classical lens design: variables, a merit function and an optimizer."""

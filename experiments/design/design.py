@@ -1,0 +1,376 @@
+"""Classical design as a Lightning module: a lens, its variables, a merit function, an optimizer."""
+
+import copy
+import logging
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
+from dolens.optimize.merit import MeritValue
+from dolens.optimize.rims import fitted_semi_diameters
+from dolens.optimize.start import start_values
+from dolens.prescriptions import lens_from_prescription
+from experiments.design.iteration import Progress, gradient_iteration, least_squares_iteration
+from experiments.design.tables import iteration_row, spot_labels, spot_table
+from experiments.running.checkpoints import refuse_another
+
+logger = logging.getLogger(__name__)
+
+SEMI_DIAMETERS = ("fixed", "follow")
+# So many iterations are logged one by one; history.csv holds all.
+_LOGGED_FIRST = 20
+# Rings of the quadrature that tells where the edges of the beams are.
+_EDGE_RINGS = 40
+
+
+class DesignModule(lightning.LightningModule):
+    """Looks for the lens of the least merit.
+
+    A step is an iteration of the optimizer.  An epoch is a round: it begins by choosing the rays
+    that pass the lens as it then is, and ends when the optimizer says that nothing is to be gained,
+    or after as many iterations as the data give.  The lens of the best round is kept.
+
+    Args:
+        lens: the lens; `start` moves it first.
+        experiment: name of the experiment; a checkpoint of another one is refused.
+        variables: settings of `DesignVariables`.
+        merit: the merit function.
+        optimizer: parameter groups → optimizer; one that takes residuals, as `DampedLeastSquares`,
+            gets them, every other one the gradient of the merit.
+        start: settings of `start_values`; None begins at the prescription.
+        published: a prescription to compare with, or None.
+        evaluation: what RMS spot radii are reported of; None: the merit's own rays.
+        semi_diameters: `fixed`: light passes where the prescription lets it; or `follow`: the rays
+            that pass the lens where the search begins are kept, and in the end every edge, and the
+            stop's, is put where they pass.
+        round_tolerance: a round that lowers the merit by a smaller part is the last.
+        seed: of the errors in `start`.
+
+    Attributes:
+        initial: the lens where the search began.
+        history: a row of numbers for every iteration.
+
+    Raises:
+        InputError: a setting that is out of range, or no variables.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        experiment: str,
+        variables: Mapping[str, Mapping[str, Any] | None] | None,
+        merit: MeritSettings,
+        optimizer: Callable[..., torch.optim.Optimizer],
+        start: Mapping[str, Any] | None = None,
+        published: Mapping[str, Any] | None = None,
+        evaluation: MeritSettings | None = None,
+        semi_diameters: str = "fixed",
+        round_tolerance: float = 1e-3,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.lens = lens.requires_grad_(False)
+        generator = torch.Generator().manual_seed(seed)
+        values = start_values(lens, start or {}, generator)
+        with torch.no_grad():
+            for name, parameter in lens.variables(list(values)).items():
+                parameter.copy_(values[name])
+        self.variables = DesignVariables(lens, variables or {})
+        if not len(self.variables):
+            raise InputError("variables: there are none; name a parameter, as surfaces.*.curvature")
+        self.variables.project()
+        self.variables.write_to(self.lens)
+        # In a tuple, so that checkpoints do not hold them.
+        self._initial = (copy.deepcopy(self.lens),)
+        self.published = None
+        if published is not None:
+            model = {"index_model": lens.index_model}
+            self.published = lens_from_prescription(
+                {**published, **model}, lens.dtype, where="published", backend=lens.backend
+            )
+        self.experiment, self.merit_settings = experiment, merit
+        self.evaluation = evaluation or replace(
+            merit, quality="spots", quality_options={}, operands=()
+        )
+        self.optimizer, self.round_tolerance = optimizer, round_tolerance
+        if semi_diameters not in SEMI_DIAMETERS:
+            raise InputError(
+                f"semi_diameters: '{semi_diameters}' is unknown (allowed: "
+                f"{', '.join(SEMI_DIAMETERS)})"
+            )
+        self.follow = semi_diameters == "follow"
+        if self.follow:
+            self.merit_settings = replace(merit, most_vignetted=1.0)
+        if not 0.0 <= round_tolerance < 1.0:
+            raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
+        self.merit: MeritFunction | None = None
+        self.history: list[dict[str, float]] = []
+        self._stopped: str | None = None
+        # Where the round began, so that a resumed one has its rays; and the best round's end.
+        for name in ("round_start", "best"):
+            self.register_buffer(name, self.variables.scaled.detach().clone())
+        for name in ("round_start_focus", "best_focus"):
+            self.register_buffer(name, self.lens.sensor_distance.detach().clone())
+        self.register_buffer("best_merit", torch.tensor(math.inf, dtype=torch.float64))
+        self._fit_seconds = self._left = 0.0
+        self._between: list[float] = []
+        self.initial_light: Tensor | None = None
+
+    @property
+    def initial(self) -> Lens:
+        """The lens where the search began."""
+        return self._initial[0]
+
+    # ---------------------------------------------------------------- rounds
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """One group, with its bounds."""
+        v = self.variables
+        group = {"params": [v.scaled], "lower": v.lower.clone(), "upper": v.upper.clone()}
+        return self.optimizer([group])
+
+    def on_fit_start(self) -> None:
+        """Start the clock."""
+        self._fit_started = time.perf_counter()
+
+    def on_train_start(self) -> None:
+        """Choose the rays of the first round, or of the one that a checkpoint was in."""
+        lens = copy.deepcopy(self.lens)
+        with torch.no_grad():
+            now = self.variables.scaled.clone()
+            self.variables.scaled.copy_(self.round_start)
+            self.variables.write_to(lens)
+            lens.sensor_distance.copy_(self.round_start_focus)
+            self.variables.scaled.copy_(now)
+        self.merit = self._build(lens)
+        fresh = math.isinf(float(self.best_merit))
+        quality = self.merit.quality if fresh else self.merit_settings.image_quality(self.initial)
+        self.initial_light = None if quality is None else quality.spots.light
+        if fresh:
+            self._keep_if_better(self.merit())
+            if not math.isfinite(float(self.best_merit)):
+                raise InputError(
+                    "the search cannot begin: rays fail, or apertures clip more than "
+                    "merit.most_vignetted of a spot"
+                )
+        logger.info(
+            "%d variables, %d rays of %d launched, merit %.6g",
+            self.variables.scaled.numel(),
+            self.rays,
+            self.rays_launched,
+            float(self.best_merit),
+        )
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> int | None:
+        """End the round when nothing is to be gained."""
+        return -1 if self._stopped else None
+
+    def training_step(self, batch: Any, batch_idx: int) -> None:
+        """One iteration."""
+        started = time.perf_counter()
+        if self._left:
+            self._between.append(started - self._left)
+        optimizer = self.optimizers()
+        bare = optimizer.optimizer
+        if getattr(bare, "takes_residuals", False):
+            progress = least_squares_iteration(bare, optimizer.step, self.merit)
+        else:
+            progress = gradient_iteration(bare, optimizer.step, self.merit, self.variables)
+        self._stopped = progress.stopped
+        if progress.value.operands:
+            progress.value.operand_derivatives()  # the next Jacobian's, and logged
+        done = time.perf_counter()
+        self._record(progress, done - started)
+        # What lies between two iterations is the training loop's, and the loggers'.
+        self._left = done
+
+    def on_train_epoch_end(self) -> None:
+        """Look at the lens with the rays that pass it now, and decide whether to go on."""
+        before = float(self.best_merit)
+        self.merit().write_to(self.lens)
+        try:
+            self.merit = self._build(self.lens)
+            value = self.merit()
+            self._check_light()
+            reached = value.sum_of_squares()
+            self._keep_if_better(value)
+        except InputError as problem:
+            # The best lens is kept; say why this one is not.
+            logger.warning("Round %d ends with a lens that fails: %s", self.current_epoch, problem)
+            reached = math.inf
+        self.log("val/merit", reached)
+        logger.info(
+            "Round %d, %d iterations in all: %s; merit over the rays that pass now %.6g",
+            self.current_epoch,
+            len(self.history),
+            self._stopped or "no end within the round",
+            reached,
+        )
+        with torch.no_grad():
+            self.round_start.copy_(self.variables.scaled)
+            self.round_start_focus.copy_(self.lens.sensor_distance)
+        optimizer = self.optimizers().optimizer
+        if not before - reached > self.round_tolerance * before:
+            self.trainer.should_stop = True
+        elif hasattr(optimizer, "restart"):
+            optimizer.restart()
+        self._stopped, self._left = None, 0.0
+
+    def on_fit_end(self) -> None:
+        """Leave the lens of the best round."""
+        self._fit_seconds = time.perf_counter() - self._fit_started
+        self._leave_best()
+
+    def on_test_start(self) -> None:
+        """The same with a checkpoint's best round, where nothing was trained."""
+        if not self._fit_seconds and math.isfinite(float(self.best_merit)):
+            self._leave_best()
+
+    def _leave_best(self) -> None:
+        with torch.no_grad():
+            self.variables.scaled.copy_(self.best)
+            self.variables.write_to(self.lens)
+            self.lens.sensor_distance.copy_(self.best_focus)
+        if self.follow:
+            self._fit_edges()
+
+    def _build(self, lens: Lens) -> MeritFunction:
+        if not self.follow:
+            return self.merit_settings.build(lens, self.variables)
+        # The rays of the start serve every round.
+        return self.merit or self.merit_settings.build(self.initial, self.variables)
+
+    def _fit_edges(self) -> None:
+        settings = replace(
+            self.merit_settings,
+            sampling="gaussian_quadrature",
+            sampling_options={"rings": _EDGE_RINGS, "arms": 2 * _EDGE_RINGS, "symmetry": True},
+        )
+        edges = fitted_semi_diameters(self.lens, settings.rays(self.initial))
+        for number, semi_diameter in edges.items():
+            self.lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
+
+    def _check_light(self) -> None:
+        """A round takes its rays from the lens as it is; without this, every one could lose some.
+
+        Raises:
+            InputError: a spot has lost more of its light than it may.
+        """
+        quality = self.merit.quality
+        if quality is None or self.follow:
+            return
+        least = self.initial_light * (1.0 - quality.most_vignetted)
+        lost = quality.spots.light < least.to(quality.spots.light)
+        if bool(lost.any()):
+            label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
+            raise InputError(
+                f"spot {label} has lost more than merit.most_vignetted = "
+                f"{quality.most_vignetted:g} of the light that it had at first"
+            )
+
+    def _keep_if_better(self, value: MeritValue) -> None:
+        merit = value.sum_of_squares()
+        if merit < float(self.best_merit):
+            with torch.no_grad():
+                self.best_merit.fill_(merit)
+                self.best.copy_(self.variables.scaled)
+                self.best_focus.fill_(value.sensor_distance)
+
+    # ---------------------------------------------------------------- what is logged
+
+    @property
+    def rays(self) -> int:
+        """That one evaluation of the merit traces."""
+        quality = None if self.merit is None else self.merit.quality
+        return 0 if quality is None else len(quality.spots.weight)
+
+    @property
+    def rays_launched(self) -> int:
+        """That were tried to find them."""
+        quality = None if self.merit is None else self.merit.quality
+        return 0 if quality is None else quality.spots.launched
+
+    def _record(self, progress: Progress, seconds: float) -> None:
+        row = iteration_row(progress, self.merit, seconds)
+        self.history.append(row)
+        self.log("train/merit", row["train/merit"], prog_bar=True, logger=False)
+        # Straight to the loggers: Lightning's own bookkeeping costs more than many an iteration.
+        count = len(self.history)
+        if count <= _LOGGED_FIRST or count % self.trainer.log_every_n_steps == 0:
+            for entry in self.loggers:
+                entry.log_metrics(row, step=self.global_step)
+
+    # ---------------------------------------------------------------- evaluation
+
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        """RMS spot radii before and after, and of the published design."""
+        final = spot_table(self.lens, self.evaluation)
+        tables = {"initial": spot_table(self.initial, self.evaluation), "final": final}
+        if self.published is not None:
+            tables["published"] = spot_table(self.published, self.evaluation)
+        for name, table in tables.items():
+            self.log(f"rms_spot_um/{name}", table.mean)
+            self.log(f"light/{name}", table.light)
+        for label, radius in final.radii.items():
+            self.log(f"rms_spot_um/final/{label}", radius)
+        self.log(
+            "error/sampling_um",
+            abs(spot_table(self.lens, self.evaluation, finer=True).mean - final.mean),
+        )
+        logger.info(
+            "RMS spot radius, mean of %d: %s µm",
+            len(final.radii),
+            ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items()),
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Numbers about the whole run, for metrics.json."""
+        numbers = {"cost/iterations": float(len(self.history)), "cost/rays": float(self.rays)}
+        numbers["cost/rays_launched"] = float(self.rays_launched)
+        if math.isfinite(float(self.best_merit)):
+            numbers["train/merit"] = float(self.best_merit)
+        for name in ("iteration_s", "jacobian_s"):
+            if self.history:
+                numbers[f"cost/{name}"] = statistics.median(r[f"cost/{name}"] for r in self.history)
+        if self.history:
+            numbers["cost/step_s"] = numbers["cost/iteration_s"]
+            numbers["cost/fit_s"] = self._fit_seconds
+        if self._between:
+            numbers["cost/trainer_s"] = statistics.median(self._between)
+        return numbers
+
+    # ---------------------------------------------------------------- checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say which design it is, and what has been done."""
+        checkpoint["dolens"] = self.identity()
+        checkpoint["history"] = self.history
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another design.
+
+        Raises:
+            InputError: it is one.
+        """
+        refuse_another(checkpoint.get("dolens"), self.identity())
+        self.history = list(checkpoint.get("history", []))
+
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must have in common with this module, as plain values."""
+        return {
+            "experiment": self.experiment,
+            "lens": self.lens.name,
+            "variables": list(self.variables.names),
+        }

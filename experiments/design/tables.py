@@ -1,0 +1,109 @@
+"""What a design says of itself: spots of a lens, an iteration's numbers, operands."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.optics.lens import Lens
+from dolens.optimize import MeritFunction, MeritSettings
+from experiments.design.iteration import Progress
+
+SQUARE_GRID_COUNT = 31
+_DEFAULTS = {
+    "gaussian_quadrature": {"rings": 6, "arms": 12},
+    "square_grid": {"count": SQUARE_GRID_COUNT},
+}
+
+
+@dataclass(frozen=True)
+class SpotTable:
+    """RMS spot radii of a lens.
+
+    Attributes:
+        radii: label of the spot, as `0,14/588nm`, → µm, about its reference.
+        mean: of all, with the merit's weights.
+        light: share of the beams that passes, mean of all; see `SpotRays.light`.
+    """
+
+    radii: dict[str, float]
+    mean: float
+    light: float
+
+
+def spot_table(lens: Lens, settings: MeritSettings, finer: bool = False) -> SpotTable:
+    """RMS spot radii of a lens, over the rays that pass it.
+
+    Args:
+        lens: initial, published or final.
+        settings: of a merit of spots.
+        finer: twice the rays in each direction, to see what the sampling costs.
+    """
+    if finer:
+        settings = replace(settings, sampling_options=_doubled(settings))
+    quality = settings.image_quality(lens)
+    rms = 1e3 * quality.values(lens).rms
+    mean = float((quality.weights.to(rms) * rms).sum())
+    radii = dict(zip(spot_labels(quality.spots), rms.tolist(), strict=True))
+    return SpotTable(radii, mean, float(quality.spots.light.mean()))
+
+
+def spot_labels(spots: SpotRays) -> list[str]:
+    """`x,y/588nm` of every spot."""
+    fields, waves = spots.fields.tolist(), spots.wavelengths.tolist()
+    return [f"{x:g},{y:g}/{w:.0f}nm" for (x, y), w in zip(fields, waves, strict=True)]
+
+
+def iteration_row(progress: Progress, merit: MeritFunction, seconds: float) -> dict[str, float]:
+    """The numbers of an iteration, by the names that they are logged under."""
+    value, cost = progress.value, progress.cost
+    row = {
+        "train/merit": value.sum_of_squares(),
+        **{f"train/{name}": number for name, number in progress.numbers.items()},
+        "cost/iteration_s": seconds,
+        "cost/jacobian_s": cost.jacobian_s,
+        "cost/iteration_rays": float(cost.rays),
+        "cost/evaluations": float(cost.evaluations),
+    }
+    if value.quality is not None:
+        row["train/quality"] = value.quality.merit
+        scale, unit = merit.quality.scale, merit.quality.unit
+        labels = spot_labels(merit.quality.spots)
+        for label, rms in zip(labels, value.quality.rms.tolist(), strict=True):
+            row[f"spot_{unit}/{label}"] = scale * rms
+    if value.operands:
+        slopes = value.operand_derivatives().norm(dim=1).tolist()
+        for item, slope in zip(value.operands, slopes, strict=True):
+            row[f"operand/{item.label}"] = item.value
+            row[f"operand_slope/{item.label}"] = slope
+            row[f"merit/{item.label}"] = (item.weight * item.deviation) ** 2
+    return row
+
+
+def operand_table(merit: MeritFunction) -> list[dict[str, Any]]:
+    """A row for every operand: value, deviation, and derivatives by the variables.
+
+    Derivatives are those of the value by each variable in its own unit.
+    """
+    value = merit()
+    if not value.operands:
+        return []
+    slopes = (value.operand_derivatives() / merit.variables.scale.cpu()).tolist()
+    labels = merit.variables.labels()
+    return [
+        {
+            "operand": item.label,
+            "value": item.value,
+            "deviation": item.deviation,
+            "weight": item.weight,
+            **dict(zip(labels, row, strict=True)),
+        }
+        for item, row in zip(value.operands, slopes, strict=True)
+    ]
+
+
+def _doubled(settings: MeritSettings) -> dict[str, Any]:
+    """Sampling options with twice the rays along each direction."""
+    given = {key: value for key, value in settings.sampling_options.items() if value is not None}
+    options = {**_DEFAULTS[settings.sampling], **given}
+    counts = ("rings", "arms", "count")
+    return {key: 2 * value if key in counts else value for key, value in options.items()}

@@ -1,1 +1,0 @@
-"""What things cost and how wrong they are, measured side by side."""

@@ -1,0 +1,1 @@
+"""Poses of lenses and elements, found from images of point sources."""

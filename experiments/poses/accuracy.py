@@ -1,0 +1,264 @@
+"""How the error of a pose falls with photons and rays, and from how far off a fit converges."""
+
+import copy
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor
+
+from dolens.alignment.information import knowledge
+from dolens.alignment.measurement import Measurement
+from dolens.alignment.pose import Pose
+from dolens.alignment.spot_loss import SpotLoss
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.rendering.spot_image import SpotImager
+from dolens.sensor.pixels import Sensor
+from experiments.poses.basin import Basin
+from experiments.poses.measurements import draw, simulated_at
+from experiments.tables import Row, write_table
+
+logger = logging.getLogger(__name__)
+
+PARTS = ("photons", "rays", "basin")
+ESTIMATORS = ("noise_weighted", "s21")
+_DIGITS = 6
+
+
+class PoseAccuracyModule(lightning.LightningModule):
+    """Measures what limits a pose fit: light, rays, and where it starts.
+
+    Errors by light and by rays are those of one Gauss-Newton step from the truth, which is where an
+    estimate from there ends but for terms of second order in its error.
+
+    Args:
+        lens: as designed; its elements may have poses.
+        experiment: name of the experiment.
+        sources: (S, 3), mm, in the lens's axes.
+        wavelength: nm.
+        sensor: the pixels.
+        truth: where the lens and the sources are, by name, degrees and mm.
+        variables: name → settings of `Pose`: what is fitted; it starts from the truth, or off it.
+        folder: where tables go.
+        parts: of `photons`, `rays` and `basin`.
+        photons: of each source, behind the lens, that bounds are quoted for.
+        read_noise: RMS of a pixel, electrons.
+        centroid_weight: μ of S21, 1/mm².
+        imagers: name → settings of `SpotImager`; the first is used where rays are not the question.
+        slopes: settings that differ for derivatives.
+        photon_levels: of a source.
+        measurements: with other photons, of each level.
+        ray_counts: of a source.
+        patterns: of rays, of each count.
+        reference_photons: of the measurement that errors by rays are judged by.
+        basin: settings of `Basin`.
+        seed: of simulations.
+
+    Raises:
+        InputError: a setting that is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        experiment: str,
+        sources: Sequence[Sequence[float]],
+        wavelength: float,
+        sensor: Sensor,
+        truth: Mapping[str, float],
+        variables: Mapping[str, Mapping[str, Any] | None],
+        folder: str,
+        imagers: Mapping[str, Mapping[str, Any]],
+        slopes: Mapping[str, Any],
+        basin: Mapping[str, Any],
+        parts: Sequence[str] = PARTS,
+        photons: int = 4_000_000,
+        read_noise: float = 2.0,
+        centroid_weight: float = 1.0,
+        photon_levels: Sequence[float] = (1e4, 1e5, 1e6, 1e7),
+        measurements: int = 20,
+        ray_counts: Sequence[float] = (1e4, 1e5, 1e6),
+        patterns: int = 4,
+        reference_photons: float = 2e8,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        for part in parts:
+            if part not in PARTS:
+                raise InputError(f"parts: '{part}' is unknown (allowed: {', '.join(PARTS)})")
+        if lens.dtype != torch.float64:
+            raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
+        if measurements < 2 or patterns < 1 or not imagers or not variables:
+            raise InputError(
+                "measurements, patterns, imagers, variables: give 2 or more, 1 or more, and at "
+                "least one of each"
+            )
+        self.lens, self.experiment, self.seed = lens.requires_grad_(False), experiment, int(seed)
+        self.folder, self.parts = Path(folder), tuple(parts)
+        self.photons, self.read_noise = int(photons), float(read_noise)
+        self.centroid_weight = float(centroid_weight)
+        self.imagers = {
+            name: SpotImager(sensor, float(wavelength), **settings)
+            for name, settings in imagers.items()
+        }
+        self.imager = next(iter(self.imagers.values()))
+        self.slopes = replace(self.imager, **slopes)
+        place = Pose(copy.deepcopy(lens), sources, {})
+        place.put(truth)
+        # It starts from where the lens now is, whatever initial values are given.
+        free = {name: {**(s or {})} for name, s in variables.items()}
+        for settings in free.values():
+            settings.pop("initial", None)
+        self.true = place.varying(free)
+        self.photon_levels = [int(level) for level in photon_levels]
+        self.ray_counts = [int(count) for count in ray_counts]
+        self.measurements, self.patterns = measurements, patterns
+        self.reference_photons = int(reference_photons)
+        self.basin = Basin(
+            self.true, self.imager.wavelength, sensor, self.read_noise, self.seed, **basin
+        )
+        self.rows: list[Row] = []
+        self._numbers: dict[str, float] = {}
+
+    def configure_optimizers(self) -> None:
+        """Nothing is trained."""
+
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        """Measure, and write each table when its part is done."""
+        with torch.inference_mode(False):
+            for part in self.parts:
+                started = time.perf_counter()
+                logger.info("%s", part)
+                getattr(self, f"_{part}")()
+                self._numbers[f"cost/{part}_s"] = time.perf_counter() - started
+        self.log_dict(self.summary(), batch_size=1)
+
+    def summary(self) -> dict[str, float]:
+        """Numbers for metrics.json."""
+        return dict(self._numbers)
+
+    # ---------------------------------------------------------------- light
+
+    @torch.no_grad()
+    def _photons(self) -> None:
+        """Errors of estimates from measurements of more and more light."""
+        for number, level in enumerate(self.photon_levels):
+            seeds = range(1000 * number, 1000 * number + self.measurements)
+            measured = [self._measurement(level, seed) for seed in seeds]
+            known = knowledge(self.true, self.imager, measured[0], self.slopes)
+            inverse = self._s21_inverse(measured[0])
+            errors = {
+                "noise_weighted": torch.stack([known.correction(m) for m in measured]),
+                "s21": torch.stack([self._s21_step(m, self.imager, inverse) for m in measured]),
+            }
+            for estimator, found in errors.items():
+                rms = found.square().mean(0).sqrt()
+                self._add("photons", estimator, level, rms, known.bounds)
+            logger.info("%.3g photons: %s", level, self._last_ratios())
+        write_table(self.folder / "accuracy.csv", self.rows, _DIGITS)
+
+    def _measurement(self, photons: int, seed: int) -> Measurement:
+        imager, generator = self.imager, draw(self.seed, 0, seed)
+        return simulated_at(
+            self.true, imager.wavelength, imager.sensor, photons, self.read_noise, generator
+        )
+
+    # ---------------------------------------------------------------- rays
+
+    @torch.no_grad()
+    def _rays(self) -> None:
+        """Errors that few rays make, of images that stand for all of them."""
+        reference = self._measurement(self.reference_photons, 999_999)
+        exact = knowledge(self.true, self.imager, reference, self.slopes)
+        # Bounds and weights are those of the light that is quoted.
+        share = self.photons / self.reference_photons
+        quoted = replace(
+            reference,
+            images=share * reference.images,
+            read_noise=self.read_noise,
+        )
+        known = knowledge(self.true, self.imager, quoted, self.slopes)
+        inverse = self._s21_inverse(reference)
+        floor = float((exact.bounds / known.bounds).square().mean().sqrt())
+        self._numbers["pose_error/reference_over_bound"] = floor
+        for (name, imager), count in (
+            (entry, count) for entry in self.imagers.items() for count in self.ray_counts
+        ):
+            found: dict[str, list[Tensor]] = {estimator: [] for estimator in ESTIMATORS}
+            seconds = []
+            for pattern in range(self.patterns):
+                own = replace(imager, rays=count, seed=pattern + 1)
+                started = time.perf_counter()
+                shares = torch.stack([image.image for image in self.true.images(own)])
+                seconds.append(time.perf_counter() - started)
+                modelled = replace(known, expected=shares)
+                found["noise_weighted"].append(modelled.correction(quoted))
+                found["s21"].append(self._s21_step(reference, own, inverse))
+            for estimator, steps in found.items():
+                rms = torch.stack(steps).square().mean(0).sqrt()
+                self._add(f"rays/{name}", estimator, count, rms, known.bounds, min(seconds))
+            logger.info("%s, %.3g rays: %s", name, count, self._last_ratios())
+        write_table(self.folder / "accuracy.csv", self.rows, _DIGITS)
+
+    # ---------------------------------------------------------------- where it starts
+
+    def _basin(self) -> None:
+        """Fits from starts that are farther and farther off."""
+        self.basin.run()
+        write_table(self.folder / "basin.csv", self.basin.rows, _DIGITS)
+        self._numbers |= self.basin.summary()
+
+    # ---------------------------------------------------------------- estimates and rows
+
+    def _s21_inverse(self, measurement: Measurement) -> Tensor:
+        """(P, rows), the pseudo-inverse of S21's derivatives by u, at the truth.
+
+        Another measurement's largest pixel scales all rows but those of the centroids a little
+        otherwise, which moves the least squares by as little.
+        """
+        loss = SpotLoss(measurement, self.slopes, self.centroid_weight)
+        every = torch.ones(len(self.true.names), dtype=torch.bool)
+        return torch.linalg.pinv(loss.jacobian(self.true, every)[1])
+
+    def _s21_step(self, measurement: Measurement, imager: SpotImager, inverse: Tensor) -> Tensor:
+        """(P,), θ's units."""
+        loss = SpotLoss(measurement, imager, self.centroid_weight)
+        return -self.true.scale * (inverse @ loss.residuals(self.true))
+
+    def _add(
+        self,
+        part: str,
+        estimator: str,
+        count: int,
+        rms: Tensor,
+        bounds: Tensor,
+        seconds: float = math.nan,
+    ) -> None:
+        """Rows of accuracy.csv, one for each variable, in degrees and mm."""
+        units = self.true.units
+        for place, name in enumerate(self.true.names):
+            self.rows.append(
+                {
+                    "part": part,
+                    "estimator": estimator,
+                    "count": float(count),
+                    "variable": name,
+                    "rms_error": float(rms[place] / units[place]),
+                    "bound": float(bounds[place] / units[place]),
+                    "image_s": seconds,
+                }
+            )
+        key = f"pose_error/over_bound/{part}_{count:g}/{estimator}"
+        self._numbers[key] = float((rms / bounds).square().mean().sqrt())
+
+    def _last_ratios(self) -> str:
+        """RMS errors over bounds of what was added last."""
+        last = list(self._numbers.items())[-len(ESTIMATORS) :]
+        return ", ".join(f"{name.rpartition('/')[2]} {value:.3g} bounds" for name, value in last)

@@ -1,0 +1,164 @@
+"""From how far off a pose fit converges: fits from a grid of starts."""
+
+import itertools
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.alignment.information import knowledge
+from dolens.alignment.measurement import Measurement
+from dolens.alignment.pose import Pose
+from dolens.errors import InputError
+from dolens.sensor.pixels import Sensor
+from experiments.poses.iteration import iterate, loss_of, optimizer_of
+from experiments.poses.measurements import simulated_at
+from experiments.poses.settings import Stage, spot_imager, stage_of
+from experiments.tables import Row
+
+logger = logging.getLogger(__name__)
+
+# RMS error over bound up to which a fit has converged: S21's own errors are some bounds.
+_CONVERGED = 10.0
+
+
+class Basin:
+    """Fits by the same stages from starts whose errors in two variables make a grid.
+
+    Args:
+        true: the lens where it is.
+        wavelength: nm.
+        whole_sensor: of the experiment.
+        read_noise: RMS of a pixel, electrons.
+        seed: of the measurement.
+        along: two variables' names → errors of their starts, degrees or mm; the first is drawn
+            across, the second upwards.
+        stages: settings of `Stage`, in turn.
+        centroid_weights: μ of S21, 1/mm²; a grid of fits for each.
+        sensor: the pixels; None: the experiment's.
+        imager: settings of `SpotImager`.
+        photons: of each source.
+
+    Raises:
+        InputError: a name that is not fitted, or not two of them.
+    """
+
+    def __init__(
+        self,
+        true: Pose,
+        wavelength: float,
+        whole_sensor: Sensor,
+        read_noise: float,
+        seed: int,
+        along: Mapping[str, Sequence[float]],
+        stages: Sequence[Mapping[str, Any]],
+        centroid_weights: Sequence[float] = (1.0,),
+        sensor: Sensor | None = None,
+        imager: Mapping[str, Any] | None = None,
+        photons: float = 1e6,
+    ) -> None:
+        unknown = set(along) - set(true.names)
+        if unknown or len(along) != 2:
+            raise InputError(
+                f"basin.along: {', '.join(along)}; allowed: two of {', '.join(true.names)}"
+            )
+        self.true, self.along = true, {n: [float(e) for e in es] for n, es in along.items()}
+        self.stages: list[Stage] = [stage_of(settings) for settings in stages]
+        self.centroid_weights = [float(weight) for weight in centroid_weights]
+        self.sensor, self.wavelength = sensor or whole_sensor, wavelength
+        self.imager = dict(imager or {})
+        self.read_noise, self.seed, self.photons = read_noise, seed, int(photons)
+        self.rows: list[Row] = []
+
+    def run(self) -> None:
+        """Make the rows: `centroid_weight`, the start's errors, `error_over_bound` before and
+        after, `converged`, `iterations`, `seconds`.
+
+        A fit whose light is lost ends where it was, and says so in the log.
+        """
+        true, generator = self.true, torch.Generator().manual_seed(self.seed)
+        measured = simulated_at(
+            true,
+            self.wavelength,
+            self.sensor,
+            self.photons,
+            self.read_noise,
+            generator,
+        )
+        imager = spot_imager(measured, self.wavelength, self.imager)
+        bounds = knowledge(true, imager, measured).bounds
+        across, up = self.along.values()
+        for weight in self.centroid_weights:
+            # The grid's rows from below, as `table` takes them.
+            for second, first in itertools.product(up, across):
+                self.rows.append(self._row(measured, bounds, weight, (first, second)))
+            mine = [row for row in self.rows if row["centroid_weight"] == weight]
+            logger.info(
+                "basin, centroid weight %g: %d of %d starts converge, %.2g s each",
+                weight,
+                sum(row["converged"] for row in mine),
+                len(mine),
+                sum(row["seconds"] for row in mine) / len(mine),
+            )
+
+    def _row(
+        self, measured: Measurement, bounds: Tensor, weight: float, errors: tuple[float, float]
+    ) -> Row:
+        """Of a fit whose start is off by two errors, degrees or mm."""
+        started, true = time.perf_counter(), self.true
+        truth = true.scale * true.scaled.detach()
+        start = truth.clone()
+        for name, error in zip(self.along, errors, strict=True):
+            place = true.names.index(name)
+            start[place] += error * true.units[place]
+        pose = true.varying(true.settings)
+        with torch.no_grad():
+            pose.scaled.copy_(start / pose.scale)
+        count = self._fit(pose, measured, weight)
+        left = _rms((pose.scale * pose.scaled.detach() - truth) / bounds)
+        return {
+            "centroid_weight": weight,
+            **dict(zip(self.along, errors, strict=True)),
+            "initial_error_over_bound": _rms((start - truth) / bounds),
+            "error_over_bound": left,
+            "converged": float(left < _CONVERGED),
+            "iterations": float(count),
+            "seconds": time.perf_counter() - started,
+        }
+
+    def _fit(self, pose: Pose, measured: Measurement, weight: float) -> int:
+        """Iterations that were made."""
+        count = 0
+        try:
+            for stage in self.stages:
+                loss = loss_of(stage, measured, self.wavelength, self.imager, weight)
+                optimizer = optimizer_of(stage, pose)
+                for _ in range(stage.iterations):
+                    iterate(pose, stage, loss, optimizer)
+                    count += 1
+        except InputError as error:
+            logger.info("a start ends after %d iterations: %s", count, error)
+        return count
+
+    def summary(self) -> dict[str, float]:
+        """The share of starts that converge, by centroid weight."""
+        numbers = {}
+        for weight in self.centroid_weights:
+            mine = [row["converged"] for row in self.rows if row["centroid_weight"] == weight]
+            numbers[f"basin/converged/centroid_weight_{weight:g}"] = sum(mine) / max(len(mine), 1)
+        return numbers
+
+    def table(self, weight: float) -> Tensor:
+        """Errors over bounds (second, first) of the grid with this centroid weight; NaN: lost."""
+        across, up = self.along.values()
+        mine = [row["error_over_bound"] for row in self.rows if row["centroid_weight"] == weight]
+        return torch.tensor(mine, dtype=torch.float64).reshape(len(up), len(across))
+
+
+def _rms(ratio: Tensor) -> float:
+    found = float(ratio.square().mean().sqrt())
+    return found if math.isfinite(found) else math.nan

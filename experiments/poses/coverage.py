@@ -1,0 +1,192 @@
+"""What becomes of poses and their bounds when a measurement has what the fit's model has not."""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
+from dolens.errors import InputError
+from experiments.poses.estimates import Estimates, probability
+from experiments.poses.misalignment import MisalignmentModule
+from experiments.poses.results import error_statistics
+from experiments.tables import Row, write_table
+
+logger = logging.getLogger(__name__)
+
+_DIGITS = 6
+
+
+class PoseCoverageModule(MisalignmentModule):
+    """Compares errors of poses with their bounds over many measurements, case by case.
+
+    Nothing is fitted from afar.  Every measurement's estimate is found by Gauss-Newton steps from
+    the truth, which is where a fit weighted by noise ends (see `experiments.poses.estimates`), and
+    fits hold what the measurement's own earlier fit found.  The first measurement, of number 0, is
+    the one that `misalignment` fits with the same seed.
+
+    Args:
+        cases: name → settings of `Unmodelled`, and `fits`, names of those that the case is worked
+            out for (default: all).
+        draws: measurements of each fit and case.
+        module: settings of `MisalignmentModule`.
+
+    Raises:
+        InputError: a setting that is unknown or out of range, or a fit without a truth.
+    """
+
+    def __init__(
+        self, cases: Mapping[str, Mapping[str, Any] | None], draws: int, **module: Any
+    ) -> None:
+        super().__init__(**module)
+        if draws < 2:
+            raise InputError(f"draws: {draws}; allowed: 2 or more")
+        if not cases or self.measured is not None:
+            raise InputError("cases: give at least one, and no photograph in `measurement`")
+        if self.unmodelled != Unmodelled():
+            raise InputError("unmodelled: effects are those of `cases` here; leave it at its zeros")
+        self.draws, names = int(draws), [fit.name for fit in self.fits]
+        self.cases: dict[str, tuple[Unmodelled, tuple[str, ...]]] = {}
+        for name, entry in cases.items():
+            settings = dict(entry or {})
+            fits = tuple(str(fit) for fit in settings.pop("fits", names))
+            self.cases[name] = (unmodelled_of(settings, f"cases.{name}"), fits)
+            for fit in fits:
+                if fit not in names:
+                    raise InputError(
+                        f"cases.{name}.fits: '{fit}' is unknown; allowed: {', '.join(names)}"
+                    )
+                needed = self.fits[names.index(fit)].held_from
+                if needed is not None and needed not in fits:
+                    raise InputError(f"cases.{name}.fits: '{fit}' holds what '{needed}' finds")
+        for number, pose in enumerate(self.poses):
+            truth = self.truth(number)
+            missing = [name for name in pose.names if name not in truth]
+            if missing:
+                raise InputError(f"fits.{names[number]}.truth: '{missing[0]}' is missing")
+            with torch.no_grad():
+                true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
+                pose.scaled.copy_(true / pose.scale_in_units)
+        self.found: dict[tuple[str, str], Estimates] = {}
+        self.rows: list[Row] = []
+        self.draw_rows: list[Row] = []
+
+    def configure_optimizers(self) -> None:  # type: ignore[override]
+        """Nothing is trained."""
+
+    @torch.no_grad()
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        """Estimate, case by case; tables are written after each."""
+        with torch.inference_mode(False), torch.no_grad():
+            for number, fit in enumerate(self.fits):
+                self._hold(number)
+                self.known[fit.name] = self._knowledge(number)
+            for case in self.cases:
+                self._work_out(case)
+                write_table(self.folder / "coverage.csv", self.rows, _DIGITS)
+                write_table(self.folder / "draws.csv", self.draw_rows, _DIGITS)
+        self.log_dict(self.summary(), batch_size=1)
+
+    def over_bound(self, case: str, fit: str) -> Tensor:
+        """(M, P): errors over their bounds, of the measurements whose estimates have settled."""
+        found = self.found[case, fit]
+        return self._every(case, fit)[found.settled]
+
+    def _every(self, case: str, fit: str) -> Tensor:
+        """(draws, P): errors over their bounds."""
+        number = self._number(fit)
+        pose, truth = self.poses[number], self.truth(number)
+        true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
+        return (self.found[case, fit].values - true) * pose.units / self.known[fit].bounds
+
+    def summary(self) -> dict[str, float]:
+        """Numbers for metrics.json."""
+        numbers: dict[str, float] = {}
+        for row in self.rows:
+            name = f"{row['case']}/{row['fit']}/{row['variable']}"
+            numbers[f"pose_rms_error/{name}"] = float(row["rms_error"])
+            numbers[f"pose_rms_over_bound/{name}"] = float(row["rms_over_bound"])
+        for case, (_, fits) in self.cases.items():
+            if (case, fits[0]) not in self.found:
+                continue
+            together = torch.cat([self.over_bound(case, fit).flatten() for fit in fits])
+            for key, value in error_statistics(together).items():
+                numbers[f"coverage/{case}/{key}"] = value
+            freedom = sum(len(self.poses[self._number(fit)].names) for fit in fits)
+            total = torch.stack([self.found[case, fit].chi_squared for fit in fits]).sum(0)
+            settled = torch.stack([self.found[case, fit].settled for fit in fits])
+            numbers[f"coverage/{case}/chi_squared"] = float(total[settled.all(0)].mean()) / freedom
+            first = probability(total[:1], freedom)
+            numbers[f"coverage/{case}/first_draw_probability"] = float(first)
+            numbers[f"coverage/{case}/unsettled"] = float((~settled).sum())
+        return numbers
+
+    def _work_out(self, case: str) -> None:
+        effects, fits = self.cases[case]
+        earlier: dict[str, Estimates] = {}
+        for number, fit in enumerate(self.fits):
+            if fit.name not in fits:
+                continue
+            self._hold(number)
+            found = self._estimates(number, range(self.draws), effects, earlier)
+            earlier[fit.name] = self.found[case, fit.name] = found
+            self.rows += self._variable_rows(case, fit.name)
+            freedom = len(self.poses[number].names)
+            chances = probability(found.chi_squared, freedom)
+            self.draw_rows += [
+                {
+                    "case": case,
+                    "fit": fit.name,
+                    "draw": draw,
+                    "chi_squared": float(chi),
+                    "degrees_of_freedom": freedom,
+                    "probability": float(chance),
+                    "settled": str(bool(settled)),
+                    **{
+                        f"{name} over bound": float(off)
+                        for name, off in zip(
+                            self.poses[number].names,
+                            self._every(case, fit.name)[draw],
+                            strict=True,
+                        )
+                    },
+                }
+                for draw, (chi, chance, settled) in enumerate(
+                    zip(found.chi_squared, chances, found.settled, strict=True)
+                )
+            ]
+            off = error_statistics(self.over_bound(case, fit.name))
+            logger.info(
+                "%s, fit %s: errors of %.3g bounds (RMS); within one bound %.0f %%, within two "
+                "%.0f %%; chi-squared of a degree of freedom %.3g",
+                case,
+                fit.name,
+                off["rms_over_bound"],
+                100.0 * off["within_1"],
+                100.0 * off["within_2"],
+                float(found.chi_squared[found.settled].mean()) / freedom,
+            )
+
+    def _variable_rows(self, case: str, fit: str) -> list[Row]:
+        """Of coverage.csv: a row for each variable."""
+        pose = self.poses[self._number(fit)]
+        bounds = (self.known[fit].bounds / pose.units).tolist()
+        rows: list[Row] = []
+        for name, bound, off in zip(
+            pose.names, bounds, self.over_bound(case, fit).unbind(-1), strict=True
+        ):
+            rows.append(
+                {
+                    "case": case,
+                    "fit": fit,
+                    "variable": name,
+                    "measurements": len(off),
+                    "bound": bound,
+                    "mean_error": bound * float(off.mean()),
+                    "rms_error": bound * float(off.square().mean().sqrt()),
+                    **error_statistics(off),
+                }
+            )
+        return rows

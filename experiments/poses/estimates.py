@@ -1,0 +1,153 @@
+"""Poses that other measurements lead to, without fitting each from its beginning."""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.alignment.information import Knowledge
+from dolens.alignment.measurement import Measurement
+from dolens.alignment.noise_weighted import NoiseWeightedLoss
+from dolens.alignment.pose import Pose
+from dolens.alignment.spot_loss import SpotMerit
+from dolens.errors import InputError
+from dolens.optimize.damped_least_squares import DampedLeastSquares
+from dolens.rendering.spot_image import SpotImager
+
+# One linear step is exact enough within so many bounds; longer ones are followed by others.
+_NEAR = 5.0
+# Iterations then, at most, their first damping, and which of them is the last: one by a part of a
+# bound, or by a part of the way from the pose.
+_ITERATIONS, _DAMPING, _SMALL, _PART = 12, 1e-6, 0.1, 0.02
+
+
+@dataclass(frozen=True)
+class Held:
+    """Numbers that a fit holds as an earlier one found them, in θ's units (radians, mm).
+
+    Attributes:
+        names: H of them.
+        units: (H,), θ's units in those of settings.
+        at: (H,), in the pose that knowledge is of.
+        found: (M, H), as the earlier fit found them in each of M measurements.
+        true: (H,); NaN where no truth is known.
+    """
+
+    names: tuple[str, ...]
+    units: Tensor
+    at: Tensor
+    found: Tensor
+    true: Tensor
+
+    def values(self, measurement: int) -> dict[str, float]:
+        """Of one measurement, degrees and mm."""
+        found = (self.found[measurement] / self.units).tolist()
+        return dict(zip(self.names, found, strict=True))
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Poses that M measurements lead to.
+
+    Attributes:
+        values: (M, P), degrees and mm.
+        chi_squared: (M,), eᵀ·C⁻¹·e of the errors that these images make by themselves, C their own
+            covariance: of the χ² distribution with P degrees of freedom where the model holds, and
+            independent of what is held; NaN where no truth is known.
+        settled: (M,), bool: the first step went a few bounds at most, or the last was a small part
+            of one, or of the whole way.  The others are no estimates: iterations ended before.
+    """
+
+    values: Tensor
+    chi_squared: Tensor
+    settled: Tensor
+
+
+@torch.no_grad()
+def estimates(
+    pose: Pose,
+    known: Knowledge,
+    imager: SpotImager,
+    measured: Callable[[int], Measurement],
+    draws: Sequence[int],
+    truth: Mapping[str, float],
+    held: Held | None = None,
+    slopes: SpotImager | None = None,
+) -> Estimates:
+    """Find the pose of each of M measurements, from one pose that is near all of them.
+
+    Args:
+        pose: of which there is knowledge.
+        known: of the pose.
+        imager: makes its images.
+        measured: a measurement by its number.
+        draws: M numbers.
+        truth: by name, degrees and mm.
+        held: what the fit takes from an earlier one; None: nothing.
+        slopes: makes the images' derivatives where one step does not do; None: `imager`.
+    """
+    true = torch.tensor([truth.get(name, torch.nan) for name in pose.names], dtype=torch.float64)
+    values, chi, settled = [], [], []
+    for place, draw in enumerate(draws):
+        theta, done = _estimate(pose, known, imager, slopes, measured(draw), held, place)
+        error = theta - true * pose.units
+        if held is not None:
+            error = error - known.inheritance @ (held.found[place] - held.true)
+        chi.append(error @ torch.linalg.solve(known.own_covariance, error))
+        values.append(theta / pose.units)
+        settled.append(done)
+    return Estimates(torch.stack(values), torch.stack(chi), torch.tensor(settled))
+
+
+def _estimate(
+    pose: Pose,
+    known: Knowledge,
+    imager: SpotImager,
+    slopes: SpotImager | None,
+    measurement: Measurement,
+    held: Held | None,
+    place: int,
+) -> tuple[Tensor, bool]:
+    """θ (P,), and whether it has settled.
+
+    One step of weighted least squares with the derivatives of the pose is all that an error of some
+    bounds needs.  Where it is longer, the measurement is fitted: by damped least squares, with
+    weights and derivatives of every iteration's own, until a step is small.
+    """
+    at = pose.scale * pose.scaled.detach()
+    moved = torch.zeros_like(at)
+    if held is not None:
+        moved = known.inheritance @ (held.found[place] - held.at)
+    step = known.correction(measurement)
+    if float(((moved + step).abs() / known.bounds).max()) <= _NEAR:
+        return at + moved + step, True
+    there = copy.deepcopy(pose)
+    if held is not None:
+        there.put(held.values(place))
+    there.scaled.copy_((at + moved) / pose.scale)
+    loss = NoiseWeightedLoss(measurement, imager, slopes, known.blur)
+    optimizer = DampedLeastSquares([there.scaled], initial_damping=_DAMPING)
+    every = torch.ones(len(pose.names), dtype=torch.bool)
+    theta = at + moved
+    for _ in range(_ITERATIONS):
+        before = theta
+        try:
+            optimizer.step(SpotMerit(loss.weighted_at(there), there, every))
+        except InputError:
+            # No light reaches the sensor from there.
+            return before, False
+        theta = pose.scale * there.scaled.detach()
+        last, way = ((d / known.bounds).abs().max() for d in (theta - before, theta - at))
+        if float(last) < max(_SMALL, _PART * float(way)):
+            return theta, True
+        # Weights are new in the next one.
+        optimizer.restart()
+    return theta, False
+
+
+def probability(chi_squared: Tensor, freedom: int) -> Tensor:
+    """The chance that a χ² variable of so many degrees of freedom is larger still."""
+    half = torch.full_like(chi_squared, 0.5 * freedom)
+    return torch.special.gammaincc(half, 0.5 * chi_squared)

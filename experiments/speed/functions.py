@@ -1,0 +1,48 @@
+"""Point spread functions: error against very many rays, and time."""
+
+from collections.abc import Sequence
+
+import torch
+
+from dolens.optics.backend import choose_backend
+from dolens.rendering.auto.probe import grey_levels
+from dolens.rendering.auto.survey import spread_pixels, survey
+from experiments.speed.renders import Subject
+from experiments.speed.timing import by_turns
+
+_POINTS, _TRUE_SAMPLES, _SIZE = 9, 160, 65
+
+
+@torch.no_grad()
+def function_rows(
+    subject: Subject, samples: Sequence[int], seconds: float
+) -> list[dict[str, float | str]]:
+    """A row for each number of rays: error in grey levels on the probe, and time a function.
+
+    Args:
+        subject: the scene.
+        samples: strata along each side of the pupil.
+        seconds: that timing may take.
+    """
+    system = subject.lens.system()
+    backend = choose_backend(system, subject.lens.backend)
+    places = spread_pixels(subject.sensor, _POINTS)
+
+    def functions(count: int, seed: int) -> torch.Tensor:
+        found = survey(system, subject.scene, subject.sensor, *places, count, backend, seed)
+        return found.functions(_SIZE, found.chief is not None)
+
+    truth = functions(_TRUE_SAMPLES, 0)
+    times = by_turns({str(n): lambda n=n: functions(n, 1) for n in samples}, seconds)
+    each = _POINTS * truth.shape[1] * truth.shape[2]
+    return [
+        {
+            "scene": subject.name,
+            "part": "psf",
+            "model": "psf",
+            "setting": f"{n * n} rays",
+            "error_grey_levels": float(grey_levels(functions(n, 1) - truth).square().mean().sqrt()),
+            "forward_s": times[str(n)] / each,
+        }
+        for n in samples
+    ]

@@ -1,0 +1,242 @@
+"""Whole renders: error against rays without end, time and memory, forward and back."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dolens.optics.lens import Lens
+from dolens.rendering.auto.agreement import (
+    Agreement,
+    Render,
+    agreement,
+    gradient,
+    gradients_of_rays,
+    image_measure,
+    judging_samples,
+)
+from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.auto.probe import probe_image
+from dolens.rendering.auto.reference import Reference, reference
+from dolens.rendering.auto.trial import without_diffraction
+from dolens.rendering.protocol import Renderer
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene, pinhole_image
+from dolens.sensor.pixels import Sensor
+from experiments.speed.timing import by_turns, peak_megabytes
+
+# Renders by more rays than these are timed on a window, and that multiplied.
+_MANY, _WINDOW, _MARGIN = 128, 64, 48
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A lens and what it looks at.
+
+    Attributes:
+        name: of the scene.
+        lens: its precision is the contenders', where they do not choose themselves.
+        scene: depths and wavelengths.
+        sensor: the pixels.
+        variables: names of the parameters that gradients are taken of.
+    """
+
+    name: str
+    lens: Lens
+    scene: PlanarScene
+    sensor: Sensor
+    variables: tuple[str, ...]
+
+    def texture(self) -> Tensor:
+        """A probe image that covers the sensor."""
+        sensor = self.sensor
+        return probe_image(sensor.height + 2 * _MARGIN, sensor.width + 2 * _MARGIN, seed=3)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A way of rendering.
+
+    Attributes:
+        model: `rays`, `psf` or `auto`, and what tells its kind.
+        setting: what tells it from others of its model.
+        renderer: for the whole sensor.
+        dtype: of the lens.
+    """
+
+    model: str
+    setting: str
+    renderer: Renderer
+    dtype: torch.dtype = torch.float32
+
+
+def render_contenders(
+    subject: Subject,
+    samples: Sequence[int],
+    fields: Sequence[int],
+    tolerances: Sequence[float],
+) -> list[Contender]:
+    """Rays of many numbers, functions on many grids, and the choices for tolerances.
+
+    Args:
+        subject: the scene.
+        samples: strata along each side of the pupil.
+        fields: functions along each side of the sensor.
+        tolerances: grey levels.
+    """
+    sensor, plans = subject.sensor, []
+    stored = subject.lens.variables(list(subject.variables))
+    values = {n: p.detach().clone().requires_grad_() for n, p in stored.items()}
+    for model, diffraction in (("auto", False), ("auto with diffraction", True)):
+        for tolerance in tolerances:
+            auto = AutoRenderer(sensor, tolerance, diffraction=diffraction)
+            auto.make_plan(subject.lens, subject.scene, values)
+            plans.append(Contender(model, f"{model}, {tolerance:g} grey levels", auto))
+    found = [Contender("rays", f"{n * n} rays", RayRenderer(sensor, n)) for n in samples]
+    size = max(
+        (p.renderer.choice.renderer.size for p in plans
+         if isinstance(p.renderer.choice.renderer, PsfRenderer)),
+        default=65,
+    )  # fmt: skip
+    for registration in ("pinhole", "chief_rays"):
+        for count in fields:
+            renderer = PsfRenderer(sensor, (count, count), 32, size, registration)
+            label = f"{count}×{count}, {registration.replace('_', ' ')}"
+            found.append(Contender(f"psf, {registration.replace('_', ' ')}", label, renderer))
+    return found + plans
+
+
+def render_rows(
+    subject: Subject, contenders: Sequence[Contender], reference_samples: int, seconds: float
+) -> tuple[list[dict[str, float | str]], Reference]:
+    """A row for each contender, and what errors were measured against.
+
+    Args:
+        subject: the scene.
+        contenders: ways of rendering it.
+        reference_samples: of the converged image, strata along each side of the pupil.
+        seconds: that times of one group of contenders may take.
+    """
+    texture = subject.texture()
+    judge = reference(
+        subject.lens, subject.scene, subject.sensor, texture, reference_samples, seed=1
+    )
+    fast = [c for c in contenders if not _is_slow(c)]
+    slow = [c for c in contenders if _is_slow(c)]
+    times = {}
+    for backward in (False, True):
+        calls = {c.setting: _call(subject, c, texture, backward) for c in fast}
+        times[backward] = by_turns(calls, seconds)
+        for contender in slow:
+            window, factor = _window(subject)
+            part = replace(contender, renderer=replace(contender.renderer, sensor=window))
+            call = _call(subject, part, texture, backward)
+            times[backward][contender.setting] = factor * by_turns({"": call}, 0.0, 1)[""]
+    rows = []
+    for contender in contenders:
+        error = judge.error(_image(subject, contender, texture, judge))
+        rows.append(
+            {
+                "scene": subject.name,
+                "part": "render",
+                "model": contender.model,
+                "setting": contender.setting,
+                "error_grey_levels": error,
+                "error_uncertainty": judge.uncertainty,
+                "forward_s": times[False][contender.setting],
+                "with_gradient_s": times[True][contender.setting],
+                "peak_mb": (
+                    float("nan")
+                    if _is_slow(contender)
+                    else peak_megabytes(_call(subject, contender, texture, True))
+                ),
+            }
+        )
+    return rows, judge
+
+
+def _is_slow(contender: Contender) -> bool:
+    renderer = contender.renderer
+    return isinstance(renderer, RayRenderer) and renderer.pupil_samples**2 > _MANY
+
+
+def _window(subject: Subject) -> tuple[Sensor, float]:
+    """A window in the middle, and how many times larger the sensor is."""
+    sensor = subject.sensor
+    height, width = min(_WINDOW, sensor.height), min(_WINDOW, sensor.width)
+    top, left = (sensor.height - height) // 2, (sensor.width - width) // 2
+    factor = sensor.height * sensor.width / (height * width)
+    return sensor.window(top, left, height, width), factor
+
+
+def _call(
+    subject: Subject, contender: Contender, texture: Tensor, backward: bool
+) -> Callable[[], Tensor]:
+    """A render, and its gradient with respect to the subject's variables."""
+    stored = {n: p.detach() for n, p in subject.lens.variables(list(subject.variables)).items()}
+
+    def call() -> Tensor:
+        values = {n: p.clone().requires_grad_(backward) for n, p in stored.items()}
+        image = contender.renderer.render(subject.lens, subject.scene, texture, 1, values)
+        if backward:
+            image.square().mean().backward()
+        return image
+
+    return call
+
+
+def _image(subject: Subject, contender: Contender, texture: Tensor, judge: Reference) -> Tensor:
+    """The contender's image; of rays, which are many, only the windows that are looked at."""
+    lens, scene = subject.lens, subject.scene
+    renderer = _without_diffraction(contender.renderer)
+    with torch.no_grad():
+        if not isinstance(renderer, RayRenderer):
+            return renderer.render(lens, scene, texture, 5)
+        sensor = subject.sensor
+        shape = (1, len(scene.depths), texture.shape[1], sensor.height, sensor.width)
+        image = texture.new_zeros(shape)
+        for top, left, height, width in judge.windows:
+            window = sensor.window(top, left, height, width)
+            part = replace(renderer, sensor=window).render(lens, scene, texture, 5)
+            image[..., top : top + height, left : left + width] = part
+        return image
+
+
+def _without_diffraction(renderer: Renderer) -> Renderer:
+    """What a renderer makes of rays alone, as the reference is of rays."""
+    if isinstance(renderer, AutoRenderer):
+        renderer = renderer.choice.renderer
+    return without_diffraction(renderer)
+
+
+def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> dict[str, Agreement]:
+    """How well contenders' gradients agree with those of rays, by setting: of the squared error to
+    what a pinhole sees, with respect to the subject's variables in units of their magnitudes.
+
+    All without diffraction; of contenders by many rays, which are slow, none is asked.
+    """
+    lens, scene, sensor = subject.lens, subject.scene, subject.sensor
+    texture = subject.texture()
+    truth = pinhole_image(texture, sensor)[:, None]
+    stored = lens.variables(list(subject.variables))
+    values = {n: p.detach().clone().requires_grad_() for n, p in stored.items()}
+    measure = image_measure(values, truth)
+    side = judging_samples(sensor.height, sensor.width, len(scene.wavelengths))
+
+    def rendered(renderer: Renderer) -> Render:
+        def render(values: Mapping[str, Tensor], seed: int) -> Tensor:
+            return renderer.render(lens, scene, texture, seed, values)
+
+        return render
+
+    judge = gradients_of_rays(rendered(RayRenderer(sensor, side)), texture, measure, 101)
+    found = {}
+    for contender in contenders:
+        if _is_slow(contender):
+            continue
+        render = rendered(_without_diffraction(contender.renderer))
+        own = gradient(render, texture, measure, (1,))
+        found[contender.setting] = agreement(own, judge)
+    return found

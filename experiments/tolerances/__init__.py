@@ -1,0 +1,1 @@
+"""Sensitivities, tolerances and yield of a lens."""

@@ -1,1 +1,0 @@
-"""How a camera looks at textures while it is trained and judged: at depths, or over its field."""

@@ -1,0 +1,276 @@
+"""The renderer that chooses: what it predicts, what it picks, and how wrong that is."""
+
+import logging
+import math
+
+import pytest
+import torch
+from scipy.integrate import dblquad
+
+from dolens import load_lens
+from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diffraction_limit
+from dolens.errors import InputError
+from dolens.prescriptions import lens_from_prescription
+from dolens.rendering.auto.auto_renderer import AutoRenderer
+from dolens.rendering.auto.cost import psf_cost
+from dolens.rendering.auto.probe import (
+    GREY_LEVEL,
+    grey_levels,
+    probe_image,
+    probe_power,
+    probe_texture,
+)
+from dolens.rendering.auto.reference import reference
+from dolens.rendering.auto.trial import with_values
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
+
+LINES = (656.2725, 587.5618, 486.1327)
+
+
+@pytest.fixture
+def backend():
+    return "auto"
+
+
+def coded(root, dtype=torch.float32):
+    lens = load_lens(root / "conf/lens/wavefront_coding.yaml", dtype=dtype)
+    with torch.no_grad():
+        lens.surfaces["5"].x3.fill_(1.5e-5)
+        lens.surfaces["5"].y3.fill_(1.5e-5)
+    return lens.requires_grad_(False)
+
+
+def measured(image, pair):
+    """RMS error in grey levels of an image against the mean of two renders, without their noise."""
+    noise = 0.25 * (pair[0] - pair[1]).square().mean()
+    squared = (image - 0.5 * (pair[0] + pair[1])).square().mean() - noise
+    return math.sqrt(max(float(squared), 0.0)) / GREY_LEVEL
+
+
+def test_the_probe_has_the_power_that_is_said():
+    image, side = probe_image(256, 256), 256
+    assert float(image.min()) >= 0.0
+    assert float(image.max()) <= 1.0
+    power = probe_power(side)
+    assert float(power[1:].sum() + power[0, 1:].sum()) == pytest.approx(0.2**2, rel=1e-12)
+    # Clipping takes a few per cent of the contrast.
+    assert float(image.std(dim=(-2, -1)).mean()) == pytest.approx(0.2, rel=0.05)
+
+
+@pytest.mark.parametrize("shift", [(0, 1), (2, 1)])
+def test_predicted_errors_are_those_on_the_probe(shift):
+    # The error of moving an image by whole pixels, and of darkening it by one per cent.
+    kernel = torch.zeros(7, 7, dtype=torch.float64)
+    kernel[3, 3], kernel[3 + shift[0], 3 + shift[1]] = -1.0, 0.99
+    image = probe_image(256, 256)
+    moved = 0.99 * image.roll(shift, (-2, -1)) - image
+    inner = moved[..., 8:-8, 8:-8]
+    found = float(inner.square().mean().sqrt()) / GREY_LEVEL
+    assert float(grey_levels(kernel)) == pytest.approx(found, rel=0.1)
+
+
+def test_the_transfer_function_is_the_pupil_s_overlap_with_itself():
+    # The area that two discs shifted by s diameters share, over a disc's, by quadrature.
+    pitch, wavelength, f_number, side = 0.002, 500.0, 8.0, 16
+    transfer = diffraction_transfer(side, side, pitch, wavelength, f_number)
+    cutoff = 1.0 / (wavelength * 1e-6 * f_number)
+    for row, column in ((1, 0), (3, 4), (0, 8)):
+        s = math.hypot(row, column) / side / pitch / cutoff
+        expected = 0.0
+        if s < 1.0:
+            half = math.sqrt(1.0 - s * s)
+            area, _ = dblquad(
+                lambda x, y: 1.0,
+                -half,
+                half,
+                lambda y, s=s: s - math.sqrt(1.0 - y * y),
+                lambda y, s=s: math.sqrt(1.0 - y * y) - s,
+            )
+            expected = area / math.pi
+        assert float(transfer[row, column]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_point_becomes_an_airy_disc_of_unit_light():
+    point = torch.zeros(1, 201, 201, dtype=torch.float64)
+    point[0, 100, 100] = 1.0
+    disc = with_diffraction_limit(point, 0.0004, [550.0], 8.0)[0]
+    # 0.16 λN: finely sampled, so values are the irradiance at points: π/(4 λ² N²) at the centre.
+    peak = math.pi * 0.0004**2 / (4.0 * (550e-6 * 8.0) ** 2)
+    assert float(disc[100, 100]) == pytest.approx(peak, rel=0.03)
+    # The first dark ring, at 1.22 λN or 13.42 pixels, and the light within it (Airy: 83.8 %).
+    place = torch.arange(201.0) - 100.0
+    radius = torch.hypot(place[:, None], place[None])
+    assert float(disc[100, 113:115].max()) < 2e-3 * peak
+    within = float(disc[radius < 13.42].sum())
+    assert within == pytest.approx(0.838, abs=0.03)
+    assert float(disc.sum()) == pytest.approx(1.0, abs=1e-12)
+    # A window keeps all light.  Of it 2/(π²·r) would fall beyond the radius r in units of λN, and
+    # beyond a square of half side 9.1 λN the mean of that over all azimuths: (4/π)·sin(π/4) of it.
+    beyond = 2.0 / (math.pi**2 * 9.1) * (4.0 / math.pi) * math.sin(0.25 * math.pi)
+    assert within == pytest.approx(0.838 / (1.0 - beyond), abs=3e-3)
+
+
+@pytest.mark.parametrize("tolerance", [4.0, 1.0])
+def test_the_plan_keeps_its_tolerance_against_independent_renders(root, tolerance):
+    lens, sensor = coded(root), Sensor(64, 64, 0.0069)
+    scene = PlanarScene((8000.0, 4500.0), LINES)
+    auto = AutoRenderer(sensor, tolerance)
+    choice = auto.make_plan(lens, scene)
+    assert choice.error < tolerance
+    # Another image, other samples.
+    texture = probe_image(112, 112, seed=5)
+    pair = [RayRenderer(sensor, 16).render(lens, scene, texture, seed)[0] for seed in (11, 12)]
+    geometric = auto.choice.renderer
+    if isinstance(geometric, PsfRenderer):
+        geometric = PsfRenderer(
+            **{**geometric.__dict__, "diffraction": "none"}  # rays have none
+        )
+    image = geometric.render(lens, scene, texture.float(), 3)[0]
+    assert measured(image, pair) < 1.2 * tolerance
+
+
+def test_less_tolerance_costs_more(root):
+    lens, sensor = coded(root), Sensor(64, 64, 0.0069)
+    scene, costs = PlanarScene((8000.0, 4500.0), LINES), []
+    for tolerance in (4.0, 1.0, 0.25):
+        choice = AutoRenderer(sensor, tolerance).make_plan(lens, scene)
+        assert isinstance(choice.renderer, PsfRenderer)
+        costs.append(psf_cost(choice.renderer, scene, len(lens.surfaces)))
+    assert costs[0] < costs[1] < costs[2]
+
+
+def test_a_scene_gets_no_more_than_it_needs(root):
+    """A pinhole camera without dispersion: one function for all fields, depths and colours."""
+    lens = lens_from_prescription(
+        {
+            "name": "Pinhole",
+            "surfaces": {"1": {"type": "aperture", "semi_diameter": 0.02, "material": "occluder"}},
+            "stop": 1,
+            "sensor": {"distance": 20.0},
+        },
+        torch.float32,
+    )
+    choice = AutoRenderer(Sensor(64, 64, 0.1), 1.0, gradients=False).make_plan(
+        lens, PlanarScene((4000.0, 1000.0), LINES)
+    )
+    renderer = choice.renderer
+    assert isinstance(renderer, PsfRenderer)
+    assert renderer.fields == (1, 1)
+    assert (renderer.depths, renderer.colours) == ("one", "one")
+    assert renderer.registration == "pinhole"
+
+
+def test_colours_are_shared_for_images_but_not_for_gradients(root):
+    lens, sensor = coded(root), Sensor(48, 48, 0.0069)
+    scene = PlanarScene((8000.0,), LINES)
+    chosen = [
+        AutoRenderer(sensor, 4.0, gradients).make_plan(lens, scene).renderer.colours
+        for gradients in (True, False)
+    ]
+    assert chosen == ["each", "one"]
+
+
+def test_diffraction_is_modelled_where_it_shows(root):
+    # The same lens, in focus, before a sensor of fine and one of coarse pixels.
+    lens = load_lens(root / "conf/lens/wavefront_coding.yaml", dtype=torch.float32)
+    with torch.no_grad():
+        lens.sensor_distance.fill_(float(lens.first_order().bfd))
+    scene = PlanarScene((1e7,), LINES[1:2])
+    for pitch, models in ((0.002, ("limit", "wave")), (0.2, ("none",))):
+        choice = AutoRenderer(Sensor(32, 32, pitch), 1.0).make_plan(lens, scene)
+        assert choice.renderer.diffraction in models
+    unasked = AutoRenderer(Sensor(32, 32, 0.002), 1.0, diffraction=False).make_plan(lens, scene)
+    assert unasked.renderer.diffraction == "none"
+    assert any("would change" in line for line in unasked.lines())
+
+
+def test_the_plan_is_kept_logged_and_counted(root, caplog):
+    lens, sensor = coded(root), Sensor(32, 32, 0.0069)
+    scene = PlanarScene((8000.0,), LINES)
+    auto = AutoRenderer(sensor, 2.0)
+    assert auto.rays_per_image(scene) == 0
+    texture = probe_image(64, 64).float()
+    with caplog.at_level(logging.INFO, logger="dolens"):
+        first = auto.render(lens, scene, texture, 1)
+    choice = auto.choice
+    assert "fields" in caplog.text
+    assert "pupil samples" in caplog.text
+    assert "auto/error_grey_levels" in choice.numbers()
+    assert auto.rays_per_image(scene) > 0
+    again = auto.render(lens, scene, texture, 1)
+    assert auto.choice is choice
+    assert torch.equal(first, again)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_image_and_its_gradient_come_in_the_lens_s_precision(root, dtype):
+    lens, scene = coded(root, dtype), PlanarScene((8000.0,), LINES)
+    auto = AutoRenderer(Sensor(24, 24, 0.0069), 2.0)
+    x3 = torch.tensor(1.5e-5, dtype=dtype, requires_grad=True)
+    texture = probe_image(56, 56).to(dtype)
+    image = auto.render(lens, scene, texture, 1, {"surfaces.5.x3": x3})
+    (slope,) = torch.autograd.grad(image.square().sum(), x3)
+    assert image.dtype == slope.dtype == dtype
+    assert float(slope) != 0.0
+
+
+def test_the_reference_says_how_well_it_knows(root):
+    lens, sensor = coded(root), Sensor(48, 48, 0.0069)
+    scene, texture = PlanarScene((8000.0,), LINES), probe_image(96, 96)
+    coarse, fine = (reference(lens, scene, sensor, texture, n, seed=n) for n in (4, 16))
+    assert fine.noise < 0.4 * coarse.noise
+    # An image that is as noisy as one of the renders errs by that noise.
+    image = RayRenderer(sensor, 4).render(lens, scene, texture, 99)
+    assert fine.error(image) == pytest.approx(math.sqrt(2.0) * coarse.noise, rel=0.1)
+
+
+def test_a_photograph_of_the_user_s_is_a_probe_as_well(root):
+    """Black and white stripes have more contrast than the built-in probes: the plan errs more, by
+    what an independent render says.
+    """
+    lens, sensor = coded(root), Sensor(32, 32, 0.0069)
+    scene = PlanarScene((6000.0,), LINES)
+    stripes = (torch.arange(96) // 8 % 2).double().expand(1, 3, 96, 96)
+    errors = []
+    for photographs in (None, stripes):
+        auto = AutoRenderer(sensor, 4.0, gradients=False, diffraction=False)
+        auto.prepare(lens, scene, photographs=photographs)
+        errors.append(auto.choice.error)
+    assert errors[1] > 1.05 * errors[0]
+    # Functions of the seed that they were tried with: few samples make others err otherwise.
+    image = auto.choice.renderer.render(lens, scene, stripes, 1)
+    pair = [RayRenderer(sensor, 40).render(lens, scene, stripes, 31 + i) for i in range(2)]
+    assert errors[1] == pytest.approx(measured(image, pair), rel=0.15)
+
+
+def test_a_plan_is_made_for_the_stop_as_it_is_varied(root):
+    """A semi-diameter is among the values of a lens, though no parameter of it."""
+    lens, scene = coded(root), PlanarScene((6000.0,), LINES)
+    radius = torch.tensor(0.5 * lens.surfaces["1"].semi_diameter, dtype=lens.dtype)
+    values = {"surfaces.1.semi_diameter": radius, "surfaces.5.x3": torch.zeros_like(radius)}
+    smaller = with_values(lens, values)
+    assert smaller.surfaces["1"].semi_diameter == float(radius)
+    assert lens.surfaces["1"].semi_diameter == pytest.approx(2.0 * float(radius))
+    auto = AutoRenderer(Sensor(16, 16, 0.0069), 4.0, gradients=False, diffraction=False)
+    auto.prepare(lens, scene, values)
+    assert auto.choice.error < 4.0
+
+
+def test_photographs_of_any_size_fit_the_probe():
+    sensor = Sensor(10, 20, 0.01)
+    for height, width in ((5, 200), (200, 5)):
+        image = torch.linspace(0.0, 1.0, height * width).reshape(1, 1, height, width)
+        found = probe_texture(sensor, 3, 0, image.expand(1, 3, -1, -1))
+        assert found.shape == (3, 3, 74, 84)
+        assert torch.equal(found[:2], probe_texture(sensor, 3, 0))
+        # Its middle lies in the middle.
+        middle = image[0, 0, height // 2, width // 2].double()
+        assert float(found[2, 0, 37, 42]) == pytest.approx(float(middle))
+
+
+def test_a_tolerance_must_be_positive():
+    with pytest.raises(InputError, match="tolerance"):
+        AutoRenderer(Sensor(4, 4, 0.01), 0.0)

@@ -1,0 +1,94 @@
+"""Where pixels look, as polynomials, against a ray for each of them."""
+
+import pytest
+import torch
+import yaml
+
+from dolens.prescriptions import lens_from_prescription
+from dolens.rendering import chief_ray_map as module
+from dolens.rendering.chief_ray_map import chief_ray_maps, distortion
+from dolens.rendering.plane_points import chief_ray_points
+from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.pupil.exit_pupil import axial_exit_pupil
+from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
+
+LINES = (656.2725, 587.5618, 486.1327)
+SENSORS = {
+    "large_fov_doublet": Sensor(300, 280, 0.12),
+    "cooke_triplet": Sensor(200, 300, 0.09),
+    "wavefront_coding": Sensor(96, 96, 0.02),
+}
+
+
+def lens_of(root, name):
+    prescription = yaml.safe_load((root / f"conf/lens/{name}.yaml").read_text())
+    return lens_from_prescription(prescription).double().requires_grad_(False)
+
+
+def by_rays(system, scene, sensor, pupil):
+    """Of each pixel its own chief ray."""
+    row, column = torch.meshgrid(
+        torch.arange(sensor.height).double(), torch.arange(sensor.width).double(), indexing="ij"
+    )
+    points = sensor.positions(row.reshape(-1), column.reshape(-1))
+    seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch, "reference")
+    return [c.permute(1, 2, 0).unflatten(-1, row.shape) for c in seen]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_polynomials_are_the_chief_rays_to_a_thousandth_of_a_pixel(root, name):
+    system, sensor = lens_of(root, name).system(), SENSORS[name]
+    scene = PlanarScene((5000.0, 9000.0), LINES)
+    pupil = axial_exit_pupil(system, LINES)
+    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
+    for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
+        assert float((one - other).abs().max()) < 1e-3
+
+
+def test_windows_of_a_sensor_look_where_the_sensor_does(root):
+    system, sensor = lens_of(root, "large_fov_doublet").system(), SENSORS["large_fov_doublet"]
+    scene = PlanarScene((5000.0,), LINES)
+    pupil = axial_exit_pupil(system, LINES)
+    whole = distortion(system, scene, sensor, pupil, "reference")
+    window = sensor.window(11, 200, 40, 30)
+    for part, all_of_it in zip(whole.seen_by(window), whole.seen_by(sensor), strict=True):
+        assert torch.allclose(part, all_of_it[..., 11:51, 200:230], rtol=0, atol=1e-9)
+
+
+def test_where_polynomials_are_not_enough_every_pixel_has_its_ray(root, monkeypatch):
+    monkeypatch.setattr(module, "_SMALL", 0.0)
+    system, sensor = lens_of(root, "cooke_triplet").system(), Sensor(12, 10, 1.0)
+    scene = PlanarScene((5000.0,), LINES)
+    pupil = axial_exit_pupil(system, LINES)
+    assert distortion(system, scene, sensor, pupil, "reference") is None
+    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
+    for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("registration", ["chief_rays", "pinhole"])
+@pytest.mark.parametrize("illumination", ["map", "functions"])
+def test_windows_rendered_together_are_those_rendered_one_by_one(root, registration, illumination):
+    """But for the pupil's disc, which serves the whole sensor; here it is the axial one."""
+    lens, sensor = lens_of(root, "wavefront_coding"), Sensor(120, 120, 0.0069)
+    scene = PlanarScene((5000.0, 9000.0), LINES)
+    generator = torch.Generator().manual_seed(3)
+    textures = torch.rand(2, 3, 64, 64, generator=generator, dtype=torch.float64)
+    windows = [sensor.window(0, 5, 32, 32), sensor.window(80, 40, 32, 32)]
+    centres = [(window.centre_row, window.centre_column) for window in windows]
+    settings = {
+        "fields": (2, 2),
+        "size": 31,
+        "registration": registration,
+        "illumination": illumination,
+        "jitter": False,
+    }
+    together = PsfRenderer(sensor, **settings).render_windows(
+        lens, scene, textures, windows, centres, 1
+    )
+    for i, window in enumerate(windows):
+        placed = PlanarScene(scene.depths, scene.wavelengths, centres[i])
+        alone = PsfRenderer(window, **settings).render(lens, placed, textures[i : i + 1], 1)
+        assert together[i].shape == alone[0].shape
+        assert torch.allclose(together[i], alone[0], rtol=0, atol=2e-4)

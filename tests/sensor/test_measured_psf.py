@@ -1,0 +1,35 @@
+"""Point spread functions as counted electrons."""
+
+import math
+
+import pytest
+import torch
+
+from dolens.sensor.measured_psf import measured_functions
+
+
+def test_a_measured_function_has_poisson_s_spread_about_the_true_one():
+    ramp = torch.arange(1.0, 10.0, dtype=torch.float64).reshape(3, 3)
+    exact = (0.9 * ramp / ramp.sum()).expand(4000, 3, 3)
+    electrons, read = 1000.0, 4.0
+    found = measured_functions(exact, electrons, read, torch.Generator().manual_seed(0))
+    assert torch.allclose(found.sum((-2, -1)), torch.tensor(0.9, dtype=torch.float64))
+    share = exact[0] / 0.9
+    # n_i over their sum Σn: to first order the variance is p(1 - p)/N for counting, and
+    # σ²((1 - p)² + (K² - 1)·p²)/N² for read noise in all K² pixels.
+    pixels = share.numel()
+    counting = share * (1.0 - share) / electrons
+    own = read**2 * ((1.0 - share) ** 2 + (pixels - 1) * share**2) / electrons**2
+    expected = 0.9 * torch.sqrt(counting + own)
+    assert torch.allclose(found.std(dim=0), expected, rtol=5.0 / math.sqrt(2.0 * 4000.0))
+    assert float((found.mean(dim=0) - exact[0]).abs().max()) < 5.0 * float(expected.max()) / 60.0
+
+
+def test_many_electrons_measure_the_function_itself():
+    exact = torch.rand(2, 3, 5, 5, generator=torch.Generator().manual_seed(1))
+    found = measured_functions(exact, 1e12, 0.0, torch.Generator().manual_seed(0))
+    assert found.dtype == exact.dtype
+    assert torch.allclose(found, exact, rtol=1e-4, atol=1e-5)
+    with pytest.raises(AssertionError):
+        few = measured_functions(exact, 1e2, 0.0, torch.Generator().manual_seed(0))
+        assert torch.allclose(few, exact, rtol=1e-2)
