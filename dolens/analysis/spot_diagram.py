@@ -57,16 +57,6 @@ class SpotDiagram:
     polychromatic_rms: Tensor
     airy_radius: Tensor
 
-    @property
-    def from_chief(self) -> Tensor:
-        """(F, W, N, 2), mm, landing points from where the field's chief ray lands."""
-        return self.landing - self.chief[:, None, None]
-
-    @property
-    def from_centroid(self) -> Tensor:
-        """(F, W, N, 2), mm, landing points from their spot's centroid."""
-        return self.landing - self.centroid[:, :, None]
-
 
 @torch.no_grad()
 def spot_diagram(

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from dolens.fft_lengths import fast_fft_length
+
 
 def wiener_deconvolve(
     image: Tensor,
@@ -65,19 +67,6 @@ def wiener_deconvolve(
     spectrum = torch.fft.rfft2(_close_periodically(image, rows, columns))
     restored = torch.fft.irfft2(spectrum * weight, s=(rows, columns))
     return restored[..., :height, :width]
-
-
-def fast_fft_length(length: int) -> int:
-    """Return the smallest product of twos, threes and fives that is at least `length`."""
-    candidate = max(length, 1)
-    while True:
-        rest = candidate
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return candidate
-        candidate += 1
 
 
 def _check(channels: int, point_spread_function: Tensor, margin: int) -> None:
