@@ -13,7 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.ray_intercepts import even_points, in_double_precision, land
+from dolens.analysis.ray_intercepts import (
+    in_double_precision,
+    trace_ray_intercepts,
+    uniform_pupil_points,
+)
 from dolens.analysis.spot_diagram import spectral_shares, working_f_numbers
 from dolens.errors import InputError
 from dolens.optics.aiming import field_tangents
@@ -135,14 +139,14 @@ def modulation(
         InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
     """
     lens = in_double_precision(lens)
-    pupil, weight = even_points(rays)
+    pupil, weight = uniform_pupil_points(rays)
     # The rim weighs nothing.
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
-    landings = land(lens, fields, wavelengths, pupil, object_distance)
-    field, waves = landings.fields, landings.wavelengths
+    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
+    field, waves = intercepts.fields, intercepts.wavelengths
     spectrum = spectral_shares(wavelength_weights, len(waves))
-    light = (weight * landings.valid * spectrum[:, None]).flatten(1, 2)
-    points = landings.points.flatten(1, 2)
+    light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
+    points = intercepts.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
     along = _radial(field, object_distance)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
@@ -160,7 +164,7 @@ def modulation(
     limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
     return Modulation(
         field,
-        landings.field_unit,
+        intercepts.field_unit,
         waves,
         frequency,
         tangential,

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dolens.analysis.vignetting import Beams
+from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
@@ -86,7 +86,7 @@ def square_grid(
         tangent = torch.tensor(tangents, dtype=torch.float64)
         width = half_width
         if width is None:
-            width = first_semi_diameter(lens, float(tangent.norm()))
+            width = beam_half_width(lens, float(tangent.norm()))
         position = torch.cat([unit * width, torch.zeros_like(unit[:, :1])], 1)
         direction = torch.cat([tangent, torch.ones(1, dtype=torch.float64)])
         direction = (direction / direction.norm()).expand(position.shape)
@@ -95,7 +95,7 @@ def square_grid(
     return _passing(lens, fields, wavelengths, launch)
 
 
-def first_semi_diameter(lens: Lens, tangent: float) -> float:
+def beam_half_width(lens: Lens, tangent: float) -> float:
     """Half-width (mm) of a beam that fills the first surface, in the plane of its vertex."""
     surface = lens.system().surfaces[0]
     return surface.semi_diameter + tangent * float(surface.rim_sag(lens.sensor_distance.detach()))
@@ -144,19 +144,23 @@ def gaussian_quadrature(
     distinct = list(dict.fromkeys(map(tuple, fields)))
     points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)
     azimuths = [_azimuths(field, arms, symmetric) for field in distinct]
-    most = max(map(len, azimuths), default=0)
+    arms_of_all = max(map(len, azimuths), default=0)
     # Fields with fewer arms repeat theirs, to be traced with the others.
-    angles = torch.stack([angle.repeat(-(-most // len(angle)))[:most] for angle in azimuths])
+    angles = torch.stack(
+        [angle.repeat(-(-arms_of_all // len(angle)))[:arms_of_all] for angle in azimuths]
+    )
     arm = torch.stack((angles.cos(), angles.sin()), -1)
-    beams = Beams(lens, points, object_distance)
-    centres = beams.centres((points[:, 0] == 0.0) & symmetric)
-    reach = beams.reach(centres, arm)
-    along = (radii[:, None] * reach[:, None])[..., None] * arm[:, None]
-    aimed = beams.aim((centres[:, None, None] + along).flatten(1, 2))
+    pupils = VignettedPupils(lens, points, object_distance)
+    centres = pupils.centres((points[:, 0] == 0.0) & symmetric)
+    boundary = pupils.boundary_radius(centres, arm)
+    along = (radii[:, None] * boundary[:, None])[..., None] * arm[:, None]
+    aimed = pupils.aim((centres[:, None, None] + along).flatten(1, 2))
     launched = {}
     for at, (field, angle) in enumerate(zip(distinct, azimuths, strict=True)):
-        own = torch.arange(rings * most).reshape(rings, most)[:, : len(angle)].flatten()
-        weight = shares[:, None] * reach[at, : len(angle)].square()
+        own = (
+            torch.arange(rings * arms_of_all).reshape(rings, arms_of_all)[:, : len(angle)].flatten()
+        )
+        weight = shares[:, None] * boundary[at, : len(angle)].square()
         launched[field] = Launched(
             aimed.position[at, own], aimed.direction[at, own], weight.reshape(-1), len(angle)
         )

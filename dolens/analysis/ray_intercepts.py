@@ -30,7 +30,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True)
-class Landings:
+class RayIntercepts:
     """Rays of F fields and W wavelengths through N points of the stop, on the sensor.
 
     Attributes:
@@ -51,7 +51,7 @@ class Landings:
     chief: Tensor
 
 
-def even_points(count: int) -> tuple[Tensor, Tensor]:
+def uniform_pupil_points(count: int) -> tuple[Tensor, Tensor]:
     """Points that share the unit disc evenly, and its rim.
 
     A spiral fills the quadrant x, y > 0, and its mirror images the others, so that odd moments are
@@ -84,14 +84,14 @@ def even_points(count: int) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def land(
+def trace_ray_intercepts(
     lens: Lens,
     fields: Sequence[Sequence[float]] | Tensor,
     wavelengths: Sequence[float] | Tensor,
     pupil: Tensor,
     object_distance: float | None = None,
     exact: bool = False,
-) -> Landings:
+) -> RayIntercepts:
     """Aim rays at points of the stop, every wavelength by itself, and trace them in one go.
 
     Args:
@@ -138,7 +138,7 @@ def land(
     valid = hit.valid & started
     reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
     reached = reached & aimed.converged[:, at, 0]
-    return Landings(
+    return RayIntercepts(
         field.cpu(),
         field_unit(object_distance),
         waves[:count].cpu(),

@@ -7,7 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.ray_intercepts import even_points, in_double_precision, land
+from dolens.analysis.ray_intercepts import (
+    in_double_precision,
+    trace_ray_intercepts,
+    uniform_pupil_points,
+)
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
@@ -27,7 +31,7 @@ class SpotDiagram:
         field_unit: `°` for an object at infinity, else `mm`.
         wavelengths: (W,), nm.
         reference_wavelength: nm, of the chief rays.
-        landing: (F, W, N, 2), mm on the sensor; NaN for rays that do not pass.
+        intercepts: (F, W, N, 2), mm on the sensor; NaN for rays that do not pass.
         valid: (F, W, N), bool.
         weight: (N,), share of a ray in the light through the stop; zero for rays on its rim.
         wavelength_weight: (W,), shares of the wavelengths in polychromatic values.
@@ -45,7 +49,7 @@ class SpotDiagram:
     field_unit: str
     wavelengths: Tensor
     reference_wavelength: float
-    landing: Tensor
+    intercepts: Tensor
     valid: Tensor
     weight: Tensor
     wavelength_weight: Tensor
@@ -83,9 +87,9 @@ def spot_diagram(
         InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
     """
     lens = in_double_precision(lens)
-    pupil, weight = even_points(rays)
-    landings = land(lens, fields, wavelengths, pupil, object_distance)
-    points, valid = landings.points, landings.valid
+    pupil, weight = uniform_pupil_points(rays)
+    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
+    points, valid = intercepts.points, intercepts.valid
     spectrum = spectral_shares(wavelength_weights, points.shape[1])
 
     light = weight * valid
@@ -93,17 +97,17 @@ def spot_diagram(
     extent = (points - centroid[:, :, None]).norm(dim=-1).nan_to_num(-math.inf).amax(-1)
     every = (light * spectrum[:, None]).flatten(1, 2)
     common, common_square = moments(points.flatten(1, 2), every)
-    waves = landings.wavelengths
+    waves = intercepts.wavelengths
     return SpotDiagram(
-        fields=landings.fields,
-        field_unit=landings.field_unit,
+        fields=intercepts.fields,
+        field_unit=intercepts.field_unit,
         wavelengths=waves,
         reference_wavelength=lens.primary_wavelength,
-        landing=points,
+        intercepts=points,
         valid=valid,
         weight=weight,
         wavelength_weight=spectrum,
-        chief=landings.chief,
+        chief=intercepts.chief,
         centroid=centroid,
         rms=mean_square.sqrt(),
         geo=extent.where(extent >= 0.0, math.nan),

@@ -13,7 +13,7 @@ _RADII = 48
 _SIDE = 32
 
 
-class Beams:
+class VignettedPupils:
     """The light of F fields on the stop, all of them at once: aiming costs by the call.
 
     Stop coordinates are x and y over its semi-diameter.
@@ -59,7 +59,7 @@ class Beams:
         middle[meridional, 0] = 0.0
         return middle
 
-    def reach(self, centres: Tensor, arms: Tensor) -> Tensor:
+    def boundary_radius(self, centres: Tensor, arms: Tensor) -> Tensor:
         """(F, A): how far along each arm (F, A, 2) from its centre light passes."""
         centres = centres[:, None]
         # |c + ρa| = 1: the stop's own edge.

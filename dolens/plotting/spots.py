@@ -46,7 +46,7 @@ def spots_figure(
     """
     fields, waves = len(spots.fields), len(spots.wavelengths)
     centre = spots.polychromatic_centroid
-    points = (1e3 * (spots.landing - centre[:, None, None])).numpy()
+    points = (1e3 * (spots.intercepts - centre[:, None, None])).numpy()
     middles = (1e3 * (spots.centroid - centre[:, None])).numpy()
     airy = 1e3 * spots.airy_radius.numpy()
     chief = (1e3 * (spots.chief - centre)).numpy()

@@ -65,7 +65,7 @@ def test_spots_are_drawn_about_the_common_centroid_in_micrometres(spots):
             axes = grid[field, wave]
             (drawn,) = by_gid(axes, "spot")
             centre = spots.polychromatic_centroid[field]
-            expected = 1e3 * (spots.landing[field, wave] - centre)
+            expected = 1e3 * (spots.intercepts[field, wave] - centre)
             np.testing.assert_allclose(np.stack(drawn.get_data(), -1), expected)
             assert drawn.get_color() == spectral_colour(float(LINES[wave]))
             (airy,) = by_gid(axes, "airy")
