@@ -144,11 +144,9 @@ def gaussian_quadrature(
     distinct = list(dict.fromkeys(map(tuple, fields)))
     points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)
     azimuths = [_azimuths(field, arms, symmetric) for field in distinct]
-    arms_of_all = max(map(len, azimuths), default=0)
+    count = max(map(len, azimuths), default=0)
     # Fields with fewer arms repeat theirs, to be traced with the others.
-    angles = torch.stack(
-        [angle.repeat(-(-arms_of_all // len(angle)))[:arms_of_all] for angle in azimuths]
-    )
+    angles = torch.stack([angle.repeat(-(-count // len(angle)))[:count] for angle in azimuths])
     arm = torch.stack((angles.cos(), angles.sin()), -1)
     pupils = VignettedPupils(lens, points, object_distance)
     centres = pupils.centres((points[:, 0] == 0.0) & symmetric)
@@ -157,9 +155,7 @@ def gaussian_quadrature(
     aimed = pupils.aim((centres[:, None, None] + along).flatten(1, 2))
     launched = {}
     for at, (field, angle) in enumerate(zip(distinct, azimuths, strict=True)):
-        own = (
-            torch.arange(rings * arms_of_all).reshape(rings, arms_of_all)[:, : len(angle)].flatten()
-        )
+        own = torch.arange(rings * count).reshape(rings, count)[:, : len(angle)].flatten()
         weight = shares[:, None] * boundary[at, : len(angle)].square()
         launched[field] = Launched(
             aimed.position[at, own], aimed.direction[at, own], weight.reshape(-1), len(angle)

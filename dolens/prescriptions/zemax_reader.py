@@ -12,7 +12,7 @@ neither refract nor clip are left out, and their gaps added to the sensor's dist
 A CLAP clips, so it gives the semi-diameter; else DIAM does.  In Zemax a DIAM without CLAP or FLAP
 draws and does not clip: here it clips.  A missing or zero DIAM is an error, because ENPD and FNUM
 size the beam of the axis alone, and its semi-diameters would vignette the fields.
-ENPD and FNUM close the stop (see `dolens.prescriptions.conditions`), which then needs no DIAM.
+ENPD and FNUM close the stop (see `dolens.prescriptions.system_data`), which then needs no DIAM.
 Vignetting factors, weights, ray aiming, temperature and coatings are not read.
 """
 
@@ -21,8 +21,8 @@ from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.conditions import PUPIL_KEYS
 from dolens.prescriptions.decimals import number_in_text, radius_of, scaled
+from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_glass import read_glass

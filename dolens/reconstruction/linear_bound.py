@@ -15,12 +15,12 @@ class LinearError(NamedTuple):
     """Mean squared errors of D depths, in the image's units squared, each (..., D).
 
     Attributes:
-        shared: one filter for all depths, of least mean error over them.
-        own: each depth has the filter that is best for it.
+        common_filter: one filter for all depths, of least mean error over them.
+        filter_per_depth: each depth has the filter that is best for it.
     """
 
-    shared: Tensor
-    own: Tensor
+    common_filter: Tensor
+    filter_per_depth: Tensor
 
 
 def natural_spectrum(
@@ -67,11 +67,11 @@ def linear_error(functions: Tensor, spectrum: Tensor, noise: float) -> LinearErr
     # The place of the origin changes the phase of all depths alike, and no error.
     transfer = torch.fft.rfft2(functions, s=(rows, rows))
     power = transfer.real.square() + transfer.imag.square()
-    shared = spectrum * transfer.mean(-3, keepdim=True).conj()
-    shared = shared / (spectrum * power.mean(-3, keepdim=True) + noise)
-    residual = 1.0 - shared * transfer
+    common_filter = spectrum * transfer.mean(-3, keepdim=True).conj()
+    common_filter = common_filter / (spectrum * power.mean(-3, keepdim=True) + noise)
+    residual = 1.0 - common_filter * transfer
     left = spectrum * (residual.real.square() + residual.imag.square())
-    left = left + noise * (shared.real.square() + shared.imag.square())
+    left = left + noise * (common_filter.real.square() + common_filter.imag.square())
     own = spectrum * noise / (spectrum * power + noise)
     return LinearError(_mean(left, rows), _mean(own, rows))
 

@@ -53,7 +53,7 @@ class Readout:
         pattern: colour filters, `RGGB`, `GRBG`, `GBRG` or `BGGR`; None where a pixel sees all
             channels.
         reference_f_number: N₀, that `exposure` is stated for; None: any lens has this exposure.
-        f_number: N, of the lens in front; None: the reference.  `behind` sets it.
+        f_number: N, of the lens in front; None: the reference.  `at_f_number` sets it.
     """
 
     exposure: float = 1.0
@@ -103,7 +103,7 @@ class Readout:
         if self.pattern is not None:
             check_pattern(self.pattern)
 
-    def behind(self, f_number: float) -> Self:
+    def at_f_number(self, f_number: float) -> Self:
         """The same sensor, exposed for the same time, behind a lens of another F-number."""
         return replace(self, f_number=f_number)
 

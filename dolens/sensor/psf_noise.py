@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 
-def measured_functions(
+def noisy_point_spread_functions(
     functions: Tensor, electrons: float, read_noise: float, generator: torch.Generator
 ) -> Tensor:
     """Point spread functions with the noise of counting.

@@ -28,7 +28,7 @@ from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.prescriptions.checks import as_number, as_positive, check_keys, require_mapping
 
 PUPIL_KEYS = ("entrance_pupil_diameter", "f_number")
-CONDITION_KEYS = (
+SYSTEM_DATA_KEYS = (
     "wavelengths",
     "reference_wavelength",
     "fields",
@@ -40,7 +40,7 @@ _FIELD_KINDS = ("angles", "heights")
 _UNDECIDED = 1e-6
 
 
-def conditions(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
+def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     """The conditions of use as arguments of `Lens`: wavelengths, fields and object distance.
 
     Raises:
@@ -76,7 +76,7 @@ def conditions(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     }
 
 
-def conditions_of(lens: Lens) -> dict[str, Any]:
+def system_data_of(lens: Lens) -> dict[str, Any]:
     """The conditions of use of a lens as plain data; only those that it has."""
     found: dict[str, Any] = {}
     if lens.wavelengths is not None:
@@ -98,7 +98,7 @@ def stop_row(row: Mapping[str, Any], number: int, prescription: Mapping[str, Any
     return row
 
 
-def close_stop(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
+def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
     """Close the stop of a new lens to the pupil that its prescription asks for, if it does.
 
     The paraxial pupil is proportional to the stop, so one ratio is enough; it is found in double
