@@ -1,4 +1,4 @@
-"""Lengths of Fourier transforms that are fast: products of small primes."""
+"""Fourier transforms are fast when their lengths are products of small primes."""
 
 
 def fast_fft_length(length: int) -> int:

@@ -1,4 +1,5 @@
-"""Modulation transfer: how much contrast of a sine pattern is left in the image.
+"""The modulation transfer function (MTF) gives the contrast that a lens leaves of a sinusoidal
+pattern.
 
 The geometric transfer function is the Fourier transform of the spot, and so of its rays
 (Goodman, Introduction to Fourier Optics, section 6.4; Smith, Modern Optical Engineering, ch. 15).
@@ -31,7 +32,8 @@ _TINY = 1e-30
 
 @dataclass(frozen=True)
 class Modulation:
-    """Polychromatic geometric MTF of F fields at Q frequencies; double precision, on the CPU.
+    """A `Modulation` holds the polychromatic geometric MTF of F fields at Q frequencies, in double
+    precision on the CPU.
 
     Attributes:
         fields: (F, 2), degrees or mm.
@@ -56,7 +58,7 @@ class Modulation:
 def modulation_transfer(
     points: Tensor, weights: Tensor, frequencies: Tensor, direction: str | Tensor
 ) -> Tensor:
-    """|Σ w·exp(-2πi·ν·(p - p̄))| / Σ w: the geometric MTF of spots.
+    """Return the geometric MTF of spots, |Σ w·exp(-2πi·ν·(p - p̄))| / Σ w.
 
     Differentiable any number of times in points and weights, but for the kink of the modulus where
     the transfer function is zero.  At ν = 0 its second derivative is -(2π)² times the variance of
@@ -98,7 +100,8 @@ def modulation_transfer(
 def diffraction_limited_transfer(
     frequencies: Tensor, wavelength: float | Tensor, f_number: float | Tensor
 ) -> Tensor:
-    """MTF of a circular pupil without aberrations: (2/π)·(arccos s - s·√(1 - s²)), s = ν·λ·N.
+    """Return the MTF of a circular pupil without aberrations, (2/π)·(arccos s - s·√(1 - s²)), s =
+    ν·λ·N.
 
     Goodman, Introduction to Fourier Optics, equation 6-31; zero from s = 1 on.
 
@@ -121,7 +124,7 @@ def modulation(
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> Modulation:
-    """The polychromatic geometric MTF of a lens, by rays spread evenly over the stop.
+    """Compute the polychromatic geometric MTF of a lens from rays spread uniformly over the stop.
 
     All wavelengths of a field make one spot, so that lateral colour counts.
 
@@ -174,7 +177,7 @@ def modulation(
 
 
 def _radial(field: Tensor, object_distance: float | None) -> Tensor:
-    """(F, 2), unit vectors along the fields; +y on the axis."""
+    """Return unit vectors along the fields, (F, 2); +y on the axis."""
     angles = torch.deg2rad(field) if vergence(object_distance) == 0.0 else field
     slopes, _ = field_tangents(angles, object_distance)
     length = slopes.norm(dim=-1, keepdim=True)

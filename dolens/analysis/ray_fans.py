@@ -1,4 +1,4 @@
-"""Ray fans: transverse ray aberrations along two diameters of the stop."""
+"""Ray fans show transverse ray aberrations along two diameters of the stop."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,8 @@ _RIM = 1.0 - 1e-9
 
 @dataclass(frozen=True)
 class RayFans:
-    """Transverse ray aberrations of F fields and W wavelengths at P points of the stop.
+    """A `RayFans` holds transverse ray aberrations of F fields and W wavelengths at P points of the
+    stop.
 
     Attributes:
         fields: (F, 2), degrees or mm.
@@ -46,7 +47,7 @@ def ray_fans(
     count: int = 41,
     object_distance: float | None = None,
 ) -> RayFans:
-    """Fans along y and x of the stop: tangential and sagittal for fields in the y-z plane.
+    """Trace fans along y and x of the stop: tangential and sagittal for fields in the y-z plane.
 
     Every ray is aimed at its own wavelength.
 

@@ -1,4 +1,4 @@
-"""Spot diagrams: where a point's light lands, and how far it spreads."""
+"""Spot diagrams show the ray intercepts of an object point and measure their spread."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,8 @@ AIRY = 1.2196698912665045
 
 @dataclass(frozen=True)
 class SpotDiagram:
-    """Spots of F fields and W wavelengths by N points of the stop; double precision, on the CPU.
+    """A `SpotDiagram` holds spots of F fields and W wavelengths by N points of the stop, in double
+    precision on the CPU.
 
     What no light reaches is NaN.
 
@@ -71,7 +72,7 @@ def spot_diagram(
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> SpotDiagram:
-    """Rays spread evenly over the stop, at every field and wavelength.
+    """Trace rays spread uniformly over the stop, at every field and wavelength.
 
     Args:
         lens: the lens.
@@ -118,7 +119,8 @@ def spot_diagram(
 
 
 def moments(points: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (..., 2) and mean square distance from it (...), of points (..., N, 2).
+    """Return the centroid (..., 2) of points (..., N, 2) and their mean square distance from it
+    (...).
 
     Args:
         points: NaN where there is no light.
@@ -134,7 +136,7 @@ def moments(points: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def spectral_shares(weights: Sequence[float] | None, count: int) -> Tensor:
-    """(count,), float64, shares of wavelengths, of sum one; equal where none are given.
+    """Return normalised wavelength weights, (count,), float64; equal ones where none are given.
 
     Raises:
         InputError: another number of weights, a negative one, or none that is positive.
@@ -150,7 +152,7 @@ def spectral_shares(weights: Sequence[float] | None, count: int) -> Tensor:
 
 
 def working_f_numbers(lens: Lens, wavelengths: Tensor, object_distance: float | None) -> Tensor:
-    """(W,), paraxial working F-number of the stop, positive, at each wavelength in nm."""
+    """Return the paraxial working F-number at each wavelength in nm, (W,), positive."""
     system = lens.system()
     numbers = [
         first_order(system, float(wavelength), object_distance).working_f_number.abs()

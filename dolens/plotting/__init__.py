@@ -1,4 +1,4 @@
-"""Figures: functions from data to a `matplotlib.figure.Figure`, without any global state."""
+"""Functions turn data into a `matplotlib.figure.Figure`, without global state."""
 
 from dolens.plotting.before_after import before_after_figure
 from dolens.plotting.comparison import comparison_figure

@@ -1,4 +1,4 @@
-"""Where a coded aperture's image beats a plain lens's: gain against light, for each depth range."""
+"""The gain of a coded aperture over a plain lens is plotted against light, for each depth range."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
 
 @dataclass(frozen=True)
 class GainRange:
-    """Gains (dB) of one depth range.
+    """A `GainRange` holds the gains (dB) of one depth range.
 
     Attributes:
         label: of the range, as `4.5 to 8 m`.
@@ -30,7 +30,7 @@ class GainRange:
 def coding_gain_figure(
     ranges: Sequence[GainRange], title: str | None = "Gain over the best plain lens"
 ) -> Figure:
-    """Gain against light: axes for each depth range.
+    """Plot gain against light, with axes for each depth range.
 
     Lines are bounds of linear restoration; points with bars are trained cameras with their
     intervals.
