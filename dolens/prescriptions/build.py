@@ -1,4 +1,4 @@
-"""From a prescription (plain data) to a lens, and back.
+"""A lens is built from a prescription (plain data), and written as one.
 
 A prescription is a mapping::
 
@@ -133,7 +133,8 @@ def lens_from_prescription(
 
 
 def prescription_of(lens: Lens) -> dict[str, Any]:
-    """The prescription of a lens as it stands now: plain numbers and strings, ready for YAML.
+    """Return the prescription of a lens in its present state: plain numbers and strings, ready for
+    YAML.
 
     Reading it back gives a lens with the same parameters to the last bit.
     """

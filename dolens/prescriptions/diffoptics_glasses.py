@@ -1,4 +1,4 @@
-"""Glass by name in diffoptics lens files."""
+"""Glasses are named in diffoptics lens files."""
 
 import re
 
@@ -44,7 +44,7 @@ _PAIR = re.compile(r"\d+(\.\d+)?/\d+(\.\d+)?")
 
 
 def diffoptics_material(name: str, place: str) -> str:
-    """A medium of the diffoptics format as a prescription writes it.
+    """Return a medium of the diffoptics format as a prescription writes it.
 
     A name stands for diffoptics's own nd and Vd, not for a catalogue's dispersion.  Vacuum is the
     medium that a prescription writes `occluder`: index 1 in every index model.

@@ -1,4 +1,4 @@
-"""The lens format of diffoptics, the program of dO: one row a surface.
+"""The lens format of diffoptics, the program of dO, has one row a surface.
 
     Cooke triplet
     type distance roc diameter material
@@ -139,7 +139,7 @@ def diffoptics_text_of(prescription: Mapping[str, Any], where: str = "lens") -> 
 
 
 def _header(line: str, place: str) -> dict[str, Any]:
-    """What stands behind a # in the second line; other programs' remarks are left alone."""
+    """Read the text behind a # in the second line; other programs' remarks are ignored."""
     _, _, extra = line.partition("#")
     if not extra.strip().startswith("{"):
         return {}
@@ -159,7 +159,7 @@ def _header(line: str, place: str) -> dict[str, Any]:
 
 
 def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], str]:
-    """Letter, distance and diameter, and medium of a row."""
+    """Return letter, distance and diameter, and medium of a row."""
     letter = words[0]
     if letter not in ("O", "S", "A", "X", "I"):
         raise InputError(f"{place}: row type '{letter}' cannot be read (allowed: O, S, A, X and I)")
@@ -173,7 +173,9 @@ def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], st
 
 
 def _shape(letter: str, words: list[str], said: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Type, radius and coefficients of a surface's row, where `said` is what line 2 knows of it."""
+    """Return type, radius and coefficients of a surface's row; `said` holds the header's values for
+    it.
+    """
     values = [number_in_text(word, f"{place}: column {6 + i}") for i, word in enumerate(words[5:])]
     if letter == "A":
         _require_plane(words, place, "an aperture")
@@ -236,7 +238,7 @@ def _roc(row: Mapping[str, Any], place: str) -> str:
 
 
 def _more(kind: str, row: Mapping[str, Any], place: str) -> list[str]:
-    """The columns behind the material."""
+    """Read the columns behind the material."""
     if kind == "xy_polynomial":
         names = ["b", *_MONOMIALS]
     elif kind == "even_asphere":

@@ -1,4 +1,4 @@
-"""Reading and writing lens files."""
+"""Lens files are read and written."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ _SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML's safe loader, which also refuses a key written twice: the first would be lost."""
+    """This safe YAML loader also refuses a key written twice: the first would be lost."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()

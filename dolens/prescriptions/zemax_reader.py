@@ -1,4 +1,4 @@
-"""From the text of a Zemax `.zmx` file to a prescription.
+"""The text of a Zemax `.zmx` file is converted to a prescription.
 
 Held: sequential systems of STANDARD and EVENASPH surfaces, glass by model (nd, Vd) or by its name
 in the catalogues of GCAT (`zemax_glass`), circular and rectangular apertures and obscurations
@@ -137,7 +137,7 @@ def _object(
 
 
 def _row(block: Block, before: str, material: str, factor: Fraction, place: str) -> dict[str, Any]:
-    """Type, radius, coefficients and medium of a surface between two media."""
+    """Return type, radius, coefficients and medium of a surface between two media."""
     kind = _type(block, place)
     row: dict[str, Any] = {"type": "sphere"}
     curvature = scaled(_arguments(block, "CURV", "0")[0], 1 / factor, f"{place}: CURV")
@@ -161,7 +161,7 @@ def _row(block: Block, before: str, material: str, factor: Fraction, place: str)
 
 
 def _coefficients(block: Block, factor: Fraction, place: str) -> dict[str, float]:
-    """The coefficients of r², r⁴, ... by name (a2, a4, ...), in mm.
+    """Return the coefficients of r², r⁴, ... by name (a2, a4, ...), in mm.
 
     Zemax lists all eight, used or not: then the zeros behind the last that is used are left out.
     """
@@ -183,7 +183,7 @@ def _coefficients(block: Block, factor: Fraction, place: str) -> dict[str, float
 def _without_square(
     curvature: float, conic: float, square: float, place: str
 ) -> tuple[float, float]:
-    """Curvature and conic constant of the surface whose r² term is part of the conic.
+    """Return curvature and conic constant of the surface whose r² term is part of the conic.
 
     A paraboloid (conic -1) of curvature c is c·r²/2, as a plane is for c = 0, so a term α·r² adds
     2α to c exactly.  Any other conic plus a paraboloid is no conic.
@@ -224,5 +224,5 @@ def _value(block: Block, operand: str, place: str) -> float:
 
 
 def _arguments(block: Block, operand: str, *default: str) -> list[str]:
-    """The arguments of an operand's last line."""
+    """Return the arguments of an operand's last line."""
     return (block[operand][-1].arguments if operand in block else []) or list(default)

@@ -1,4 +1,4 @@
-"""How well any linear filter can restore: the least mean squared error, from transfer functions.
+"""The least mean squared error of any linear filter is computed from transfer functions.
 
 A cross-check of trained cameras that takes milliseconds and no photographs.  Where the depth of a
 pixel is unknown one filter serves all depths; where it is known each depth has its own.  A network
@@ -12,7 +12,8 @@ from torch import Tensor
 
 
 class LinearError(NamedTuple):
-    """Mean squared errors of D depths, in the image's units squared, each (..., D).
+    """A `LinearError` holds mean squared errors of D depths, in the image's units squared, each
+    (..., D).
 
     Attributes:
         common_filter: one filter for all depths, of least mean error over them.
@@ -26,7 +27,7 @@ class LinearError(NamedTuple):
 def natural_spectrum(
     rows: int, columns: int, variance: float, outer_scale: float, like: Tensor
 ) -> Tensor:
-    """The power spectrum of natural images, S ∝ 1/(f² + f₀²) without its mean.
+    """Return the power spectrum of natural images, S ∝ 1/(f² + f₀²) without its mean.
 
     Field (J. Opt. Soc. Am. A 4, 2379, 1987) has 1/f²; f₀ keeps low frequencies finite.
 
@@ -49,7 +50,8 @@ def natural_spectrum(
 
 
 def linear_error(functions: Tensor, spectrum: Tensor, noise: float) -> LinearError:
-    """The least errors of restoring an image of spectrum S that was blurred and got white noise.
+    """Return the least errors of restoring an image of spectrum S that was blurred and got white
+    noise.
 
     With transfer functions H_d and noise of variance N a pixel, a filter W leaves at depth d the
     error e_d = ⟨|1 - W·H_d|²·S + |W|²·N⟩, ⟨⟩ the mean over frequencies.  The mean of e_d over d is
@@ -77,7 +79,7 @@ def linear_error(functions: Tensor, spectrum: Tensor, noise: float) -> LinearErr
 
 
 def _mean(values: Tensor, columns: int) -> Tensor:
-    """Over all frequencies of a real image, of which the transform has one half."""
+    """Average over all frequencies of a real image, of which the transform holds one half."""
     weight = values.new_full(values.shape[-1:], 2.0)
     weight[0] = 1.0
     if columns % 2 == 0:

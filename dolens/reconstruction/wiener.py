@@ -1,4 +1,6 @@
-"""Wiener deconvolution with a prior for natural images, differentiable in all that enters it."""
+"""Wiener deconvolution uses a prior for natural images, and is differentiable in all of its
+arguments.
+"""
 
 import math
 
@@ -15,7 +17,7 @@ def wiener_deconvolve(
     noise_to_signal: Tensor | float,
     margin: int,
 ) -> Tensor:
-    """Undo a blur by the linear filter of least expected error.
+    """Undo a blur by the linear filter of least expected squared error.
 
     The image model is a true convolution plus white noise,
 
