@@ -1,4 +1,4 @@
-"""Whether a lens file holds a prescription: what was written is read again and compared."""
+"""A written lens file is read again and compared with its prescription."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -17,7 +17,7 @@ def require_same(
     medium: Callable[[str], str] = str,
     assumed: tuple[str, ...] = (),
 ) -> None:
-    """Refuse to write a prescription that its file would not give back.
+    """Raise `InputError` where a file would not give back the prescription.
 
     Numbers must agree to the last bit, a radius through its curvature.  A key that the format's
     writer does not know is missing from what comes back, so it is refused here and never lost.
@@ -74,7 +74,7 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers as floats, so that 25 and 25.0 are the same; rows as lists."""
+    """Return numbers as floats, so that 25 and 25.0 are the same; rows as lists."""
     if isinstance(value, bool) or value is None:
         return value
     if isinstance(value, int | float):

@@ -1,4 +1,4 @@
-"""How elements and their poses are written down.
+"""Elements and their poses are read from a prescription and written to it.
 
 ``elements`` maps names to groups of neighbouring surfaces; angles are in degrees, lengths in mm::
 
@@ -37,7 +37,7 @@ def elements_from(value: object, dtype: torch.dtype, where: str) -> dict[str, El
 
 
 def element_rows(elements: Mapping[str, Element]) -> dict[str, dict[str, Any]]:
-    """What `elements_from` reads back to the same parameters, to the last bit."""
+    """Return rows that `elements_from` reads back to the same parameters, to the last bit."""
     rows = {}
     for name, element in elements.items():
         row: dict[str, Any] = {"surfaces": [element.first, element.last]}
@@ -82,7 +82,7 @@ def _element(row: object, dtype: torch.dtype, place: str) -> Element:
 
 
 def _degrees(radians: float) -> float | None:
-    """Degrees that are these radians to the last bit, if there are any."""
+    """Return degrees that are these radians to the last bit, if there are any."""
     guess = math.degrees(radians)
     for candidate in (guess, math.nextafter(guess, -math.inf), math.nextafter(guess, math.inf)):
         if math.radians(candidate) == radians:

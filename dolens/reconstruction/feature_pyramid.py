@@ -1,4 +1,4 @@
-"""The generator of DeblurGAN-v2: a feature pyramid over a classifier's stages."""
+"""The generator of DeblurGAN-v2 is a feature pyramid over a classifier's stages."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ _SLOPE = 0.2
 
 
 class FeaturePyramid(nn.Module):
-    """Image to image, through a backbone down and a pyramid of features up again.
+    """A `FeaturePyramid` maps images to images, through a backbone and a pyramid of its features.
 
     After Kupyn et al., DeblurGAN-v2, ICCV 2019, with P = `pyramid_channels` and the
     backbone's features Cₖ at stride 2ᵏ, k = 0 … n, C₀ being the image:
@@ -94,7 +94,7 @@ class FeaturePyramid(nn.Module):
         return self.output(finished)[..., :height, :width]
 
     def _levels(self, features: list[Tensor]) -> list[Tensor]:
-        """P₂ … Pₙ of C₂ … Cₙ."""
+        """Return the pyramid's levels P₂ … Pₙ from the features C₂ … Cₙ."""
         laterals = [
             lateral(values) for lateral, values in zip(self.laterals, features, strict=True)
         ]

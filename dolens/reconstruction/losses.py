@@ -1,4 +1,6 @@
-"""The training loss of equation S20: squared error, total variation, perceptual error, and L1."""
+"""The training loss of equation S20 adds squared error, total variation, perceptual error, and
+L1.
+"""
 
 import difflib
 import logging
@@ -54,7 +56,8 @@ def total_variation(image: Tensor) -> Tensor:
 
 
 class RestorationLoss(nn.Module):
-    """Equation S20, with means in place of the norms so that weights do not depend on size.
+    """A `RestorationLoss` is equation S20, with means instead of norms so that weights do not
+    depend on size.
 
         total = mse_weight · mse + tv_weight · tv + perceptual_weight · perceptual + l1_weight · l1
 
@@ -106,7 +109,7 @@ class RestorationLoss(nn.Module):
 
     @property
     def perceptual_available(self) -> bool:
-        """Whether the perceptual term is part of the loss."""
+        """Return whether the perceptual term is part of the loss."""
         return len(self._features) > 0
 
     def forward(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:

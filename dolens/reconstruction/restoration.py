@@ -1,4 +1,4 @@
-"""The networks that turn a sensor image into the picture, behind one interface."""
+"""Restoring networks turn a sensor image into a picture, behind one interface."""
 
 import math
 from typing import ClassVar
@@ -18,7 +18,7 @@ COLORS = 3
 
 
 class Restoration(nn.Module):
-    """What every restoring network offers: `forward(raw, point_spread_functions, field)`.
+    """A restoring network offers `forward(raw, point_spread_functions, field)`.
 
     `needs_point_spread_function` and `needs_field` tell the caller whether to compute the point
     spread functions and the field coordinates at all; where one is False they are ignored and
@@ -55,12 +55,12 @@ class Restoration(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """The floating-point type of the network's parameters."""
+        """Return the floating-point type of the network's parameters."""
         return next(self.parameters()).dtype
 
 
 class ResidualRestoration(Restoration):
-    """A network alone, which gives what the encoded image lacks.
+    """A residual network predicts the difference between the encoded image and the truth.
 
         restored = encoded + network(encoded),   encoded = sRGB(raw),
 
@@ -102,7 +102,7 @@ class ResidualRestoration(Restoration):
 
 
 class UNetRestoration(ResidualRestoration):
-    """A U-Net alone, as in the supplement.
+    """Restore by a U-Net alone, as in the supplement.
 
     It begins as the identity on the encoded image.
 
@@ -119,7 +119,7 @@ class UNetRestoration(ResidualRestoration):
 
 
 class FeaturePyramidRestoration(ResidualRestoration):
-    """The generator of DeblurGAN-v2, a feature pyramid over a classifier's layers.
+    """Restore by the generator of DeblurGAN-v2, a feature pyramid over a classifier's layers.
 
     It begins as the identity on the encoded image.
 
@@ -156,7 +156,7 @@ class FeaturePyramidRestoration(ResidualRestoration):
 
 
 class WienerUNetRestoration(Restoration):
-    """Wiener deconvolution in linear light, then a U-Net that mends what it leaves.
+    """Restore by Wiener deconvolution in linear light, followed by a U-Net.
 
     The point spread functions are averaged over the depths: the deconvolution is one for all
     of them, as it must be where the depth of a pixel is unknown.  Both the deconvolved and the

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.fft_lengths import even_fft_length
 from dolens.rendering.psf import splat
 from dolens.rendering.spline_lookup import spline_lookup
 
@@ -65,8 +66,7 @@ def patches(height: int, width: int, rows: int, columns: int, like: Tensor) -> l
             f"not {rows}, {columns}"
         )
     vertical, horizontal = (
-        [_hat(length, count, i, like) for i in range(count)]
-        for length, count in ((height, rows), (width, columns))
+        _sides(length, count, like) for length, count in ((height, rows), (width, columns))
     )
     return [
         Patch(top, bottom, left, right, down[:, None] * across)
@@ -75,19 +75,31 @@ def patches(height: int, width: int, rows: int, columns: int, like: Tensor) -> l
     ]
 
 
-def _hat(length: int, count: int, node: int, like: Tensor) -> tuple[int, int, Tensor]:
-    """First pixel, end and weights of a node along one side."""
-    place = torch.arange(length, dtype=torch.float64)
+def triangle_weights(places: Tensor, length: int, count: int) -> Tensor:
+    """Return the linear interpolation weights, (N, count), of the nodes of `node_positions`.
+
+    Args:
+        places: (N,), coordinates along the side, pixels.
+        length: pixels of the side.
+        count: nodes along it.
+    """
     if count == 1:
-        return 0, length, torch.ones_like(place).to(like)
+        return torch.ones(len(places), 1, dtype=places.dtype)
     spacing = (length - 1) / (count - 1)
-    weight = (1.0 - (place - node * spacing).abs() / spacing).clamp(min=0.0)
-    if count == 2:
-        # All patches are then the whole, and share what is done to the texture.
-        return 0, length, weight.to(like)
-    inside = torch.nonzero(weight > 0.0).flatten()
-    first, end = int(inside[0]), int(inside[-1]) + 1
-    return first, end, weight[first:end].to(like)
+    node = torch.arange(count, dtype=places.dtype) * spacing
+    return (1.0 - (places[:, None] - node).abs() / spacing).clamp(min=0.0)
+
+
+def _sides(length: int, count: int, like: Tensor) -> list[tuple[int, int, Tensor]]:
+    """Return the first pixel, the end and the weights of every node along one side."""
+    weights = triangle_weights(torch.arange(length, dtype=torch.float64), length, count)
+    sides = []
+    for weight in weights.T.contiguous():
+        inside = torch.nonzero(weight > 0.0).flatten()
+        # Two patches are each the whole, and share the transform of the texture.
+        first, end = (0, length) if count <= 2 else (int(inside[0]), int(inside[-1]) + 1)
+        sides.append((first, end, weight[first:end].to(like)))
+    return sides
 
 
 def convolve_patches(
@@ -233,7 +245,7 @@ class _Tile:
         self.first = (top - reach, left - reach)
         # Texels up to a length that transforms are fast at cost less than zeros in their place;
         # what they do to the image lies outside of what is seen.
-        self.transform = (fast_length(height + size - 1), fast_length(width + size - 1))
+        self.transform = (even_fft_length(height + size - 1), even_fft_length(width + size - 1))
         self.rows = _clamped(top - reach, self.transform[0], textures.shape[-2], textures)
         self.columns = _clamped(left - reach, self.transform[1], textures.shape[-1], textures)
 
@@ -346,16 +358,3 @@ def _bounds(coordinate: Tensor) -> tuple[int, int]:
 def _clamped(start: int, count: int, size: int, like: Tensor) -> Tensor:
     """Indices of `count` texels from `start` on, those of the edge beyond it."""
     return (torch.arange(count, device=like.device) + start).clamp(0, size - 1)
-
-
-def fast_length(length: int) -> int:
-    """The least even number of 2, 3 and 5 that is not below: FFTs of such lengths are fast."""
-    candidate = length + length % 2
-    while True:
-        rest = candidate
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return candidate
-        candidate += 2

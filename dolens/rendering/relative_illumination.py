@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.analysis.ray_intercepts import even_points
+from dolens.analysis.ray_intercepts import uniform_pupil_points
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.plane_points import pupil_rays, rim_rays
 from dolens.rendering.pupil.exit_pupil import ExitPupil
@@ -53,7 +53,7 @@ def relative_illumination(
         torch.arange(height, **options), torch.arange(width, **options), indexing="ij"
     )
     # No two of them on one circle: strata lie on rings, which an aperture's edge takes as wholes.
-    spiral = even_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
+    spiral = uniform_pupil_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
     disc = tuple(d.expand(max(RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
     if symmetric:
         x, y = sensor.positions(*grid)

@@ -7,7 +7,6 @@ from dolens.errors import InputError
 from dolens.rendering.patch_convolution import (
     Coordinates,
     convolve_patches,
-    fast_length,
     node_positions,
     patches,
 )
@@ -140,14 +139,3 @@ def test_gradients_are_those_of_the_sum(looked, shapes, backend):
         return convolve_patches(textures, kernels, layout, (-2, 3), (4, 3), coordinates, backend)
 
     assert torch.autograd.gradcheck(image, (textures, kernels))
-
-
-@pytest.mark.parametrize("length", [1, 2, 7, 31, 97, 211, 320, 641])
-def test_transforms_are_of_lengths_with_small_factors(length):
-    found = fast_length(length)
-    assert length <= found <= 1.25 * length + 2
-    rest = found
-    for factor in (2, 3, 5):
-        while rest % factor == 0:
-            rest //= factor
-    assert rest == 1

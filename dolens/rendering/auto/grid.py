@@ -13,7 +13,7 @@ from dolens.rendering.auto.cost import psf_cost
 from dolens.rendering.auto.finding import Finding
 from dolens.rendering.auto.probe import MEAN, grey_levels
 from dolens.rendering.auto.survey import Survey, survey
-from dolens.rendering.patch_convolution import node_positions
+from dolens.rendering.patch_convolution import node_positions, triangle_weights
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
@@ -165,19 +165,10 @@ def _interpolation_error(
         functions = functions / light.clamp(min=torch.finfo(light.dtype).tiny)
     weights = torch.einsum(
         "nr,nc->nrc",
-        _hats(rows, sensor.height, renderer.fields[0]),
-        _hats(columns, sensor.width, renderer.fields[1]),
+        triangle_weights(rows, sensor.height, renderer.fields[0]),
+        triangle_weights(columns, sensor.width, renderer.fields[1]),
     ).flatten(1)
     found = torch.einsum("nm,mdcij->ndcij", weights.to(functions), functions)
     if renderer.illumination == "map":
         found = found * truth.light()[..., None, None]
     return float(grey_levels(found - wanted).square().mean().sqrt())
-
-
-def _hats(places: Tensor, length: int, count: int) -> Tensor:
-    """(N, count): bilinear weights of nodes at places along a side."""
-    if count == 1:
-        return torch.ones(len(places), 1, dtype=places.dtype)
-    spacing = (length - 1) / (count - 1)
-    node = torch.arange(count, dtype=places.dtype) * spacing
-    return (1.0 - (places[:, None] - node).abs() / spacing).clamp(min=0.0)

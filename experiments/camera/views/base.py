@@ -138,7 +138,7 @@ def exposed(readout: Readout, lens: Lens) -> Readout:
     """The readout behind a lens: as it is where it has no reference F-number."""
     if readout.reference_f_number is None:
         return readout
-    return readout.behind(axial_f_number(lens))
+    return readout.at_f_number(axial_f_number(lens))
 
 
 def seed_of(seed: int, stage: str, index: int) -> int:
