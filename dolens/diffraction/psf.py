@@ -45,7 +45,6 @@ def wave_kernels(
     pitch: float,
     size: int,
     settings: DiffractionSettings | None = None,
-    backend: str = "auto",
 ) -> Tensor:
     """What pixels collect of object points' light, with diffraction.
 
@@ -64,7 +63,6 @@ def wave_kernels(
         pitch: of the pixels, mm.
         size: pixels along each side of a window.
         settings: how finely; None: the default.
-        backend: what traces; see `choose_backend`.
 
     Returns:
         (N, size, size), in the lens's precision, upright as in `Sensor`: the point (x, y) from the
@@ -77,7 +75,7 @@ def wave_kernels(
         InputError: numbers that do not fit, or a wavefront too steep for diffraction.
     """
     settings = settings or DiffractionSettings()
-    found = _prepare(system, points, wavelength, centres, pitch, size, settings, backend)
+    found = _prepare(system, points, wavelength, centres, pitch, size, settings)
     window = _Window(pitch, size, settings.subsamples or subsamples(found.fit, pitch), system.dtype)
     fourier = found.chosen.fourier
     if settings.method != "auto":
@@ -96,7 +94,6 @@ def wave_kernels(
         front.centre[which],
         direct_samples(front, window.half_width, settings),
         1.0 / front.curvature[which],
-        backend,
     )
     direct = _by_integration(rays, window)
     if len(which) == len(found.points):
@@ -113,11 +110,10 @@ def propagation(
     pitch: float,
     size: int,
     settings: DiffractionSettings | None = None,
-    backend: str = "auto",
 ) -> Propagation:
     """How `wave_kernels` of the same arguments propagates light by itself, and why."""
     settings = settings or DiffractionSettings()
-    return _prepare(system, points, wavelength, centres, pitch, size, settings, backend).chosen
+    return _prepare(system, points, wavelength, centres, pitch, size, settings).chosen
 
 
 @dataclass(frozen=True)
@@ -168,13 +164,12 @@ def _prepare(
     pitch: float,
     size: int,
     settings: DiffractionSettings,
-    backend: str,
 ) -> _Prepared:
     if not pitch > 0.0 or size < 1:
         raise InputError(f"pitch must be positive and size at least 1, not {pitch} and {size}")
     if not isinstance(points, ObjectPoints):
         points = ObjectPoints.at(points)
-    rays = pupil_wavefront(system, points, wavelength, centres, settings.rays, backend=backend)
+    rays = pupil_wavefront(system, points, wavelength, centres, settings.rays)
     fit = with_moving_bounds(_fitted(rays, settings))
     half_width = pitch * (0.5 * size + 1.0)
     points = points.to(rays.opd.dtype, rays.opd.device)

@@ -44,7 +44,7 @@ class Distortion(NamedTuple):
 
 
 def distortion(
-    system: OpticalSystem, scene: Scene, sensor: Sensor, pupil: ExitPupil, backend: str
+    system: OpticalSystem, scene: Scene, sensor: Sensor, pupil: ExitPupil
 ) -> Distortion | None:
     """Where the chief rays of a sensor's pixels meet the planes of a scene, as polynomials.
 
@@ -57,7 +57,6 @@ def distortion(
         scene: D depths and C wavelengths.
         sensor: the pixels.
         pupil: the disc whose centre the rays are aimed at.
-        backend: what traces.
 
     Returns:
         The polynomials; None where none of the orders that are tried is enough.
@@ -72,7 +71,7 @@ def distortion(
             for side in (sensor.height, sensor.width)
         )
         row, column = torch.meshgrid(down, across, indexing="ij")
-        found = _seen(system, scene, sensor, pupil, backend, row, column)
+        found = _seen(system, scene, sensor, pupil, row, column)
         transform = _to_coefficients(order).to(system.device)
         coefficients = transform @ found @ transform.mT
         last = torch.maximum(
@@ -89,7 +88,6 @@ def chief_ray_maps(
     sensor: Sensor,
     windows: Sequence[Sensor],
     pupil: ExitPupil,
-    backend: str,
 ) -> list[tuple[Tensor, Tensor]]:
     """Where the chief rays of windows' pixels meet the planes of a scene.
 
@@ -103,10 +101,10 @@ def chief_ray_maps(
         Of each window rows and columns from the axis in the image of a pinhole, each
         (D, C, height, width), double precision; differentiable in the lens.
     """
-    found = distortion(system, scene, sensor, pupil, backend)
+    found = distortion(system, scene, sensor, pupil)
     if found is not None:
         return [found.seen_by(window) for window in windows]
-    return [_by_itself(system, scene, sensor, window, pupil, backend) for window in windows]
+    return [_by_itself(system, scene, sensor, window, pupil) for window in windows]
 
 
 def _by_itself(
@@ -115,18 +113,17 @@ def _by_itself(
     sensor: Sensor,
     window: Sensor,
     pupil: ExitPupil,
-    backend: str,
 ) -> tuple[Tensor, Tensor]:
     """Of a window for whose sensor there are no polynomials."""
     if window != sensor:
-        return chief_ray_maps(system, scene, window, [window], pupil, backend)[0]
+        return chief_ray_maps(system, scene, window, [window], pupil)[0]
     options = {"dtype": torch.float64, "device": system.device}
     row, column = torch.meshgrid(
         torch.arange(window.height, **options),
         torch.arange(window.width, **options),
         indexing="ij",
     )
-    return _seen(system, scene, window, pupil, backend, row, column).unbind(0)
+    return _seen(system, scene, window, pupil, row, column).unbind(0)
 
 
 def _seen(
@@ -134,13 +131,12 @@ def _seen(
     scene: Scene,
     sensor: Sensor,
     pupil: ExitPupil,
-    backend: str,
     row: Tensor,
     column: Tensor,
 ) -> Tensor:
     """(2, D, C, ...) of pixels (...)."""
     points = sensor.positions(row.reshape(-1), column.reshape(-1))
-    seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch, backend)
+    seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch)
     found = torch.stack([c.double().permute(1, 2, 0) for c in seen])
     return found.unflatten(-1, row.shape)
 

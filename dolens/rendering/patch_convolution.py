@@ -109,7 +109,7 @@ def convolve_patches(
     origin: tuple[int, int],
     image_size: tuple[int, int],
     coordinates: Coordinates | None,
-    backend: str,
+    fused: bool,
 ) -> Tensor:
     """Σ over nodes of weight · (texture ∗ kernel), at the image's pixels.
 
@@ -126,7 +126,7 @@ def convolve_patches(
             `coordinates`.
         image_size: height and width.
         coordinates: where the pixels look, if that is not simply every pixel a texel further.
-        backend: `cpu`, `cuda` or `reference`, for lookups.
+        fused: whether the CPU's kernels look up and splat.
 
     Returns:
         (B, D, C, height, width).
@@ -135,7 +135,7 @@ def convolve_patches(
     if coordinates is not None:
         sizes.append(coordinates.rows.shape[:2])
     shape = (*torch.broadcast_shapes(*sizes), *image_size)
-    settings = (tuple(layout), origin, shape, backend)
+    settings = (tuple(layout), origin, shape, fused)
     return _Convolution.apply(textures, kernels, *(coordinates or (None, None)), settings)
 
 
@@ -224,7 +224,7 @@ class _Tile:
         coordinates: Coordinates | None,
         spectrum: Tensor | None,
     ) -> None:
-        _, origin, self.shape, self.backend = settings
+        _, origin, self.shape, self.fused = settings
         self.textures, self.size, self.area = textures, size, patch[:4]
         self._spectrum = spectrum
         self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
@@ -294,7 +294,7 @@ class _Tile:
             return image
         image = image.expand(-1, *self.shape[:2], -1, -1)
         flat, rows, columns = self._lookup_arguments(image)
-        seen = spline_lookup(flat, rows, columns, self.backend)
+        seen = spline_lookup(flat, rows, columns, self.fused)
         return seen.reshape(*image.shape[:3], self.height, self.width)
 
     def of_seen(self, of_seen: Tensor) -> Tensor:
@@ -304,7 +304,7 @@ class _Tile:
             images = self._batched(self.coordinates.rows, of_seen)
             columns = self._batched(self.coordinates.columns, of_seen)
             flat = of_seen.reshape(-1, self.height * self.width)
-            grids = splat(images, columns, flat, height, self.backend)
+            grids = splat(images, columns, flat, height, self.fused)
             of_seen = grids.reshape(*of_seen.shape[:3], height, width)
         image = of_seen.new_zeros((*of_seen.shape[:3], *self.transform))
         image[..., first : first + height, first : first + width] = of_seen
@@ -319,8 +319,8 @@ class _Tile:
         flat, rows, columns = self._lookup_arguments(image)
         found = []
         for down, across in ((_NUDGE, 0.0), (0.0, _NUDGE)):
-            after = spline_lookup(flat, rows + down, columns + across, self.backend)
-            before = spline_lookup(flat, rows - down, columns - across, self.backend)
+            after = spline_lookup(flat, rows + down, columns + across, self.fused)
+            before = spline_lookup(flat, rows - down, columns - across, self.fused)
             slope = (after - before) / (2.0 * _NUDGE)
             found.append(slope.reshape(of_seen.shape) * of_seen)
         return found[0], found[1]

@@ -18,7 +18,7 @@ class PlaneBlur:
         origin: row and column of the texture that pixel (0, 0) looks at.
         image_size: height and width.
         coordinates: where the pixels look, if that is not simply every pixel a texel further.
-        backend: what looks up.
+        fused: whether the CPU's kernels look up.
         illumination: (C or 1, height, width), what the image of every plane is multiplied by; or
             None.
     """
@@ -28,7 +28,7 @@ class PlaneBlur:
     origin: tuple[int, int]
     image_size: tuple[int, int]
     coordinates: Coordinates | None
-    backend: str
+    fused: bool
     illumination: Tensor | None = None
 
     def __call__(self, maps: Tensor) -> Tensor:
@@ -40,7 +40,7 @@ class PlaneBlur:
             self.origin,
             self.image_size,
             self.coordinates,
-            self.backend,
+            self.fused,
         )
         return image if self.illumination is None else image * self.illumination
 

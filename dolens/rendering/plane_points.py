@@ -45,8 +45,6 @@ def plane_points(
     pupil: ExitPupil,
     disc: tuple[Tensor, Tensor],
     pitch: float,
-    symmetric: bool,
-    backend: str,
 ) -> PlanePoints:
     """Trace rays from points of the sensor through the exit pupil to the planes of a scene.
 
@@ -65,17 +63,15 @@ def plane_points(
         disc: x and y of the rays in it, in units of its radius, each (N or 1, S), in the frame in
             which a symmetric lens's point lies on the positive x axis.
         pitch: of the pixels, mm.
-        symmetric: whether the lens has rotational symmetry.
-        backend: what traces.
     """
     x, y = points
     again = None
-    if symmetric:
+    if system.rotationally_symmetric:
         # Sorted radii, and which of them each point has.
         radius, again = torch.unique(_rounded(torch.hypot(x, y)), return_inverse=True)
         x, y = radius, torch.zeros_like(radius)
-    ray, weight = pupil_rays(system, scene.wavelengths, (x, y), pupil, disc, backend)
-    rim = rim_rays(system, scene.wavelengths, (x, y), pupil, backend)
+    ray, weight = pupil_rays(system, scene.wavelengths, (x, y), pupil, disc)
+    rim = rim_rays(system, scene.wavelengths, (x, y), pupil)
     if rim is not None:
         ray = Components(*(torch.cat(pair, -1) for pair in zip(ray, rim.ray, strict=True)))
         weight = torch.cat((weight, rim.weight), -1)
@@ -102,7 +98,6 @@ def pupil_rays(
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     disc: tuple[Tensor, Tensor],
-    backend: str,
 ) -> tuple[Components, Tensor]:
     """Rays from sensor points through the exit pupil, traced into object space.
 
@@ -112,7 +107,6 @@ def pupil_rays(
         points: x and y, mm, each (N,).
         pupil: the disc.
         disc: x and y in it, in units of its radius, each (N, S).
-        backend: what traces.
 
     Returns:
         The rays in front of the lens, (C, N, S), and their shares in the irradiance relative to
@@ -122,7 +116,7 @@ def pupil_rays(
     x, y = (p.to(sensor_z.dtype)[:, None] for p in points)
     disc_x, disc_y = (d[: len(x)] * pupil.radius for d in disc)
     ray = aim(x, y, sensor_z, disc_x, disc_y, pupil.z)
-    there, valid = _before_the_lens(system, ray, wavelengths, backend)
+    there, valid = _before_the_lens(system, ray, wavelengths)
     share = (pupil.radius / pupil.axial_radius) ** 2
     share = share / (pupil.axial_mean(sensor_z) * disc_x.shape[-1])
     return there, torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
@@ -133,7 +127,6 @@ def rim_rays(
     wavelengths: Sequence[float],
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
-    backend: str,
 ) -> EdgeRays | None:
     """Rays (C, N, AZIMUTHS) along the edges that end the light of sensor points.
 
@@ -143,14 +136,14 @@ def rim_rays(
     if not depends_on_parameters(system):
         return None
     middle = wavelengths[len(wavelengths) // 2]
-    found = light_edges(system, middle, points, pupil.numbers(), backend)
+    found = light_edges(system, middle, points, pupil.numbers())
     if found is None:
         return None
     angle = torch.arange(AZIMUTHS, dtype=system.dtype, device=system.device)
     angle = (angle * (2.0 * math.pi / AZIMUTHS)).expand(len(points[0]), -1)
     arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
     edge = (found.middle[:, None], arms, found.radius, found.surface)
-    return edge_rays(system, wavelengths, points, pupil, edge, backend)
+    return edge_rays(system, wavelengths, points, pupil, edge)
 
 
 def chief_ray_points(
@@ -159,7 +152,6 @@ def chief_ray_points(
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     pitch: float,
-    backend: str,
 ) -> tuple[Tensor, Tensor]:
     """Where the rays from sensor points through the exit pupil's centre meet the planes.
 
@@ -171,7 +163,6 @@ def chief_ray_points(
         points: x and y, mm, each (N,).
         pupil: the disc.
         pitch: mm.
-        backend: what traces.
 
     Returns:
         Rows and columns from the axis in the image of a pinhole, each (N, D, C).
@@ -184,13 +175,13 @@ def chief_ray_points(
     ray = aim(x, y, system.vertices[-1], zero, zero, pupil.z)
     wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64, device=system.device)
     rays = Rays.from_components(ray, wavelengths[:, None])
-    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
+    hit = trace_rays(system, rays, -1.0)
     if bool(((hit.status == Status.TIR) | (hit.status == Status.MISSED)).any()):
         raise InputError(
             "renderer: chief rays of the sensor's outer pixels do not pass the lens, which leaves "
             "its distortion undefined; use registration=pinhole, renderer=rays or a smaller sensor"
         )
-    there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
+    there = hit.components()
     rows, columns = [], []
     for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
         t, _ = distance_to_plane(there, -depth, -1.0)
@@ -224,10 +215,10 @@ def _rounded(radius: Tensor) -> Tensor:
 
 
 def _before_the_lens(
-    system: OpticalSystem, ray: Components, wavelengths: Sequence[float], backend: str
+    system: OpticalSystem, ray: Components, wavelengths: Sequence[float]
 ) -> tuple[Components, Tensor]:
     """Rays (C, N, S) in object space, and which of them got there."""
     every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
     rays = Rays.from_components(ray, every[:, None, None])
-    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
-    return Components(*hit.position.unbind(-1), *hit.direction.unbind(-1)), hit.valid
+    hit = trace_rays(system, rays, -1.0)
+    return hit.components(), hit.valid

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from dolens.diffraction.propagation import DiffractionSettings
 from dolens.diffraction.psf import propagation, wave_kernels
+from dolens.optics.backend import cpu_kernels_serve
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.plane_points import (
     PlanePoints,
@@ -50,8 +51,6 @@ def field_point_spread_functions(
     pupil_samples: int,
     seed: int | None,
     distortion: bool,
-    symmetric: bool,
-    backend: str,
 ) -> FieldFunctions:
     """Geometric point spread functions at points of the sensor.
 
@@ -70,33 +69,33 @@ def field_point_spread_functions(
         seed: of the points in the strata; None: their centres.
         distortion: whether a function's centre is where the chief ray meets the plane, else where
             a pinhole sees it.
-        symmetric: whether the lens has rotational symmetry.
-        backend: what traces and splats.
 
     Centres move with the lens, and so do the functions about them: gradients are of both, and where
     pixels look has to carry its own (`convolve_patches`).
     """
-    count = distinct_radii(points) if symmetric else len(points[0])
+    count = distinct_radii(points) if system.rotationally_symmetric else len(points[0])
     disc = sampled_disc(count, pupil_samples, seed, system)
-    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    seen = plane_points(system, scene, points, pupil, disc, pitch)
     planes, channels = len(scene.depths), len(scene.wavelengths)
     if distortion:
-        centre = chief_ray_points(system, scene, points, pupil, pitch, backend)
+        centre = chief_ray_points(system, scene, points, pupil, pitch)
     else:
         centre = pinhole_points(points, pitch, planes, channels)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
     return splatted(
-        PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight), size, backend
+        PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight),
+        size,
+        cpu_kernels_serve(system),
     )
 
 
-def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
+def splatted(seen: PlanePoints, size: int, fused: bool) -> FieldFunctions:
     """Functions (N, D, C, size, size) of rays by where they meet the planes, from their centre."""
     middle = size // 2
     # A pixel sees the point at +e: seen from there, the pixel is at -e.
     rows, columns = middle - seen.rows, middle - seen.columns
     weight = seen.weight.expand(rows.shape)
-    functions = splat(rows, columns, weight, size, backend)
+    functions = splat(rows, columns, weight, size, fused)
     total = weight.sum(-1)
     with torch.no_grad():
         kept = functions.sum((-2, -1)) / total.clamp(min=torch.finfo(total.dtype).tiny)
@@ -112,8 +111,6 @@ def wave_point_spread_functions(
     pitch: float,
     size: int,
     distortion: bool,
-    symmetric: bool,
-    backend: str,
     settings: DiffractionSettings | None = None,
 ) -> FieldFunctions:
     """The same with diffraction: of the wavefronts of the points that functions are centred on.
@@ -122,12 +119,12 @@ def wave_point_spread_functions(
     window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
     finely diffraction is computed.
     """
-    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
+    places = _object_points(system, scene, points, pupil, pitch, distortion)
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
-    kernels = wave_kernels(system, *places, pitch, size, settings, backend)
+    kernels = wave_kernels(system, *places, pitch, size, settings)
     kernels = kernels.reshape(*shape, size, size)
     disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
-    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    seen = plane_points(system, scene, points, pupil, disc, pitch)
     light = seen.weight.sum(-1)
     total = kernels.sum((-2, -1))
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
@@ -143,7 +140,6 @@ def wave_cost(
     pitch: float,
     size: int,
     distortion: bool,
-    backend: str,
 ) -> tuple[int, str | None]:
     """What functions of `wave_point_spread_functions` take.
 
@@ -153,8 +149,8 @@ def wave_cost(
         Samples along each side of a pupil by Fourier transform, and why one of them needs direct
         integration, which takes a thousand times as long; None where none does.
     """
-    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
-    found = propagation(system, *places, pitch, size, None, backend)
+    places = _object_points(system, scene, points, pupil, pitch, distortion)
+    found = propagation(system, *places, pitch, size, None)
     direct = (reason for reason in found.reasons if reason.startswith("direct"))
     return found.samples, next(direct, None)
 
@@ -166,12 +162,11 @@ def _object_points(
     pupil: ExitPupil,
     pitch: float,
     distortion: bool,
-    backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Object points (N·D·C, 3), mm, their wavelengths, nm, and the windows' centres, mm."""
     planes, channels = len(scene.depths), len(scene.wavelengths)
     if distortion:
-        rows, columns = chief_ray_points(system, scene, points, pupil, pitch, backend)
+        rows, columns = chief_ray_points(system, scene, points, pupil, pitch)
     else:
         rows, columns = pinhole_points(points, pitch, planes, channels)
     options = {"dtype": torch.float64, "device": system.device}

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend, say_once
+from dolens.optics.backend import cpu_kernels_serve, say_once, with_chosen_backend
 from dolens.optics.lens import Lens
-from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.optics.system import OpticalSystem
 from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.patch_convolution import (
     Coordinates,
@@ -187,22 +187,21 @@ class PsfRenderer(Unprepared):
         """Images (B, images, C, height, width) of views of the sensor, all rays traced at once."""
         options = {"device": lens.device, "dtype": lens.dtype}
         textures = [view.textures.to(**options) for view in views]
-        system = lens.system(values)
-        backend = choose_backend(system, lens.backend, others=textures)
+        system = with_chosen_backend(lens.system(values), textures)
         with torch.no_grad():
             scene.check(system)
             pupil = self.pupil
             if pupil is None:
-                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
-        pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
+                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor)
+        pupil = moving_exit_pupil(system, scene.wavelengths, pupil)
         parts = [replace(self, sensor=view.sensor) for view in views]
         x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
-        found = self.point_spread_functions(system, scene, pupil, seed, backend, (x, y))
+        found = self.point_spread_functions(system, scene, pupil, seed, (x, y))
         self._warn_of_loss(found)
         looks = [None] * len(views)
         if self.registration == "chief_rays":
             windows = [view.sensor for view in views]
-            looks = chief_ray_maps(system, scene, self.sensor, windows, pupil, backend)
+            looks = chief_ray_maps(system, scene, self.sensor, windows, pupil)
         nodes, images = self.fields[0] * self.fields[1], []
         for i, (part, view, look) in enumerate(zip(parts, views, looks, strict=True)):
             own = slice(i * nodes, (i + 1) * nodes)
@@ -210,9 +209,7 @@ class PsfRenderer(Unprepared):
             placed = replace(scene, texture_centre=view.texture_centre)
             coordinates, origin = part._coordinates(placed, textures[i], look)
             images.append(
-                part._blurred(
-                    system, placed, textures[i], functions, coordinates, origin, pupil, backend
-                )
+                part._blurred(system, placed, textures[i], functions, coordinates, origin, pupil)
             )
         return images
 
@@ -225,14 +222,14 @@ class PsfRenderer(Unprepared):
         coordinates: Coordinates | None,
         origin: tuple[int, int],
         pupil: ExitPupil,
-        backend: str,
     ) -> Tensor:
         """The image by functions that are known, of pixels that look where coordinates say."""
         area = (self.sensor.height, self.sensor.width)
         layout, functions, lit = patches(*area, *self.fields, textures), found.functions, None
         if self.illumination == "map":
-            functions, layout, lit = self._illuminated(found, layout, system, scene, pupil, backend)
-        blur = PlaneBlur(functions, layout, origin, area, coordinates, backend, lit)
+            functions, layout, lit = self._illuminated(found, layout, system, scene, pupil)
+        fused = cpu_kernels_serve(system)
+        blur = PlaneBlur(functions, layout, origin, area, coordinates, fused, lit)
         return scene.blend(scene.on_planes(textures), blur)
 
     def _warn_of_loss(self, found: FieldFunctions) -> None:
@@ -248,7 +245,6 @@ class PsfRenderer(Unprepared):
         scene: Scene,
         pupil: ExitPupil,
         seed: int,
-        backend: str,
         points: tuple[Tensor, Tensor] | None = None,
     ) -> FieldFunctions:
         """The functions at the grid's points, row after row, or at others.
@@ -257,7 +253,7 @@ class PsfRenderer(Unprepared):
         """
         shared, pitch = self.shared(scene), self.sensor.pixel_pitch
         points = points or self.points()
-        centred, symmetric = self.registration == "chief_rays", is_rotationally_symmetric(system)
+        centred = self.registration == "chief_rays"
         if self.diffraction == "wave":
             return wave_point_spread_functions(
                 system,
@@ -267,8 +263,6 @@ class PsfRenderer(Unprepared):
                 pitch,
                 self.size,
                 centred,
-                symmetric,
-                backend,
             )
         found = field_point_spread_functions(
             system,
@@ -280,8 +274,6 @@ class PsfRenderer(Unprepared):
             self.pupil_samples,
             seed if self.jitter else None,
             centred,
-            symmetric,
-            backend,
         )
         if self.diffraction == "none":
             return found
@@ -294,8 +286,7 @@ class PsfRenderer(Unprepared):
     ) -> "PsfRenderer":
         """The renderer with the pupil of the lens as it is, for a lens that hardly changes."""
         system = lens.system(values)
-        backend = choose_backend(system, lens.backend)
-        pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor)
         return replace(self, pupil=pupil)
 
     def points(self) -> tuple[Tensor, Tensor]:
@@ -322,14 +313,13 @@ class PsfRenderer(Unprepared):
         system: OpticalSystem,
         scene: Scene,
         pupil: ExitPupil,
-        backend: str,
     ) -> tuple[Tensor, list[Patch], Tensor]:
         """Functions of unit light, patches of those that have any, and each pixel's illumination.
 
         Pixels whose functions are partly dark get their light from the others.
         """
-        wavelengths, symmetric = self.shared(scene).wavelengths, is_rotationally_symmetric(system)
-        wanted = relative_illumination(system, wavelengths, self.sensor, pupil, symmetric, backend)
+        wavelengths = self.shared(scene).wavelengths
+        wanted = relative_illumination(system, wavelengths, self.sensor, pupil)
         bright = found.light.detach() > 0.0
         light = torch.where(bright, found.light, 1.0)
         covered, lit = torch.zeros_like(wanted), []

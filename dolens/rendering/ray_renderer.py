@@ -13,13 +13,13 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels import rendering
 from dolens.kernels.view import View
-from dolens.optics.backend import choose_backend, say_once, trace_rays
+from dolens.optics.backend import say_once, trace_components, with_chosen_backend
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack
-from dolens.optics.rays import Components, Rays
+from dolens.optics.rays import Components
 from dolens.optics.replay import replay
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import distance_to_plane, trace_surfaces
+from dolens.optics.trace import distance_to_plane
 from dolens.rendering.moving_view import MovingView, moving_view, sample_share
 from dolens.rendering.protocol import Unprepared
 from dolens.rendering.pupil.aim import aim
@@ -108,8 +108,7 @@ class RayRenderer(Unprepared):
         """
         still = {name: value.detach() for name, value in (values or {}).items()}
         system = lens.system(still)
-        backend = choose_backend(system, lens.backend)
-        return axial_exit_pupil(system, scene.wavelengths, backend)
+        return axial_exit_pupil(system, scene.wavelengths)
 
     def render(
         self,
@@ -142,17 +141,17 @@ class RayRenderer(Unprepared):
         parameters = {**stored, **(values or {})}
         textures = textures.to(device=lens.device, dtype=lens.dtype)
         shown = scene.on_planes(textures)
-        system = lens.system(parameters)
-        backend = choose_backend(system, lens.backend, others=[textures])
-        now = lens.system({n: p.detach() for n, p in parameters.items()})
+        system = with_chosen_backend(lens.system(parameters), [textures])
+        backend = system.backend
+        now = lens.system({n: p.detach() for n, p in parameters.items()}).traced_by(backend)
         scene.check(now)
-        pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, backend, axial)
+        pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, axial)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, pupil)
-        moving = moving_view(system, scene, view, backend)
+        moving = moving_view(system, scene, view)
         edges = None
         if depends_on_parameters(system):
             still = moving.pupil.numbers()
-            edges = edge_map(now, scene.wavelengths, self.sensor, still, backend)
+            edges = edge_map(now, scene.wavelengths, self.sensor, still)
         if backend == "cpu" and scene.separate_planes:
             image = self._fused(system, scene, textures, view, moving)
             if edges is None:
@@ -165,14 +164,13 @@ class RayRenderer(Unprepared):
 
         def piece(i: int, *tensors: Tensor) -> Tensor:
             system = lens.system(dict(zip(names, tensors[planes:-1], strict=True)))
+            system = system.traced_by(backend)
             start, end = self._chunk(i)
             now = moving.of(tensors[-1])
             ray, weight = self._samples(system, view, now.pupil, start, end)
-            rim = pixel_edge_rays(
-                system, scene, self.sensor, view, now.pupil, edges, start, end, backend
-            )
+            rim = pixel_edge_rays(system, scene, self.sensor, view, now.pupil, edges, start, end)
             shown = tensors[:planes]
-            return self._shade(system, scene, view, now, shown, ray, weight, rim, backend)
+            return self._shade(system, scene, view, now, shown, ray, weight, rim)
 
         tensors = [*shown, *parameters.values(), moving.joined(system)]
         sizes = [end - start for start, end in map(self._chunk, range(self._chunks))]
@@ -297,9 +295,10 @@ class RayRenderer(Unprepared):
         def piece(i: int, *tensors: Tensor) -> Tensor:
             shape = (images, len(scene.depths), len(scene.wavelengths), sizes[i])
             system = lens.system(dict(zip(names, tensors[planes:-1], strict=True)))
+            system = system.traced_by("cpu")
             now, start = moving.of(tensors[-1]), starts[i]
             rim = pixel_edge_rays(
-                system, scene, self.sensor, view, now.pupil, edges, start, start + sizes[i], "cpu"
+                system, scene, self.sensor, view, now.pupil, edges, start, start + sizes[i]
             )
             if rim is None:
                 return shown[0].new_zeros(shape)
@@ -328,7 +327,6 @@ class RayRenderer(Unprepared):
         ray: Components,
         weight: Tensor,
         rim: EdgeRays | None,
-        backend: str,
     ) -> Tensor:
         """(B, images, C, count): trace, meet the planes, gather what they show.
 
@@ -336,7 +334,7 @@ class RayRenderer(Unprepared):
         """
         channels = []
         for channel, wavelength in enumerate(scene.wavelengths):
-            there, valid = _trace(system, ray, wavelength, backend)
+            there, valid = trace_components(system, ray, wavelength, -1.0)
             arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
             if rim is not None:
                 beside = of_channel(rim.ray, channel)
@@ -359,15 +357,3 @@ def _texture_places(
         x = torch.addcmul(there.x, t, there.l)
         y = torch.addcmul(there.y, t, there.m)
         yield texture_coordinates(x, y, magnification, view.pixel_pitch, origin)
-
-
-def _trace(
-    system: OpticalSystem, ray: Components, wavelength: float, backend: str
-) -> tuple[Components, Tensor]:
-    """Rays behind the lens, in object space, and which of them got there."""
-    if backend == "reference":
-        traced = trace_surfaces(system, ray, wavelength, sense=-1.0)
-        return traced.ray, traced.valid
-    rays = Rays.from_components(ray, wavelength)
-    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
-    return Components(*hit.position.unbind(-1), *hit.direction.unbind(-1)), hit.valid

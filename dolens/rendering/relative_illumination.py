@@ -25,8 +25,6 @@ def relative_illumination(
     wavelengths: Sequence[float],
     sensor: Sensor,
     pupil: ExitPupil,
-    symmetric: bool,
-    backend: str,
     rays: int = RAYS,
 ) -> Tensor:
     """Irradiance of every pixel under a uniform scene, over that on the axis.
@@ -40,8 +38,6 @@ def relative_illumination(
         wavelengths: nm.
         sensor: the pixels.
         pupil: the disc that is sampled.
-        symmetric: whether the lens has rotational symmetry.
-        backend: what traces.
         rays: through the pupil, for each point and wavelength; a multiple of four.
 
     Returns:
@@ -55,16 +51,16 @@ def relative_illumination(
     # No two of them on one circle: strata lie on rings, which an aperture's edge takes as wholes.
     spiral = uniform_pupil_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
     disc = tuple(d.expand(max(RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
-    if symmetric:
+    if system.rotationally_symmetric:
         x, y = sensor.positions(*grid)
         distance = torch.hypot(x, y)
         low, high = float(distance.min()), float(distance.max())
         radius = torch.linspace(low, high, RADII, **options)
         points = (radius, torch.zeros_like(radius))
-        _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
+        _, weight = pupil_rays(system, wavelengths, points, pupil, disc)
         light = weight.sum(-1)
         few = tuple(p[::_RIM_RADII] for p in points)
-        rim = rim_rays(system, wavelengths, few, pupil, backend)
+        rim = rim_rays(system, wavelengths, few, pupil)
         if rim is not None:
             light = light + functional.interpolate(
                 rim.weight.sum(-1)[None], size=RADII, mode="linear", align_corners=True
@@ -77,12 +73,12 @@ def relative_illumination(
     columns = torch.linspace(0.0, width - 1.0, _SIDE, **options)
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     points = sensor.positions(row.reshape(-1), column.reshape(-1))
-    _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
+    _, weight = pupil_rays(system, wavelengths, points, pupil, disc)
     light = weight.sum(-1).unflatten(-1, (_SIDE, _SIDE))
     few = tuple(
         p.unflatten(0, (_SIDE, _SIDE))[::_RIM_SIDE, ::_RIM_SIDE].reshape(-1) for p in points
     )
-    rim = rim_rays(system, wavelengths, few, pupil, backend)
+    rim = rim_rays(system, wavelengths, few, pupil)
     if rim is not None:
         coarse = rim.weight.sum(-1).unflatten(-1, (-1, 1 + (_SIDE - 1) // _RIM_SIDE))
         light = light + functional.interpolate(

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import torch
 
-from dolens.optics.backend import choose_backend
 from dolens.rendering.auto.probe import grey_levels
 from dolens.rendering.auto.survey import spread_pixels, survey
 from experiments.speed.renders import Subject
@@ -25,11 +24,10 @@ def function_rows(
         seconds: that timing may take.
     """
     system = subject.lens.system()
-    backend = choose_backend(system, subject.lens.backend)
     places = spread_pixels(subject.sensor, _POINTS)
 
     def functions(count: int, seed: int) -> torch.Tensor:
-        found = survey(system, subject.scene, subject.sensor, *places, count, backend, seed)
+        found = survey(system, subject.scene, subject.sensor, *places, count, seed)
         return found.functions(_SIZE, found.chief is not None)
 
     truth = functions(_TRUE_SAMPLES, 0)

@@ -52,7 +52,7 @@ def measured(lens, renderer, window):
 def measured_on(texture, lens, renderer, window):
     system = lens.double().system()
     pupil, middle = axial_exit_pupil(system, LINES[1:2]), PlanarScene(SCENE.depths, LINES[1:2])
-    (look,) = chief_ray_maps(system, middle, WHOLE, [window], pupil, "reference")
+    (look,) = chief_ray_maps(system, middle, WHOLE, [window], pupil)
     lens.float()
     centre = tuple(float(c.mean().round()) for c in look)
     image = renderer.render_windows(lens, SCENE, texture, [window], [centre], seed=11)[0]

@@ -32,7 +32,7 @@ def by_rays(system, scene, sensor, pupil):
         torch.arange(sensor.height).double(), torch.arange(sensor.width).double(), indexing="ij"
     )
     points = sensor.positions(row.reshape(-1), column.reshape(-1))
-    seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch, "reference")
+    seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch)
     return [c.permute(1, 2, 0).unflatten(-1, row.shape) for c in seen]
 
 
@@ -41,7 +41,7 @@ def test_polynomials_are_the_chief_rays_to_a_thousandth_of_a_pixel(root, name):
     system, sensor = lens_of(root, name).system(), SENSORS[name]
     scene = PlanarScene((5000.0, 9000.0), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
+    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil)
     for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
         assert float((one - other).abs().max()) < 1e-3
 
@@ -50,7 +50,7 @@ def test_windows_of_a_sensor_look_where_the_sensor_does(root):
     system, sensor = lens_of(root, "large_fov_doublet").system(), SENSORS["large_fov_doublet"]
     scene = PlanarScene((5000.0,), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    whole = distortion(system, scene, sensor, pupil, "reference")
+    whole = distortion(system, scene, sensor, pupil)
     window = sensor.window(11, 200, 40, 30)
     for part, all_of_it in zip(whole.seen_by(window), whole.seen_by(sensor), strict=True):
         assert torch.allclose(part, all_of_it[..., 11:51, 200:230], rtol=0, atol=1e-9)
@@ -61,8 +61,8 @@ def test_where_polynomials_are_not_enough_every_pixel_has_its_ray(root, monkeypa
     system, sensor = lens_of(root, "cooke_triplet").system(), Sensor(12, 10, 1.0)
     scene = PlanarScene((5000.0,), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    assert distortion(system, scene, sensor, pupil, "reference") is None
-    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
+    assert distortion(system, scene, sensor, pupil) is None
+    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil)
     for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
         assert torch.equal(one, other)
 

@@ -219,11 +219,13 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
     view = renderer._view(system, scene, (40, 43), 0, sampled_exit_pupil(system, LINES, SMALL))
-    moving = moving_view(system, scene, view, "reference")
+    moving = moving_view(system, scene, view)
     ray, weight = renderer._samples(system, view, moving.pupil, 0, 180)
     shown = scene.on_planes(texture(40))
-    images = [renderer._shade(system, scene, view, moving, shown, ray, weight, None, backend)
-              for backend in ("reference", "cpu")]  # fmt: skip
+    images = [
+        renderer._shade(system.traced_by(backend), scene, view, moving, shown, ray, weight, None)
+        for backend in ("reference", "cpu")
+    ]
     assert torch.allclose(*images, rtol=1e-11, atol=0)
 
 

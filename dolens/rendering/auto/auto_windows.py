@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import (
     Agreement,
@@ -225,7 +224,6 @@ class _Trial:
         self.lens, self.scene, self.auto, self.sensor = lens, scene, owner.auto, owner.sensor
         self.names, self.windows = list(owner.windows), list(owner.windows.values())
         self.single, self.double = in_both_precisions(lens)
-        self.backend = choose_backend(self.double.system(), lens.backend)
         self.centres = self._centres(owner.sensor)
         channels = len(scene.wavelengths)
         self.textures = [
@@ -267,7 +265,6 @@ class _Trial:
             tolerance,
             self.auto.gradients,
             self.auto.diffraction,
-            self.backend,
             registrations=("chief_rays",),
         )
 
@@ -311,5 +308,5 @@ class _Trial:
         system, wavelengths = self.double.system(), (self.scene.middle_wavelength,)
         middle = self.scene.as_planes(wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
-        looks = chief_ray_maps(system, middle, sensor, self.windows, pupil, self.backend)
+        looks = chief_ray_maps(system, middle, sensor, self.windows, pupil)
         return [tuple(float(c.mean().round()) for c in look) for look in looks]

@@ -43,7 +43,6 @@ def choose_fields(
     columns: Tensor,
     truth: Survey,
     tolerance: float,
-    backend: str,
     registrations: Sequence[str] = REGISTRATIONS,
 ) -> Layout:
     """The cheapest grid whose interpolated functions are those of the points in between."""
@@ -61,7 +60,7 @@ def choose_fields(
     best: tuple[float, PsfRenderer] | None = None
     for renderer in candidates:
         if renderer.fields not in nodes:
-            nodes[renderer.fields] = _node_survey(system, scene, sensor, renderer, backend)
+            nodes[renderer.fields] = _node_survey(system, scene, sensor, renderer)
         error = _interpolation_error(renderer, sensor, rows, columns, truth, nodes[renderer.fields])
         if best is None or error < best[0]:
             best = error, renderer
@@ -137,14 +136,14 @@ def window_finding(truth: Survey, size: int, distortion: bool) -> Finding:
 
 
 def _node_survey(
-    system: OpticalSystem, scene: PlanarScene, sensor: Sensor, renderer: PsfRenderer, backend: str
+    system: OpticalSystem, scene: PlanarScene, sensor: Sensor, renderer: PsfRenderer
 ) -> Survey:
     down, across = (
         torch.tensor(node_positions(side, count), dtype=torch.float64)
         for side, count in zip((sensor.height, sensor.width), renderer.fields, strict=True)
     )
     rows, columns = torch.meshgrid(down, across, indexing="ij")
-    return survey(system, scene, sensor, rows.reshape(-1), columns.reshape(-1), SAMPLES, backend)
+    return survey(system, scene, sensor, rows.reshape(-1), columns.reshape(-1), SAMPLES)
 
 
 def _interpolation_error(

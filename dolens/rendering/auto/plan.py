@@ -71,7 +71,6 @@ def plan(
     tolerance: float,
     gradients: bool,
     diffraction: bool,
-    backend: str,
     registrations: Sequence[str] = REGISTRATIONS,
 ) -> Plan:
     """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
@@ -84,17 +83,14 @@ def plan(
         tolerance: RMS grey levels (1/255 of full scale, linear light) on the probe.
         gradients: whether the lens's gradients matter too.
         diffraction: whether it may be modelled.
-        backend: what traces.
         registrations: that may be chosen, of `PsfRenderer`.
 
     Raises:
         InputError: functions are too wide for any window.
     """
     rows, columns = spread_pixels(sensor, _POINTS)
-    truth = survey(precise, scene, sensor, rows, columns, SAMPLES, backend)
-    layout = choose_fields(
-        precise, scene, sensor, rows, columns, truth, tolerance, backend, registrations
-    )
+    truth = survey(precise, scene, sensor, rows, columns, SAMPLES)
+    layout = choose_fields(precise, scene, sensor, rows, columns, truth, tolerance, registrations)
     renderer, distortion = layout.renderer, layout.renderer.registration == "chief_rays"
     functions = truth.functions(renderer.size, distortion)
     findings = [layout.finding, window_finding(truth, renderer.size, distortion)]
@@ -105,7 +101,7 @@ def plan(
     ):
         renderer = replace(renderer, **{name: finding.chosen})
         findings.append(finding)
-    finding, without = _diffraction(functions, truth, precise, scene, renderer, tolerance, backend)
+    finding, without = _diffraction(functions, truth, precise, scene, renderer, tolerance)
     if not diffraction:
         finding = Finding(
             "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
@@ -119,10 +115,10 @@ def plan(
         functions = truth.functions(renderer.size, distortion)
     few = slice(0, 8)
     part = rows[few], columns[few]
-    finding = _sampling(precise, scene, sensor, part, functions[few], renderer, tolerance, backend)
+    finding = _sampling(precise, scene, sensor, part, functions[few], renderer, tolerance)
     renderer = replace(renderer, pupil_samples=int(finding.chosen))
     findings.append(finding)
-    finding = _precision(system, precise, scene, sensor, part, renderer, tolerance, backend)
+    finding = _precision(system, precise, scene, sensor, part, renderer, tolerance)
     findings.append(finding)
     dtype = torch.float32 if finding.chosen == "single" else torch.float64
     return Plan(renderer, dtype, tuple(findings), without)
@@ -154,7 +150,6 @@ def _diffraction(
     scene: PlanarScene,
     renderer: PsfRenderer,
     tolerance: float,
-    backend: str,
 ) -> tuple[Finding, float]:
     """What model of diffraction is enough, and what leaving it out would cost.
 
@@ -178,9 +173,7 @@ def _diffraction(
     # From the middle to a corner: what diffracts there may be beyond Fourier transforms.
     share = torch.linspace(0.5, 1.0, _WAVES, dtype=torch.float64)
     places = share * (sensor.height - 1), share * (sensor.width - 1)
-    found, again = (
-        survey(system, scene, sensor, *places, SAMPLES, backend, seed) for seed in (0, 1)
-    )
+    found, again = (survey(system, scene, sensor, *places, SAMPLES, seed) for seed in (0, 1))
     # As wide as diffraction spreads light, within reason.
     size = renderer.size + 2 * min(math.ceil(8.0 * airy) + 2, _MARGINS[-1])
     at = (system, scene, sensor, *places, size, distortion)
@@ -241,13 +234,12 @@ def _sampling(
     functions: Tensor,
     renderer: PsfRenderer,
     tolerance: float,
-    backend: str,
 ) -> Finding:
     """The fewest rays whose functions are those of many."""
     distortion = renderer.registration == "chief_rays"
     error, samples = math.inf, _PUPIL_SAMPLES[-1]
     for samples in _PUPIL_SAMPLES:
-        found = survey(system, scene, sensor, *places, samples, backend, seed=1)
+        found = survey(system, scene, sensor, *places, samples, seed=1)
         coarse = found.functions(renderer.size, distortion)
         error = float(grey_levels(coarse - functions).square().mean().sqrt())
         if error <= _SAMPLING * tolerance:
@@ -264,11 +256,10 @@ def _precision(
     places: tuple[Tensor, Tensor],
     renderer: PsfRenderer,
     tolerance: float,
-    backend: str,
 ) -> Finding:
     distortion = renderer.registration == "chief_rays"
     found = [
-        survey(lens, scene, sensor, *places, 16, backend).functions(renderer.size, distortion)
+        survey(lens, scene, sensor, *places, 16).functions(renderer.size, distortion)
         for lens in (system, precise)
     ]
     error = float(grey_levels(found[0].double() - found[1]).square().mean().sqrt())

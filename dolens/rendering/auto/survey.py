@@ -7,7 +7,8 @@ from torch import Tensor
 
 from dolens.diffraction.propagation import DiffractionSettings
 from dolens.errors import InputError
-from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.optics.backend import cpu_kernels_serve
+from dolens.optics.system import OpticalSystem
 from dolens.rendering.plane_points import (
     PlanePoints,
     chief_ray_points,
@@ -37,14 +38,14 @@ class Survey:
         chief: rows and columns of the chief rays, each (N, D, C); None where some do not pass.
         pinhole: rows and columns as a pinhole sees the points.
         f_number: that the axial beam works with.
-        backend: what splats.
+        fused: whether the CPU's kernels splat.
     """
 
     seen: PlanePoints
     chief: tuple[Tensor, Tensor] | None
     pinhole: tuple[Tensor, Tensor]
     f_number: float
-    backend: str
+    fused: bool
 
     def centres(self, distortion: bool) -> tuple[Tensor, Tensor]:
         """What functions are centred on: the chief rays, or a pinhole's points."""
@@ -57,7 +58,7 @@ class Survey:
 
     def functions(self, size: int, distortion: bool) -> Tensor:
         """(N, D, C, size, size)."""
-        return splatted(self.offsets(distortion), size, self.backend).functions
+        return splatted(self.offsets(distortion), size, self.fused).functions
 
     def waves(
         self,
@@ -70,7 +71,7 @@ class Survey:
         distortion: bool,
     ) -> Tensor:
         """Functions (N, D, C, size, size) with diffraction, of the same points."""
-        pupil = sampled_exit_pupil(system, scene.wavelengths, sensor, self.backend)
+        pupil = sampled_exit_pupil(system, scene.wavelengths, sensor)
         return wave_point_spread_functions(
             system,
             scene,
@@ -79,8 +80,6 @@ class Survey:
             sensor.pixel_pitch,
             size,
             distortion,
-            is_rotationally_symmetric(system),
-            self.backend,
             # Near enough for a plan; direct integration would take minutes.
             DiffractionSettings(method="fourier"),
         ).functions
@@ -100,11 +99,10 @@ class Survey:
             system,
             scene,
             sensor.positions(rows, columns),
-            sampled_exit_pupil(system, scene.wavelengths, sensor, self.backend),
+            sampled_exit_pupil(system, scene.wavelengths, sensor),
             sensor.pixel_pitch,
             size,
             distortion,
-            self.backend,
         )
 
     def light(self) -> Tensor:
@@ -120,7 +118,6 @@ def survey(
     rows: Tensor,
     columns: Tensor,
     pupil_samples: int,
-    backend: str,
     seed: int = 0,
 ) -> Survey:
     """Trace rays from pixels (N,), at fractional rows and columns, to the planes of a scene.
@@ -128,18 +125,17 @@ def survey(
     All points share their places in the pupil, so that functions of neighbours are alike in what
     the sampling leaves.
     """
-    pupil = sampled_exit_pupil(system, scene.wavelengths, sensor, backend)
+    pupil = sampled_exit_pupil(system, scene.wavelengths, sensor)
     points = sensor.positions(rows, columns)
-    symmetric = is_rotationally_symmetric(system)
     disc = sampled_disc(1, pupil_samples, seed, system)
     pitch = sensor.pixel_pitch
-    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    seen = plane_points(system, scene, points, pupil, disc, pitch)
     return Survey(
         seen,
-        _chief(system, scene, points, pupil, pitch, backend),
+        _chief(system, scene, points, pupil, pitch),
         pinhole_points(points, pitch, len(scene.depths), len(scene.wavelengths)),
         working_f_number(pupil, float(system.vertices[-1])),
-        backend,
+        cpu_kernels_serve(system),
     )
 
 
@@ -149,10 +145,9 @@ def _chief(
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     pitch: float,
-    backend: str,
 ) -> tuple[Tensor, Tensor] | None:
     try:
-        return chief_ray_points(system, scene, points, pupil, pitch, backend)
+        return chief_ray_points(system, scene, points, pupil, pitch)
     except InputError:
         return None
 

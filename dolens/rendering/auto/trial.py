@@ -7,7 +7,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import (
     Agreement,
@@ -63,7 +62,6 @@ class Trial:
         self.sensor, self.tolerance, self.seed = sensor, tolerance, seed
         self.gradients, self.diffraction = gradients, diffraction
         self._single, self._double = in_both_precisions(current)
-        self._backend = choose_backend(self._double.system(), current.backend)
         self.texture = probe_texture(sensor, len(scene.wavelengths), seed, photographs)
         centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
         self.scene = scene.as_planes(texture_centre=centre)
@@ -92,7 +90,6 @@ class Trial:
             tolerance,
             self.gradients,
             self.diffraction,
-            self._backend,
         )
 
     def error(self, renderer: PsfRenderer | RayRenderer, dtype: torch.dtype) -> float:

@@ -34,7 +34,6 @@ def pixel_edge_rays(
     edges: EdgeMap | None,
     start: int,
     end: int,
-    backend: str,
 ) -> EdgeRays | None:
     """Rays (C, pixels, samples) of pixels `start` to `end`; None where no gradient asks for them.
 
@@ -47,7 +46,6 @@ def pixel_edge_rays(
         edges: where edges are; None where they cut nothing.
         start: number of the first pixel.
         end: number behind the last.
-        backend: what traces.
     """
     if edges is None or not depends_on_parameters(system):
         return None
@@ -65,7 +63,7 @@ def pixel_edge_rays(
         rows, columns = rows + (area[0][:, 0] - 0.5), columns + (area[1][:, 0] - 0.5)
     points = sensor.positions(rows, columns)
     edge = edges.at(*points, angle)
-    return edge_rays(system, scene.wavelengths, points, pupil, edge, backend)
+    return edge_rays(system, scene.wavelengths, points, pupil, edge)
 
 
 def of_channel(ray: Components, channel: int) -> Components:

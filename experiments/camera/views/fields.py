@@ -11,7 +11,6 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import GradientMeasure
 from dolens.rendering.auto.auto_renderer import AutoRenderer
@@ -265,9 +264,8 @@ class FieldViews:
                 window, (1, 1), pupil_samples or 32, self._psf_size(), jitter=False
             )
             system = lens.system(values)
-            backend = choose_backend(system, lens.backend)
-            pupil = sampled_exit_pupil(system, scene.wavelengths, window, backend)
-            functions = renderer.point_spread_functions(system, scene, pupil, 0, backend)
+            pupil = sampled_exit_pupil(system, scene.wavelengths, window)
+            functions = renderer.point_spread_functions(system, scene, pupil, 0)
             found.append(functions.functions[0, 0])
         return torch.stack(found)
 

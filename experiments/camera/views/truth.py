@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
@@ -42,11 +41,10 @@ def chief_ray_looks(
         (D, height, width), in double precision.
     """
     system = lens.system(values)
-    backend = choose_backend(system, lens.backend)
     wavelengths = (lens.primary_wavelength,)
     planes = scene.as_planes(wavelengths=wavelengths)
     pupil = moving_chief_pupil(system, wavelengths, paraxial_exit_pupil(system, wavelengths))
-    looks = chief_ray_maps(system, planes, whole, windows, pupil, backend)
+    looks = chief_ray_maps(system, planes, whole, windows, pupil)
     return [(rows[:, 0], columns[:, 0]) for rows, columns in looks]
 
 
