@@ -19,19 +19,13 @@ from dolens.prescriptions import lens_from_prescription, save_lens
 from experiments.callbacks.interruption import InterruptionNotice
 from experiments.experiment import Experiment, check_experiment
 from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
+from experiments.running.resolvers import register_resolvers
 from experiments.running.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
 from experiments.running.unread_settings import refuse_unread
 
 logger = logging.getLogger(__name__)
 
-# Arithmetic that configurations need: the number of steps of a whole training.
-OmegaConf.register_new_resolver("total_steps", lambda epochs, steps: epochs * steps, replace=True)
-
-# And the iterations of stages together.
-OmegaConf.register_new_resolver(
-    "iterations", lambda stages: sum(stage["iterations"] for stage in stages), replace=True
-)
-OmegaConf.register_new_resolver("count", len, replace=True)
+register_resolvers()
 
 # The top-level keys that `run` itself takes; all others must be read by one of these.
 TAKEN = (

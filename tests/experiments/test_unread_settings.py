@@ -7,9 +7,9 @@ from experiments.running.training import TAKEN
 from experiments.running.unread_settings import refuse_unread
 
 UNREAD = {
-    "a group": (["experiment=wavefront_coding", "discriminator=double_scale"], "discriminator="),
+    "a group": (["experiment=asphere", "discriminator=double_scale"], "discriminator="),
     "a new key": (
-        ["experiment=wavefront_coding", "+operands=[{kind: efl, target: 100}]"],
+        ["experiment=asphere", "+operands=[{kind: efl, target: 100}]"],
         "operands:",
     ),
     "a group of images for a lens alone": (["experiment=nikon", "network=unet"], "network=unet:"),
@@ -29,7 +29,9 @@ READ = {
     "an argument of a resolver": ["data.steps_per_epoch=7"],
     "a group without keys of its own": ["search=seeds"],
     "what is taken away": ["callbacks.pictures=null", "~callbacks.best"],
-    "something empty": ["+operands=[]"],
+    "something empty": ["+wishes=[]"],
+    "an adversarial term": ["discriminator=double_scale"],
+    "operands": ["operands=[{kind: efl, target: 100}]"],
     "a tag of the run folder": ["+tag=3", "hydra.run.dir=outputs/${tag}"],
     "a default of a group, named": ["discriminator=none"],
 }
