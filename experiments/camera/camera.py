@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor, nn
 
@@ -27,10 +26,10 @@ from experiments.camera.lens_least_squares import LensLeastSquares
 from experiments.camera.operands import CameraOperands
 from experiments.camera.photograph_scores import PhotographScores
 from experiments.camera.views.base import Comparison, Imaging, Views
-from experiments.running.checkpoints import refuse_another
+from experiments.experiment import Experiment
 
 
-class CameraModule(lightning.LightningModule):
+class CameraModule(Experiment):
     """End-to-end training of a camera.
 
     A batch of textures is imaged in several ways (at depths, or at places of the field), read out,
@@ -74,15 +73,13 @@ class CameraModule(lightning.LightningModule):
         view_norm: float = 1.0,
         calibrations: Mapping[str, Calibration] | None = None,
     ) -> None:
-        super().__init__()
-        self.lens = lens.requires_grad_(False)
+        super().__init__(lens, experiment)
         self.variables = DesignVariables(lens, variables or {})
         self.variables.write_to(self.lens)
         self.operands = CameraOperands(operands, lens, views.object_distance)
         self.network = network
         self.loss = loss
         self.adversary = Adversary(discriminator, learning_rates) if discriminator else None
-        self.experiment = experiment
         self.views = views
         self.optimizer = optimizer
         self.lens_steps: LensLeastSquares | None = getattr(optimizer, "lens_steps", None)
@@ -390,18 +387,17 @@ class CameraModule(lightning.LightningModule):
 
     # ---------------------------------------------------------------- checkpoints
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say whose checkpoint it is, in plain values."""
-        checkpoint["dolens"] = self.identity()
-        checkpoint["dolens_views"] = self.views.state()
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return what the views, the lens's optimizer and the discriminators go on from."""
+        state: dict[str, Any] = {"dolens_views": self.views.state()}
         if self.lens_steps is not None:
-            checkpoint["dolens_lens_steps"] = self.lens_steps.state()
+            state["dolens_lens_steps"] = self.lens_steps.state()
         if self.adversary is not None:
-            checkpoint["dolens_adversary"] = self.adversary.optimizer.state_dict()
+            state["dolens_adversary"] = self.adversary.optimizer.state_dict()
+        return state
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another experiment before any weight is loaded."""
-        refuse_another(checkpoint.get("dolens"), self.identity())
+    def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
+        """Take it up."""
         self.views.load_state(self.lens, checkpoint.get("dolens_views", {}))
         if self.lens_steps is not None and "dolens_lens_steps" in checkpoint:
             self.lens_steps.load_state(checkpoint["dolens_lens_steps"])
@@ -409,10 +405,9 @@ class CameraModule(lightning.LightningModule):
             self.adversary.optimizer.load_state_dict(checkpoint["dolens_adversary"])
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must have in common with this module, as plain values."""
+        """Return the experiment, the lens, the variables' names and the network's shapes."""
         return {
-            "experiment": self.experiment,
-            "lens": self.lens.name,
+            **super().identity(),
             "variables": list(self.variables.names),
             "network": ", ".join(f"{n} {tuple(p.shape)}" for n, p in _shapes(self.network)),
         }

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -23,7 +22,7 @@ from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
 from experiments.design.iteration import Progress, gradient_iteration, least_squares_iteration
 from experiments.design.tables import iteration_row, spot_labels, spot_table
-from experiments.running.checkpoints import refuse_another
+from experiments.experiment import Experiment
 
 logger = logging.getLogger(__name__)
 
@@ -34,7 +33,7 @@ _LOGGED_FIRST = 20
 _EDGE_RINGS = 40
 
 
-class DesignModule(lightning.LightningModule):
+class DesignModule(Experiment):
     """Looks for the lens of the least merit.
 
     A step is an iteration of the optimizer.  An epoch is a round: it begins by choosing the rays
@@ -79,9 +78,8 @@ class DesignModule(lightning.LightningModule):
         round_tolerance: float = 1e-3,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment)
         self.automatic_optimization = False
-        self.lens = lens.requires_grad_(False)
         generator = torch.Generator().manual_seed(seed)
         values = start_values(lens, start or {}, generator)
         with torch.no_grad():
@@ -100,7 +98,7 @@ class DesignModule(lightning.LightningModule):
             self.published = lens_from_prescription(
                 {**published, **model}, lens.dtype, where="published", backend=lens.backend
             )
-        self.experiment, self.merit_settings = experiment, merit
+        self.merit_settings = merit
         self.evaluation = evaluation or replace(
             merit, quality="spots", quality_options={}, operands=()
         )
@@ -353,24 +351,14 @@ class DesignModule(lightning.LightningModule):
 
     # ---------------------------------------------------------------- checkpoints
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say which design it is, and what has been done."""
-        checkpoint["dolens"] = self.identity()
-        checkpoint["history"] = self.history
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return the iterations that were made."""
+        return {"history": self.history}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another design.
-
-        Raises:
-            InputError: it is one.
-        """
-        refuse_another(checkpoint.get("dolens"), self.identity())
+    def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
+        """Take them up."""
         self.history = list(checkpoint.get("history", []))
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must have in common with this module, as plain values."""
-        return {
-            "experiment": self.experiment,
-            "lens": self.lens.name,
-            "variables": list(self.variables.names),
-        }
+        """Return the experiment, the lens and the names of the variables."""
+        return {**super().identity(), "variables": list(self.variables.names)}

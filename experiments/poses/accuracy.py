@@ -6,10 +6,8 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -21,18 +19,18 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
+from experiments.analysis import Analysis
 from experiments.poses.basin import Basin
 from experiments.poses.measurements import draw, simulated_at
-from experiments.tables import Row, write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
 PARTS = ("photons", "rays", "basin")
 ESTIMATORS = ("noise_weighted", "s21")
-_DIGITS = 6
 
 
-class PoseAccuracyModule(lightning.LightningModule):
+class PoseAccuracyModule(Analysis):
     """Measures what limits a pose fit: light, rays, and where it starts.
 
     Errors by light and by rays are those of one Gauss-Newton step from the truth, which is where an
@@ -89,7 +87,7 @@ class PoseAccuracyModule(lightning.LightningModule):
         reference_photons: float = 2e8,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         for part in parts:
             if part not in PARTS:
                 raise InputError(f"parts: '{part}' is unknown (allowed: {', '.join(PARTS)})")
@@ -100,8 +98,7 @@ class PoseAccuracyModule(lightning.LightningModule):
                 "measurements, patterns, imagers, variables: give 2 or more, 1 or more, and at "
                 "least one of each"
             )
-        self.lens, self.experiment, self.seed = lens.requires_grad_(False), experiment, int(seed)
-        self.folder, self.parts = Path(folder), tuple(parts)
+        self.seed, self.parts = int(seed), tuple(parts)
         self.photons, self.read_noise = int(photons), float(read_noise)
         self.centroid_weight = float(centroid_weight)
         self.imagers = {
@@ -125,24 +122,21 @@ class PoseAccuracyModule(lightning.LightningModule):
             self.true, self.imager.wavelength, sensor, self.read_noise, self.seed, **basin
         )
         self.rows: list[Row] = []
-        self._numbers: dict[str, float] = {}
+        self.numbers: dict[str, float] = {}
 
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
+    def analyse(self) -> dict[str, float]:
+        """Measure part by part, and write the tables after each."""
+        for part in self.parts:
+            started = time.perf_counter()
+            logger.info("%s", part)
+            getattr(self, f"_{part}")()
+            self.write_tables()
+            self.numbers[f"cost/{part}_s"] = time.perf_counter() - started
+        return self.numbers
 
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Measure, and write each table when its part is done."""
-        with torch.inference_mode(False):
-            for part in self.parts:
-                started = time.perf_counter()
-                logger.info("%s", part)
-                getattr(self, f"_{part}")()
-                self._numbers[f"cost/{part}_s"] = time.perf_counter() - started
-        self.log_dict(self.summary(), batch_size=1)
-
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
-        return dict(self._numbers)
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `accuracy` and `basin`, as far as they have been measured."""
+        return {"accuracy": self.rows, "basin": self.basin.rows}
 
     # ---------------------------------------------------------------- light
 
@@ -162,7 +156,6 @@ class PoseAccuracyModule(lightning.LightningModule):
                 rms = found.square().mean(0).sqrt()
                 self._add("photons", estimator, level, rms, known.bounds)
             logger.info("%.3g photons: %s", level, self._last_ratios())
-        write_table(self.folder / "accuracy.csv", self.rows, _DIGITS)
 
     def _measurement(self, photons: int, seed: int) -> Measurement:
         imager, generator = self.imager, draw(self.seed, 0, seed)
@@ -187,7 +180,7 @@ class PoseAccuracyModule(lightning.LightningModule):
         known = knowledge(self.true, self.imager, quoted, self.slopes)
         inverse = self._s21_inverse(reference)
         floor = float((exact.bounds / known.bounds).square().mean().sqrt())
-        self._numbers["pose_error/reference_over_bound"] = floor
+        self.numbers["pose_error/reference_over_bound"] = floor
         for (name, imager), count in (
             (entry, count) for entry in self.imagers.items() for count in self.ray_counts
         ):
@@ -205,15 +198,13 @@ class PoseAccuracyModule(lightning.LightningModule):
                 rms = torch.stack(steps).square().mean(0).sqrt()
                 self._add(f"rays/{name}", estimator, count, rms, known.bounds, min(seconds))
             logger.info("%s, %.3g rays: %s", name, count, self._last_ratios())
-        write_table(self.folder / "accuracy.csv", self.rows, _DIGITS)
 
     # ---------------------------------------------------------------- where it starts
 
     def _basin(self) -> None:
         """Fits from starts that are farther and farther off."""
         self.basin.run()
-        write_table(self.folder / "basin.csv", self.basin.rows, _DIGITS)
-        self._numbers |= self.basin.summary()
+        self.numbers |= self.basin.summary()
 
     # ---------------------------------------------------------------- estimates and rows
 
@@ -256,9 +247,9 @@ class PoseAccuracyModule(lightning.LightningModule):
                 }
             )
         key = f"pose_error/over_bound/{part}_{count:g}/{estimator}"
-        self._numbers[key] = float((rms / bounds).square().mean().sqrt())
+        self.numbers[key] = float((rms / bounds).square().mean().sqrt())
 
     def _last_ratios(self) -> str:
         """RMS errors over bounds of what was added last."""
-        last = list(self._numbers.items())[-len(ESTIMATORS) :]
+        last = list(self.numbers.items())[-len(ESTIMATORS) :]
         return ", ".join(f"{name.rpartition('/')[2]} {value:.3g} bounds" for name, value in last)

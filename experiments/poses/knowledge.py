@@ -4,10 +4,8 @@ import copy
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -17,15 +15,15 @@ from dolens.alignment.pose import Pose
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
+from experiments.analysis import Analysis
 from experiments.poses.measurements import draw, repetitions, simulated_at
 from experiments.poses.results import spread_metrics
 from experiments.poses.settings import blur_for, slopes_imager, spot_imager
-from experiments.tables import Row, write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
 _KEYS = ("sources", "planes", "variables")
-_DIGITS = 6
 # A combination known worse than so many of its scales is not known at all.
 UNSEEN = 1e4
 
@@ -56,7 +54,7 @@ class Arrangement:
         return self.known.bounds / self.pose.units
 
 
-class PoseKnowledgeModule(lightning.LightningModule):
+class PoseKnowledgeModule(Analysis):
     """Compares arrangements of sources and planes by what they tell of the same unknowns.
 
     Args:
@@ -98,13 +96,12 @@ class PoseKnowledgeModule(lightning.LightningModule):
         monte_carlo: int = 0,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         if lens.dtype != torch.float64:
             raise InputError(f"lens_dtype: poses are known in float64, not {lens.dtype}")
         if not variables or not arrangements:
             raise InputError("variables, arrangements: give at least one of each")
-        self.lens = lens.requires_grad_(False)
-        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.seed = int(seed)
         self.photons, self.read_noise = int(photons), float(read_noise)
         self.monte_carlo = repetitions(monte_carlo)
         self.sensor, self.wavelength = sensor, float(wavelength)
@@ -113,27 +110,21 @@ class PoseKnowledgeModule(lightning.LightningModule):
             name: self._pose(name, entry, values, variables) for name, entry in arrangements.items()
         }
         self.arrangements: list[Arrangement] = []
-        self._numbers: dict[str, float] = {}
-
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
 
     @torch.no_grad()
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Evaluate, log, and write the tables."""
-        with torch.inference_mode(False), torch.no_grad():
-            for number, (name, pose) in enumerate(self.poses.items()):
-                found = self._evaluate(number, name, pose)
-                self.arrangements.append(found)
-                self._numbers |= self._metrics(found)
-                logger.info("%s: %s", name, self._verdict(found))
-        write_table(self.folder / "bounds.csv", self.bound_rows(), _DIGITS)
-        write_table(self.folder / "combinations.csv", self.combination_rows(), _DIGITS)
-        self.log_dict(self.summary(), batch_size=1)
+    def analyse(self) -> dict[str, float]:
+        """Evaluate every arrangement."""
+        numbers: dict[str, float] = {}
+        for number, (name, pose) in enumerate(self.poses.items()):
+            found = self._evaluate(number, name, pose)
+            self.arrangements.append(found)
+            numbers |= self._metrics(found)
+            logger.info("%s: %s", name, self._verdict(found))
+        return numbers
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
-        return dict(self._numbers)
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `bounds` and `combinations`."""
+        return {"bounds": self.bound_rows(), "combinations": self.combination_rows()}
 
     def bound_rows(self) -> list[Row]:
         """Of bounds.csv: a row for each variable of each arrangement."""

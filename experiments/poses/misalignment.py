@@ -5,10 +5,8 @@ import itertools
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor, nn
 
@@ -21,6 +19,7 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.sensor.pixels import Sensor
+from experiments.experiment import Experiment
 from experiments.poses.estimates import Estimates, Held, estimates
 from experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
 from experiments.poses.measurements import draw, making, repetitions, simulated_at
@@ -32,7 +31,6 @@ from experiments.poses.results import (
     spread_metrics,
 )
 from experiments.poses.settings import Stage, fit_of, plain_imager, spot_imager, stage_of
-from experiments.running.checkpoints import refuse_another
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
@@ -41,7 +39,7 @@ logger = logging.getLogger(__name__)
 _LOGGED = 8
 
 
-class MisalignmentModule(lightning.LightningModule):
+class MisalignmentModule(Experiment):
     """Finds poses one after another: an epoch is a fit, a step an iteration of one of its stages.
 
     Args:
@@ -93,12 +91,11 @@ class MisalignmentModule(lightning.LightningModule):
         planes: Sequence[float] = (0.0,),
         unmodelled: Mapping[str, Any] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         self.automatic_optimization = False
         if lens.dtype != torch.float64:
             raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
-        self.lens = lens.requires_grad_(False)
-        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.seed = int(seed)
         self.unmodelled = unmodelled_of(unmodelled)
         self.measured = None
         if measurement is not None and self.unmodelled != Unmodelled():
@@ -374,26 +371,19 @@ class MisalignmentModule(lightning.LightningModule):
 
     # ---------------------------------------------------------------- checkpoints
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say which experiment it is, and what has been done."""
-        checkpoint["dolens"] = self.identity()
-        checkpoint["history"], checkpoint["seconds"] = self.history, self.seconds
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return the iterations that were made."""
+        return {"history": self.history, "seconds": self.seconds}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another experiment.
-
-        Raises:
-            InputError: it is one.
-        """
-        refuse_another(checkpoint.get("dolens"), self.identity())
+    def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
+        """Take them up."""
         self.history = list(checkpoint.get("history", []))
         self.seconds = dict(checkpoint.get("seconds", {}))
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must have in common with this module, as plain values."""
+        """Return the experiment, the lens, the fits and the stages."""
         return {
-            "experiment": self.experiment,
-            "lens": self.lens.name,
+            **super().identity(),
             "fits": {fit.name: list(fit.variables) for fit in self.fits},
             "stages": [[stage.optimizer, stage.iterations] for stage in self.stages],
         }

@@ -4,11 +4,9 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -26,20 +24,20 @@ from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from experiments.analysis import Analysis
 from experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
 from experiments.settings import numbers_of
-from experiments.tables import write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
-_DIGITS = 9
 # Radians and mm as tables have them: degrees and µm.
 _DEGREES, _MICROMETRES = math.degrees(1.0), 1e3
 # Rings and arms with many rays in every pixel, and how many places of the grid are tried.
 _DENSE, _PLACES = (40, 120), 16
 
 
-class TripletAlignmentModule(lightning.LightningModule):
+class TripletAlignmentModule(Analysis):
     """Simulates spots of lenses with one element off, and finds which and by how much.
 
     Where the sensor is counts as unknown: every hypothesis has the pose of one element and, where
@@ -73,6 +71,8 @@ class TripletAlignmentModule(lightning.LightningModule):
         InputError: a setting out of range, a lens with fewer elements, an unknown element.
     """
 
+    digits: ClassVar[int] = 9
+
     def __init__(
         self,
         lens: Lens,
@@ -97,8 +97,7 @@ class TripletAlignmentModule(lightning.LightningModule):
         iterations: int = 20,
         seed: int = 0,
     ) -> None:
-        super().__init__()
-        self.lens = lens.requires_grad_(False)
+        super().__init__(lens, experiment, folder)
         self.elements = list(lens.elements)
         if len(self.elements) < 2:
             raise InputError("lens.elements: two or more are needed to tell one from another")
@@ -113,7 +112,7 @@ class TripletAlignmentModule(lightning.LightningModule):
         ):
             if not 0.0 <= number < math.inf:
                 raise InputError(f"{key}: {number!r}; allowed: a positive number, or 0 if known")
-        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.seed = int(seed)
         self.fields = [numbers_of("fields", field, 2) for field in fields]
         self.wavelengths = numbers_of("wavelengths", wavelengths)
         if not self.fields or not self.wavelengths:
@@ -134,21 +133,17 @@ class TripletAlignmentModule(lightning.LightningModule):
         self.iterations = iterations
         self.alignment: Alignment | None = None
 
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
-
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Simulate, fit, log, and write the table."""
-        # Lightning tests in inference mode, which forward derivatives do not work in.
-        with torch.inference_mode(False), torch.no_grad(), one_thread():
+    @torch.no_grad()
+    def analyse(self) -> dict[str, float]:
+        """Simulate all cases, and fit them in one batch."""
+        with one_thread():
             self.alignment = self._align()
-        self.log_dict(self.summary(), batch_size=1)
-        write_table(self.folder / "alignment.csv", self.alignment.rows(), _DIGITS)
         logger.info("%s", self.alignment.verdict())
+        return self.alignment.summary()
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json; none before the test."""
-        return {} if self.alignment is None else self.alignment.summary()
+    def tables(self) -> dict[str, Iterable[Row]]:
+        """Return `alignment`: a row for each case, the demo first."""
+        return {"alignment": self.alignment.rows()}
 
     def _align(self) -> Alignment:
         lens = copy.deepcopy(self.lens).double()

@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription, save_lens
 from experiments.callbacks.interruption import InterruptionNotice
+from experiments.experiment import Experiment, check_experiment
 from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
 from experiments.running.resolvers import register_resolvers
 from experiments.running.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
@@ -52,6 +53,7 @@ def run(cfg: DictConfig) -> float:
     torch.set_float32_matmul_precision(cfg.matmul_precision)
     lens = build_lens(cfg)
     module = instantiate(cfg.module)(lens=lens)
+    check_experiment(module, cfg.train)
     checkpoint = cfg.ckpt_path
     if checkpoint is not None:
         refuse_idle_checkpoint(cfg, module)
@@ -123,7 +125,7 @@ def build_lens(cfg: DictConfig) -> Any:
     )
 
 
-def refuse_idle_checkpoint(cfg: DictConfig, module: lightning.LightningModule) -> None:
+def refuse_idle_checkpoint(cfg: DictConfig, module: Experiment) -> None:
     """Refuse a checkpoint that nothing would load.
 
     Raises:
@@ -131,20 +133,20 @@ def refuse_idle_checkpoint(cfg: DictConfig, module: lightning.LightningModule) -
     """
     if not (cfg.train or cfg.test):
         raise InputError("ckpt_path: train=false test=false loads no checkpoint; leave it out")
-    if type(module).training_step is lightning.LightningModule.training_step:
+    if not module.trains:
         raise InputError(
             f"ckpt_path: {type(module).__name__} trains nothing that a checkpoint could hold; "
             "leave it out"
         )
 
 
-def summary_of(module: lightning.LightningModule) -> dict[str, float]:
+def summary_of(module: Experiment) -> dict[str, float]:
     """What a module says of the whole run; nothing where it fails, which is logged.
 
     The run is finished: what was measured before must not be lost with this.
     """
     try:
-        return plain_metrics(getattr(module, "summary", dict)())
+        return plain_metrics(module.summary())
     except Exception:
         logger.exception(
             "%s.summary() failed: metrics.json is written without its numbers",
