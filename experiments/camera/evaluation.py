@@ -4,43 +4,16 @@ import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
+from experiments.camera.base import Camera
 from experiments.camera.calibration import Calibration
 from experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
-from experiments.camera.views.base import Imaging, Views, seed_of
-
-
-class Camera(Protocol):
-    """What is measured."""
-
-    lens: Lens
-    views: Imaging
-
-    def variables(self) -> Mapping[str, Tensor]:
-        """The lens's variables as they are."""
-
-    def take(
-        self,
-        values: Mapping[str, Tensor],
-        batch: Tensor,
-        stage: str,
-        index: int,
-        judge: str | None = None,
-    ) -> tuple[Views, Tensor | None]:
-        """Images of textures, and point spread functions where the network asks for them."""
-
-    def restore(self, taken: Views, functions: Tensor | None) -> Tensor:
-        """(B, V, 3, H, W), display-encoded."""
-
-    def loss_over_views(self, restored: Tensor, truth: Tensor) -> Mapping[str, Tensor]:
-        """The loss as `total`."""
+from experiments.camera.views.base import Views, seed_of
 
 
 class Evaluation:

@@ -20,9 +20,10 @@ from dolens.optimize.merit import MeritValue
 from dolens.optimize.rims import fitted_semi_diameters
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
+from experiments.design.figures import design_figures
 from experiments.design.iteration import Progress, gradient_iteration, least_squares_iteration
 from experiments.design.tables import iteration_row, spot_labels, spot_table
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, Figures
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +56,7 @@ class DesignModule(Experiment):
             stop's, is put where they pass.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
+        mtf_max_frequency: the end of the MTF curves in figures, cycles/mm; see `design_figures`.
 
     Attributes:
         initial: the lens where the search began.
@@ -77,6 +79,7 @@ class DesignModule(Experiment):
         semi_diameters: str = "fixed",
         round_tolerance: float = 1e-3,
         seed: int = 0,
+        mtf_max_frequency: float | None = None,
     ) -> None:
         super().__init__(lens, experiment)
         self.automatic_optimization = False
@@ -103,6 +106,7 @@ class DesignModule(Experiment):
             merit, quality="spots", quality_options={}, operands=()
         )
         self.optimizer, self.round_tolerance = optimizer, round_tolerance
+        self.mtf_max_frequency = mtf_max_frequency
         if semi_diameters not in SEMI_DIAMETERS:
             raise InputError(
                 f"semi_diameters: '{semi_diameters}' is unknown (allowed: "
@@ -348,6 +352,11 @@ class DesignModule(Experiment):
         if self._between:
             numbers["cost/trainer_s"] = statistics.median(self._between)
         return numbers
+
+    def figures(self) -> Figures:
+        """Return the layout, spots, ray fans, MTF, RMS curves and the history."""
+        evaluated = (self.lens, self.initial, self.evaluation)
+        return design_figures(*evaluated, self.history, self.mtf_max_frequency)
 
     # ---------------------------------------------------------------- checkpoints
 

@@ -20,6 +20,8 @@ from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
 from experiments.poses.basin import Basin
 from experiments.poses.measurements import draw, simulated_at
 from experiments.tables import Row
@@ -137,6 +139,19 @@ class PoseAccuracyModule(Analysis):
     def tables(self) -> dict[str, list[Row]]:
         """Return `accuracy` and `basin`, as far as they have been measured."""
         return {"accuracy": self.rows, "basin": self.basin.rows}
+
+    def figures(self) -> Figures:
+        """Return a figure for each part that was measured, by its name."""
+        name = self.lens.name
+        title = f"{name}: error and light, {self.measurements} measurements each"
+        figures = {
+            "photons": lambda: photons_figure(self.rows, self.true, title),
+            "rays": lambda: rays_figure(
+                self.numbers, self.imagers, self.ray_counts, self.photons, name
+            ),
+            "basin": lambda: basin_figure(self.basin, name),
+        }
+        return {part: figures[part] for part in self.parts}
 
     # ---------------------------------------------------------------- light
 

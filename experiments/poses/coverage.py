@@ -5,11 +5,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.coverage_figures import coverage_figure
 from experiments.poses.estimates import Estimates, probability
 from experiments.poses.misalignment import MisalignmentModule
 from experiments.poses.results import error_statistics
@@ -86,6 +89,18 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
     def tables(self) -> dict[str, list[Row]]:
         """Return `coverage`, a row for each variable, and `draws`, a row for each measurement."""
         return {"coverage": self.rows, "draws": self.draw_rows}
+
+    def figures(self) -> Figures:
+        """Return `errors_over_bounds`."""
+        return {"errors_over_bounds": self._figure}
+
+    def _figure(self) -> Figure:
+        errors = {
+            case: {fit: self.over_bound(case, fit) for fit in fits}
+            for case, (_, fits) in self.cases.items()
+        }
+        title = f"{self.lens.name}: errors over bounds, {self.draws} measurements"
+        return coverage_figure(errors, [fit.name for fit in self.fits], title)
 
     def over_bound(self, case: str, fit: str) -> Tensor:
         """(M, P): errors over their bounds, of the measurements whose estimates have settled."""

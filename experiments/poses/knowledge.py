@@ -3,19 +3,20 @@
 import copy
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from dolens.alignment.information import Knowledge, knowledge
+from dolens.alignment.information import knowledge
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.arrangement import UNSEEN, Arrangement
+from experiments.poses.knowledge_figures import knowledge_figures
 from experiments.poses.measurements import draw, repetitions, simulated_at
 from experiments.poses.results import spread_metrics
 from experiments.poses.settings import blur_for, slopes_imager, spot_imager
@@ -24,34 +25,6 @@ from experiments.tables import Row
 logger = logging.getLogger(__name__)
 
 _KEYS = ("sources", "planes", "variables")
-# A combination known worse than so many of its scales is not known at all.
-UNSEEN = 1e4
-
-
-@dataclass(frozen=True)
-class Arrangement:
-    """Sources and planes, and what they tell.
-
-    Attributes:
-        name: of the arrangement.
-        pose: the lens where it is; its variables are what is unknown.
-        known: of it.
-        spread: (P,), standard deviations of combinations of θ/scale, the worst known first.
-        combinations: (P, P), those, one a row.
-        estimates: (M, P), degrees and mm, from M measurements with other photons; None: none.
-    """
-
-    name: str
-    pose: Pose
-    known: Knowledge
-    spread: Tensor
-    combinations: Tensor
-    estimates: Tensor | None
-
-    @property
-    def bounds(self) -> Tensor:
-        """(P,), degrees and mm."""
-        return self.known.bounds / self.pose.units
 
 
 class PoseKnowledgeModule(Analysis):
@@ -125,6 +98,10 @@ class PoseKnowledgeModule(Analysis):
     def tables(self) -> dict[str, list[Row]]:
         """Return `bounds` and `combinations`."""
         return {"bounds": self.bound_rows(), "combinations": self.combination_rows()}
+
+    def figures(self) -> Figures:
+        """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
+        return knowledge_figures(self.arrangements, self.lens.name, self.photons)
 
     def bound_rows(self) -> list[Row]:
         """Of bounds.csv: a row for each variable of each arrangement."""

@@ -19,10 +19,11 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.sensor.pixels import Sensor
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, Figures
 from experiments.poses.estimates import Estimates, Held, estimates
 from experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
 from experiments.poses.measurements import draw, making, repetitions, simulated_at
+from experiments.poses.misalignment_figures import misalignment_figures
 from experiments.poses.results import (
     error_over_bound,
     pose_metrics,
@@ -358,8 +359,12 @@ class MisalignmentModule(Experiment):
         with torch.no_grad():
             return self.poses[number].images(self.finest(number), scaled)
 
+    def figures(self) -> Figures:
+        """Return images before and after, the convergence of each fit, and bounds of its pose."""
+        return misalignment_figures(self)
+
     def summary(self) -> dict[str, float]:
-        """Numbers about the whole run, for metrics.json."""
+        """Return what the run cost, and errors over bounds where the truth is known."""
         numbers = {f"cost/{name}_s": value for name, value in self.seconds.items()}
         numbers["cost/iterations"] = float(len(self.history))
         images = len(self.measurement(0).images)

@@ -25,6 +25,8 @@ from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.alignment_figures import Setup, alignment_figure
 from experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
 from experiments.settings import numbers_of
 from experiments.tables import Row
@@ -144,6 +146,11 @@ class TripletAlignmentModule(Analysis):
     def tables(self) -> dict[str, Iterable[Row]]:
         """Return `alignment`: a row for each case, the demo first."""
         return {"alignment": self.alignment.rows()}
+
+    def figures(self) -> Figures:
+        """Return `alignment`."""
+        setup = Setup(self.lens.name, len(self.fields), self.photons, self.pixels, self.sensor)
+        return {"alignment": lambda: alignment_figure(self.alignment, setup)}
 
     def _align(self) -> Alignment:
         lens = copy.deepcopy(self.lens).double()

@@ -21,8 +21,10 @@ from dolens.tolerancing import (
     tolerances_from,
 )
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
 from experiments.settings import numbers_of
 from experiments.tables import Row
+from experiments.tolerances.figures import tolerance_figures
 from experiments.tolerances.tables import (
     monte_carlo_rows,
     offender_rows,
@@ -111,6 +113,10 @@ class TolerancesModule(Analysis):
             "monte_carlo": monte_carlo_rows(found),
         }
 
+    def figures(self) -> Figures:
+        """Return the matrices, the yield curves and the worst offenders."""
+        return tolerance_figures(self.analysis, self.lens.name, self._spot_labels(), self.weights)
+
     def _metrics(self, found: ToleranceAnalysis) -> dict[str, float]:
         increase = (1e3 * found.sensitivities.increase()).tolist()
         numbers = {
@@ -132,8 +138,8 @@ class TolerancesModule(Analysis):
         numbers["cost/rays"] = float(self.lenses * len(found.spots.weight))
         return numbers
 
-    def spot_labels(self) -> list[str]:
-        """A label a spot: its field and wavelength."""
+    def _spot_labels(self) -> list[str]:
+        """Return the field and the wavelength of every spot."""
         spots = self.analysis.spots
         unit = "°" if self.lens.object_distance is None else " mm"
         pairs = zip(spots.fields.tolist(), spots.wavelengths.tolist(), strict=True)
