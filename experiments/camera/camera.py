@@ -195,8 +195,7 @@ class CameraModule(Camera):
         """Log the cost, and the lens as it is."""
         self.log_dict(self.costs.end())
         self.log("cost/rays", float(self.views.rays()))
-        with torch.no_grad():
-            self.log_dict(variable_numbers(self.variables()))
+        self.log_dict(variable_numbers(self.variables()))
 
     # ---------------------------------------------------------------- evaluation
 

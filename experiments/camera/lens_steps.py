@@ -115,13 +115,13 @@ class LensSteps:
             self.least_squares.load_state(checkpoint["dolens_lens_steps"])
 
 
-@torch.no_grad()
 def variable_numbers(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return variables as metrics: a number as it is, an array by its root mean square."""
     numbers = {}
     for name, value in values.items():
-        if value.dim() == 0:
-            numbers[f"variables/{name}"] = value.float()
+        number = value.detach().float()
+        if number.dim() == 0:
+            numbers[f"variables/{name}"] = number
         else:
-            numbers[f"variables/{name}/rms"] = value.float().square().mean().sqrt()
+            numbers[f"variables/{name}/rms"] = number.square().mean().sqrt()
     return numbers
