@@ -14,7 +14,7 @@ from experiments.camera.views.base import Imaging
 
 
 class LensSteps:
-    """What is done with the lens at each step of the training.
+    """Finishes each training step for the lens.
 
     Its variables move with the network's parameters by the same optimizer, or apart from them by
     damped least squares, once for some steps of the network.
@@ -48,7 +48,7 @@ class LensSteps:
 
     @property
     def apart(self) -> bool:
-        """Whether the lens moves by least squares, which knows the operands itself."""
+        """Return whether the lens moves by least squares, which knows the operands itself."""
         return self.least_squares is not None
 
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
@@ -58,8 +58,7 @@ class LensSteps:
     def finish(
         self, optimizer: torch.optim.Optimizer, before: Tensor, steps: int, share: float
     ) -> dict[str, float]:
-        """Move the lens, if that is done apart; project its variables onto their bounds (S17) and
-        store them in it.
+        """Move the lens if that is done apart, project its variables (S17), and store them in it.
 
         Args:
             optimizer: of the network, after its step.
