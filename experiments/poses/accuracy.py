@@ -1,4 +1,4 @@
-"""How the error of a pose falls with photons and rays, and from how far off a fit converges."""
+"""Errors of a pose fit by photons and rays, and its basin of convergence."""
 
 import copy
 import logging
@@ -20,6 +20,8 @@ from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
 from experiments.poses.basin import Basin
 from experiments.poses.measurements import draw, simulated_at
 from experiments.tables import Row
@@ -31,7 +33,7 @@ ESTIMATORS = ("noise_weighted", "s21")
 
 
 class PoseAccuracyModule(Analysis):
-    """Measures what limits a pose fit: light, rays, and where it starts.
+    """Measures how light, rays and the start limit a pose fit.
 
     Errors by light and by rays are those of one Gauss-Newton step from the truth, which is where an
     estimate from there ends but for terms of second order in its error.
@@ -137,11 +139,24 @@ class PoseAccuracyModule(Analysis):
         """Return `accuracy` and `basin`, as far as they have been measured."""
         return {"accuracy": self.rows, "basin": self.basin.rows}
 
+    def figures(self) -> Figures:
+        """Return a figure for each part that was measured, by its name."""
+        name = self.lens.name
+        title = f"{name}: error and light, {self.measurements} measurements each"
+        figures = {
+            "photons": lambda: photons_figure(self.rows, self.true, title),
+            "rays": lambda: rays_figure(
+                self.numbers, self.imagers, self.ray_counts, self.photons, name
+            ),
+            "basin": lambda: basin_figure(self.basin, name),
+        }
+        return {part: figures[part] for part in self.parts}
+
     # ---------------------------------------------------------------- light
 
     @torch.no_grad()
     def _photons(self) -> None:
-        """Errors of estimates from measurements of more and more light."""
+        """Find errors of estimates from measurements of more and more light."""
         for number, level in enumerate(self.photon_levels):
             seeds = range(1000 * number, 1000 * number + self.measurements)
             measured = [self._measurement(level, seed) for seed in seeds]
@@ -166,7 +181,7 @@ class PoseAccuracyModule(Analysis):
 
     @torch.no_grad()
     def _rays(self) -> None:
-        """Errors that few rays make, of images that stand for all of them."""
+        """Find the errors that few rays make."""
         reference = self._measurement(self.reference_photons, 999_999)
         exact = knowledge(self.true, self.imager, reference, self.slopes)
         # Bounds and weights are those of the light that is quoted.
@@ -201,14 +216,14 @@ class PoseAccuracyModule(Analysis):
     # ---------------------------------------------------------------- where it starts
 
     def _basin(self) -> None:
-        """Fits from starts that are farther and farther off."""
+        """Fit from starts that are farther and farther off."""
         self.basin.run()
         self.numbers |= self.basin.summary()
 
     # ---------------------------------------------------------------- estimates and rows
 
     def _s21_inverse(self, measurement: Measurement) -> Tensor:
-        """(P, rows), the pseudo-inverse of S21's derivatives by u, at the truth.
+        """Return the pseudo-inverse (P, rows) of S21's Jacobian with respect to u, at the truth.
 
         Another measurement's largest pixel scales all rows but those of the centroids a little
         otherwise, which moves the least squares by as little.
@@ -218,7 +233,7 @@ class PoseAccuracyModule(Analysis):
         return torch.linalg.pinv(loss.jacobian(self.true, every)[1])
 
     def _s21_step(self, measurement: Measurement, imager: SpotImager, inverse: Tensor) -> Tensor:
-        """(P,), θ's units."""
+        """Return the step (P,) of S21 from the truth, in the units of θ."""
         loss = SpotLoss(measurement, imager, self.centroid_weight)
         return -self.true.scale * (inverse @ loss.residuals(self.true))
 
@@ -231,7 +246,7 @@ class PoseAccuracyModule(Analysis):
         bounds: Tensor,
         seconds: float = math.nan,
     ) -> None:
-        """Rows of accuracy.csv, one for each variable, in degrees and mm."""
+        """Add rows of accuracy.csv, one for each variable, in degrees and mm."""
         units = self.true.units
         for place, name in enumerate(self.true.names):
             self.rows.append(
@@ -249,6 +264,6 @@ class PoseAccuracyModule(Analysis):
         self.numbers[key] = float((rms / bounds).square().mean().sqrt())
 
     def _last_ratios(self) -> str:
-        """RMS errors over bounds of what was added last."""
+        """Return the RMS errors over bounds that were added last, for the log."""
         last = list(self.numbers.items())[-len(ESTIMATORS) :]
         return ", ".join(f"{name.rpartition('/')[2]} {value:.3g} bounds" for name, value in last)

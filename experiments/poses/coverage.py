@@ -1,15 +1,18 @@
-"""What becomes of poses and their bounds when a measurement has what the fit's model has not."""
+"""Coverage of pose bounds when measurements have effects that the fit's model lacks."""
 
 import logging
 from collections.abc import Mapping
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError, check_choice
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.coverage_figures import coverage_figure
 from experiments.poses.estimates import Estimates, probability
 from experiments.poses.misalignment import MisalignmentModule
 from experiments.poses.results import error_statistics
@@ -84,13 +87,25 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         """Return `coverage`, a row for each variable, and `draws`, a row for each measurement."""
         return {"coverage": self.rows, "draws": self.draw_rows}
 
+    def figures(self) -> Figures:
+        """Return `errors_over_bounds`."""
+        return {"errors_over_bounds": self._figure}
+
+    def _figure(self) -> Figure:
+        errors = {
+            case: {fit: self.over_bound(case, fit) for fit in fits}
+            for case, (_, fits) in self.cases.items()
+        }
+        title = f"{self.lens.name}: errors over bounds, {self.draws} measurements"
+        return coverage_figure(errors, [fit.name for fit in self.fits], title)
+
     def over_bound(self, case: str, fit: str) -> Tensor:
-        """(M, P): errors over their bounds, of the measurements whose estimates have settled."""
+        """Return errors over bounds (M, P), for the measurements whose estimates have settled."""
         found = self.found[case, fit]
         return self._every(case, fit)[found.settled]
 
     def _every(self, case: str, fit: str) -> Tensor:
-        """(draws, P): errors over their bounds."""
+        """Return errors over their bounds (draws, P), for all measurements."""
         number = self._number(fit)
         pose, truth = self.poses[number], self.truth(number)
         true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
@@ -162,7 +177,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             )
 
     def _variable_rows(self, case: str, fit: str) -> list[Row]:
-        """Of coverage.csv: a row for each variable."""
+        """Return rows of coverage.csv, one for each variable."""
         pose = self.poses[self._number(fit)]
         bounds = (self.known[fit].bounds / pose.units).tolist()
         rows: list[Row] = []

@@ -1,21 +1,22 @@
-"""How well a lens's pose can be known from one source or several, on one plane or several."""
+"""Cramér–Rao bounds of a lens's pose for arrangements of sources and planes."""
 
 import copy
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from dolens.alignment.information import Knowledge, knowledge
+from dolens.alignment.information import knowledge
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.arrangement import UNSEEN, Arrangement
+from experiments.poses.knowledge_figures import knowledge_figures
 from experiments.poses.measurements import draw, repetitions, simulated_at
 from experiments.poses.results import spread_metrics
 from experiments.poses.settings import blur_for, slopes_imager, spot_imager
@@ -24,38 +25,10 @@ from experiments.tables import Row
 logger = logging.getLogger(__name__)
 
 _KEYS = ("sources", "planes", "variables")
-# A combination known worse than so many of its scales is not known at all.
-UNSEEN = 1e4
-
-
-@dataclass(frozen=True)
-class Arrangement:
-    """Sources and planes, and what they tell.
-
-    Attributes:
-        name: of the arrangement.
-        pose: the lens where it is; its variables are what is unknown.
-        known: of it.
-        spread: (P,), standard deviations of combinations of θ/scale, the worst known first.
-        combinations: (P, P), those, one a row.
-        estimates: (M, P), degrees and mm, from M measurements with other photons; None: none.
-    """
-
-    name: str
-    pose: Pose
-    known: Knowledge
-    spread: Tensor
-    combinations: Tensor
-    estimates: Tensor | None
-
-    @property
-    def bounds(self) -> Tensor:
-        """(P,), degrees and mm."""
-        return self.known.bounds / self.pose.units
 
 
 class PoseKnowledgeModule(Analysis):
-    """Compares arrangements of sources and planes by what they tell of the same unknowns.
+    """Compares arrangements of sources and planes by their bounds of the same unknowns.
 
     Args:
         lens: as designed; its elements may have poses.
@@ -126,8 +99,12 @@ class PoseKnowledgeModule(Analysis):
         """Return `bounds` and `combinations`."""
         return {"bounds": self.bound_rows(), "combinations": self.combination_rows()}
 
+    def figures(self) -> Figures:
+        """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
+        return knowledge_figures(self.arrangements, self.lens.name, self.photons)
+
     def bound_rows(self) -> list[Row]:
-        """Of bounds.csv: a row for each variable of each arrangement."""
+        """Return rows of bounds.csv, one for each variable of each arrangement."""
         rows: list[Row] = []
         for found in self.arrangements:
             names, correlations = found.pose.names, found.known.correlations
@@ -148,7 +125,7 @@ class PoseKnowledgeModule(Analysis):
         return rows
 
     def combination_rows(self) -> list[Row]:
-        """Of combinations.csv: a row for each combination, the worst known first."""
+        """Return rows of combinations.csv, one for each combination, the worst known first."""
         return [
             {
                 "arrangement": found.name,
@@ -166,7 +143,7 @@ class PoseKnowledgeModule(Analysis):
         values: Mapping[str, float],
         variables: Mapping[str, Mapping[str, Any] | None],
     ) -> Pose:
-        """The lens where it is, and what is unknown in an arrangement."""
+        """Return the lens where it is, with the unknowns of an arrangement as variables."""
         check_keys(entry, _KEYS, f"arrangements.{name}")
         if not entry.get("sources"):
             raise InputError(
@@ -218,7 +195,7 @@ class PoseKnowledgeModule(Analysis):
         return numbers
 
     def _verdict(self, found: Arrangement) -> str:
-        """The combination that is known worst, in words."""
+        """Return the combination that is known worst, in words."""
         worst = found.combinations[0]
         order = worst.abs().argsort(descending=True)
         names = [

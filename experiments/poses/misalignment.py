@@ -1,4 +1,4 @@
-"""Section VI as a Lightning module: poses of a lens, fitted to images of point sources."""
+"""Poses of a lens, fitted to images of point sources (Section VI)."""
 
 import copy
 import itertools
@@ -19,10 +19,11 @@ from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.sensor.pixels import Sensor
-from experiments.experiment import Experiment
+from experiments.experiment import Experiment, Figures
 from experiments.poses.estimates import Estimates, Held, estimates
 from experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
 from experiments.poses.measurements import draw, making, repetitions, simulated_at
+from experiments.poses.misalignment_figures import misalignment_figures
 from experiments.poses.results import (
     error_over_bound,
     pose_metrics,
@@ -40,7 +41,7 @@ _LOGGED = 8
 
 
 class MisalignmentModule(Experiment):
-    """Finds poses one after another: an epoch is a fit, a step an iteration of one of its stages.
+    """Fits poses one after another: an epoch is a fit, a step an iteration of one of its stages.
 
     Args:
         lens: as designed; its elements may have poses.
@@ -143,8 +144,9 @@ class MisalignmentModule(Experiment):
     # ---------------------------------------------------------------- what is measured
 
     def truth(self, number: int) -> dict[str, float]:
-        """All numbers that a fit's simulation has other than the lens: its own and those held; none
-        where a photograph is fitted.
+        """Return the true values of a fit, its own and those that it holds, degrees and mm.
+
+        There are none where a photograph is fitted.
         """
         if self.measured is not None:
             return {}
@@ -156,14 +158,14 @@ class MisalignmentModule(Experiment):
         return {**found, **fit.truth}
 
     def true_pose(self, number: int) -> Pose:
-        """The lens and the sources that are simulated; what the truth does not name is as given."""
+        """Return the simulated lens and sources; values without a truth are as given."""
         pose = self.poses[number]
         true = Pose(copy.deepcopy(self.lens), pose.sources.tolist(), {}, pose.planes)
         true.put(self.truth(number))
         return true
 
     def measurement(self, number: int, seed: int = 0) -> Measurement:
-        """What a fit is to explain."""
+        """Return the measurement that a fit is to explain."""
         if self.measured is not None:
             return self.measured
         if seed == 0 and number in self._measurements:
@@ -174,7 +176,7 @@ class MisalignmentModule(Experiment):
         return found
 
     def simulation(self, number: int, seed: int, unmodelled: Unmodelled) -> Measurement:
-        """One of a fit's measurements, with these effects."""
+        """Simulate one of a fit's measurements with these effects."""
         return simulated_at(
             self.true_pose(number),
             self.wavelength,
@@ -188,22 +190,22 @@ class MisalignmentModule(Experiment):
         )
 
     def finest(self, number: int) -> SpotImager:
-        """The imager of a fit's last stage, by which its result is judged."""
+        """Return the imager of a fit's last stage, by which its result is judged."""
         settings = (self.imager, self.stages[-1].imager)
         return spot_imager(self.measurement(number), self.wavelength, *settings)
 
     # ---------------------------------------------------------------- iterations
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        """One for each stage of each fit, all of which a checkpoint holds."""
+        """Return an optimizer for each stage of each fit; a checkpoint holds them all."""
         return [optimizer_of(stage, pose) for pose in self.poses for stage in self.stages]
 
     def on_train_epoch_start(self) -> None:
-        """Hold what earlier fits have found."""
+        """Put the values that the fit holds to those that an earlier fit has found."""
         self._hold(self.current_epoch)
 
     def on_train_start(self) -> None:
-        """The same when a run is resumed within a fit."""
+        """Do the same when a run is resumed within a fit."""
         self._hold(min(self.current_epoch, len(self.fits) - 1))
 
     def _hold(self, number: int) -> None:
@@ -217,7 +219,7 @@ class MisalignmentModule(Experiment):
         return [fit.name for fit in self.fits].index(name)
 
     def training_step(self, batch: Tensor, batch_idx: int) -> None:
-        """One iteration of the stage that is on."""
+        """Make one iteration of the present stage."""
         started = time.perf_counter()
         number, place = self.current_epoch, self._stage_at(batch_idx)
         stage = self.stages[place]
@@ -233,7 +235,7 @@ class MisalignmentModule(Experiment):
         self._record(number, place, stage, terms, bare, started)
 
     def _stage_at(self, iteration: int) -> int:
-        """Number of the stage that an iteration of a fit belongs to."""
+        """Return the number of the stage that an iteration of a fit belongs to."""
         ends = itertools.accumulate(stage.iterations for stage in self.stages)
         return next((i for i, end in enumerate(ends) if iteration < end), len(self.stages) - 1)
 
@@ -274,7 +276,7 @@ class MisalignmentModule(Experiment):
 
     @torch.no_grad()
     def test_step(self, batch: Tensor, batch_idx: int) -> None:
-        """Errors, bounds, and what cannot be told apart; tables and metrics."""
+        """Find errors and bounds of every fit; log them, and write the tables."""
         for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
             self._hold(number)
             known = self._knowledge(number)
@@ -303,11 +305,11 @@ class MisalignmentModule(Experiment):
             )
 
     def _slopes(self, number: int) -> tuple[SpotImager, float]:
-        """What makes derivatives of a fit's images, and their blur, pixels."""
+        """Return the imager for derivatives of a fit's images, and their blur in pixels."""
         return slopes_of(self.stages[-1], self.measurement(number), self.wavelength, self.imager)
 
     def _knowledge(self, number: int) -> Knowledge:
-        """Of a fit's pose, with the uncertainty of what it holds from an earlier one."""
+        """Return the information on a fit's pose, with the uncertainty of values that it holds."""
         fit, pose, measurement = self.fits[number], self.poses[number], self.measurement(number)
         own, finest = self._slopes(number), self.finest(number)
         if fit.held_from is None:
@@ -326,7 +328,7 @@ class MisalignmentModule(Experiment):
         unmodelled: Unmodelled,
         earlier: Mapping[str, Estimates],
     ) -> Estimates:
-        """What other measurements lead to, from where a fit ended, those of an earlier fit too."""
+        """Estimate the pose from other measurements, by steps from where the fit ended."""
         fit, pose = self.fits[number], self.poses[number]
         held = None
         if fit.held_from is not None:
@@ -352,13 +354,17 @@ class MisalignmentModule(Experiment):
         )
 
     def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:
-        """Of a fit's pose, or of another point u."""
+        """Return the images of a fit's pose, or of other values u of its variables."""
         self._hold(number)
         with torch.no_grad():
             return self.poses[number].images(self.finest(number), scaled)
 
+    def figures(self) -> Figures:
+        """Return images before and after, the convergence of each fit, and bounds of its pose."""
+        return misalignment_figures(self)
+
     def summary(self) -> dict[str, float]:
-        """Numbers about the whole run, for metrics.json."""
+        """Return what the run cost, and errors over bounds where the truth is known."""
         numbers = {f"cost/{name}_s": value for name, value in self.seconds.items()}
         numbers["cost/iterations"] = float(len(self.history))
         images = len(self.measurement(0).images)
@@ -371,11 +377,11 @@ class MisalignmentModule(Experiment):
     # ---------------------------------------------------------------- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return the iterations that were made."""
+        """Return the history of iterations, and the seconds of each fit."""
         return {"history": self.history, "seconds": self.seconds}
 
     def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
-        """Take them up."""
+        """Go on with them."""
         self.history = list(checkpoint.get("history", []))
         self.seconds = dict(checkpoint.get("seconds", {}))
 

@@ -1,4 +1,4 @@
-"""Which element of a lens is misaligned, and by how much: one case, and many in one batch."""
+"""Identification of the misaligned element of a lens from its spots."""
 
 import copy
 import logging
@@ -25,6 +25,8 @@ from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.alignment_figures import Setup, alignment_figure
 from experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
 from experiments.settings import numbers_of
 from experiments.tables import Row
@@ -38,7 +40,7 @@ _DENSE, _PLACES = (40, 120), 16
 
 
 class TripletAlignmentModule(Analysis):
-    """Simulates spots of lenses with one element off, and finds which and by how much.
+    """Simulates spots of lenses with one misaligned element, and finds the element and its pose.
 
     Where the sensor is counts as unknown: every hypothesis has the pose of one element and, where
     a range is not zero, the sensor's place across or along the axis.
@@ -145,6 +147,11 @@ class TripletAlignmentModule(Analysis):
         """Return `alignment`: a row for each case, the demo first."""
         return {"alignment": self.alignment.rows()}
 
+    def figures(self) -> Figures:
+        """Return `alignment`."""
+        setup = Setup(self.lens.name, len(self.fields), self.photons, self.pixels, self.sensor)
+        return {"alignment": lambda: alignment_figure(self.alignment, setup)}
+
     def _align(self) -> Alignment:
         lens = copy.deepcopy(self.lens).double()
         names = [element_names(lens, element) for element in self.elements]
@@ -197,7 +204,7 @@ class TripletAlignmentModule(Analysis):
         )
 
     def _spots(self, lens: Lens, rings: int, arms: int) -> SpotRays:
-        """Rays of the lens as designed."""
+        """Return the rays of the lens as designed."""
         return gaussian_quadrature(
             lens,
             self.fields,
@@ -209,7 +216,10 @@ class TripletAlignmentModule(Analysis):
         )
 
     def _cases(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Elements (1 + K,), and poses and places (1 + K, P) in radians and mm, the demo first."""
+        """Draw the cases: elements (1 + K,), poses and places (1 + K, P) in radians and mm.
+
+        The demo is the first.
+        """
         count, poses = self.misalignments, len(POSE)
         element = torch.randint(len(self.elements), (count,), generator=generator)
         shares = torch.rand((count, poses), generator=generator, dtype=torch.float64)
@@ -231,7 +241,7 @@ class TripletAlignmentModule(Analysis):
 
 
 def _pixels(pitch: float, read_noise: float, window: float) -> Pixels | None:
-    """None for a pitch of zero."""
+    """Return the settings of the pixels; None for a pitch of zero, an ideal sensor."""
     if pitch != 0.0:
         return Pixels(pitch, read_noise, window)
     if read_noise != 0.0:
@@ -240,7 +250,13 @@ def _pixels(pitch: float, read_noise: float, window: float) -> Pixels | None:
 
 
 def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
-    """(K, E·4 + Q), all elements' poses and the sensor's place, from those of one (K, 4 + Q)."""
+    """Return the poses of all elements and the sensor's place (K, E·4 + Q).
+
+    Args:
+        element: (K,), the number of the misaligned element.
+        true: (K, 4 + Q), its pose and the sensor's place.
+        elements: E.
+    """
     poses = true.new_zeros(len(true), elements, len(POSE))
     poses[torch.arange(len(true)), element] = true[:, : len(POSE)]
     return torch.cat([poses.flatten(1), true[:, len(POSE) :]], 1)
@@ -249,7 +265,7 @@ def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
 def _sampling_error(
     fitted: MomentModel, simulated: MomentModel, errors: Tensor, measured: MeasuredMoments
 ) -> dict[str, float]:
-    """What two quadratures of the same pupil differ by, over the noise of the moments."""
+    """Return the difference of two quadratures of the same pupil, over the noise of the moments."""
     difference = fitted.moments(errors, measured.origin) - simulated.moments(
         errors, measured.origin
     )
@@ -263,8 +279,13 @@ def _sampling_error(
 def _grid_error(
     dense: MomentModel, pixels: Pixels, errors: Tensor, measured: MeasuredMoments
 ) -> dict[str, float]:
-    """What one exposure instead of many dithered ones would change, over the noise: of one lens
-    (1, P), over places of the grid on a lattice.
+    """Return the error of one exposure instead of many dithered ones, over the noise.
+
+    Args:
+        dense: model with many rays in every pixel.
+        pixels: those of the sensor.
+        errors: (1, P), those of one lens.
+        measured: its moments.
     """
     side = (torch.arange(math.isqrt(_PLACES)) + 0.5) / math.isqrt(_PLACES)
     places = torch.cartesian_prod(side, side)
@@ -283,7 +304,7 @@ def _grid_error(
 def _information_roots(
     models: Sequence[MomentModel], measured: MeasuredMoments, element: Tensor, true: Tensor
 ) -> Tensor:
-    """(K, P, P), each with the element that is off."""
+    """Return roots of the information (K, P, P), each for the element that is misaligned."""
     roots = true.new_zeros(len(true), true.shape[1], true.shape[1])
     for number, model in enumerate(models):
         mine = torch.nonzero(element == number)[:, 0]

@@ -1,7 +1,6 @@
-"""How fast and how wrong, as one Lightning module: a test, and nothing to train."""
+"""Measurement of speed and error of traces, point spread functions and renders."""
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +12,8 @@ from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.speed.figures import speed_figures
 from experiments.speed.functions import function_rows
 from experiments.speed.renders import (
     Subject,
@@ -31,10 +32,10 @@ _SUBJECT_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables
 
 
 class SpeedVsErrorModule(Analysis):
-    """Draws error against cost for traces, point spread functions and renders of several scenes.
+    """Measures error and cost of traces, point spread functions and renders of several scenes.
 
     Args:
-        lens: of the run; it is not looked at.
+        lens: the lens of the run; it is not used.
         experiment: name of the experiment.
         scenes: name → `lens` (a prescription), `values` (parameters to change), `depths` (mm),
             `wavelengths` (nm), `sensor`, and `variables`, patterns of what gradients are taken of.
@@ -89,22 +90,9 @@ class SpeedVsErrorModule(Analysis):
         """Return `speed_vs_error`: a row for each scene, part and setting."""
         return {"speed_vs_error": self.rows}
 
-    def points(self, scene: str, part: str, cost: str, error: str) -> dict[str, list[Point]]:
-        """Points of a scene and part by model, for a figure."""
-        families: dict[str, list[Point]] = {}
-        for row in self.rows:
-            if row["scene"] == scene and row["part"] == part:
-                model = str(row["model"])
-                if not math.isfinite(float(row[error])):
-                    continue
-                point = Point(str(row["setting"]), row[cost], row[error], model == "auto")
-                families.setdefault(model, []).append(point)
-        return families
-
-    def uncertainty(self, scene: str) -> float | None:
-        """Grey levels below which errors of a scene's renders are not known."""
-        rows = [r for r in self.rows if r["scene"] == scene and r["part"] == "render"]
-        return rows[0]["error_uncertainty"] if rows else None
+    def figures(self) -> Figures:
+        """Return error against cost for each scene and part."""
+        return speed_figures(self.rows, [s.name for s in self.subjects], self.parts)
 
     def _trace(self, subject: Subject) -> list[dict[str, float | str]]:
         return trace_rows(subject, ("reference", "cpu"), self.rays, self.seconds)

@@ -1,4 +1,4 @@
-"""Sensitivities and tolerances of a lens as one Lightning module: a test, and nothing to train."""
+"""Analysis of a lens's sensitivities and tolerances."""
 
 import copy
 import logging
@@ -21,8 +21,10 @@ from dolens.tolerancing import (
     tolerances_from,
 )
 from experiments.analysis import Analysis
+from experiments.experiment import Figures
 from experiments.settings import numbers_of
 from experiments.tables import Row
+from experiments.tolerances.figures import tolerance_figures
 from experiments.tolerances.tables import (
     monte_carlo_rows,
     offender_rows,
@@ -36,7 +38,7 @@ QUANTILES = (0.5, 0.8, 0.9, 0.95, 0.98)
 
 
 class TolerancesModule(Analysis):
-    """Which errors of manufacture a lens minds, and how many of the lenses made are good enough.
+    """Finds a lens's sensitivities to errors of manufacture, and the yield under tolerances.
 
     Radii are √(Σ W·RMS²) over the spots, each spot (a field and a wavelength) about its own
     centroid.  Perturbed lenses are refocused for all spots together unless a name says otherwise.
@@ -111,6 +113,10 @@ class TolerancesModule(Analysis):
             "monte_carlo": monte_carlo_rows(found),
         }
 
+    def figures(self) -> Figures:
+        """Return the matrices, the yield curves and the worst offenders."""
+        return tolerance_figures(self.analysis, self.lens.name, self._spot_labels(), self.weights)
+
     def _metrics(self, found: ToleranceAnalysis) -> dict[str, float]:
         increase = (1e3 * found.sensitivities.increase()).tolist()
         numbers = {
@@ -132,8 +138,8 @@ class TolerancesModule(Analysis):
         numbers["cost/rays"] = float(self.lenses * len(found.spots.weight))
         return numbers
 
-    def spot_labels(self) -> list[str]:
-        """A label a spot: its field and wavelength."""
+    def _spot_labels(self) -> list[str]:
+        """Return the field and the wavelength of every spot."""
         spots = self.analysis.spots
         unit = "°" if self.lens.object_distance is None else " mm"
         pairs = zip(spots.fields.tolist(), spots.wavelengths.tolist(), strict=True)
@@ -158,7 +164,7 @@ class TolerancesModule(Analysis):
         )
 
     def _outcome(self, name: str, outcome: Outcome, refocused: bool) -> dict[str, float]:
-        """Quantiles, yields, and the lens as designed."""
+        """Return quantiles of RMS radii, yields, and the radii of the lens as designed."""
         found = outcome.found(refocused)
         s = self.analysis.sensitivities
         design = s.rms_refocused if refocused else s.rms
@@ -190,7 +196,7 @@ class TolerancesModule(Analysis):
         )
 
     def _weights(self, weights: Sequence[float] | None) -> Tensor:
-        """(S,), from the fields': every wavelength of a field counts alike."""
+        """Return weights of spots (S,) from those of fields; all wavelengths count alike."""
         if weights is not None:
             weights = torch.tensor(numbers_of("weights", weights, len(self.fields)))
             weights = weights.double().repeat_interleave(len(self.wavelengths))
