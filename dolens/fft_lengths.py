@@ -1,17 +1,11 @@
 """Fourier transforms are fast when their lengths are products of small primes."""
 
+from scipy.fft import next_fast_len
+
 
 def fast_fft_length(length: int) -> int:
     """Return the smallest product of twos, threes and fives that is at least `length`."""
-    candidate = max(length, 1)
-    while True:
-        rest = candidate
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return candidate
-        candidate += 1
+    return next_fast_len(max(length, 1), real=True)
 
 
 def even_fft_length(length: int) -> int:

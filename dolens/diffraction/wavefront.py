@@ -124,6 +124,8 @@ def pupil_wavefront(
         wavelength: nm, one or N.
         centres: (N, 2), mm on the sensor; None: where the chief rays land.
         samples: S, rays along each side of a box about the beam; the outermost lie outside of it.
+
+    Rarely needed:
         radius: mm, of the reference spheres, one or N; infinite ones are planes far away.  None: to
             the paraxial exit pupil at the first wavelength (see `sphere_curvature`).
         beam: of the same points through this lens; None: it is searched.

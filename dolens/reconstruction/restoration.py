@@ -55,7 +55,7 @@ class Restoration(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Return the floating-point type of the network's parameters, or of its buffers if it has none."""
+        """Return the floating-point type of the parameters, or else of the buffers."""
         tensors = (*self.parameters(), *self.buffers())
         found = (tensor.dtype for tensor in tensors if tensor.is_floating_point())
         return next(found, torch.get_default_dtype())

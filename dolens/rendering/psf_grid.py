@@ -5,10 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.diffraction.pixel_integration import PixelWindow
 from dolens.diffraction.propagation import DiffractionSettings
 from dolens.diffraction.psf import propagation, wave_kernels
 from dolens.optics.backend import cpu_kernels_serve
 from dolens.optics.system import OpticalSystem
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import (
     PlanePoints,
     chief_ray_points,
@@ -17,10 +19,8 @@ from dolens.rendering.plane_points import (
     plane_points,
 )
 from dolens.rendering.psf import splat
-from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.random_numbers import random_words, uniform
 from dolens.rendering.sampling import square_to_disc, stratified_square
-from dolens.scene.planar import Scene
 
 # Strata of the pupil along each side, for the light of a function that rays do not make.
 _LIGHT_SAMPLES = 32
@@ -42,11 +42,8 @@ class FieldFunctions(NamedTuple):
 
 
 def field_point_spread_functions(
-    system: OpticalSystem,
-    scene: Scene,
+    imaging: ImagingSystem,
     points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
     size: int,
     pupil_samples: int,
     seed: int | None,
@@ -59,11 +56,9 @@ def field_point_spread_functions(
     ray lands as a quadratic B-spline, the pixel's box convolved with the texel's tent.
 
     Args:
-        system: the lens.
-        scene: D depths and C wavelengths.
-        points: x and y, mm, each (N,), double precision.
-        pupil: what is sampled.
-        pitch: of the pixels, mm.
+        imaging: the lens, D depths and C wavelengths, the pupil's disc, which is sampled, and the
+            pixels' pitch.
+        points: x and y on the sensor, mm, each (N,), double precision.
         size: K, odd.
         pupil_samples: strata along each side of the pupil.
         seed: of the points in the strata; None: their centres.
@@ -73,14 +68,11 @@ def field_point_spread_functions(
     Centres move with the lens, and so do the functions about them: gradients are of both, and where
     pixels look has to carry its own (`convolve_patches`).
     """
+    system = imaging.system
     count = distinct_radii(points) if system.rotationally_symmetric else len(points[0])
     disc = sampled_disc(count, pupil_samples, seed, system)
-    seen = plane_points(system, scene, points, pupil, disc, pitch)
-    planes, channels = len(scene.depths), len(scene.wavelengths)
-    if distortion:
-        centre = chief_ray_points(system, scene, points, pupil, pitch)
-    else:
-        centre = pinhole_points(points, pitch, planes, channels)
+    seen = plane_points(imaging, points, disc)
+    centre = (chief_ray_points if distortion else pinhole_points)(imaging, points)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
     return splatted(
         PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight),
@@ -104,11 +96,8 @@ def splatted(seen: PlanePoints, size: int, fused: bool) -> FieldFunctions:
 
 
 def wave_point_spread_functions(
-    system: OpticalSystem,
-    scene: Scene,
+    imaging: ImagingSystem,
     points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
     size: int,
     distortion: bool,
     settings: DiffractionSettings | None = None,
@@ -119,12 +108,13 @@ def wave_point_spread_functions(
     window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
     finely diffraction is computed.
     """
-    places = _object_points(system, scene, points, pupil, pitch, distortion)
+    system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
+    places = _object_points(imaging, points, distortion)
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
-    kernels = wave_kernels(system, *places, pitch, size, settings)
+    kernels = wave_kernels(system, *places, PixelWindow(pitch, size), settings)
     kernels = kernels.reshape(*shape, size, size)
     disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
-    seen = plane_points(system, scene, points, pupil, disc, pitch)
+    seen = plane_points(imaging, points, disc)
     light = seen.weight.sum(-1)
     total = kernels.sum((-2, -1))
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
@@ -133,15 +123,9 @@ def wave_point_spread_functions(
 
 
 def wave_cost(
-    system: OpticalSystem,
-    scene: Scene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
-    size: int,
-    distortion: bool,
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor], size: int, distortion: bool
 ) -> tuple[int, str | None]:
-    """What functions of `wave_point_spread_functions` take.
+    """Estimate what functions of `wave_point_spread_functions` take.
 
     Arguments as there.
 
@@ -149,26 +133,19 @@ def wave_cost(
         Samples along each side of a pupil by Fourier transform, and why one of them needs direct
         integration, which takes a thousand times as long; None where none does.
     """
-    places = _object_points(system, scene, points, pupil, pitch, distortion)
-    found = propagation(system, *places, pitch, size, None)
+    places = _object_points(imaging, points, distortion)
+    found = propagation(imaging.system, *places, PixelWindow(imaging.sensor.pixel_pitch, size))
     direct = (reason for reason in found.reasons if reason.startswith("direct"))
     return found.samples, next(direct, None)
 
 
 def _object_points(
-    system: OpticalSystem,
-    scene: Scene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
-    distortion: bool,
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor], distortion: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Object points (N·D·C, 3), mm, their wavelengths, nm, and the windows' centres, mm."""
+    system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     planes, channels = len(scene.depths), len(scene.wavelengths)
-    if distortion:
-        rows, columns = chief_ray_points(system, scene, points, pupil, pitch)
-    else:
-        rows, columns = pinhole_points(points, pitch, planes, channels)
+    rows, columns = (chief_ray_points if distortion else pinhole_points)(imaging, points)
     options = {"dtype": torch.float64, "device": system.device}
     depth = torch.tensor(scene.depths, **options)[:, None]
     magnifications = scene.moving_magnifications(system)

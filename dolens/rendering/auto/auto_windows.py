@@ -23,12 +23,13 @@ from dolens.rendering.auto.agreement import (
 )
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.chosen import gradient_numbers, settings_of
-from dolens.rendering.auto.plan import Plan, plan
+from dolens.rendering.auto.plan import Plan, Requirements, plan
 from dolens.rendering.auto.probe import probe_texture
 from dolens.rendering.auto.reference import Reference, reference
 from dolens.rendering.auto.tightening import tightened
 from dolens.rendering.auto.trial import REFERENCE_SAMPLES, in_both_precisions, with_values
 from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
@@ -257,15 +258,15 @@ class _Trial:
     def plan(self, number: int, tolerance: float) -> Plan:
         """For one window by itself."""
         scene = replace(self.scene, texture_centre=self.centres[number])
+        single, double = (
+            ImagingSystem.of(lens.system(), scene, self.windows[number])
+            for lens in (self.single, self.double)
+        )
+        auto = self.auto
         return plan(
-            self.single.system(),
-            self.double.system(),
-            scene,
-            self.windows[number],
-            tolerance,
-            self.auto.gradients,
-            self.auto.diffraction,
-            registrations=("chief_rays",),
+            single,
+            double,
+            Requirements(tolerance, auto.gradients, auto.diffraction, ("chief_rays",)),
         )
 
     def errors(self, renderer: PsfRenderer) -> dict[str, float]:
@@ -308,5 +309,5 @@ class _Trial:
         system, wavelengths = self.double.system(), (self.scene.middle_wavelength,)
         middle = self.scene.as_planes(wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
-        looks = chief_ray_maps(system, middle, sensor, self.windows, pupil)
+        looks = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), self.windows)
         return [tuple(float(c.mean().round()) for c in look) for look in looks]

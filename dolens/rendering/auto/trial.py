@@ -18,9 +18,10 @@ from dolens.rendering.auto.agreement import (
     judging_samples,
 )
 from dolens.rendering.auto.cost import psf_cost, rays_cost
-from dolens.rendering.auto.plan import Plan, plan
+from dolens.rendering.auto.plan import Plan, Requirements, plan
 from dolens.rendering.auto.probe import probe_texture
 from dolens.rendering.auto.reference import rays_samples, reference
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import Scene, pinhole_image
@@ -82,15 +83,11 @@ class Trial:
 
     def plan(self, tolerance: float) -> Plan:
         """Functions that are expected to err by a tolerance."""
-        return plan(
-            self._single.system(),
-            self._double.system(),
-            self._planned,
-            self.sensor,
-            tolerance,
-            self.gradients,
-            self.diffraction,
+        single, double = (
+            ImagingSystem.of(lens.system(), self._planned, self.sensor)
+            for lens in (self._single, self._double)
         )
+        return plan(single, double, Requirements(tolerance, self.gradients, self.diffraction))
 
     def error(self, renderer: PsfRenderer | RayRenderer, dtype: torch.dtype) -> float:
         """Grey levels against the reference, both without diffraction."""

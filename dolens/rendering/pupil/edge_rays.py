@@ -11,6 +11,7 @@ gradient is f's factor R ∂R/∂θ.  What collects rays by their weights needs 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -127,22 +128,17 @@ def _filled(whole: Tensor, where: Tensor, values: Tensor) -> Tensor:
     return whole.masked_scatter(where.expand(whole.shape), values)
 
 
+@dataclass(frozen=True)
 class _Beam:
     """Rays of n points of the sensor to places on arms from middles, towards one surface's edge."""
 
-    def __init__(
-        self,
-        system: OpticalSystem,
-        wavelength: Tensor,
-        points: tuple[Tensor, ...],
-        pupil: ExitPupil,
-        middle: Tensor,
-        arms: Tensor,
-        surface: int,
-    ) -> None:
-        self.system, self.wavelength, self.points = system, wavelength, points
-        self.pupil, self.middle, self.arms = pupil, middle, arms
-        self.surface = surface
+    system: OpticalSystem
+    wavelength: Tensor
+    points: tuple[Tensor, ...]
+    pupil: ExitPupil
+    middle: Tensor
+    arms: Tensor
+    surface: int
 
     def rays(self, radius: Tensor, pupil: ExitPupil) -> Components:
         """Towards radii (C, n) on the arms."""

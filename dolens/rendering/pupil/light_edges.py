@@ -1,7 +1,6 @@
 """Where on the exit pupil's disc the light of a sensor's points ends, and which surface ends it."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,9 +9,9 @@ from torch import Tensor
 from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Rays, Status
 from dolens.optics.system import OpticalSystem
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.pupil.aim import aim
 from dolens.rendering.pupil.exit_pupil import ExitPupil
-from dolens.sensor.pixels import Sensor
 
 # Azimuths of the edge, points along each side of the disc in the search for its middle, and
 # halvings of the interval that the edge lies in: Newton's iteration does the rest.
@@ -201,20 +200,14 @@ def _neighbours(place: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 @torch.no_grad()
-def edge_map(
-    system: OpticalSystem,
-    wavelengths: Sequence[float],
-    sensor: Sensor,
-    pupil: ExitPupil,
-) -> EdgeMap | None:
-    """The edges of the light all over a sensor; None where nothing cuts the disc.
+def edge_map(imaging: ImagingSystem) -> EdgeMap | None:
+    """Find the edges of the light all over a sensor; None where nothing cuts the disc.
 
     Args:
-        system: the lens.
-        wavelengths: nm; the middle one's edges start the search for the others'.
-        sensor: the pixels.
-        pupil: the disc, numbers.
+        imaging: the lens, the pixels, the pupil's disc, numbers, and wavelengths, of which the
+            middle one's edges start the search for the others'.
     """
+    system, sensor, wavelengths = imaging.system, imaging.sensor, imaging.scene.wavelengths
     options = {"dtype": torch.float64, "device": system.device}
     ends = torch.tensor([0.0, 1.0], **options)
     rows, columns = (
@@ -237,7 +230,7 @@ def edge_map(
             corner[1] + grid * step[1], corner[0] + grid * step[0], indexing="ij"
         )
         points = (across.reshape(-1), up.reshape(-1))
-    edges = light_edges(system, wavelength, points, pupil)
+    edges = light_edges(system, wavelength, points, imaging.pupil)
     return None if edges is None else EdgeMap(edges, symmetric, corner, step)
 
 
