@@ -13,7 +13,16 @@ from hydra.core.global_hydra import GlobalHydra
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SUPPLEMENT = (ROOT / "docs/supplement.md").read_text(encoding="utf-8")
-NAMES = sorted(set(re.findall(r"`((?:dolens|experiments|torch)(?:\.\w+)+)`", SUPPLEMENT)))
+NAMES = sorted(
+    {
+        name
+        for document in DOCUMENTS
+        for name in re.findall(
+            r"`((?:dolens|experiments|torch)(?:\.\w+)+)`", document.read_text(encoding="utf-8")
+        )
+        if not name.endswith((".py", ".txt"))
+    }
+)
 COMMANDS = sorted(set(re.findall(r"`python train\.py ([^`]+)`", SUPPLEMENT)))
 # Packages whose docstrings follow the rules of docs/glossary.md.
 PROSE = ("analysis", "sensor", "plotting", "reconstruction", "prescriptions")
@@ -36,7 +45,7 @@ def resolved(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_name_of_the_supplement_is_in_the_code(name):
+def test_a_dotted_name_of_the_documents_is_in_the_code(name):
     resolved(name)
 
 
@@ -64,6 +73,14 @@ def test_the_supplement_is_complete():
         *("Table II", "Table III"),
     ):
         assert rows.count(item) == 1, item
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_path_of_the_repository_exists(document):
+    """`tests/…`, `conf/…` and so on; a path with a placeholder or a pattern is not looked up."""
+    text = document.read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:dolens|experiments|tests|conf|scripts|docs)/[\w./-]+)`", text):
+        assert (ROOT / path).exists(), path
 
 
 def anchors(document):
