@@ -70,7 +70,7 @@ class RestorationLoss(nn.Module):
         perceptual_weight: α₃; at 0 no VGG-16 weights are looked for.
         perceptual: "vgg16" requires the perceptual term; "auto" leaves it out, with a warning,
             where VGG-16's weights are not available; "vgg16_edges" requires it with weights
-            that were trained further to find edges, whose features are larger; "none" leaves it out.
+            that were trained further to find edges, whose features are larger; "none" omits it.
         vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`, `load_edge_weights`.
         l1_weight: of the mean absolute error; at 0 it is not computed.
 
