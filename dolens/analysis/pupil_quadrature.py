@@ -18,7 +18,6 @@ from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-from dolens.optics.system import is_rotationally_symmetric
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,7 @@ def gaussian_quadrature(
     # Gauss and Legendre's nodes in ρ², on which an area's element is even.
     radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))
     shares = torch.from_numpy(0.5 * shares)
-    symmetric = symmetry and is_rotationally_symmetric(lens.system())
+    symmetric = symmetry and lens.system().rotationally_symmetric
 
     distinct = list(dict.fromkeys(map(tuple, fields)))
     points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)

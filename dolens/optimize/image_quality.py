@@ -169,9 +169,7 @@ class ImageQuality(ABC):
             lens: one `without_edges`.
             parameters: name → value.
         """
-        hit = trace_rays(
-            lens.system(parameters), self.spots.rays, lens.backend, 1.0, False, 1, None
-        )
+        hit = trace_rays(lens.system(parameters), self.spots.rays)
         deviations, _ = self._traced(lens, hit)
         return self._loss(deviations)
 

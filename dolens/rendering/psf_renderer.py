@@ -10,16 +10,11 @@ from torch import Tensor
 
 from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend, say_once
+from dolens.optics.backend import cpu_kernels_serve, say_once, with_chosen_backend
 from dolens.optics.lens import Lens
-from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
 from dolens.rendering.chief_ray_map import chief_ray_maps
-from dolens.rendering.patch_convolution import (
-    Coordinates,
-    Patch,
-    node_positions,
-    patches,
-)
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.patches import Coordinates, Patch, PatchLayout, node_positions, patches
 from dolens.rendering.plane_blur import PlaneBlur
 from dolens.rendering.protocol import Unprepared
 from dolens.rendering.psf_grid import (
@@ -187,53 +182,49 @@ class PsfRenderer(Unprepared):
         """Images (B, images, C, height, width) of views of the sensor, all rays traced at once."""
         options = {"device": lens.device, "dtype": lens.dtype}
         textures = [view.textures.to(**options) for view in views]
-        system = lens.system(values)
-        backend = choose_backend(system, lens.backend, others=textures)
+        system = with_chosen_backend(lens.system(values), textures)
         with torch.no_grad():
             scene.check(system)
             pupil = self.pupil
             if pupil is None:
-                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
-        pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
+                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor)
+        pupil = moving_exit_pupil(system, scene.wavelengths, pupil)
+        imaging = ImagingSystem(system, scene, self.sensor, pupil)
         parts = [replace(self, sensor=view.sensor) for view in views]
         x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
-        found = self.point_spread_functions(system, scene, pupil, seed, backend, (x, y))
+        found = self.point_spread_functions(imaging, seed, (x, y))
         self._warn_of_loss(found)
         looks = [None] * len(views)
         if self.registration == "chief_rays":
             windows = [view.sensor for view in views]
-            looks = chief_ray_maps(system, scene, self.sensor, windows, pupil, backend)
+            looks = chief_ray_maps(imaging, windows)
         nodes, images = self.fields[0] * self.fields[1], []
         for i, (part, view, look) in enumerate(zip(parts, views, looks, strict=True)):
             own = slice(i * nodes, (i + 1) * nodes)
             functions = found._replace(functions=found.functions[own], light=found.light[own])
             placed = replace(scene, texture_centre=view.texture_centre)
-            coordinates, origin = part._coordinates(placed, textures[i], look)
-            images.append(
-                part._blurred(
-                    system, placed, textures[i], functions, coordinates, origin, pupil, backend
-                )
-            )
+            seen = replace(imaging, scene=placed, sensor=view.sensor)
+            images.append(part._blurred(seen, textures[i], functions, look))
         return images
 
     def _blurred(
         self,
-        system: OpticalSystem,
-        scene: Scene,
+        imaging: ImagingSystem,
         textures: Tensor,
         found: FieldFunctions,
-        coordinates: Coordinates | None,
-        origin: tuple[int, int],
-        pupil: ExitPupil,
-        backend: str,
+        look: tuple[Tensor, Tensor] | None,
     ) -> Tensor:
-        """The image by functions that are known, of pixels that look where coordinates say."""
+        """The image by functions that are known; `look` is where chief rays meet the scene, None
+        for a pinhole's.
+        """
+        scene = imaging.scene
         area = (self.sensor.height, self.sensor.width)
-        layout, functions, lit = patches(*area, *self.fields, textures), found.functions, None
+        coordinates, origin = self._coordinates(scene, textures, look)
+        parts, functions, lit = patches(*area, *self.fields, textures), found.functions, None
         if self.illumination == "map":
-            functions, layout, lit = self._illuminated(found, layout, system, scene, pupil, backend)
-        blur = PlaneBlur(functions, layout, origin, area, coordinates, backend, lit)
-        return scene.blend(scene.on_planes(textures), blur)
+            functions, parts, lit = self._illuminated(found, parts, imaging)
+        layout = PatchLayout(parts, area, origin, coordinates, cpu_kernels_serve(imaging.system))
+        return scene.blend(scene.on_planes(textures), PlaneBlur(functions, layout, lit))
 
     def _warn_of_loss(self, found: FieldFunctions) -> None:
         if float(found.lost) > _NOTABLE_LOSS:
@@ -244,49 +235,36 @@ class PsfRenderer(Unprepared):
 
     def point_spread_functions(
         self,
-        system: OpticalSystem,
-        scene: Scene,
-        pupil: ExitPupil,
+        imaging: ImagingSystem,
         seed: int,
-        backend: str,
         points: tuple[Tensor, Tensor] | None = None,
     ) -> FieldFunctions:
-        """The functions at the grid's points, row after row, or at others.
+        """The functions at the grid's points, row after row, or at others; differentiable.
 
-        Differentiable in the system.
+        Args:
+            imaging: the lens, its pupil, and the scene with all its depths and wavelengths.
+            seed: of the points in the pupil's strata.
+            points: x and y on the sensor, mm, each (N,), double precision; None: the grid's.
         """
-        shared, pitch = self.shared(scene), self.sensor.pixel_pitch
+        imaging = imaging.showing(self.shared(imaging.scene))
         points = points or self.points()
-        centred, symmetric = self.registration == "chief_rays", is_rotationally_symmetric(system)
+        centred = self.registration == "chief_rays"
         if self.diffraction == "wave":
-            return wave_point_spread_functions(
-                system,
-                shared,
-                points,
-                pupil,
-                pitch,
-                self.size,
-                centred,
-                symmetric,
-                backend,
-            )
+            return wave_point_spread_functions(imaging, points, self.size, centred)
         found = field_point_spread_functions(
-            system,
-            shared,
+            imaging,
             points,
-            pupil,
-            pitch,
             self.size,
             self.pupil_samples,
             seed if self.jitter else None,
             centred,
-            symmetric,
-            backend,
         )
         if self.diffraction == "none":
             return found
-        f_number = working_f_number(pupil, system.vertices[-1])
-        blurred = with_diffraction_limit(found.functions, pitch, shared.wavelengths, f_number)
+        f_number = working_f_number(imaging.pupil, imaging.system.vertices[-1])
+        blurred = with_diffraction_limit(
+            found.functions, self.sensor.pixel_pitch, imaging.scene.wavelengths, f_number
+        )
         return found._replace(functions=blurred)
 
     def with_pupil(
@@ -294,8 +272,7 @@ class PsfRenderer(Unprepared):
     ) -> "PsfRenderer":
         """The renderer with the pupil of the lens as it is, for a lens that hardly changes."""
         system = lens.system(values)
-        backend = choose_backend(system, lens.backend)
-        pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
+        pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor)
         return replace(self, pupil=pupil)
 
     def points(self) -> tuple[Tensor, Tensor]:
@@ -316,20 +293,13 @@ class PsfRenderer(Unprepared):
         return scene.as_planes(depths, wavelengths)
 
     def _illuminated(
-        self,
-        found: FieldFunctions,
-        layout: list[Patch],
-        system: OpticalSystem,
-        scene: Scene,
-        pupil: ExitPupil,
-        backend: str,
+        self, found: FieldFunctions, layout: list[Patch], imaging: ImagingSystem
     ) -> tuple[Tensor, list[Patch], Tensor]:
         """Functions of unit light, patches of those that have any, and each pixel's illumination.
 
         Pixels whose functions are partly dark get their light from the others.
         """
-        wavelengths, symmetric = self.shared(scene).wavelengths, is_rotationally_symmetric(system)
-        wanted = relative_illumination(system, wavelengths, self.sensor, pupil, symmetric, backend)
+        wanted = relative_illumination(imaging.showing(self.shared(imaging.scene)))
         bright = found.light.detach() > 0.0
         light = torch.where(bright, found.light, 1.0)
         covered, lit = torch.zeros_like(wanted), []

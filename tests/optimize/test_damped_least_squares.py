@@ -268,6 +268,6 @@ def triplet_residuals(root):
 
     def residuals(curvature):
         system = lens.system({"surfaces.1.curvature": curvature})
-        return trace_rays(system, rays, "cpu", 1.0, False, 1, None).position[:, :2].reshape(-1)
+        return trace_rays(system, rays).position[:, :2].reshape(-1)
 
     return residuals, lens.surfaces["1"].curvature.detach().clone().requires_grad_(), 1e-6

@@ -13,7 +13,6 @@ from dolens.analysis.pupil_quadrature import (
     with_chief_rays,
 )
 from dolens.errors import InputError
-from dolens.optics.system import is_rotationally_symmetric
 from dolens.optimize import DesignVariables, MeritSettings
 from dolens.optimize.bounded_step import damped_step
 from dolens.optimize.image_quality import without_edges
@@ -81,7 +80,7 @@ def test_quadrature_agrees_with_a_fine_sampling(triplet, field):
 
 def test_symmetry_saves_rays_and_nothing_else(triplet):
     """Half of the arms for a field along y, one for the axis: the radii stay."""
-    assert is_rotationally_symmetric(triplet.system())
+    assert triplet.system().rotationally_symmetric
     fields = [(0.0, 0.0), (0.0, 12.0)]
     spots = gaussian_quadrature(triplet, fields, LINES, 5, 16)
     assert len(spots.weight) == 3 * (5 + 5 * 8)
@@ -236,7 +235,7 @@ def test_the_jacobian_is_that_of_forward_mode(triplet):
         values = dict(zip(names, theta.unbind(), strict=True))
         from dolens.optics.backend import trace_rays
 
-        hit = trace_rays(lens.system(values), spots.rays, "reference", 1.0, False, 1, None)
+        hit = trace_rays(lens.system(values).traced_by("reference"), spots.rays)
         points = hit.position[:, :2]
         means = torch.zeros(spots.count, 2, dtype=points.dtype)
         means = means.index_add(0, spots.spot, spots.weight[:, None] * points)

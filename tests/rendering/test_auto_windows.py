@@ -11,6 +11,7 @@ from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.auto_windows import AutoWindows
 from dolens.rendering.auto.probe import GREY_LEVEL, fine_detail, probe_image
 from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.pupil.exit_pupil import axial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -52,7 +53,7 @@ def measured(lens, renderer, window):
 def measured_on(texture, lens, renderer, window):
     system = lens.double().system()
     pupil, middle = axial_exit_pupil(system, LINES[1:2]), PlanarScene(SCENE.depths, LINES[1:2])
-    (look,) = chief_ray_maps(system, middle, WHOLE, [window], pupil, "reference")
+    (look,) = chief_ray_maps(ImagingSystem(system, middle, WHOLE, pupil), [window])
     lens.float()
     centre = tuple(float(c.mean().round()) for c in look)
     image = renderer.render_windows(lens, SCENE, texture, [window], [centre], seed=11)[0]

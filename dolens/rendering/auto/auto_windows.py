@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import (
     Agreement,
@@ -24,12 +23,13 @@ from dolens.rendering.auto.agreement import (
 )
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.chosen import gradient_numbers, settings_of
-from dolens.rendering.auto.plan import Plan, plan
+from dolens.rendering.auto.plan import Plan, Requirements, plan
 from dolens.rendering.auto.probe import probe_texture
 from dolens.rendering.auto.reference import Reference, reference
 from dolens.rendering.auto.tightening import tightened
 from dolens.rendering.auto.trial import REFERENCE_SAMPLES, in_both_precisions, with_values
 from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
@@ -225,7 +225,6 @@ class _Trial:
         self.lens, self.scene, self.auto, self.sensor = lens, scene, owner.auto, owner.sensor
         self.names, self.windows = list(owner.windows), list(owner.windows.values())
         self.single, self.double = in_both_precisions(lens)
-        self.backend = choose_backend(self.double.system(), lens.backend)
         self.centres = self._centres(owner.sensor)
         channels = len(scene.wavelengths)
         self.textures = [
@@ -259,16 +258,15 @@ class _Trial:
     def plan(self, number: int, tolerance: float) -> Plan:
         """For one window by itself."""
         scene = replace(self.scene, texture_centre=self.centres[number])
+        single, double = (
+            ImagingSystem.of(lens.system(), scene, self.windows[number])
+            for lens in (self.single, self.double)
+        )
+        auto = self.auto
         return plan(
-            self.single.system(),
-            self.double.system(),
-            scene,
-            self.windows[number],
-            tolerance,
-            self.auto.gradients,
-            self.auto.diffraction,
-            self.backend,
-            registrations=("chief_rays",),
+            single,
+            double,
+            Requirements(tolerance, auto.gradients, auto.diffraction, ("chief_rays",)),
         )
 
     def errors(self, renderer: PsfRenderer) -> dict[str, float]:
@@ -311,5 +309,5 @@ class _Trial:
         system, wavelengths = self.double.system(), (self.scene.middle_wavelength,)
         middle = self.scene.as_planes(wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
-        looks = chief_ray_maps(system, middle, sensor, self.windows, pupil, self.backend)
+        looks = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), self.windows)
         return [tuple(float(c.mean().round()) for c in look) for look in looks]

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diffraction_limit
-from dolens.optics.system import OpticalSystem
 from dolens.rendering.auto.finding import Finding
 from dolens.rendering.auto.grid import (
     REGISTRATIONS,
@@ -18,10 +17,10 @@ from dolens.rendering.auto.grid import (
     window_finding,
 )
 from dolens.rendering.auto.probe import blurred_grey_levels, grey_levels
-from dolens.rendering.auto.survey import Survey, spread_pixels, survey
+from dolens.rendering.auto.survey import Pixels, Survey, spread_pixels, survey
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.planar import PlanarScene
-from dolens.sensor.pixels import Sensor
 
 # Points of the sensor where functions are compared.
 _POINTS = 24
@@ -62,67 +61,66 @@ class Plan:
         return math.sqrt(sum(finding.error**2 for finding in self.findings))
 
 
-@torch.no_grad()
-def plan(
-    system: OpticalSystem,
-    precise: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    tolerance: float,
-    gradients: bool,
-    diffraction: bool,
-    backend: str,
-    registrations: Sequence[str] = REGISTRATIONS,
-) -> Plan:
-    """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
+@dataclass(frozen=True)
+class Requirements:
+    """The conditions that a plan keeps to.
 
-    Args:
-        system: the lens in single precision.
-        precise: the same in double precision.
-        scene: depths and wavelengths.
-        sensor: the pixels.
+    Attributes:
         tolerance: RMS grey levels (1/255 of full scale, linear light) on the probe.
         gradients: whether the lens's gradients matter too.
         diffraction: whether it may be modelled.
-        backend: what traces.
         registrations: that may be chosen, of `PsfRenderer`.
+    """
+
+    tolerance: float
+    gradients: bool
+    diffraction: bool
+    registrations: Sequence[str] = REGISTRATIONS
+
+
+@torch.no_grad()
+def plan(single: ImagingSystem, double: ImagingSystem, requirements: Requirements) -> Plan:
+    """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
+
+    Args:
+        single: the lens in single precision, depths and wavelengths, and the pixels.
+        double: the same in double precision.
+        requirements: the tolerance, and what is asked for.
 
     Raises:
         InputError: functions are too wide for any window.
     """
-    rows, columns = spread_pixels(sensor, _POINTS)
-    truth = survey(precise, scene, sensor, rows, columns, SAMPLES, backend)
-    layout = choose_fields(
-        precise, scene, sensor, rows, columns, truth, tolerance, backend, registrations
-    )
+    scene, tolerance = double.scene, requirements.tolerance
+    truth = survey(double, spread_pixels(double.sensor, _POINTS), SAMPLES)
+    layout = choose_fields(truth, tolerance, requirements.registrations)
     renderer, distortion = layout.renderer, layout.renderer.registration == "chief_rays"
     functions = truth.functions(renderer.size, distortion)
     findings = [layout.finding, window_finding(truth, renderer.size, distortion)]
-    shared = (_SHARING_OF_GRADIENTS if gradients else _SHARING) * tolerance
+    shared = (_SHARING_OF_GRADIENTS if requirements.gradients else _SHARING) * tolerance
     for name, finding in (
         ("depths", _shared_depths(functions, scene, shared)),
         ("colours", _shared_colours(functions, scene, shared)),
     ):
         renderer = replace(renderer, **{name: finding.chosen})
         findings.append(finding)
-    finding, without = _diffraction(functions, truth, precise, scene, renderer, tolerance, backend)
-    if not diffraction:
+    finding, without = _diffraction(functions, truth, renderer, tolerance)
+    if not requirements.diffraction:
         finding = Finding(
             "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
         )
     renderer = replace(renderer, diffraction=finding.chosen)
     findings.append(finding)
     if finding.chosen != "none":
-        finding = _wider_window(truth, scene, renderer, tolerance)
+        finding = _wider_window(truth, renderer, tolerance)
         renderer = replace(renderer, size=int(finding.chosen))
         findings.append(finding)
         functions = truth.functions(renderer.size, distortion)
     few = slice(0, 8)
-    part = rows[few], columns[few]
-    finding = _sampling(precise, scene, sensor, part, functions[few], renderer, tolerance, backend)
+    part = tuple(place[few] for place in truth.pixels)
+    finding = _sampling(double, part, functions[few], renderer, tolerance)
     renderer = replace(renderer, pupil_samples=int(finding.chosen))
     findings.append(finding)
-    finding = _precision(system, precise, scene, sensor, part, renderer, tolerance, backend)
+    finding = _precision((single, double), part, renderer, tolerance)
     findings.append(finding)
     dtype = torch.float32 if finding.chosen == "single" else torch.float64
     return Plan(renderer, dtype, tuple(findings), without)
@@ -148,19 +146,13 @@ def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Fin
 
 
 def _diffraction(
-    functions: Tensor,
-    truth: Survey,
-    system: OpticalSystem,
-    scene: PlanarScene,
-    renderer: PsfRenderer,
-    tolerance: float,
-    backend: str,
+    functions: Tensor, truth: Survey, renderer: PsfRenderer, tolerance: float
 ) -> tuple[Finding, float]:
     """What model of diffraction is enough, and what leaving it out would cost.
 
     A perfect pupil's says whether it can matter at all; where it can, wavefronts are asked.
     """
-    pitch = renderer.sensor.pixel_pitch
+    scene, pitch = truth.imaging.scene, renderer.sensor.pixel_pitch
     airy = 1.22 * max(scene.wavelengths) * 1e-6 * truth.f_number / pitch
     seen = f"the Airy disc's radius is {airy:.2g} pixels"
     side = max(128, functions.shape[-1] + 1)
@@ -178,13 +170,10 @@ def _diffraction(
     # From the middle to a corner: what diffracts there may be beyond Fourier transforms.
     share = torch.linspace(0.5, 1.0, _WAVES, dtype=torch.float64)
     places = share * (sensor.height - 1), share * (sensor.width - 1)
-    found, again = (
-        survey(system, scene, sensor, *places, SAMPLES, backend, seed) for seed in (0, 1)
-    )
+    found, again = (survey(truth.imaging, places, SAMPLES, seed) for seed in (0, 1))
     # As wide as diffraction spreads light, within reason.
     size = renderer.size + 2 * min(math.ceil(8.0 * airy) + 2, _MARGINS[-1])
-    at = (system, scene, sensor, *places, size, distortion)
-    samples, against = found.wave_cost(*at)
+    samples, against = found.wave_cost(size, distortion)
     pupils = math.prod(renderer.fields) * len(scene.depths) * len(scene.wavelengths)
     if against is None and pupils * samples**2 > _MOST_SAMPLES:
         against = f"{pupils} pupils of {samples}² samples are too many"
@@ -192,7 +181,7 @@ def _diffraction(
         # A perfect pupil's effect is then all that is known of it, and its size.
         because = f"{seen}; not by waves: {against}"
         return Finding("diffraction", "limit", error, because), error
-    waves = found.waves(*at)
+    waves = found.waves(size, distortion)
     pair = [s.functions(size, distortion).double() for s in (found, again)]
     rays, noise = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
     limited = with_diffraction_limit(rays, pitch, scene.wavelengths, truth.f_number)
@@ -211,10 +200,9 @@ def _diffraction(
     return Finding("diffraction", "wave", 0.0, because), without
 
 
-def _wider_window(
-    truth: Survey, scene: PlanarScene, renderer: PsfRenderer, tolerance: float
-) -> Finding:
+def _wider_window(truth: Survey, renderer: PsfRenderer, tolerance: float) -> Finding:
     """A window that holds what diffraction spreads."""
+    scene = truth.imaging.scene
     pitch, distortion = renderer.sensor.pixel_pitch, renderer.registration == "chief_rays"
 
     def blurred(size: int) -> Tensor:
@@ -234,20 +222,17 @@ def _wider_window(
 
 
 def _sampling(
-    system: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    places: tuple[Tensor, Tensor],
+    imaging: ImagingSystem,
+    places: Pixels,
     functions: Tensor,
     renderer: PsfRenderer,
     tolerance: float,
-    backend: str,
 ) -> Finding:
     """The fewest rays whose functions are those of many."""
     distortion = renderer.registration == "chief_rays"
     error, samples = math.inf, _PUPIL_SAMPLES[-1]
     for samples in _PUPIL_SAMPLES:
-        found = survey(system, scene, sensor, *places, samples, backend, seed=1)
+        found = survey(imaging, places, samples, seed=1)
         coarse = found.functions(renderer.size, distortion)
         error = float(grey_levels(coarse - functions).square().mean().sqrt())
         if error <= _SAMPLING * tolerance:
@@ -257,20 +242,13 @@ def _sampling(
 
 
 def _precision(
-    system: OpticalSystem,
-    precise: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    places: tuple[Tensor, Tensor],
+    imaging: Sequence[ImagingSystem],
+    places: Pixels,
     renderer: PsfRenderer,
     tolerance: float,
-    backend: str,
 ) -> Finding:
     distortion = renderer.registration == "chief_rays"
-    found = [
-        survey(lens, scene, sensor, *places, 16, backend).functions(renderer.size, distortion)
-        for lens in (system, precise)
-    ]
+    found = [survey(each, places, 16).functions(renderer.size, distortion) for each in imaging]
     error = float(grey_levels(found[0].double() - found[1]).square().mean().sqrt())
     if error <= _PRECISION * tolerance:
         return Finding("precision", "single", error, "rounding does not show")

@@ -7,7 +7,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import (
     Agreement,
@@ -19,9 +18,10 @@ from dolens.rendering.auto.agreement import (
     judging_samples,
 )
 from dolens.rendering.auto.cost import psf_cost, rays_cost
-from dolens.rendering.auto.plan import Plan, plan
+from dolens.rendering.auto.plan import Plan, Requirements, plan
 from dolens.rendering.auto.probe import probe_texture
 from dolens.rendering.auto.reference import rays_samples, reference
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import Scene, pinhole_image
@@ -63,7 +63,6 @@ class Trial:
         self.sensor, self.tolerance, self.seed = sensor, tolerance, seed
         self.gradients, self.diffraction = gradients, diffraction
         self._single, self._double = in_both_precisions(current)
-        self._backend = choose_backend(self._double.system(), current.backend)
         self.texture = probe_texture(sensor, len(scene.wavelengths), seed, photographs)
         centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
         self.scene = scene.as_planes(texture_centre=centre)
@@ -84,16 +83,11 @@ class Trial:
 
     def plan(self, tolerance: float) -> Plan:
         """Functions that are expected to err by a tolerance."""
-        return plan(
-            self._single.system(),
-            self._double.system(),
-            self._planned,
-            self.sensor,
-            tolerance,
-            self.gradients,
-            self.diffraction,
-            self._backend,
+        single, double = (
+            ImagingSystem.of(lens.system(), self._planned, self.sensor)
+            for lens in (self._single, self._double)
         )
+        return plan(single, double, Requirements(tolerance, self.gradients, self.diffraction))
 
     def error(self, renderer: PsfRenderer | RayRenderer, dtype: torch.dtype) -> float:
         """Grey levels against the reference, both without diffraction."""

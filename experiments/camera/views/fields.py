@@ -11,13 +11,13 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import GradientMeasure
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.auto_windows import AutoWindows
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil
+from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.colour import linear_to_srgb
@@ -264,10 +264,8 @@ class FieldViews:
             renderer = PsfRenderer(
                 window, (1, 1), pupil_samples or 32, self._psf_size(), jitter=False
             )
-            system = lens.system(values)
-            backend = choose_backend(system, lens.backend)
-            pupil = sampled_exit_pupil(system, scene.wavelengths, window, backend)
-            functions = renderer.point_spread_functions(system, scene, pupil, 0, backend)
+            imaging = ImagingSystem.of(lens.system(values), scene, window)
+            functions = renderer.point_spread_functions(imaging, 0)
             found.append(functions.functions[0, 0])
         return torch.stack(found)
 
