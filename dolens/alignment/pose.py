@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.elements import TILTS
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
@@ -61,11 +61,7 @@ class Pose(nn.Module):
         scales, starts, units = [], [], []
         for name, settings in variables.items():
             settings = dict(settings or {})
-            for key in settings:
-                if key not in _KEYS:
-                    raise InputError(
-                        f"variable '{name}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-                    )
+            check_keys(settings, _KEYS, f"variable '{name}'")
             scale = float(settings.get("scale", 1.0))
             if not scale > 0.0:
                 raise InputError(f"variable '{name}': scale must be positive, not {scale:g}")

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.aiming import aim
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import FirstOrder, first_order
@@ -144,11 +144,8 @@ def operand(settings: Mapping[str, Any], lens: Lens) -> Operand:
             positive, or a gap that the lens does not have.
     """
     kind = settings.get("kind")
-    if kind not in KINDS:
-        raise InputError(f"operand: kind '{kind}' is unknown (allowed: {', '.join(KINDS)})")
-    for key in settings:
-        if key not in _KEYS:
-            raise InputError(f"operand '{kind}': unknown key '{key}' (allowed: {', '.join(_KEYS)})")
+    check_choice(kind, KINDS, "operand: kind")
+    check_keys(settings, _KEYS, f"operand '{kind}'")
     numbers = {
         key: None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
         for key in ("target", "min", "max")

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
 
 _KEYS = ("multiply", "add", "relative", "absolute")
@@ -47,11 +47,9 @@ def start_values(
 
 def _numbers(pattern: str, change: object) -> dict[str, float]:
     given = dict(change) if isinstance(change, Mapping) else {"value": change}
+    if isinstance(change, Mapping):
+        check_keys(change, _KEYS, f"start '{pattern}'")
     for key, value in given.items():
-        if key not in (*_KEYS, "value"):
-            raise InputError(
-                f"start '{pattern}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-            )
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(f"start '{pattern}': {key} must be a number, not {value!r}")
     return {key: float(value) for key, value in given.items()}

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
 from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.dependents import Dependent, dependent
@@ -56,11 +56,7 @@ class DesignVariables(nn.Module):
             settings = dict(settings or {})
             if pattern in following:
                 continue
-            for key in settings:
-                if key not in _KEYS:
-                    raise InputError(
-                        f"variable '{pattern}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-                    )
+            check_keys(settings, _KEYS, f"variable '{pattern}'")
             for name, parameter in lens.variables([pattern]).items():
                 if name in following:
                     continue

@@ -14,9 +14,9 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.elements import DISPLACEMENTS, TILTS, Element
-from dolens.prescriptions.checks import as_integer, as_number, check_keys, require_mapping
+from dolens.prescriptions.checks import as_integer, as_number, require_mapping
 
 # A tilt that no number of degrees gives to the last bit is written in radians, under this name.
 _RADIANS = tuple(f"{name}_radians" for name in TILTS)

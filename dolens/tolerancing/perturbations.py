@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.elements import TILTS
 from dolens.optics.lens import Lens
 
@@ -163,18 +163,12 @@ def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
     where = f"tolerances.{pattern}"
     if not isinstance(given, Mapping):
         given = {"half_range": given}
-    for key in given:
-        if key not in _KEYS:
-            raise InputError(f"{where}: unknown key '{key}' (allowed: {', '.join(_KEYS)})")
+    check_keys(given, _KEYS, where)
     half_range = given.get("half_range")
     if not _is_number(half_range) or not 0.0 < half_range < math.inf:
         raise InputError(f"{where}: half_range must be a positive number, not {half_range!r}")
     distribution = given.get("distribution", "uniform")
-    if distribution not in DISTRIBUTIONS:
-        raise InputError(
-            f"{where}: distribution '{distribution}' is unknown "
-            f"(allowed: {', '.join(DISTRIBUTIONS)})"
-        )
+    check_choice(distribution, DISTRIBUTIONS, f"{where}: distribution")
     relative = given.get("relative", False)
     if not isinstance(relative, bool):
         raise InputError(f"{where}: relative must be true or false, not {relative!r}")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice
 from dolens.optics.lens import Lens
 from dolens.optimize.operand_model import OperandModel
 from dolens.optimize.operands import Operand
@@ -44,10 +44,12 @@ class CameraOptimizer:
         lens: str = "adam",
         least_squares: Mapping[str, Any] | None = None,
     ) -> None:
-        if lens not in ("adam", "dls"):
-            raise InputError(f"optimizer.lens: '{lens}' is unknown; allowed: adam, dls")
+        check_choice(lens, ("adam", "dls"), "optimizer.lens")
         self.network = network
-        self.lens_steps = LensLeastSquares(**(least_squares or {})) if lens == "dls" else None
+        self.lens_steps = None
+        if lens == "dls":
+            where = "optimizer.least_squares"
+            self.lens_steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
 
     def __call__(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
         """The optimizer of parameter groups."""

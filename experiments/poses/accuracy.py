@@ -15,7 +15,7 @@ from dolens.alignment.information import knowledge
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import SpotLoss
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
@@ -91,8 +91,7 @@ class PoseAccuracyModule(Analysis):
     ) -> None:
         super().__init__(lens, experiment, folder)
         for part in parts:
-            if part not in PARTS:
-                raise InputError(f"parts: '{part}' is unknown (allowed: {', '.join(PARTS)})")
+            check_choice(part, PARTS, "parts")
         if lens.dtype != torch.float64:
             raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
         if measurements < 2 or patterns < 1 or not imagers or not variables:

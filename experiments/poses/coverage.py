@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.poses.coverage_figures import coverage_figure
@@ -56,10 +56,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             fits = tuple(str(fit) for fit in settings.pop("fits", names))
             self.cases[name] = (unmodelled_of(settings, f"cases.{name}"), fits)
             for fit in fits:
-                if fit not in names:
-                    raise InputError(
-                        f"cases.{name}.fits: '{fit}' is unknown; allowed: {', '.join(names)}"
-                    )
+                check_choice(fit, names, f"cases.{name}.fits")
                 needed = self.fits[names.index(fit)].held_from
                 if needed is not None and needed not in fits:
                     raise InputError(f"cases.{name}.fits: '{fit}' holds what '{needed}' finds")

@@ -10,7 +10,7 @@ import torch
 from dolens.alignment.information import knowledge
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
@@ -144,11 +144,7 @@ class PoseKnowledgeModule(Analysis):
         variables: Mapping[str, Mapping[str, Any] | None],
     ) -> Pose:
         """The lens where it is, and what is unknown in an arrangement."""
-        for key in entry:
-            if key not in _KEYS:
-                raise InputError(
-                    f"arrangements.{name}: unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-                )
+        check_keys(entry, _KEYS, f"arrangements.{name}")
         if not entry.get("sources"):
             raise InputError(
                 f"arrangements.{name}: sources are missing; give one (x, y, z) or more"

@@ -15,7 +15,7 @@ from dolens.alignment.measurement import Measurement
 from dolens.alignment.photograph import read_measurements
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.sensor.pixels import Sensor
@@ -131,9 +131,8 @@ class MisalignmentModule(Experiment):
             for name in (*fit.truth, *fit.held):
                 pose.value(name)
             for stage in self.stages:
-                unknown = set(stage.variables or ()) - set(pose.names)
-                if unknown:
-                    raise InputError(f"stages: variable '{unknown.pop()}' is not of fit {fit.name}")
+                for name in stage.variables or ():
+                    check_choice(name, pose.names, f"stages: variable of fit {fit.name}")
         self.initial = [pose.scaled.detach().clone() for pose in self.poses]
         self.history: list[dict[str, float | str]] = []
         self.results: list[Row] = []

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dolens.alignment.measurement import Measurement
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 
@@ -50,11 +50,7 @@ class Stage:
 
     def __post_init__(self) -> None:
         for key, allowed in (("optimizer", OPTIMIZERS), ("loss", LOSSES)):
-            if getattr(self, key) not in allowed:
-                raise InputError(
-                    f"stages: {key} '{getattr(self, key)}' is unknown; allowed: "
-                    f"{', '.join(allowed)}"
-                )
+            check_choice(getattr(self, key), allowed, f"stages: {key}")
         if self.loss != "s21" and self.centroid_weight is not None:
             raise InputError(f"stages: centroid_weight is of loss s21, not {self.loss}")
         if self.iterations < 1:
@@ -85,10 +81,7 @@ def stage_of(settings: Mapping[str, Any]) -> Stage:
     Raises:
         InputError: an unknown key, or a number out of range.
     """
-    try:
-        stage = Stage(**settings)
-    except TypeError as error:
-        raise InputError(f"stages: {error}") from None
+    stage = call_with_settings(Stage, settings, "stages")
     if stage.variables is None:
         return stage
     return replace(stage, variables=tuple(stage.variables))
@@ -106,10 +99,7 @@ def plain_imager(
     auto = merged.get("subpixels") == AUTO
     if auto:
         merged.pop("subpixels")
-    try:
-        return SpotImager(sensor, wavelength, **merged), auto
-    except TypeError as error:
-        raise InputError(f"imager: {error}") from None
+    return call_with_settings(SpotImager, merged, "imager", sensor, wavelength), auto
 
 
 def spot_imager(
@@ -169,9 +159,7 @@ def fit_of(name: str, settings: Mapping[str, Any]) -> Fit:
     Raises:
         InputError: an unknown key.
     """
-    unknown = set(settings) - {"variables", "truth", "held"}
-    if unknown:
-        raise InputError(f"fits.{name}: unknown key '{unknown.pop()}'")
+    check_keys(settings, ("variables", "truth", "held"), f"fits.{name}")
     held = dict(settings.get("held") or {})
     return Fit(
         name,

@@ -22,7 +22,7 @@ from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
 from dolens.alignment.pixel_moments import Pixels, grid_error
 from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one_thread
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
@@ -229,12 +229,9 @@ class TripletAlignmentModule(Analysis):
         )
 
     def _demo(self, settings: Mapping[str, Any]) -> tuple[int, Tensor]:
-        unknown = set(settings) - {"element", *POSE}
-        if unknown:
-            raise InputError(f"demo: '{unknown.pop()}' is unknown; allowed: element, {POSE}")
+        check_keys(settings, ("element", *POSE), "demo")
         name = settings.get("element")
-        if name not in self.elements:
-            raise InputError(f"demo.element: '{name}'; allowed: {', '.join(self.elements)}")
+        check_choice(name, self.elements, "demo.element")
         pose = torch.tensor([float(settings.get(part, 0.0)) for part in POSE], dtype=torch.float64)
         pose[:2] *= math.pi / 180.0
         return self.elements.index(name), pose

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import check_choice, check_keys
 from dolens.plotting import Point, pareto_front
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
@@ -65,8 +65,7 @@ class SpeedVsErrorModule(Analysis):
     ) -> None:
         super().__init__(lens, experiment, folder)
         for part in parts:
-            if part not in PARTS:
-                raise InputError(f"parts: '{part}' is unknown (allowed: {', '.join(PARTS)})")
+            check_choice(part, PARTS, "parts")
         self.parts = tuple(parts)
         self.subjects = [_subject(name, entry) for name, entry in scenes.items()]
         self.pupil_samples = tuple(pupil_samples)
@@ -140,11 +139,7 @@ def _points(rows: Sequence[Mapping[str, Any]]) -> list[Point]:
 
 
 def _subject(name: str, entry: Mapping[str, Any]) -> Subject:
-    for key in entry:
-        if key not in _SUBJECT_KEYS:
-            raise InputError(
-                f"scenes.{name}: unknown key '{key}' (allowed: {', '.join(_SUBJECT_KEYS)})"
-            )
+    check_keys(entry, _SUBJECT_KEYS, f"scenes.{name}")
     lens = lens_from_prescription(entry["lens"], torch.float32, where=f"scenes.{name}.lens")
     with torch.no_grad():
         for pattern, value in (entry.get("values") or {}).items():
