@@ -44,8 +44,7 @@ def unit_of(name: str) -> Unit:
     """Return the unit of a parameter in files and configuration.
 
     Args:
-        name: as `surfaces.1.curvature`, `elements.front.tilt_x` or `sources.1.z`; a pattern, too,
-            whose last part names the parameter.
+        name: as `surfaces.1.curvature`, `elements.front.tilt_x` or `sources.1.z`.
     """
     first, _, _ = name.partition(".")
     _, _, last = name.rpartition(".")
@@ -74,7 +73,7 @@ def file_value(name: str, value: float) -> float | None:
     Returns:
         None where rounding skips the value, so that no number of degrees stands for it.
     """
-    guess = to_file_units(name, value)
+    guess = value * (1.0 / unit_of(name).factor)
     for candidate in (guess, math.nextafter(guess, -math.inf), math.nextafter(guess, math.inf)):
         if to_lens_units(name, candidate) == value:
             return candidate

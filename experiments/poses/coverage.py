@@ -67,7 +67,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
                 raise InputError(f"fits.{names[number]}.truth: '{missing[0]}' is missing")
             with torch.no_grad():
                 true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
-                pose.scaled.copy_(true / pose.scale_in_units)
+                pose.scaled.copy_(true / pose.file_scale)
         self.found: dict[tuple[str, str], Estimates] = {}
         self.rows: list[Row] = []
         self.draw_rows: list[Row] = []

@@ -128,7 +128,7 @@ def _estimate(
         there.put(held.values(place))
     there.scaled.copy_((at + moved) / pose.scale)
     loss = NoiseWeightedLoss(measurement, imager, slopes, known.blur)
-    optimizer = DampedLeastSquares([there.scaled], initial_damping=_DAMPING)
+    optimizer = DampedLeastSquares([there.parameter_group()], initial_damping=_DAMPING)
     every = torch.ones(len(pose.names), dtype=torch.bool)
     theta = at + moved
     for _ in range(_ITERATIONS):

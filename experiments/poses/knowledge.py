@@ -116,7 +116,7 @@ class PoseKnowledgeModule(Analysis):
                     {
                         "arrangement": found.name,
                         "variable": name,
-                        "value": found.pose.found()[name],
+                        "value": found.pose.file_values()[name],
                         "bound": float(found.bounds[place]),
                         "most_like": names[other],
                         "correlation": float(correlations[place, other]),
@@ -188,7 +188,7 @@ class PoseKnowledgeModule(Analysis):
         numbers[f"knowledge/{found.name}/worst"] = min(float(found.spread[0]), UNSEEN)
         numbers[f"knowledge/{found.name}/unseen"] = float((found.spread > UNSEEN).sum())
         if found.estimates is not None:
-            truth = found.pose.found()
+            truth = found.pose.file_values()
             numbers |= spread_metrics(
                 found.name, found.pose.names, found.estimates, found.bounds, truth
             )

@@ -129,7 +129,7 @@ class MisalignmentModule(Experiment):
         )
         for fit, pose in zip(self.fits, self.poses, strict=True):
             for name in (*fit.truth, *fit.held):
-                pose.value(name)
+                pose.check_name(name)
             for stage in self.stages:
                 for name in stage.variables or ():
                     check_choice(name, pose.names, f"stages: variable of fit {fit.name}")
@@ -211,7 +211,7 @@ class MisalignmentModule(Experiment):
         fit, pose = self.fits[number], self.poses[number]
         if fit.held_from is None:
             return
-        found = self.poses[self._number(fit.held_from)].found()
+        found = self.poses[self._number(fit.held_from)].file_values()
         pose.put({name: found[name] for name in fit.held})
 
     def _number(self, name: str) -> int:
@@ -255,7 +255,7 @@ class MisalignmentModule(Experiment):
             "optimizer": stage.optimizer,
             "loss": float(sum(terms.values())),
             **{f"loss/{name}": float(value) for name, value in terms.items()},
-            **pose.found(),
+            **pose.file_values(),
             "seconds": seconds,
         }
         last = getattr(optimizer, "last", None)

@@ -29,11 +29,11 @@ def pose_rows(
         `true`, `initial`, `found`, `error`, `bound`, and `own_bound`, which would be the bound if
         all that the fit holds were exact.
     """
-    begun = (initial * pose.scale_in_units).tolist()
+    begun = (initial * pose.file_scale).tolist()
     bounds = (known.bounds / pose.units).tolist()
     own = (known.own_covariance.diagonal().sqrt() / pose.units).tolist()
     rows: list[Row] = []
-    for place, (name, value) in enumerate(pose.found().items()):
+    for place, (name, value) in enumerate(pose.file_values().items()):
         true = truth.get(name, math.nan)
         rows.append(
             {

@@ -24,6 +24,7 @@ from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import DEGREE, unit_factors, unit_of
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.poses.alignment_figures import Setup, alignment_figure
@@ -33,8 +34,6 @@ from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
-# Radians and mm as tables have them: degrees and µm.
-_DEGREES, _MICROMETRES = math.degrees(1.0), 1e3
 # Rings and arms with many rays in every pixel, and how many places of the grid are tried.
 _DENSE, _PLACES = (40, 120), 16
 
@@ -183,9 +182,7 @@ class TripletAlignmentModule(Analysis):
         covariance = least_covariance(root)
         bound = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         known = least_covariance(root[:, : len(POSE), : len(POSE)])
-        units = torch.tensor(
-            [_DEGREES] * 2 + [_MICROMETRES] * (2 + len(self.sensor)), dtype=torch.float64
-        )
+        units = _table_units((*POSE, *self.sensor))
         return Alignment(
             elements=self.elements,
             columns=[*COLUMNS, *(SENSOR_COLUMNS[name] for name in self.sensor)],
@@ -233,7 +230,7 @@ class TripletAlignmentModule(Analysis):
         name = settings.get("element")
         check_choice(name, self.elements, "demo.element")
         pose = torch.tensor([float(settings.get(part, 0.0)) for part in POSE], dtype=torch.float64)
-        pose[:2] *= math.pi / 180.0
+        pose *= unit_factors(POSE)
         return self.elements.index(name), pose
 
 
@@ -244,6 +241,12 @@ def _pixels(pitch: float, read_noise: float, window: float) -> Pixels | None:
     if read_noise != 0.0:
         raise InputError(f"read_noise: {read_noise!r}; allowed: 0 where pixel_pitch is 0")
     return None
+
+
+def _table_units(names: Sequence[str]) -> Tensor:
+    """Return what a number of the lens is multiplied by for a table in degrees and µm, (P,)."""
+    factors = [1.0 / unit_of(name).factor if unit_of(name) is DEGREE else 1e3 for name in names]
+    return torch.tensor(factors, dtype=torch.float64)
 
 
 def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
