@@ -6,12 +6,14 @@ degrees.  This module alone converts between the two.
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from dolens.optics.elements import DISPLACEMENTS, TILTS
+
+Value = TypeVar("Value", float, Tensor)
 
 
 class Unit(NamedTuple):
@@ -51,12 +53,12 @@ def unit_of(name: str) -> Unit:
     return _UNIT_OF_GROUP.get(first) or _UNIT_OF.get(last, UNNAMED)
 
 
-def to_lens_units(name: str, value: float) -> float:
+def to_lens_units(name: str, value: Value) -> Value:
     """Convert a parameter's value from files (degrees, mm) to the lens's own unit (radians, mm)."""
     return value * unit_of(name).factor
 
 
-def to_file_units(name: str, value: float) -> float:
+def to_file_units(name: str, value: Value) -> Value:
     """Convert a parameter's value from the lens's own unit (radians, mm) to that of files."""
     return value / unit_of(name).factor
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_file_units
 from dolens.optimize.variables import DesignVariables
 from experiments.camera.lens_least_squares import LensLeastSquares
 from experiments.camera.operands import CameraOperands
@@ -79,9 +80,8 @@ class LensSteps:
                     self.variables,
                     self._spots,
                     self._pitch,
-                    self.operands.entries,
+                    self.operands,
                     share,
-                    self.operands.object_distance,
                 )
         self.variables.project()
         self.operands.take_back_if_unreachable(
@@ -117,9 +117,10 @@ class LensSteps:
 
 @torch.no_grad()
 def variable_numbers(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return variables as metrics: a number as it is, an array by its root mean square."""
+    """Return variables as metrics in the units of files: a number as it is, an array by its RMS."""
     numbers = {}
-    for name, value in values.items():
+    for name, stored in values.items():
+        value = to_file_units(name, stored)
         if value.dim() == 0:
             numbers[f"variables/{name}"] = value.float()
         else:
