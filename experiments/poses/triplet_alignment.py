@@ -19,7 +19,7 @@ from dolens.alignment.element_fit import (
     named_element,
 )
 from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
-from dolens.alignment.pixel_moments import Pixels, grid_error
+from dolens.alignment.pixel_moments import Pixels
 from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one_thread
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError, check_choice, check_keys
@@ -27,6 +27,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import DEGREE, unit_factors, unit_of
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
+from experiments.poses.alignment_checks import one_exposure_error, sampling_error
 from experiments.poses.alignment_figures import Setup, alignment_figure
 from experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
 from experiments.settings import numbers_of
@@ -34,8 +35,8 @@ from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
-# Rings and arms with many rays in every pixel, and how many places of the grid are tried.
-_DENSE, _PLACES = (40, 120), 16
+# Rings and arms with many rays in every pixel.
+_DENSE = 40, 120
 
 
 class TripletAlignmentModule(Analysis):
@@ -165,11 +166,13 @@ class TripletAlignmentModule(Analysis):
         element, true = self._cases(generator)
         errors = _of_whole_lens(element, true, len(names))
         measured = simulated_moments(simulation, errors, self.photons, generator)
-        checks = _sampling_error(whole, simulation, errors, measured)
+        checks = sampling_error(whole, simulation, errors, measured)
         if self.pixels is not None:
             dense = self._spots(lens, *_DENSE)
             model = moment_model(lens, dense, every, self.sensor, None, whole.size)
-            checks |= _grid_error(model, self.pixels, errors[:1], measured[torch.tensor([0])])
+            checks |= one_exposure_error(
+                model, self.pixels, errors[:1], measured[torch.tensor([0])]
+            )
 
         started = time.perf_counter()
         fits = [fit_element(model, measured, self.iterations) for model in models]
@@ -254,40 +257,6 @@ def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
     poses = true.new_zeros(len(true), elements, len(POSE))
     poses[torch.arange(len(true)), element] = true[:, : len(POSE)]
     return torch.cat([poses.flatten(1), true[:, len(POSE) :]], 1)
-
-
-def _sampling_error(
-    fitted: MomentModel, simulated: MomentModel, errors: Tensor, measured: MeasuredMoments
-) -> dict[str, float]:
-    """What two quadratures of the same pupil differ by, over the noise of the moments."""
-    difference = fitted.moments(errors, measured.origin) - simulated.moments(
-        errors, measured.origin
-    )
-    apart = measured.over_noise(difference)
-    return {
-        "alignment/sampling_error_over_noise": float(apart.square().mean().sqrt()),
-        "alignment/sampling_error_over_noise/largest": float(apart.abs().max()),
-    }
-
-
-def _grid_error(
-    dense: MomentModel, pixels: Pixels, errors: Tensor, measured: MeasuredMoments
-) -> dict[str, float]:
-    """What one exposure instead of many dithered ones would change, over the noise: of one lens
-    (1, P), over places of the grid on a lattice.
-    """
-    side = (torch.arange(math.isqrt(_PLACES)) + 0.5) / math.isqrt(_PLACES)
-    places = torch.cartesian_prod(side, side)
-    difference = grid_error(
-        dense.points(errors)[0],
-        dense.shares,
-        measured.origin[0],
-        dense.size,
-        pixels.pitch,
-        places,
-    )
-    apart = measured.over_noise(difference[:, None])
-    return {"alignment/pixel_grid_over_noise": float(apart.square().mean().sqrt())}
 
 
 def _information_roots(
