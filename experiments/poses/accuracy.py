@@ -1,4 +1,4 @@
-"""How the error of a pose falls with photons and rays, and from how far off a fit converges."""
+"""Errors of a pose fit by photons and rays, and its basin of convergence."""
 
 import copy
 import logging
@@ -6,10 +6,8 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -21,19 +19,21 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
 from experiments.poses.basin import Basin
 from experiments.poses.measurements import draw, simulated_at
-from experiments.tables import Row, write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
 PARTS = ("photons", "rays", "basin")
 ESTIMATORS = ("noise_weighted", "s21")
-_DIGITS = 6
 
 
-class PoseAccuracyModule(lightning.LightningModule):
-    """Measures what limits a pose fit: light, rays, and where it starts.
+class PoseAccuracyModule(Analysis):
+    """Measures how light, rays and the start limit a pose fit.
 
     Errors by light and by rays are those of one Gauss-Newton step from the truth, which is where an
     estimate from there ends but for terms of second order in its error.
@@ -89,7 +89,7 @@ class PoseAccuracyModule(lightning.LightningModule):
         reference_photons: float = 2e8,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         for part in parts:
             if part not in PARTS:
                 raise InputError(f"parts: '{part}' is unknown (allowed: {', '.join(PARTS)})")
@@ -100,8 +100,7 @@ class PoseAccuracyModule(lightning.LightningModule):
                 "measurements, patterns, imagers, variables: give 2 or more, 1 or more, and at "
                 "least one of each"
             )
-        self.lens, self.experiment, self.seed = lens.requires_grad_(False), experiment, int(seed)
-        self.folder, self.parts = Path(folder), tuple(parts)
+        self.seed, self.parts = int(seed), tuple(parts)
         self.photons, self.read_noise = int(photons), float(read_noise)
         self.centroid_weight = float(centroid_weight)
         self.imagers = {
@@ -125,30 +124,40 @@ class PoseAccuracyModule(lightning.LightningModule):
             self.true, self.imager.wavelength, sensor, self.read_noise, self.seed, **basin
         )
         self.rows: list[Row] = []
-        self._numbers: dict[str, float] = {}
+        self.numbers: dict[str, float] = {}
 
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
+    def analyse(self) -> dict[str, float]:
+        """Measure part by part, and write the tables after each."""
+        for part in self.parts:
+            started = time.perf_counter()
+            logger.info("%s", part)
+            getattr(self, f"_{part}")()
+            self.write_tables()
+            self.numbers[f"cost/{part}_s"] = time.perf_counter() - started
+        return self.numbers
 
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Measure, and write each table when its part is done."""
-        with torch.inference_mode(False):
-            for part in self.parts:
-                started = time.perf_counter()
-                logger.info("%s", part)
-                getattr(self, f"_{part}")()
-                self._numbers[f"cost/{part}_s"] = time.perf_counter() - started
-        self.log_dict(self.summary(), batch_size=1)
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `accuracy` and `basin`, as far as they have been measured."""
+        return {"accuracy": self.rows, "basin": self.basin.rows}
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
-        return dict(self._numbers)
+    def figures(self) -> Figures:
+        """Return a figure for each part that was measured, by its name."""
+        name = self.lens.name
+        title = f"{name}: error and light, {self.measurements} measurements each"
+        figures = {
+            "photons": lambda: photons_figure(self.rows, self.true, title),
+            "rays": lambda: rays_figure(
+                self.numbers, self.imagers, self.ray_counts, self.photons, name
+            ),
+            "basin": lambda: basin_figure(self.basin, name),
+        }
+        return {part: figures[part] for part in self.parts}
 
     # ---------------------------------------------------------------- light
 
     @torch.no_grad()
     def _photons(self) -> None:
-        """Errors of estimates from measurements of more and more light."""
+        """Find errors of estimates from measurements of more and more light."""
         for number, level in enumerate(self.photon_levels):
             seeds = range(1000 * number, 1000 * number + self.measurements)
             measured = [self._measurement(level, seed) for seed in seeds]
@@ -162,7 +171,6 @@ class PoseAccuracyModule(lightning.LightningModule):
                 rms = found.square().mean(0).sqrt()
                 self._add("photons", estimator, level, rms, known.bounds)
             logger.info("%.3g photons: %s", level, self._last_ratios())
-        write_table(self.folder / "accuracy.csv", self.rows, _DIGITS)
 
     def _measurement(self, photons: int, seed: int) -> Measurement:
         imager, generator = self.imager, draw(self.seed, 0, seed)
@@ -174,7 +182,7 @@ class PoseAccuracyModule(lightning.LightningModule):
 
     @torch.no_grad()
     def _rays(self) -> None:
-        """Errors that few rays make, of images that stand for all of them."""
+        """Find the errors that few rays make."""
         reference = self._measurement(self.reference_photons, 999_999)
         exact = knowledge(self.true, self.imager, reference, self.slopes)
         # Bounds and weights are those of the light that is quoted.
@@ -187,7 +195,7 @@ class PoseAccuracyModule(lightning.LightningModule):
         known = knowledge(self.true, self.imager, quoted, self.slopes)
         inverse = self._s21_inverse(reference)
         floor = float((exact.bounds / known.bounds).square().mean().sqrt())
-        self._numbers["pose_error/reference_over_bound"] = floor
+        self.numbers["pose_error/reference_over_bound"] = floor
         for (name, imager), count in (
             (entry, count) for entry in self.imagers.items() for count in self.ray_counts
         ):
@@ -205,20 +213,18 @@ class PoseAccuracyModule(lightning.LightningModule):
                 rms = torch.stack(steps).square().mean(0).sqrt()
                 self._add(f"rays/{name}", estimator, count, rms, known.bounds, min(seconds))
             logger.info("%s, %.3g rays: %s", name, count, self._last_ratios())
-        write_table(self.folder / "accuracy.csv", self.rows, _DIGITS)
 
     # ---------------------------------------------------------------- where it starts
 
     def _basin(self) -> None:
-        """Fits from starts that are farther and farther off."""
+        """Fit from starts that are farther and farther off."""
         self.basin.run()
-        write_table(self.folder / "basin.csv", self.basin.rows, _DIGITS)
-        self._numbers |= self.basin.summary()
+        self.numbers |= self.basin.summary()
 
     # ---------------------------------------------------------------- estimates and rows
 
     def _s21_inverse(self, measurement: Measurement) -> Tensor:
-        """(P, rows), the pseudo-inverse of S21's derivatives by u, at the truth.
+        """Return the pseudo-inverse (P, rows) of S21's Jacobian with respect to u, at the truth.
 
         Another measurement's largest pixel scales all rows but those of the centroids a little
         otherwise, which moves the least squares by as little.
@@ -228,7 +234,7 @@ class PoseAccuracyModule(lightning.LightningModule):
         return torch.linalg.pinv(loss.jacobian(self.true, every)[1])
 
     def _s21_step(self, measurement: Measurement, imager: SpotImager, inverse: Tensor) -> Tensor:
-        """(P,), θ's units."""
+        """Return the step (P,) of S21 from the truth, in the units of θ."""
         loss = SpotLoss(measurement, imager, self.centroid_weight)
         return -self.true.scale * (inverse @ loss.residuals(self.true))
 
@@ -241,7 +247,7 @@ class PoseAccuracyModule(lightning.LightningModule):
         bounds: Tensor,
         seconds: float = math.nan,
     ) -> None:
-        """Rows of accuracy.csv, one for each variable, in degrees and mm."""
+        """Add rows of accuracy.csv, one for each variable, in degrees and mm."""
         units = self.true.units
         for place, name in enumerate(self.true.names):
             self.rows.append(
@@ -256,9 +262,9 @@ class PoseAccuracyModule(lightning.LightningModule):
                 }
             )
         key = f"pose_error/over_bound/{part}_{count:g}/{estimator}"
-        self._numbers[key] = float((rms / bounds).square().mean().sqrt())
+        self.numbers[key] = float((rms / bounds).square().mean().sqrt())
 
     def _last_ratios(self) -> str:
-        """RMS errors over bounds of what was added last."""
-        last = list(self._numbers.items())[-len(ESTIMATORS) :]
+        """Return the RMS errors over bounds that were added last, for the log."""
+        last = list(self.numbers.items())[-len(ESTIMATORS) :]
         return ", ".join(f"{name.rpartition('/')[2]} {value:.3g} bounds" for name, value in last)

@@ -1,25 +1,27 @@
-"""What becomes of poses and their bounds when a measurement has what the fit's model has not."""
+"""Coverage of pose bounds when measurements have effects that the fit's model lacks."""
 
 import logging
 from collections.abc import Mapping
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.coverage_figures import coverage_figure
 from experiments.poses.estimates import Estimates, probability
 from experiments.poses.misalignment import MisalignmentModule
 from experiments.poses.results import error_statistics
-from experiments.tables import Row, write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
-_DIGITS = 6
 
-
-class PoseCoverageModule(MisalignmentModule):
+class PoseCoverageModule(Analysis, MisalignmentModule):
     """Compares errors of poses with their bounds over many measurements, case by case.
 
     Nothing is fitted from afar.  Every measurement's estimate is found by Gauss-Newton steps from
@@ -73,44 +75,52 @@ class PoseCoverageModule(MisalignmentModule):
         self.rows: list[Row] = []
         self.draw_rows: list[Row] = []
 
-    def configure_optimizers(self) -> None:  # type: ignore[override]
-        """Nothing is trained."""
-
     @torch.no_grad()
-    def test_step(self, batch: Any, batch_idx: int) -> None:
+    def analyse(self) -> dict[str, float]:
         """Estimate, case by case; tables are written after each."""
-        with torch.inference_mode(False), torch.no_grad():
-            for number, fit in enumerate(self.fits):
-                self._hold(number)
-                self.known[fit.name] = self._knowledge(number)
-            for case in self.cases:
-                self._work_out(case)
-                write_table(self.folder / "coverage.csv", self.rows, _DIGITS)
-                write_table(self.folder / "draws.csv", self.draw_rows, _DIGITS)
-        self.log_dict(self.summary(), batch_size=1)
+        for number, fit in enumerate(self.fits):
+            self._hold(number)
+            self.known[fit.name] = self._knowledge(number)
+        for case in self.cases:
+            self._work_out(case)
+            self.write_tables()
+        return self._metrics()
+
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `coverage`, a row for each variable, and `draws`, a row for each measurement."""
+        return {"coverage": self.rows, "draws": self.draw_rows}
+
+    def figures(self) -> Figures:
+        """Return `errors_over_bounds`."""
+        return {"errors_over_bounds": self._figure}
+
+    def _figure(self) -> Figure:
+        errors = {
+            case: {fit: self.over_bound(case, fit) for fit in fits}
+            for case, (_, fits) in self.cases.items()
+        }
+        title = f"{self.lens.name}: errors over bounds, {self.draws} measurements"
+        return coverage_figure(errors, [fit.name for fit in self.fits], title)
 
     def over_bound(self, case: str, fit: str) -> Tensor:
-        """(M, P): errors over their bounds, of the measurements whose estimates have settled."""
+        """Return errors over bounds (M, P), for the measurements whose estimates have settled."""
         found = self.found[case, fit]
         return self._every(case, fit)[found.settled]
 
     def _every(self, case: str, fit: str) -> Tensor:
-        """(draws, P): errors over their bounds."""
+        """Return errors over their bounds (draws, P), for all measurements."""
         number = self._number(fit)
         pose, truth = self.poses[number], self.truth(number)
         true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
         return (self.found[case, fit].values - true) * pose.units / self.known[fit].bounds
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
+    def _metrics(self) -> dict[str, float]:
         numbers: dict[str, float] = {}
         for row in self.rows:
             name = f"{row['case']}/{row['fit']}/{row['variable']}"
             numbers[f"pose_rms_error/{name}"] = float(row["rms_error"])
             numbers[f"pose_rms_over_bound/{name}"] = float(row["rms_over_bound"])
         for case, (_, fits) in self.cases.items():
-            if (case, fits[0]) not in self.found:
-                continue
             together = torch.cat([self.over_bound(case, fit).flatten() for fit in fits])
             for key, value in error_statistics(together).items():
                 numbers[f"coverage/{case}/{key}"] = value
@@ -170,7 +180,7 @@ class PoseCoverageModule(MisalignmentModule):
             )
 
     def _variable_rows(self, case: str, fit: str) -> list[Row]:
-        """Of coverage.csv: a row for each variable."""
+        """Return rows of coverage.csv, one for each variable."""
         pose = self.poses[self._number(fit)]
         bounds = (self.known[fit].bounds / pose.units).tolist()
         rows: list[Row] = []

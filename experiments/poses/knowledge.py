@@ -1,63 +1,34 @@
-"""How well a lens's pose can be known from one source or several, on one plane or several."""
+"""Cramér–Rao bounds of a lens's pose for arrangements of sources and planes."""
 
 import copy
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
-from torch import Tensor
 
-from dolens.alignment.information import Knowledge, knowledge
+from dolens.alignment.information import knowledge
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.arrangement import UNSEEN, Arrangement
+from experiments.poses.knowledge_figures import knowledge_figures
 from experiments.poses.measurements import draw, repetitions, simulated_at
 from experiments.poses.results import spread_metrics
 from experiments.poses.settings import blur_for, slopes_imager, spot_imager
-from experiments.tables import Row, write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
 _KEYS = ("sources", "planes", "variables")
-_DIGITS = 6
-# A combination known worse than so many of its scales is not known at all.
-UNSEEN = 1e4
 
 
-@dataclass(frozen=True)
-class Arrangement:
-    """Sources and planes, and what they tell.
-
-    Attributes:
-        name: of the arrangement.
-        pose: the lens where it is; its variables are what is unknown.
-        known: of it.
-        spread: (P,), standard deviations of combinations of θ/scale, the worst known first.
-        combinations: (P, P), those, one a row.
-        estimates: (M, P), degrees and mm, from M measurements with other photons; None: none.
-    """
-
-    name: str
-    pose: Pose
-    known: Knowledge
-    spread: Tensor
-    combinations: Tensor
-    estimates: Tensor | None
-
-    @property
-    def bounds(self) -> Tensor:
-        """(P,), degrees and mm."""
-        return self.known.bounds / self.pose.units
-
-
-class PoseKnowledgeModule(lightning.LightningModule):
-    """Compares arrangements of sources and planes by what they tell of the same unknowns.
+class PoseKnowledgeModule(Analysis):
+    """Compares arrangements of sources and planes by their bounds of the same unknowns.
 
     Args:
         lens: as designed; its elements may have poses.
@@ -98,13 +69,12 @@ class PoseKnowledgeModule(lightning.LightningModule):
         monte_carlo: int = 0,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         if lens.dtype != torch.float64:
             raise InputError(f"lens_dtype: poses are known in float64, not {lens.dtype}")
         if not variables or not arrangements:
             raise InputError("variables, arrangements: give at least one of each")
-        self.lens = lens.requires_grad_(False)
-        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.seed = int(seed)
         self.photons, self.read_noise = int(photons), float(read_noise)
         self.monte_carlo = repetitions(monte_carlo)
         self.sensor, self.wavelength = sensor, float(wavelength)
@@ -113,30 +83,28 @@ class PoseKnowledgeModule(lightning.LightningModule):
             name: self._pose(name, entry, values, variables) for name, entry in arrangements.items()
         }
         self.arrangements: list[Arrangement] = []
-        self._numbers: dict[str, float] = {}
-
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
 
     @torch.no_grad()
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Evaluate, log, and write the tables."""
-        with torch.inference_mode(False), torch.no_grad():
-            for number, (name, pose) in enumerate(self.poses.items()):
-                found = self._evaluate(number, name, pose)
-                self.arrangements.append(found)
-                self._numbers |= self._metrics(found)
-                logger.info("%s: %s", name, self._verdict(found))
-        write_table(self.folder / "bounds.csv", self.bound_rows(), _DIGITS)
-        write_table(self.folder / "combinations.csv", self.combination_rows(), _DIGITS)
-        self.log_dict(self.summary(), batch_size=1)
+    def analyse(self) -> dict[str, float]:
+        """Evaluate every arrangement."""
+        numbers: dict[str, float] = {}
+        for number, (name, pose) in enumerate(self.poses.items()):
+            found = self._evaluate(number, name, pose)
+            self.arrangements.append(found)
+            numbers |= self._metrics(found)
+            logger.info("%s: %s", name, self._verdict(found))
+        return numbers
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
-        return dict(self._numbers)
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `bounds` and `combinations`."""
+        return {"bounds": self.bound_rows(), "combinations": self.combination_rows()}
+
+    def figures(self) -> Figures:
+        """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
+        return knowledge_figures(self.arrangements, self.lens.name, self.photons)
 
     def bound_rows(self) -> list[Row]:
-        """Of bounds.csv: a row for each variable of each arrangement."""
+        """Return rows of bounds.csv, one for each variable of each arrangement."""
         rows: list[Row] = []
         for found in self.arrangements:
             names, correlations = found.pose.names, found.known.correlations
@@ -157,7 +125,7 @@ class PoseKnowledgeModule(lightning.LightningModule):
         return rows
 
     def combination_rows(self) -> list[Row]:
-        """Of combinations.csv: a row for each combination, the worst known first."""
+        """Return rows of combinations.csv, one for each combination, the worst known first."""
         return [
             {
                 "arrangement": found.name,
@@ -175,7 +143,7 @@ class PoseKnowledgeModule(lightning.LightningModule):
         values: Mapping[str, float],
         variables: Mapping[str, Mapping[str, Any] | None],
     ) -> Pose:
-        """The lens where it is, and what is unknown in an arrangement."""
+        """Return the lens where it is, with the unknowns of an arrangement as variables."""
         for key in entry:
             if key not in _KEYS:
                 raise InputError(
@@ -231,7 +199,7 @@ class PoseKnowledgeModule(lightning.LightningModule):
         return numbers
 
     def _verdict(self, found: Arrangement) -> str:
-        """The combination that is known worst, in words."""
+        """Return the combination that is known worst, in words."""
         worst = found.combinations[0]
         order = worst.abs().argsort(descending=True)
         names = [

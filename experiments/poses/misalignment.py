@@ -1,14 +1,12 @@
-"""Section VI as a Lightning module: poses of a lens, fitted to images of point sources."""
+"""Poses of a lens, fitted to images of point sources (Section VI)."""
 
 import copy
 import itertools
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor, nn
 
@@ -21,9 +19,11 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.sensor.pixels import Sensor
+from experiments.experiment import Experiment, Figures
 from experiments.poses.estimates import Estimates, Held, estimates
 from experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
 from experiments.poses.measurements import draw, making, repetitions, simulated_at
+from experiments.poses.misalignment_figures import misalignment_figures
 from experiments.poses.results import (
     error_over_bound,
     pose_metrics,
@@ -32,7 +32,6 @@ from experiments.poses.results import (
     spread_metrics,
 )
 from experiments.poses.settings import Stage, fit_of, plain_imager, spot_imager, stage_of
-from experiments.running.checkpoints import refuse_another
 from experiments.tables import Row, write_table
 
 logger = logging.getLogger(__name__)
@@ -41,8 +40,8 @@ logger = logging.getLogger(__name__)
 _LOGGED = 8
 
 
-class MisalignmentModule(lightning.LightningModule):
-    """Finds poses one after another: an epoch is a fit, a step an iteration of one of its stages.
+class MisalignmentModule(Experiment):
+    """Fits poses one after another: an epoch is a fit, a step an iteration of one of its stages.
 
     Args:
         lens: as designed; its elements may have poses.
@@ -93,12 +92,11 @@ class MisalignmentModule(lightning.LightningModule):
         planes: Sequence[float] = (0.0,),
         unmodelled: Mapping[str, Any] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         self.automatic_optimization = False
         if lens.dtype != torch.float64:
             raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
-        self.lens = lens.requires_grad_(False)
-        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.seed = int(seed)
         self.unmodelled = unmodelled_of(unmodelled)
         self.measured = None
         if measurement is not None and self.unmodelled != Unmodelled():
@@ -147,8 +145,9 @@ class MisalignmentModule(lightning.LightningModule):
     # ---------------------------------------------------------------- what is measured
 
     def truth(self, number: int) -> dict[str, float]:
-        """All numbers that a fit's simulation has other than the lens: its own and those held; none
-        where a photograph is fitted.
+        """Return the true values of a fit, its own and those that it holds, degrees and mm.
+
+        There are none where a photograph is fitted.
         """
         if self.measured is not None:
             return {}
@@ -160,14 +159,14 @@ class MisalignmentModule(lightning.LightningModule):
         return {**found, **fit.truth}
 
     def true_pose(self, number: int) -> Pose:
-        """The lens and the sources that are simulated; what the truth does not name is as given."""
+        """Return the simulated lens and sources; values without a truth are as given."""
         pose = self.poses[number]
         true = Pose(copy.deepcopy(self.lens), pose.sources.tolist(), {}, pose.planes)
         true.put(self.truth(number))
         return true
 
     def measurement(self, number: int, seed: int = 0) -> Measurement:
-        """What a fit is to explain."""
+        """Return the measurement that a fit is to explain."""
         if self.measured is not None:
             return self.measured
         if seed == 0 and number in self._measurements:
@@ -178,7 +177,7 @@ class MisalignmentModule(lightning.LightningModule):
         return found
 
     def simulation(self, number: int, seed: int, unmodelled: Unmodelled) -> Measurement:
-        """One of a fit's measurements, with these effects."""
+        """Simulate one of a fit's measurements with these effects."""
         return simulated_at(
             self.true_pose(number),
             self.wavelength,
@@ -192,22 +191,22 @@ class MisalignmentModule(lightning.LightningModule):
         )
 
     def finest(self, number: int) -> SpotImager:
-        """The imager of a fit's last stage, by which its result is judged."""
+        """Return the imager of a fit's last stage, by which its result is judged."""
         settings = (self.imager, self.stages[-1].imager)
         return spot_imager(self.measurement(number), self.wavelength, *settings)
 
     # ---------------------------------------------------------------- iterations
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        """One for each stage of each fit, all of which a checkpoint holds."""
+        """Return an optimizer for each stage of each fit; a checkpoint holds them all."""
         return [optimizer_of(stage, pose) for pose in self.poses for stage in self.stages]
 
     def on_train_epoch_start(self) -> None:
-        """Hold what earlier fits have found."""
+        """Put the values that the fit holds to those that an earlier fit has found."""
         self._hold(self.current_epoch)
 
     def on_train_start(self) -> None:
-        """The same when a run is resumed within a fit."""
+        """Do the same when a run is resumed within a fit."""
         self._hold(min(self.current_epoch, len(self.fits) - 1))
 
     def _hold(self, number: int) -> None:
@@ -221,7 +220,7 @@ class MisalignmentModule(lightning.LightningModule):
         return [fit.name for fit in self.fits].index(name)
 
     def training_step(self, batch: Tensor, batch_idx: int) -> None:
-        """One iteration of the stage that is on."""
+        """Make one iteration of the present stage."""
         started = time.perf_counter()
         number, place = self.current_epoch, self._stage_at(batch_idx)
         stage = self.stages[place]
@@ -237,7 +236,7 @@ class MisalignmentModule(lightning.LightningModule):
         self._record(number, place, stage, terms, bare, started)
 
     def _stage_at(self, iteration: int) -> int:
-        """Number of the stage that an iteration of a fit belongs to."""
+        """Return the number of the stage that an iteration of a fit belongs to."""
         ends = itertools.accumulate(stage.iterations for stage in self.stages)
         return next((i for i, end in enumerate(ends) if iteration < end), len(self.stages) - 1)
 
@@ -278,7 +277,7 @@ class MisalignmentModule(lightning.LightningModule):
 
     @torch.no_grad()
     def test_step(self, batch: Tensor, batch_idx: int) -> None:
-        """Errors, bounds, and what cannot be told apart; tables and metrics."""
+        """Find errors and bounds of every fit; log them, and write the tables."""
         for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
             self._hold(number)
             known = self._knowledge(number)
@@ -307,11 +306,11 @@ class MisalignmentModule(lightning.LightningModule):
             )
 
     def _slopes(self, number: int) -> tuple[SpotImager, float]:
-        """What makes derivatives of a fit's images, and their blur, pixels."""
+        """Return the imager for derivatives of a fit's images, and their blur in pixels."""
         return slopes_of(self.stages[-1], self.measurement(number), self.wavelength, self.imager)
 
     def _knowledge(self, number: int) -> Knowledge:
-        """Of a fit's pose, with the uncertainty of what it holds from an earlier one."""
+        """Return the information on a fit's pose, with the uncertainty of values that it holds."""
         fit, pose, measurement = self.fits[number], self.poses[number], self.measurement(number)
         own, finest = self._slopes(number), self.finest(number)
         if fit.held_from is None:
@@ -330,7 +329,7 @@ class MisalignmentModule(lightning.LightningModule):
         unmodelled: Unmodelled,
         earlier: Mapping[str, Estimates],
     ) -> Estimates:
-        """What other measurements lead to, from where a fit ended, those of an earlier fit too."""
+        """Estimate the pose from other measurements, by steps from where the fit ended."""
         fit, pose = self.fits[number], self.poses[number]
         held = None
         if fit.held_from is not None:
@@ -356,13 +355,17 @@ class MisalignmentModule(lightning.LightningModule):
         )
 
     def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:
-        """Of a fit's pose, or of another point u."""
+        """Return the images of a fit's pose, or of other values u of its variables."""
         self._hold(number)
         with torch.no_grad():
             return self.poses[number].images(self.finest(number), scaled)
 
+    def figures(self) -> Figures:
+        """Return images before and after, the convergence of each fit, and bounds of its pose."""
+        return misalignment_figures(self)
+
     def summary(self) -> dict[str, float]:
-        """Numbers about the whole run, for metrics.json."""
+        """Return what the run cost, and errors over bounds where the truth is known."""
         numbers = {f"cost/{name}_s": value for name, value in self.seconds.items()}
         numbers["cost/iterations"] = float(len(self.history))
         images = len(self.measurement(0).images)
@@ -374,26 +377,19 @@ class MisalignmentModule(lightning.LightningModule):
 
     # ---------------------------------------------------------------- checkpoints
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say which experiment it is, and what has been done."""
-        checkpoint["dolens"] = self.identity()
-        checkpoint["history"], checkpoint["seconds"] = self.history, self.seconds
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return the history of iterations, and the seconds of each fit."""
+        return {"history": self.history, "seconds": self.seconds}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another experiment.
-
-        Raises:
-            InputError: it is one.
-        """
-        refuse_another(checkpoint.get("dolens"), self.identity())
+    def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on with them."""
         self.history = list(checkpoint.get("history", []))
         self.seconds = dict(checkpoint.get("seconds", {}))
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must have in common with this module, as plain values."""
+        """Return the experiment, the lens, the fits and the stages."""
         return {
-            "experiment": self.experiment,
-            "lens": self.lens.name,
+            **super().identity(),
             "fits": {fit.name: list(fit.variables) for fit in self.fits},
             "stages": [[stage.optimizer, stage.iterations] for stage in self.stages],
         }

@@ -80,7 +80,7 @@ def _files() -> list[Mapping[str, Any]] | None:
         )
         if file is None:
             return None
-        content = OmegaConf.to_container(OmegaConf.load(file), resolve=False) or {}
+        content = OmegaConf.to_container(OmegaConf.load(files[0]), resolve=False) or {}
         for key in reversed([key for key in (entry.package or "").split(".") if key]):
             content = {key: content}
         found.append(content)

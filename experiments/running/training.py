@@ -18,6 +18,7 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
 from experiments.callbacks.interruption import InterruptionNotice
+from experiments.experiment import Experiment, check_experiment
 from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
 from experiments.running.configuration import checked
 from experiments.running.resolvers import register_resolvers
@@ -51,6 +52,7 @@ def run(cfg: DictConfig) -> float:
     torch.set_float32_matmul_precision(settings.matmul_precision)
     lens = build_lens(settings)
     module = instantiate(settings.module)(lens=lens)
+    check_experiment(module, settings.train)
     checkpoint = settings.ckpt_path
     if checkpoint is not None:
         refuse_idle_checkpoint(settings, module)
@@ -115,7 +117,7 @@ def build_lens(settings: RunSettings) -> Lens:
     )
 
 
-def refuse_idle_checkpoint(settings: RunSettings, module: lightning.LightningModule) -> None:
+def refuse_idle_checkpoint(settings: RunSettings, module: Experiment) -> None:
     """Refuse a checkpoint that nothing would load.
 
     Raises:
@@ -123,20 +125,20 @@ def refuse_idle_checkpoint(settings: RunSettings, module: lightning.LightningMod
     """
     if not (settings.train or settings.test):
         raise InputError("ckpt_path: train=false test=false loads no checkpoint; leave it out")
-    if type(module).training_step is lightning.LightningModule.training_step:
+    if not module.trains:
         raise InputError(
             f"ckpt_path: {type(module).__name__} trains nothing that a checkpoint could hold; "
             "leave it out"
         )
 
 
-def summary_of(module: lightning.LightningModule) -> dict[str, float]:
+def summary_of(module: Experiment) -> dict[str, float]:
     """What a module says of the whole run; nothing where it fails, which is logged.
 
     The run is finished: what was measured before must not be lost with this.
     """
     try:
-        return plain_metrics(getattr(module, "summary", dict)())
+        return plain_metrics(module.summary())
     except Exception:
         logger.exception(
             "%s.summary() failed: metrics.json is written without its numbers",

@@ -117,7 +117,7 @@ def test_every_class_of_the_table_exists():
 
 
 def test_the_rate_that_nothing_read_names_the_one_that_is(composed):
-    with pytest.raises(InputError, match="optimizer.network.lr: .* learning_rates.network is"):
+    with pytest.raises(InputError, match=r"optimizer.network.lr: .* learning_rates.network is"):
         checked(composed(CAMERA, "+optimizer.network.lr=0.1"))
 
 

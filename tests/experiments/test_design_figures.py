@@ -5,15 +5,15 @@ from hydra.utils import instantiate
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dolens.optimize import MeritSettings
-from experiments.callbacks.design_pictures import design_drawings, pupil_note
+from experiments.design.figures import pupil_note
 from experiments.running.training import build_lens
 
 
 @pytest.fixture
-def drawings(composed):
+def figures(composed):
     """Of the aspheric singlet as it begins; its merit has another pupil than its stop."""
     cfg = composed("experiment=asphere")
-    return design_drawings(instantiate(cfg.module)(lens=build_lens(cfg)))
+    return instantiate(cfg.module)(lens=build_lens(cfg)).figures()
 
 
 def title_of(figure):
@@ -21,14 +21,14 @@ def title_of(figure):
 
 
 @pytest.mark.parametrize("name", ["spots", "ray_fans", "modulation", "rms_curves"])
-def test_figures_of_another_pupil_than_the_headline_say_so(drawings, name):
-    title = title_of(drawings[name]())
+def test_figures_of_another_pupil_than_the_headline_say_so(figures, name):
+    title = title_of(figures[name]())
     assert "the whole stop" in title
     assert "(rms_spot_um: 31×31 rays over ±15 mm)" in title
 
 
-def test_the_title_of_a_narrow_figure_is_not_cut_off(drawings):
-    figure = drawings["spots"]()
+def test_the_title_of_a_narrow_figure_is_not_cut_off(figures):
+    figure = figures["spots"]()
     FigureCanvasAgg(figure).draw()
     title = figure._suptitle.get_window_extent()
     assert 0.0 < title.x0 < title.x1 < figure.bbox.width

@@ -1,61 +1,64 @@
-"""A picture of which elements were named, and how well their poses were found."""
+"""The figure of elements named, and of errors of their poses."""
 
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-import lightning
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dolens.alignment.pixel_moments import Pixels
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-from experiments.callbacks.figures import keep_figures
-from experiments.poses.alignment_result import COLUMNS
-from experiments.poses.triplet_alignment import TripletAlignmentModule
+from experiments.poses.alignment_result import COLUMNS, Alignment
 
 _PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
 
 
-class AlignmentPictures(lightning.Callback):
-    """`alignment.png`, and the same in TensorBoard.
+@dataclass(frozen=True)
+class Setup:
+    """Describes the simulated measurement, for titles and lines.
 
-    Args:
-        folder: where it goes; made when needed.
+    Attributes:
+        lens: the name of the lens.
+        fields: the number of fields.
+        photons: photons of each spot.
+        pixels: pixels of the sensor; None: an ideal one.
+        sensor: the parts of the sensor's place that are unknown.
     """
 
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
+    lens: str
+    fields: int
+    photons: float
+    pixels: Pixels | None
+    sensor: Sequence[str]
 
-    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Draw."""
-        keep_figures(trainer, self.folder, {"alignment": alignment_figure(pl_module)})
 
+def alignment_figure(found: Alignment, setup: Setup) -> Figure:
+    """Draw elements misaligned against elements named, and errors beside their bounds.
 
-def alignment_figure(module: TripletAlignmentModule) -> Figure:
-    """Elements off against elements named, and the spread of errors beside their bounds.
-
-    Where the sensor is unknown, its own errors are beside them.
+    Where the place of the sensor is unknown, its own errors are beside them.
     """
-    unknown = bool(module.sensor)
+    unknown = bool(setup.sensor)
     figure = Figure(figsize=(14.0 if unknown else 11.0, 3.6), layout="constrained")
     left, *others = figure.subplots(1, 3 + unknown, width_ratios=(0.8, *[1.0] * (2 + unknown)))
-    _confusion(left, module)
+    _confusion(left, found)
     for axes, (name, columns, unit) in zip(others, _PANELS, strict=False):
-        _errors(axes, module, name, columns, unit)
+        _errors(axes, found, name, columns, unit, unknown)
     if unknown:
-        _sensor_errors(others[-1], module)
-    photons = f"{module.photons:_.0f}".replace("_", " ")
+        _sensor_errors(others[-1], found, setup.sensor)
+    photons = f"{setup.photons:_.0f}".replace("_", " ")
     figure.suptitle(
-        f"{module.lens.name}: {module.misalignments} misalignments from {len(module.fields)} fields"
-        f", {photons} photons a spot{_sensor(module)}",
+        f"{setup.lens}: {len(found.element) - 1} misalignments from {setup.fields} fields"
+        f", {photons} photons a spot{_sensor(setup)}",
         fontsize=TITLE,
     )
     return figure
 
 
-def _sensor(module: TripletAlignmentModule) -> str:
-    """What counts the photons, and what of its place is unknown, for the title."""
-    pixels, unknown = module.pixels, module.sensor
+def _sensor(setup: Setup) -> str:
+    """Return the pixels and the unknown parts of their place, for the title."""
+    pixels, unknown = setup.pixels, setup.sensor
     text = ""
     if pixels is not None:
         text = f"; {1e3 * pixels.pitch:.3g} µm pixels, {pixels.read_noise:.3g} e⁻ read noise"
@@ -66,8 +69,8 @@ def _sensor(module: TripletAlignmentModule) -> str:
     return text
 
 
-def _confusion(axes: Axes, module: TripletAlignmentModule) -> None:
-    found, names = module.alignment, module.elements
+def _confusion(axes: Axes, found: Alignment) -> None:
+    names = found.elements
     count = len(names)
     # The demo is a case of its own, not of the batch.
     pairs = (found.element * count + found.named)[1:]
@@ -87,33 +90,32 @@ def _confusion(axes: Axes, module: TripletAlignmentModule) -> None:
 
 
 def _errors(
-    axes: Axes, module: TripletAlignmentModule, name: str, columns: slice, unit: str
+    axes: Axes, found: Alignment, name: str, columns: slice, unit: str, sensor_unknown: bool
 ) -> None:
-    found = module.alignment
     errors = found.errors(columns)
     # The expected square of the error's length is the sum of the variances.
     bound = found.bound[:, columns].norm(dim=1)
     known = (found.bound[:, :4] / found.bound_ratio)[:, columns].norm(dim=1)
     batch = torch.arange(len(errors)) > 0
     for number, (element, colour) in enumerate(
-        zip(module.elements, colours(len(module.elements)), strict=True)
+        zip(found.elements, colours(len(found.elements)), strict=True)
     ):
         mine = batch & (found.element == number)
         if not bool(mine.any()):
             continue
         _spread(axes, errors[mine], bound[mine], colour, element)
-        if module.sensor:
+        if sensor_unknown:
             median = float(known[mine].median())
             axes.axvline(median, color=colour, linewidth=1.0, linestyle="--")
-    _finish(axes, f"error of the {name}, {unit}", bool(module.sensor))
+    _finish(axes, f"error of the {name}, {unit}", sensor_unknown)
 
 
-def _sensor_errors(axes: Axes, module: TripletAlignmentModule) -> None:
-    """All elements together: across by its length, and along the axis."""
-    found, pose = module.alignment, len(COLUMNS)
+def _sensor_errors(axes: Axes, found: Alignment, sensor: Sequence[str]) -> None:
+    """Draw the errors of all elements together: the length across the axis, and along it."""
+    pose = len(COLUMNS)
     difference = (found.found - found.true)[1:, pose:]
     bound = found.bound[1:, pose:]
-    along = torch.tensor([name == "sensor_distance" for name in module.sensor])
+    along = torch.tensor([name == "sensor_distance" for name in sensor])
     for chosen, colour, name in ((~along, "0.2", "shift"), (along, "0.6", "focus")):
         if bool(chosen.any()):
             errors = difference[:, chosen].norm(dim=1)
@@ -122,7 +124,7 @@ def _sensor_errors(axes: Axes, module: TripletAlignmentModule) -> None:
 
 
 def _spread(axes: Axes, errors: Tensor, bound: Tensor, colour: str, label: str) -> None:
-    """How many of (K,) errors are below each, and the median of their bounds."""
+    """Draw how many of (K,) errors are below each, and the median of their bounds."""
     ordered = errors.sort().values.clamp(min=1e-12)
     share = 100.0 * torch.arange(1, len(ordered) + 1) / len(ordered)
     axes.plot(ordered.numpy(), share.numpy(), color=colour, linewidth=1.5, label=label)

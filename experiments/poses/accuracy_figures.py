@@ -1,52 +1,39 @@
-"""Pictures of what limits a pose fit."""
+"""Figures of errors of a pose fit by photons and by rays, and of its basin of convergence."""
 
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
-import lightning
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from dolens.alignment.pose import Pose
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-from experiments.callbacks.figures import keep_figures
-from experiments.callbacks.misalignment_pictures import variable_label
-from experiments.poses.accuracy import ESTIMATORS, PoseAccuracyModule
+from dolens.rendering.spot_image import SpotImager
+from experiments.poses.basin import Basin
+from experiments.poses.labels import variable_label
+from experiments.tables import Row
 
 _LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}
 _MARKERS = {"noise_weighted": "o", "s21": "s"}
+_LINES = {"noise_weighted": "-", "s21": "--"}
 
 
-class PoseAccuracyPictures(lightning.Callback):
-    """`photons.png`, `rays.png` and `basin.png`, and the same in TensorBoard.
+def photons_figure(rows: Sequence[Row], true: Pose, title: str) -> Figure:
+    """Draw a panel for each variable: RMS errors of both estimates, and the bound.
 
     Args:
-        folder: where they go; made when needed.
+        rows: of accuracy.csv.
+        true: the pose whose variables are fitted.
+        title: the title.
     """
-
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
-
-    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Draw what was measured."""
-        keep_figures(trainer, self.folder, pose_accuracy_figures(pl_module))
-
-
-def pose_accuracy_figures(module: PoseAccuracyModule) -> dict[str, Figure]:
-    """Figures by name, of the parts that were measured."""
-    drawn = {"photons": _photons, "rays": _rays, "basin": _basin}
-    return {part: drawn[part](module) for part in module.parts}
-
-
-def _photons(module: PoseAccuracyModule) -> Figure:
-    """A panel for each variable: errors of both estimates, and the bound."""
-    names = module.true.names
+    names = true.names
     figure = Figure(figsize=(2.6 * len(names), 3.3), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(names)))
-    for axes, name, unit in zip(panels, names, module.true.unit_names, strict=True):
-        rows = [r for r in module.rows if r["part"] == "photons" and r["variable"] == name]
-        for estimator, colour in zip(ESTIMATORS, colours(2), strict=True):
-            mine = [r for r in rows if r["estimator"] == estimator]
+    for axes, name, unit in zip(panels, names, true.unit_names, strict=True):
+        own = [r for r in rows if r["part"] == "photons" and r["variable"] == name]
+        for estimator, colour in zip(_LABELS, colours(2), strict=True):
+            mine = [r for r in own if r["estimator"] == estimator]
             counts = [r["count"] for r in mine]
             axes.plot(
                 counts,
@@ -66,29 +53,39 @@ def _photons(module: PoseAccuracyModule) -> Figure:
     figure.legend(
         handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL
     )
-    figure.suptitle(
-        f"{module.lens.name}: error and light, {module.measurements} measurements each",
-        fontsize=TITLE,
-    )
+    figure.suptitle(title, fontsize=TITLE)
     return figure
 
 
-def _rays(module: PoseAccuracyModule) -> Figure:
-    """Errors that rays make, over the bound of the light that is quoted."""
+def rays_figure(
+    numbers: Mapping[str, float],
+    imagers: Mapping[str, SpotImager],
+    ray_counts: Sequence[int],
+    photons: int,
+    name: str,
+) -> Figure:
+    """Draw the errors that few rays make, over the bound of the quoted light.
+
+    Args:
+        numbers: metrics of the run.
+        imagers: name → how images are made.
+        ray_counts: of a source.
+        photons: of a source, that the bound is of.
+        name: the name of the lens, for the title.
+    """
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     axes = figure.subplots(1, 1)
-    for imager, colour in zip(module.imagers, colours(len(module.imagers)), strict=True):
-        settings = module.imagers[imager]
-        for estimator in ESTIMATORS:
+    for (imager, settings), colour in zip(imagers.items(), colours(len(imagers)), strict=True):
+        for estimator in _LABELS:
             found = [
-                module.summary()[f"pose_error/over_bound/rays/{imager}_{count:g}/{estimator}"]
-                for count in module.ray_counts
+                numbers[f"pose_error/over_bound/rays/{imager}_{count:g}/{estimator}"]
+                for count in ray_counts
             ]
             axes.plot(
-                module.ray_counts,
+                ray_counts,
                 found,
                 marker=_MARKERS[estimator],
-                linestyle="-" if estimator == ESTIMATORS[0] else "--",
+                linestyle=_LINES[estimator],
                 color=colour,
                 markersize=5,
                 linewidth=1.2,
@@ -96,31 +93,31 @@ def _rays(module: PoseAccuracyModule) -> Figure:
             )
     axes.axhline(1.0, color="0.3", linewidth=1.0)
     axes.text(
-        module.ray_counts[0],
+        ray_counts[0],
         1.08,
-        f"bound of {module.photons:.3g} photons",
+        f"bound of {photons:.3g} photons",
         fontsize=SMALL,
         color="0.3",
         va="bottom",
     )
-    floor = module.summary()["pose_error/reference_over_bound"]
+    floor = numbers["pose_error/reference_over_bound"]
     axes.axhspan(0.0, floor, color="0.92", label="noise of the reference", zorder=0)
     axes.set(xscale="log", yscale="log")
     axes.set_xlabel("rays of a source", fontsize=SMALL + 1)
     axes.set_ylabel("RMS error over bound", fontsize=SMALL + 1)
     ruled_axes(axes)
     axes.legend(frameon=False, fontsize=SMALL)
-    figure.suptitle(f"{module.lens.name}: error that the model's rays make", fontsize=TITLE)
+    figure.suptitle(f"{name}: error that the model's rays make", fontsize=TITLE)
     return figure
 
 
-def _basin(module: PoseAccuracyModule) -> Figure:
-    """A map of final errors for each centroid weight."""
-    basin = module.basin
+def basin_figure(basin: Basin, name: str) -> Figure:
+    """Draw a map of final errors against errors of the start, for each centroid weight."""
+    shares = basin.summary()
     weights = basin.centroid_weights
     figure = Figure(figsize=(1.2 + 4.2 * len(weights), 4.0), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(weights), sharey=True))
-    units = dict(zip(module.true.names, module.true.unit_names, strict=True))
+    units = dict(zip(basin.true.names, basin.true.unit_names, strict=True))
     across, up = basin.along
     for axes, weight in zip(panels, weights, strict=True):
         table = basin.table(weight).numpy()
@@ -136,13 +133,13 @@ def _basin(module: PoseAccuracyModule) -> Figure:
         axes.set_xticks(range(len(errors[0])), [f"{e:g}" for e in errors[0]], fontsize=SMALL)
         axes.set_yticks(range(len(errors[1])), [f"{e:g}" for e in errors[1]], fontsize=SMALL)
         axes.set_xlabel(_start(across, units), fontsize=SMALL + 1)
-        share = module.summary()[f"basin/converged/centroid_weight_{weight:g}"]
+        share = shares[f"basin/converged/centroid_weight_{weight:g}"]
         axes.set_title(f"μ = {weight:g} /mm²: {100.0 * share:.0f} % converge", fontsize=SMALL + 1)
     panels[0].set_ylabel(_start(up, units), fontsize=SMALL + 1)
     bar = figure.colorbar(shown, ax=list(panels), pad=0.01, extend="both")
     bar.set_label("RMS error of the fit over bound", fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
-    figure.suptitle(f"{module.lens.name}: from where a fit converges", fontsize=TITLE)
+    figure.suptitle(f"{name}: from where a fit converges", fontsize=TITLE)
     return figure
 
 
@@ -151,7 +148,7 @@ def _start(name: str, units: dict[str, str]) -> str:
 
 
 def _write(axes: Axes, table: np.ndarray) -> None:
-    """The number in each cell."""
+    """Write the number into each cell."""
     for row, column in np.ndindex(*table.shape):
         value = table[row, column]
         text = f"{value:.2g}" if value < 100.0 else f"{value:.0e}".replace("e+0", "e")

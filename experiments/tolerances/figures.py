@@ -1,8 +1,7 @@
-"""Pictures of a tolerance analysis when it is done."""
+"""Figures of a tolerance analysis."""
 
-from pathlib import Path
+from collections.abc import Sequence
 
-import lightning
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -13,34 +12,27 @@ from dolens.plotting.tolerances import (
     parameter_label,
     yield_figure,
 )
-from experiments.callbacks.figures import keep_figures
+from dolens.tolerancing import ToleranceAnalysis
+from experiments.experiment import Figures
 from experiments.tolerances.tables import per_unit
-from experiments.tolerances.tolerances import TolerancesModule
 
 _MOST_OFFENDERS = 20
 _UNIT_WORDS = {"deg": "µm per degree", "mm": "µm per mm", "%": "µm per %", "1/mm": "µm per 1/mm"}
 
 
-class TolerancePictures(lightning.Callback):
-    """Jacobians as matrices, yield curves, and the worst offenders, as PNG files.
+def tolerance_figures(
+    found: ToleranceAnalysis, name: str, spots: Sequence[str], weights: Tensor
+) -> Figures:
+    """Return Jacobians as matrices, yield curves, and the worst offenders.
 
     Args:
-        folder: where they go; made when needed.
+        found: the analysis.
+        name: the name of the lens, for titles.
+        spots: labels of its S spots.
+        weights: (S,), weights of the spots, of sum 1.
     """
-
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
-
-    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Write the files, and log them to TensorBoard."""
-        keep_figures(trainer, self.folder, tolerance_figures(pl_module))
-
-
-def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:
-    """Figures of an analysis by name."""
-    found, name = module.analysis, module.lens.name
     s, t, c = found.sensitivities, found.tolerances, found.contributions
-    spots = module.spot_labels()
+    spots = list(spots)
     blocks = [("x", len(spots)), ("y", len(spots))]
     motion = s.centroid_jacobian.transpose(0, 1).flatten(0, 1)
     labels = [parameter_label(parameter) for parameter in t.names]
@@ -49,24 +41,24 @@ def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:
     first = c.order[:_MOST_OFFENDERS]
     ends = s.rms_at_ends_refocused.square() - s.rms_refocused.square()
     return {
-        "centroid_jacobian": matrix_figure(
+        "centroid_jacobian": lambda: matrix_figure(
             _by_unit(motion * scale, labels, t.unit_names),
             spots * 2,
             blocks,
             f"{name}: how spots move (Jacobian of their centroids)",
         ),
-        "centroid_by_tolerance": matrix_figure(
+        "centroid_by_tolerance": lambda: matrix_figure(
             {"µm": (1e3 * motion * s.steps, with_tolerance)},
             spots * 2,
             blocks,
             f"{name}: how far a whole tolerance moves spots",
         ),
-        "rms_jacobian": matrix_figure(
+        "rms_jacobian": lambda: matrix_figure(
             _by_unit(s.rms_jacobian * scale, labels, t.unit_names),
             spots,
             title=f"{name}: Jacobian of the spots' RMS radii",
         ),
-        "rms_by_tolerance": matrix_figure(
+        "rms_by_tolerance": lambda: matrix_figure(
             {
                 "growth of RMS to first order, not refocused, µm": (
                     1e3 * s.rms_jacobian * s.steps,
@@ -80,8 +72,8 @@ def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:
             spots,
             title=f"{name}: what a whole tolerance does to the spots' RMS radii",
         ),
-        "yield": _yields(module),
-        "worst_offenders": offenders_figure(
+        "yield": lambda: _yields(found, name, weights),
+        "worst_offenders": lambda: offenders_figure(
             [with_tolerance[p] for p in first],
             c.share[first].tolist(),
             {
@@ -93,8 +85,7 @@ def tolerance_figures(module: TolerancesModule) -> dict[str, Figure]:
     }
 
 
-def _yields(module: TolerancesModule) -> Figure:
-    found = module.analysis
+def _yields(found: ToleranceAnalysis, name: str, weights: Tensor) -> Figure:
     outcomes = {
         f"{how}, {stage}": outcome.found(stage == "refocused")
         for stage in ("refocused", "not refocused")
@@ -108,17 +99,17 @@ def _yields(module: TolerancesModule) -> Figure:
             worst: {label: radii.worst for label, radii in outcomes.items()},
         },
         {
-            mean: float((design @ module.weights).sqrt()),
-            worst: float(design[module.weights > 0.0].amax().sqrt()),
+            mean: float((design @ weights).sqrt()),
+            worst: float(design[weights > 0.0].amax().sqrt()),
         },
-        f"{module.lens.name}: {module.lenses} lenses drawn from the tolerances",
+        f"{name}: {len(found.errors)} lenses drawn from the tolerances",
     )
 
 
 def _by_unit(
     matrix: Tensor, labels: list[str], units: tuple[str, ...]
 ) -> dict[str, tuple[Tensor, list[str]]]:
-    """A panel for each unit: numbers of several units share no scale."""
+    """Return a panel for each unit, since numbers of several units share no scale."""
     panels = {}
     for unit in dict.fromkeys(units):
         columns = [p for p, other in enumerate(units) if other == unit]

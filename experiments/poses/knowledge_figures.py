@@ -1,8 +1,8 @@
-"""Pictures of how well arrangements of sources and planes tell a lens's pose."""
+"""Figures of Cramér–Rao bounds for arrangements of sources and planes."""
 
-from pathlib import Path
+from collections.abc import Sequence
+from functools import partial
 
-import lightning
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -10,77 +10,66 @@ from matplotlib.figure import Figure
 
 from dolens.plotting.corner import corner_figure
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-from experiments.callbacks.figures import keep_figures
-from experiments.callbacks.misalignment_pictures import variable_label
-from experiments.poses.knowledge import UNSEEN, Arrangement, PoseKnowledgeModule
+from experiments.experiment import Figures
+from experiments.poses.arrangement import UNSEEN, Arrangement
+from experiments.poses.labels import variable_label
 
 _MARKERS = "osD^vP*X"
 
 
-class PoseKnowledgePictures(lightning.Callback):
-    """`knowledge.png` and a corner plot of each arrangement, and the same in TensorBoard.
+def knowledge_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:
+    """Return `knowledge`, and `corner_<arrangement>` of those that tell all variables.
 
     Args:
-        folder: where they go; made when needed.
+        arrangements: what was found.
+        name: the name of the lens.
+        photons: of all images of an arrangement together.
     """
-
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
-
-    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Draw."""
-        keep_figures(trainer, self.folder, pose_knowledge_figures(pl_module))
-
-
-def pose_knowledge_figures(module: PoseKnowledgeModule) -> dict[str, Figure]:
-    """Figures by name: `knowledge`, and `corner_<arrangement>` where all can be seen."""
-    figures = {"knowledge": _overview(module)}
-    for found in module.arrangements:
+    figures = {"knowledge": partial(_overview, arrangements, name, photons)}
+    for found in arrangements:
         if float(found.spread[0]) < UNSEEN:
-            figures[f"corner_{found.name}"] = _corner(module, found)
+            figures[f"corner_{found.name}"] = partial(_corner, found, name)
     return figures
 
 
-def _overview(module: PoseKnowledgeModule) -> Figure:
+def _overview(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figure:
     figure = Figure(figsize=(11.5, 7.4), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.8))
     left, right = above.subplots(1, 2, width_ratios=(1.5, 1.0))
-    _bounds(left, module)
-    _spectrum(right, module)
+    _bounds(left, arrangements)
+    _spectrum(right, arrangements)
     axes = below.subplots(1, 1)
-    _worst(axes, module, below)
+    _worst(axes, arrangements, below)
     figure.suptitle(
-        f"{module.lens.name}: what images of {module.photons:.3g} photons in all tell of its pose",
+        f"{name}: what images of {photons:.3g} photons in all tell of its pose",
         fontsize=TITLE,
     )
     return figure
 
 
-def _bounds(axes: Axes, module: PoseKnowledgeModule) -> None:
-    """Bounds of each variable over its scale, a mark for each arrangement."""
-    names = _names(module)
+def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
+    """Draw bounds of each variable over its scale, a mark for each arrangement."""
+    names = _names(arrangements)
     units = {
-        n: u
-        for f in module.arrangements
-        for n, u in zip(f.pose.names, f.pose.unit_names, strict=True)
+        n: u for f in arrangements for n, u in zip(f.pose.names, f.pose.unit_names, strict=True)
     }
     scales = {
         n: float(s)
-        for f in module.arrangements
+        for f in arrangements
         for n, s in zip(f.pose.names, f.pose.scale_in_units, strict=True)
     }
     far = 0.0
-    for found in module.arrangements:
+    for found in arrangements:
         for name, bound in zip(found.pose.names, found.bounds.tolist(), strict=True):
             share = bound / scales[name]
             far = max(far, share if share < UNSEEN else 0.0)
-    for number, (found, colour) in enumerate(_coloured(module)):
+    for number, (found, colour) in enumerate(_coloured(arrangements)):
         for row, name in enumerate(names):
             if name not in found.pose.names:
                 continue
             share = float(found.bounds[found.pose.names.index(name)]) / scales[name]
             seen = share < UNSEEN
-            offset = 0.13 * (number - 0.5 * (len(module.arrangements) - 1))
+            offset = 0.13 * (number - 0.5 * (len(arrangements) - 1))
             axes.plot(
                 share if seen else 8.0 * far,
                 row + offset,
@@ -97,9 +86,9 @@ def _bounds(axes: Axes, module: PoseKnowledgeModule) -> None:
     ruled_axes(axes)
 
 
-def _spectrum(axes: Axes, module: PoseKnowledgeModule) -> None:
-    """Standard deviations of combinations, from the worst known to the best."""
-    for number, (found, colour) in enumerate(_coloured(module)):
+def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
+    """Draw standard deviations of combinations, from the worst known to the best."""
+    for number, (found, colour) in enumerate(_coloured(arrangements)):
         spread = found.spread.clone()
         unseen = int((spread > UNSEEN).sum())
         spread[:unseen] = torch.nan
@@ -120,11 +109,11 @@ def _spectrum(axes: Axes, module: PoseKnowledgeModule) -> None:
     axes.legend(frameon=False, fontsize=SMALL)
 
 
-def _worst(axes: Axes, module: PoseKnowledgeModule, figure: Figure) -> None:
-    """What the worst known combination of each arrangement is made of."""
-    names = _names(module)
-    table = np.full((len(module.arrangements), len(names)), np.nan)
-    for row, found in enumerate(module.arrangements):
+def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> None:
+    """Draw the parts of the worst known combination of each arrangement."""
+    names = _names(arrangements)
+    table = np.full((len(arrangements), len(names)), np.nan)
+    for row, found in enumerate(arrangements):
         worst = found.combinations[0]
         # Of one sign: its largest part is positive.
         worst = worst * torch.sign(worst[worst.abs().argmax()])
@@ -139,7 +128,7 @@ def _worst(axes: Axes, module: PoseKnowledgeModule, figure: Figure) -> None:
             axes.text(column, row, text, ha="center", va="center", fontsize=SMALL, color=pale)
     axes.set_facecolor("0.93")
     labels = []
-    for found in module.arrangements:
+    for found in arrangements:
         spread = float(found.spread[0])
         labels.append(
             f"{_label(found)}\nσ = {spread:.2g}" if spread < UNSEEN else f"{_label(found)}\n∞"
@@ -150,7 +139,7 @@ def _worst(axes: Axes, module: PoseKnowledgeModule, figure: Figure) -> None:
     figure.colorbar(shown, ax=axes, pad=0.01).ax.tick_params(labelsize=SMALL)
 
 
-def _corner(module: PoseKnowledgeModule, found: Arrangement) -> Figure:
+def _corner(found: Arrangement, name: str) -> Figure:
     units = found.pose.units
     values = torch.tensor(list(found.pose.found().values()), dtype=torch.float64)
     return corner_figure(
@@ -160,7 +149,7 @@ def _corner(module: PoseKnowledgeModule, found: Arrangement) -> Figure:
         values,
         found.estimates,
         values if found.estimates is not None else None,
-        f"{module.lens.name}, {_label(found)}: Cramér–Rao",
+        f"{name}, {_label(found)}: Cramér–Rao",
     )
 
 
@@ -168,10 +157,10 @@ def _label(found: Arrangement) -> str:
     return found.name.replace("_", " ")
 
 
-def _names(module: PoseKnowledgeModule) -> list[str]:
-    """Of all variables of all arrangements."""
-    return list(dict.fromkeys(name for f in module.arrangements for name in f.pose.names))
+def _names(arrangements: Sequence[Arrangement]) -> list[str]:
+    """Return the names of all variables of all arrangements."""
+    return list(dict.fromkeys(name for f in arrangements for name in f.pose.names))
 
 
-def _coloured(module: PoseKnowledgeModule) -> zip:
-    return zip(module.arrangements, colours(len(module.arrangements)), strict=True)
+def _coloured(arrangements: Sequence[Arrangement]) -> zip:
+    return zip(arrangements, colours(len(arrangements)), strict=True)

@@ -1,10 +1,7 @@
-"""Pictures of a lens before and after its design."""
+"""Figures of a lens before and after its design."""
 
-import logging
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 
-import lightning
 import torch
 from matplotlib.figure import Figure
 
@@ -12,7 +9,6 @@ from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.analysis.spot_diagram import spot_diagram, working_f_numbers
-from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optimize import MeritSettings
 from dolens.plotting import (
@@ -21,54 +17,33 @@ from dolens.plotting import (
     modulation_figure,
     ray_fans_figure,
     rms_curves_figure,
-    save_figure,
     spots_figure,
 )
-from experiments.callbacks.figures import log_figure
-from experiments.design.design import DesignModule
 from experiments.design.tables import SQUARE_GRID_COUNT, spot_table
-
-logger = logging.getLogger(__name__)
+from experiments.experiment import Figures
 
 _FREQUENCIES = 51
 # Beyond this over the RMS radius a spot's modulation is nearly nothing.
 _BLURRED = 1.5
 
 
-class DesignPictures(lightning.Callback):
-    """Layout before and after, spots, ray fans, modulation, RMS curves, and the history.
-
-    PNG files when the test ends, and the same in TensorBoard.
+def design_figures(
+    lens: Lens,
+    initial: Lens,
+    settings: MeritSettings,
+    history: Sequence[Mapping[str, float]],
+    max_frequency: float | None = None,
+) -> Figures:
+    """Return the layout, spots, ray fans, MTF and RMS curves of a design, and its history.
 
     Args:
-        folder: where PNG files go; made when needed.
-        most_frequency: cycles/mm, where the modulation's curves end; None: at half of what
-            diffraction lets through, or where the final lens's spots leave nothing.
+        lens: the design.
+        initial: the lens where the search began.
+        settings: fields and wavelengths, and the rays of `rms_spot_um`.
+        history: a row of numbers for every iteration; empty if nothing was trained.
+        max_frequency: the end of the MTF curves, cycles/mm; None: half of the diffraction limit, or
+            less, where the spots of the design leave no contrast.
     """
-
-    def __init__(self, folder: str, most_frequency: float | None = None) -> None:
-        self.folder, self.most_frequency = Path(folder), most_frequency
-
-    def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Draw, save and log them."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        for name, draw in design_drawings(pl_module, self.most_frequency).items():
-            try:
-                figure = draw()
-            except InputError as problem:
-                # One analysis that this lens does not allow must not cost the others.
-                logger.warning("No figure '%s': %s", name, problem)
-                continue
-            save_figure(figure, self.folder / f"{name}.png")
-            log_figure(trainer, name, figure)
-
-
-def design_drawings(
-    module: DesignModule, most_frequency: float | None = None
-) -> dict[str, Callable[[], Figure]]:
-    """Name → what draws it."""
-    lens, initial = module.lens, module.initial
-    settings = module.evaluation
     fields = [tuple(field) for field in settings.fields_of(lens)]
     waves = list(settings.wavelengths_of(lens))
     distance = lens.object_distance
@@ -88,12 +63,12 @@ def design_drawings(
         )
 
     def transfer(of: Lens, title: str) -> Figure:
-        most = most_frequency
+        most = max_frequency
         if most is None:
             wave = torch.tensor([lens.primary_wavelength], dtype=torch.float64)
             number = float(working_f_numbers(lens, wave, distance)[0])
             most = 0.5 / (1e-6 * lens.primary_wavelength * number)
-            blur = 1e-3 * spot_table(lens, module.evaluation).mean
+            blur = 1e-3 * spot_table(lens, settings).mean
             most = min(most, _BLURRED / max(blur, 1e-12))
         frequencies = torch.linspace(0.0, most, _FREQUENCIES, dtype=torch.float64)
         found = modulation(of, fields, waves, frequencies, object_distance=distance)
@@ -108,7 +83,7 @@ def design_drawings(
             title=f"RMS spot radius, rays over the whole stop{pupil}",
         )
 
-    drawings = {
+    figures: dict[str, Callable[[], Figure]] = {
         "layout": layouts,
         "spots": lambda: spots(lens, "final"),
         "spots_initial": lambda: spots(initial, "initial"),
@@ -120,18 +95,17 @@ def design_drawings(
         "modulation_initial": lambda: transfer(initial, "initial"),
         "rms_curves": curves,
     }
-    if module.history:
-        history = module.history
+    if history:
         damping = [row.get("train/damping", float("nan")) for row in history]
         merits = [row["train/merit"] for row in history]
-        drawings["history"] = lambda: history_figure(
+        figures["history"] = lambda: history_figure(
             merits, damping if any(value == value for value in damping) else None
         )
-    return drawings
+    return figures
 
 
 def pupil_note(settings: MeritSettings) -> str:
-    """Lines for titles: which rays the run's RMS spot radii are of, where not the figure's.
+    """Return lines for titles that name the rays of `rms_spot_um`, if they are not the figure's.
 
     The figures' rays fill the stop evenly, and radii count from each colour's own centroid.
 
@@ -160,6 +134,6 @@ def _size(field: tuple[float, float]) -> float:
 
 
 def _interval(wavelengths: list[float]) -> tuple[float, float]:
-    """From the shortest to the longest; about a single one, 5 % both ways."""
+    """Return the range of wavelengths; about a single one, 5 % both ways."""
     low, high = min(wavelengths), max(wavelengths)
     return (low, high) if high > low else (0.95 * low, 1.05 * low)
