@@ -75,10 +75,8 @@ def _files() -> list[Mapping[str, Any]] | None:
         name = entry.config_path
         if name is None or name.startswith("hydra/"):
             continue
-        file = next(
-            (f for f in (folder / f"{name}.yaml" for folder in folders) if f.is_file()), None
-        )
-        if file is None:
+        files = [file for folder in folders if (file := folder / f"{name}.yaml").is_file()]
+        if not files:
             return None
         content = OmegaConf.to_container(OmegaConf.load(files[0]), resolve=False) or {}
         for key in reversed([key for key in (entry.package or "").split(".") if key]):
