@@ -89,7 +89,7 @@ def test_a_key_that_no_class_takes_is_one_line_with_the_nearest(composed, case):
 
 
 def test_the_published_lens_is_data_too(composed):
-    with pytest.raises(InputError, match="^published: a prescription is data and makes nothing"):
+    with pytest.raises(InputError, match=r"^published: a prescription is data and makes nothing"):
         checked(composed("experiment=asphere", "+published._target_=os.system"))
 
 
