@@ -21,7 +21,7 @@ from experiments.experiment import Experiment
 
 
 class Camera(Experiment):
-    """The path from textures through lens, sensor and network to restored images and their loss.
+    """Images textures through a lens and a sensor, restores them, and compares them with the truth.
 
     Args:
         lens: the lens; its other parameters than the variables stay as they are.
@@ -129,6 +129,6 @@ class Camera(Experiment):
 
 
 def _shapes(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    """The first and last parameters: enough to tell networks of other widths or kinds apart."""
+    """Return the first and last parameters, which tell networks of other widths or kinds apart."""
     parameters = list(module.named_parameters())
     return iter([parameters[0], parameters[-1]]) if parameters else iter([])

@@ -1,4 +1,4 @@
-"""A camera as one Lightning module: a lens, how it looks, reconstruction and loss."""
+"""Training and evaluation of a camera."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -25,7 +25,7 @@ from experiments.experiment import Figures
 
 
 class CameraModule(Camera):
-    """End-to-end training of a camera.
+    """Trains a lens and the network that restores its images, end to end.
 
     A batch of textures is imaged in several ways (at depths, or at places of the field), read out,
     and one network restores all the images without being told which.  The loss reaches the network
@@ -100,7 +100,7 @@ class CameraModule(Camera):
     # ---------------------------------------------------------------- training
 
     def configure_optimizers(self) -> Any:
-        """One optimizer; the lens's variables and the network have learning rates of their own."""
+        """Return one optimizer, with a group for the network and one for the lens's variables."""
         groups = [
             {
                 "params": list(self.network.parameters()),
@@ -135,9 +135,7 @@ class CameraModule(Camera):
         self.views.prepare(self.lens, self.variables(), self.comparison(), self._photographs())
 
     def _photographs(self) -> Tensor | None:
-        """What a renderer that chooses its model is tried on besides its own images, where the data
-        have some.
-        """
+        """Return photographs on which a renderer chooses its model, if the data have some."""
         found = getattr(self.trainer.datamodule, "most_detailed", None)
         return None if found is None else found()
 
@@ -178,7 +176,7 @@ class CameraModule(Camera):
     def optimizer_step(
         self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None
     ) -> None:
-        """Step, and finish the step of the lens.  A checkpoint of this step has it all."""
+        """Step, and finish the step of the lens, so that a checkpoint of this step holds it all."""
         before = self.variables.scaled.detach().clone()
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         if len(self.variables):
@@ -192,11 +190,10 @@ class CameraModule(Camera):
         self.costs.end_backward()
 
     def on_train_batch_end(self, outputs: Any, batch: Tensor, batch_idx: int) -> None:
-        """Log the cost, and the lens as it is."""
+        """Log the costs, and the lens's variables."""
         self.log_dict(self.costs.end())
         self.log("cost/rays", float(self.views.rays()))
-        with torch.no_grad():
-            self.log_dict(variable_numbers(self.variables()))
+        self.log_dict(variable_numbers(self.variables()))
 
     # ---------------------------------------------------------------- evaluation
 
@@ -252,14 +249,14 @@ class CameraModule(Camera):
     # ---------------------------------------------------------------- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return what the views, the lens's optimizer and the discriminators go on from."""
+        """Return the states of the views, the lens's steps and the discriminators."""
         state: dict[str, Any] = {"dolens_views": self.views.state(), **self.lens_steps.state()}
         if self.adversary is not None:
             state["dolens_adversary"] = self.adversary.optimizer.state_dict()
         return state
 
     def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
-        """Take it up."""
+        """Go on from these states."""
         self.views.load_state(self.lens, checkpoint.get("dolens_views", {}))
         self.lens_steps.load_state(checkpoint)
         if self.adversary is not None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class StepCosts:
-    """Clocks of training steps.
+    """Measures the wall time of training steps.
 
     The optics' share is the time in which images are made, and in the backward pass the time after
     the gradient has reached the images.

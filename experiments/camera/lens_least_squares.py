@@ -25,7 +25,7 @@ _LEAST_REACH = 0.02
 
 
 class CameraOptimizer:
-    """How a camera's parameters move: its network's by `network`, its lens's by it too or apart.
+    """Makes the optimizer of a camera's network, and chooses the one of its lens.
 
     Args:
         network: parameter groups → optimizer.
@@ -51,12 +51,12 @@ class CameraOptimizer:
             self.lens_steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
 
     def __call__(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """The optimizer of parameter groups."""
+        """Return the optimizer of parameter groups."""
         return self.network(groups)
 
 
 class LensLeastSquares:
-    """Moves a lens once for some steps of the network, by the gradient they have gathered.
+    """Moves a lens once for some steps of the network, by the gradient gathered in them.
 
     The step minimises the loss's linear model and the operands while rays move no farther than
     `reach`; see `trusted_step`.  Batches are small and differ, so that a trial on one of them would
@@ -100,7 +100,7 @@ class LensLeastSquares:
         self._slope = 0.0
 
     def is_due(self, steps: int) -> bool:
-        """Whether the lens moves after so many steps of the network."""
+        """Return whether the lens moves after so many steps of the network."""
         return steps % self.every == 0
 
     def gather(self, variables: DesignVariables) -> None:
@@ -120,7 +120,7 @@ class LensLeastSquares:
         operands: CameraOperands | None = None,
         share: float = 1.0,
     ) -> dict[str, float]:
-        """One step, by the gradient that was gathered; it is used up.
+        """Make one step by the gradient that was gathered, and forget that gradient.
 
         Args:
             lens: where the values are stored.
@@ -175,11 +175,11 @@ class LensLeastSquares:
         self._last, self._slope = None, 0.0
 
     def numbers(self) -> dict[str, float]:
-        """How many steps were taken, and how far rays may move now (pixels)."""
+        """Return how many steps were taken, and how far rays may move now (pixels)."""
         return {"lens_steps/taken": float(self.taken), "lens_steps/reach": self.reach}
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps, the gradient gathered so far included."""
+        """Return what a checkpoint keeps, the gradient gathered so far included."""
         return {
             "reach": self.reach,
             "taken": self.taken,
@@ -189,7 +189,7 @@ class LensLeastSquares:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on with it."""
+        """Go on with what a checkpoint kept."""
         self.reach, self.taken = float(state["reach"]), int(state["taken"])
         self._gathered, self._last = state["gathered"], state["last"]
         self._slope = float(state["slope"])

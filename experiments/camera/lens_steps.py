@@ -15,7 +15,7 @@ from experiments.camera.views.base import Imaging
 
 
 class LensSteps:
-    """What is done with the lens at each step of the training.
+    """Finishes each training step for the lens.
 
     Its variables move with the network's parameters by the same optimizer, or apart from them by
     damped least squares, once for some steps of the network.
@@ -49,7 +49,7 @@ class LensSteps:
 
     @property
     def apart(self) -> bool:
-        """Whether the lens moves by least squares, which knows the operands itself."""
+        """Return whether the lens moves by least squares, which knows the operands itself."""
         return self.least_squares is not None
 
     def penalty(self, values: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
@@ -59,8 +59,7 @@ class LensSteps:
     def finish(
         self, optimizer: torch.optim.Optimizer, before: Tensor, steps: int, share: float
     ) -> dict[str, float]:
-        """Move the lens, if that is done apart; project its variables onto their bounds (S17) and
-        store them in it.
+        """Move the lens if that is done apart, project its variables (S17), and store them in it.
 
         Args:
             optimizer: of the network, after its step.
@@ -115,14 +114,13 @@ class LensSteps:
             self.least_squares.load_state(checkpoint["dolens_lens_steps"])
 
 
-@torch.no_grad()
 def variable_numbers(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return variables as metrics in the units of files: a number as it is, an array by its RMS."""
     numbers = {}
-    for name, stored in values.items():
-        value = to_file_units(name, stored)
-        if value.dim() == 0:
-            numbers[f"variables/{name}"] = value.float()
+    for name, value in values.items():
+        number = to_file_units(name, value.detach()).float()
+        if number.dim() == 0:
+            numbers[f"variables/{name}"] = number
         else:
-            numbers[f"variables/{name}/rms"] = value.float().square().mean().sqrt()
+            numbers[f"variables/{name}/rms"] = number.square().mean().sqrt()
     return numbers

@@ -1,4 +1,4 @@
-"""What a camera's lens must be besides good for its images: operands beside the loss."""
+"""Operands of a camera's lens, which are added to the loss of its images."""
 
 import logging
 import math
@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 
 
 class CameraOperands:
-    """Operands of a lens whose objects are where a camera looks.
+    """Evaluates operands of a lens whose objects are where a camera looks.
 
     Args:
         settings: of each operand, as `dolens.optimize.operands.operand` takes them.

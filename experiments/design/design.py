@@ -1,4 +1,4 @@
-"""Classical design as a Lightning module: a lens, its variables, a merit function, an optimizer."""
+"""Design of a lens by a merit function."""
 
 import copy
 import logging
@@ -35,7 +35,7 @@ _EDGE_RINGS = 40
 
 
 class DesignModule(Experiment):
-    """Looks for the lens of the least merit.
+    """Searches for the lens of the least merit.
 
     A step is an iteration of the optimizer.  An epoch is a round: it begins by choosing the rays
     that pass the lens as it then is, and ends when the optimizer says that nothing is to be gained,
@@ -132,13 +132,13 @@ class DesignModule(Experiment):
 
     @property
     def initial(self) -> Lens:
-        """The lens where the search began."""
+        """Return the lens where the search began."""
         return self._initial[0]
 
     # ---------------------------------------------------------------- rounds
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One group, with its bounds."""
+        """Return an optimizer of one group, which holds the variables and their bounds."""
         return self.optimizer([self.variables.parameter_group()])
 
     def on_fit_start(self) -> None:
@@ -178,7 +178,7 @@ class DesignModule(Experiment):
         return -1 if self._stopped else None
 
     def training_step(self, batch: Any, batch_idx: int) -> None:
-        """One iteration."""
+        """Make one iteration of the optimizer."""
         started = time.perf_counter()
         if self._left:
             self._between.append(started - self._left)
@@ -197,7 +197,7 @@ class DesignModule(Experiment):
         self._left = done
 
     def on_train_epoch_end(self) -> None:
-        """Look at the lens with the rays that pass it now, and decide whether to go on."""
+        """Choose the rays that pass the lens now, and decide whether to go on."""
         before = float(self.best_merit)
         self.merit().write_to(self.lens)
         try:
@@ -229,12 +229,12 @@ class DesignModule(Experiment):
         self._stopped, self._left = None, 0.0
 
     def on_fit_end(self) -> None:
-        """Leave the lens of the best round."""
+        """Put the variables back to the best round."""
         self._fit_seconds = time.perf_counter() - self._fit_started
         self._leave_best()
 
     def on_test_start(self) -> None:
-        """The same with a checkpoint's best round, where nothing was trained."""
+        """Put the variables to the best round of a checkpoint, if nothing was trained."""
         if not self._fit_seconds and math.isfinite(float(self.best_merit)):
             self._leave_best()
 
@@ -263,7 +263,9 @@ class DesignModule(Experiment):
             self.lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
 
     def _check_light(self) -> None:
-        """A round takes its rays from the lens as it is; without this, every one could lose some.
+        """Check that no spot has lost too much light since the search began.
+
+        Each round takes its rays from the lens as it then is, so that every one could lose some.
 
         Raises:
             InputError: a spot has lost more of its light than it may.
@@ -292,13 +294,13 @@ class DesignModule(Experiment):
 
     @property
     def rays(self) -> int:
-        """That one evaluation of the merit traces."""
+        """Return the number of rays of one evaluation of the merit."""
         quality = None if self.merit is None else self.merit.quality
         return 0 if quality is None else len(quality.spots.weight)
 
     @property
     def rays_launched(self) -> int:
-        """That were tried to find them."""
+        """Return the number of rays that were launched to find those that pass."""
         quality = None if self.merit is None else self.merit.quality
         return 0 if quality is None else quality.spots.launched
 
@@ -315,7 +317,7 @@ class DesignModule(Experiment):
     # ---------------------------------------------------------------- evaluation
 
     def test_step(self, batch: Any, batch_idx: int) -> None:
-        """RMS spot radii before and after, and of the published design."""
+        """Log RMS spot radii before and after the design, and those of the published one."""
         final = spot_table(self.lens, self.evaluation)
         tables = {"initial": spot_table(self.initial, self.evaluation), "final": final}
         if self.published is not None:
@@ -336,7 +338,7 @@ class DesignModule(Experiment):
         )
 
     def summary(self) -> dict[str, float]:
-        """Numbers about the whole run, for metrics.json."""
+        """Return the merit of the best round, and costs."""
         numbers = {"cost/iterations": float(len(self.history)), "cost/rays": float(self.rays)}
         numbers["cost/rays_launched"] = float(self.rays_launched)
         if math.isfinite(float(self.best_merit)):
@@ -359,11 +361,11 @@ class DesignModule(Experiment):
     # ---------------------------------------------------------------- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return the iterations that were made."""
+        """Return the history of iterations."""
         return {"history": self.history}
 
     def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
-        """Take them up."""
+        """Go on with that history."""
         self.history = list(checkpoint.get("history", []))
 
     def identity(self) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def design_figures(
 
 
 def pupil_note(settings: MeritSettings) -> str:
-    """Lines for titles: which rays the run's RMS spot radii are of, where not the figure's.
+    """Return lines for titles that name the rays of `rms_spot_um`, if they are not the figure's.
 
     The figures' rays fill the stop evenly, and radii count from each colour's own centroid.
 
@@ -134,6 +134,6 @@ def _size(field: tuple[float, float]) -> float:
 
 
 def _interval(wavelengths: list[float]) -> tuple[float, float]:
-    """From the shortest to the longest; about a single one, 5 % both ways."""
+    """Return the range of wavelengths; about a single one, 5 % both ways."""
     low, high = min(wavelengths), max(wavelengths)
     return (low, high) if high > low else (0.95 * low, 1.05 * low)

@@ -1,4 +1,4 @@
-"""How the error of a pose falls with photons and rays, and from how far off a fit converges."""
+"""Errors of a pose fit by photons and rays, and its basin of convergence."""
 
 import copy
 import logging
@@ -37,7 +37,7 @@ ESTIMATORS = ("noise_weighted", "s21")
 
 
 class PoseAccuracyModule(Analysis):
-    """Measures what limits a pose fit: light, rays, and where it starts.
+    """Measures how light, rays and the start limit a pose fit.
 
     Errors by light and by rays are those of one Gauss-Newton step from the truth, which is where an
     estimate from there ends but for terms of second order in its error.
@@ -142,7 +142,7 @@ class PoseAccuracyModule(Analysis):
 
     @torch.no_grad()
     def _photons(self) -> None:
-        """Errors of estimates from measurements of more and more light."""
+        """Find errors of estimates from measurements of more and more light."""
         for number, level in enumerate(self.by_photons.levels):
             seeds = range(1000 * number, 1000 * number + self.by_photons.measurements)
             measured = [self._measurement(level, seed) for seed in seeds]
@@ -165,7 +165,7 @@ class PoseAccuracyModule(Analysis):
 
     @torch.no_grad()
     def _rays(self) -> None:
-        """Errors that few rays make, of images that stand for all of them."""
+        """Find the errors that few rays make."""
         reference_photons, photons = self.by_rays.reference_photons, int(self.light.photons)
         reference = self._measurement(reference_photons, 999_999)
         exact = knowledge(self.true, self.imager, reference, self.slopes)
@@ -201,14 +201,14 @@ class PoseAccuracyModule(Analysis):
     # ---------------------------------------------------------------- where it starts
 
     def _basin(self) -> None:
-        """Fits from starts that are farther and farther off."""
+        """Fit from starts that are farther and farther off."""
         self.basin.run()
         self.numbers |= self.basin.summary()
 
     # ---------------------------------------------------------------- estimates and rows
 
     def _s21_inverse(self, measurement: Measurement) -> Tensor:
-        """(P, rows), the pseudo-inverse of S21's derivatives by u, at the truth.
+        """Return the pseudo-inverse (P, rows) of S21's Jacobian with respect to u, at the truth.
 
         Another measurement's largest pixel scales all rows but those of the centroids a little
         otherwise, which moves the least squares by as little.
@@ -218,7 +218,7 @@ class PoseAccuracyModule(Analysis):
         return torch.linalg.pinv(loss.jacobian(self.true, every)[1])
 
     def _s21_step(self, measurement: Measurement, imager: SpotImager, inverse: Tensor) -> Tensor:
-        """(P,), θ's units."""
+        """Return the step (P,) of S21 from the truth, in the units of θ."""
         loss = SpotLoss(measurement, imager, self.images.centroid_weight)
         return -self.true.scale * (inverse @ loss.residuals(self.true))
 
@@ -231,7 +231,7 @@ class PoseAccuracyModule(Analysis):
         bounds: Tensor,
         seconds: float = math.nan,
     ) -> None:
-        """Rows of accuracy.csv, one for each variable, in degrees and mm."""
+        """Add rows of accuracy.csv, one for each variable, in degrees and mm."""
         units = self.true.units
         for place, name in enumerate(self.true.names):
             self.rows.append(
@@ -249,6 +249,6 @@ class PoseAccuracyModule(Analysis):
         self.numbers[key] = float((rms / bounds).square().mean().sqrt())
 
     def _last_ratios(self) -> str:
-        """RMS errors over bounds of what was added last."""
+        """Return the RMS errors over bounds that were added last, for the log."""
         last = list(self.numbers.items())[-len(ESTIMATORS) :]
         return ", ".join(f"{name.rpartition('/')[2]} {value:.3g} bounds" for name, value in last)

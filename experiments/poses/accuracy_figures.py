@@ -148,7 +148,7 @@ def _start(name: str, units: dict[str, str]) -> str:
 
 
 def _write(axes: Axes, table: np.ndarray) -> None:
-    """The number in each cell."""
+    """Write the number into each cell."""
     for row, column in np.ndindex(*table.shape):
         value = table[row, column]
         text = f"{value:.2g}" if value < 100.0 else f"{value:.0e}".replace("e+0", "e")

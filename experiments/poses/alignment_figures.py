@@ -17,13 +17,13 @@ _PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
 
 @dataclass(frozen=True)
 class Setup:
-    """The simulated measurement, for titles and lines.
+    """Describes the simulated measurement, for titles and lines.
 
     Attributes:
         lens: the name of the lens.
         fields: the number of fields.
-        photons: of each spot.
-        pixels: those of the sensor; None: an ideal one.
+        photons: photons of each spot.
+        pixels: pixels of the sensor; None: an ideal one.
         sensor: the parts of the sensor's place that are unknown.
     """
 
@@ -124,7 +124,7 @@ def _sensor_errors(axes: Axes, found: Alignment, sensor: Sequence[str]) -> None:
 
 
 def _spread(axes: Axes, errors: Tensor, bound: Tensor, colour: str, label: str) -> None:
-    """How many of (K,) errors are below each, and the median of their bounds."""
+    """Draw how many of (K,) errors are below each, and the median of their bounds."""
     ordered = errors.sort().values.clamp(min=1e-12)
     share = 100.0 * torch.arange(1, len(ordered) + 1) / len(ordered)
     axes.plot(ordered.numpy(), share.numpy(), color=colour, linewidth=1.5, label=label)

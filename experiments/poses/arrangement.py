@@ -1,4 +1,4 @@
-"""An arrangement of sources and planes, and how well it tells a pose."""
+"""An arrangement of sources and planes, and the information in its images."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ UNSEEN = 1e4
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Sources and planes, and what they tell.
+    """Holds sources and planes, and the information in their images.
 
     Attributes:
         name: of the arrangement.
@@ -33,5 +33,5 @@ class Arrangement:
 
     @property
     def bounds(self) -> Tensor:
-        """(P,), degrees and mm."""
+        """Return bounds (P,), degrees and mm."""
         return self.known.bounds / self.pose.units

@@ -1,4 +1,4 @@
-"""What becomes of poses and their bounds when a measurement has what the fit's model has not."""
+"""Coverage of pose bounds when measurements have effects that the fit's model lacks."""
 
 import logging
 from collections.abc import Mapping
@@ -101,12 +101,12 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         return coverage_figure(errors, [fit.name for fit in self.fits], title)
 
     def over_bound(self, case: str, fit: str) -> Tensor:
-        """(M, P): errors over their bounds, of the measurements whose estimates have settled."""
+        """Return errors over bounds (M, P), for the measurements whose estimates have settled."""
         found = self.found[case, fit]
         return self._every(case, fit)[found.settled]
 
     def _every(self, case: str, fit: str) -> Tensor:
-        """(draws, P): errors over their bounds."""
+        """Return errors over their bounds (draws, P), for all measurements."""
         number = self.plan.number(fit)
         pose, truth = self.poses[number], self.truth(number)
         true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
@@ -179,7 +179,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             )
 
     def _variable_rows(self, case: str, fit: str) -> list[Row]:
-        """Of coverage.csv: a row for each variable."""
+        """Return rows of coverage.csv, one for each variable."""
         pose = self.poses[self.plan.number(fit)]
         bounds = (self.known[fit].bounds / pose.units).tolist()
         rows: list[Row] = []

@@ -1,4 +1,4 @@
-"""How well a lens's pose can be known from one source or several, on one plane or several."""
+"""Cramér–Rao bounds of a lens's pose for arrangements of sources and planes."""
 
 import copy
 import logging
@@ -28,7 +28,7 @@ _KEYS = ("sources", "planes", "variables")
 
 
 class PoseKnowledgeModule(Analysis):
-    """Compares arrangements of sources and planes by what they tell of the same unknowns.
+    """Compares arrangements of sources and planes by their bounds of the same unknowns.
 
     Args:
         lens: as designed; its elements may have poses.
@@ -96,7 +96,7 @@ class PoseKnowledgeModule(Analysis):
         return knowledge_figures(self.arrangements, self.lens.name, int(self.light.photons))
 
     def bound_rows(self) -> list[Row]:
-        """Of bounds.csv: a row for each variable of each arrangement."""
+        """Return rows of bounds.csv, one for each variable of each arrangement."""
         rows: list[Row] = []
         for found in self.arrangements:
             names, correlations = found.pose.names, found.known.correlations
@@ -117,7 +117,7 @@ class PoseKnowledgeModule(Analysis):
         return rows
 
     def combination_rows(self) -> list[Row]:
-        """Of combinations.csv: a row for each combination, the worst known first."""
+        """Return rows of combinations.csv, one for each combination, the worst known first."""
         return [
             {
                 "arrangement": found.name,
@@ -135,7 +135,7 @@ class PoseKnowledgeModule(Analysis):
         values: Mapping[str, float],
         variables: Mapping[str, Mapping[str, Any] | None],
     ) -> Pose:
-        """The lens where it is, and what is unknown in an arrangement."""
+        """Return the lens where it is, with the unknowns of an arrangement as variables."""
         check_keys(entry, _KEYS, f"arrangements.{name}")
         if not entry.get("sources"):
             raise InputError(
@@ -183,7 +183,7 @@ class PoseKnowledgeModule(Analysis):
         return numbers
 
     def _verdict(self, found: Arrangement) -> str:
-        """The combination that is known worst, in words."""
+        """Return the combination that is known worst, in words."""
         worst = found.combinations[0]
         order = worst.abs().argsort(descending=True)
         names = [

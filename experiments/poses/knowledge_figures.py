@@ -1,4 +1,4 @@
-"""Figures of how well arrangements of sources and planes tell a pose."""
+"""Figures of Cramér–Rao bounds for arrangements of sources and planes."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -48,7 +48,7 @@ def _overview(arrangements: Sequence[Arrangement], name: str, photons: float) ->
 
 
 def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
-    """Bounds of each variable over its scale, a mark for each arrangement."""
+    """Draw bounds of each variable over its scale, a mark for each arrangement."""
     names = _names(arrangements)
     units = {
         n: u for f in arrangements for n, u in zip(f.pose.names, f.pose.unit_names, strict=True)
@@ -87,7 +87,7 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
 
 
 def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
-    """Standard deviations of combinations, from the worst known to the best."""
+    """Draw standard deviations of combinations, from the worst known to the best."""
     for number, (found, colour) in enumerate(_coloured(arrangements)):
         spread = found.spread.clone()
         unseen = int((spread > UNSEEN).sum())
@@ -110,7 +110,7 @@ def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
 
 
 def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> None:
-    """What the worst known combination of each arrangement is made of."""
+    """Draw the parts of the worst known combination of each arrangement."""
     names = _names(arrangements)
     table = np.full((len(arrangements), len(names)), np.nan)
     for row, found in enumerate(arrangements):
@@ -158,7 +158,7 @@ def _label(found: Arrangement) -> str:
 
 
 def _names(arrangements: Sequence[Arrangement]) -> list[str]:
-    """Of all variables of all arrangements."""
+    """Return the names of all variables of all arrangements."""
     return list(dict.fromkeys(name for f in arrangements for name in f.pose.names))
 
 

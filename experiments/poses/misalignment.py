@@ -1,4 +1,4 @@
-"""Section VI as a Lightning module: poses of a lens, fitted to images of point sources."""
+"""Poses of a lens, fitted to images of point sources (Section VI)."""
 
 import copy
 import logging
@@ -38,7 +38,7 @@ _LOGGED = 8
 
 
 class MisalignmentModule(Experiment):
-    """Finds poses one after another: an epoch is a fit, a step an iteration of one of its stages.
+    """Fits poses one after another: an epoch is a fit, a step an iteration of one of its stages.
 
     Args:
         lens: as designed; its elements may have poses.
@@ -115,15 +115,15 @@ class MisalignmentModule(Experiment):
     # ---------------------------------------------------------------- iterations
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        """One for each stage of each fit, all of which a checkpoint holds."""
+        """Return an optimizer for each stage of each fit; a checkpoint holds them all."""
         return [optimizer_of(stage, pose) for pose in self.poses for stage in self.stages]
 
     def on_train_epoch_start(self) -> None:
-        """Hold what earlier fits have found."""
+        """Put the values that the fit holds to those that an earlier fit has found."""
         self._hold(self.current_epoch)
 
     def on_train_start(self) -> None:
-        """The same when a run is resumed within a fit."""
+        """Do the same when a run is resumed within a fit."""
         self._hold(min(self.current_epoch, len(self.fits) - 1))
 
     def _hold(self, number: int) -> None:
@@ -134,7 +134,7 @@ class MisalignmentModule(Experiment):
         pose.put({name: found[name] for name in fit.held})
 
     def training_step(self, batch: Tensor, batch_idx: int) -> None:
-        """One iteration of the stage that is on."""
+        """Make one iteration of the present stage."""
         started = time.perf_counter()
         number, place = self.current_epoch, self.plan.stage_at(batch_idx)
         stage = self.stages[place]
@@ -170,7 +170,7 @@ class MisalignmentModule(Experiment):
 
     @torch.no_grad()
     def test_step(self, batch: Tensor, batch_idx: int) -> None:
-        """Errors, bounds, and what cannot be told apart; tables and metrics."""
+        """Find errors and bounds of every fit; log them, and write the tables."""
         for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
             self._hold(number)
             known = self._knowledge(number)
@@ -245,7 +245,7 @@ class MisalignmentModule(Experiment):
         )
 
     def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:
-        """Return the images of a fit's pose, or of another point u."""
+        """Return the images of a fit's pose, or of other values u of its variables."""
         self._hold(number)
         with torch.no_grad():
             return self.poses[number].images(self.finest(number), scaled)
@@ -268,11 +268,11 @@ class MisalignmentModule(Experiment):
     # ---------------------------------------------------------------- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return the iterations that were made."""
+        """Return the history of iterations, and the seconds of each fit."""
         return {"history": self.history, "seconds": self.seconds}
 
     def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
-        """Take them up."""
+        """Go on with them."""
         self.history = list(checkpoint.get("history", []))
         self.seconds = dict(checkpoint.get("seconds", {}))
 

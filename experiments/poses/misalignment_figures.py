@@ -27,7 +27,7 @@ from experiments.tables import Row
 
 
 class FittedPoses(Protocol):
-    """Poses that were fitted to measurements, one fit after another.
+    """Describes poses that were fitted to measurements, one fit after another.
 
     Attributes:
         lens: as designed.

@@ -1,4 +1,4 @@
-"""Which element of a lens is misaligned, and by how much: one case, and many in one batch."""
+"""Identification of the misaligned element of a lens from its spots."""
 
 import copy
 import logging
@@ -40,7 +40,7 @@ _DENSE = 40, 120
 
 
 class TripletAlignmentModule(Analysis):
-    """Simulates spots of lenses with one element off, and finds which and by how much.
+    """Simulates spots of lenses with one misaligned element, and finds the element and its pose.
 
     Where the sensor is counts as unknown: every hypothesis has the pose of one element and, where
     a range is not zero, the sensor's place across or along the axis.
@@ -204,7 +204,7 @@ class TripletAlignmentModule(Analysis):
         )
 
     def _spots(self, lens: Lens, rings: int, arms: int) -> SpotRays:
-        """Rays of the lens as designed."""
+        """Return the rays of the lens as designed."""
         return gaussian_quadrature(
             lens,
             self.fields,
@@ -216,7 +216,10 @@ class TripletAlignmentModule(Analysis):
         )
 
     def _cases(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Elements (1 + K,), and poses and places (1 + K, P) in radians and mm, the demo first."""
+        """Draw the cases: elements (1 + K,), poses and places (1 + K, P) in radians and mm.
+
+        The demo is the first.
+        """
         count, poses = self.misalignments, len(POSE)
         element = torch.randint(len(self.elements), (count,), generator=generator)
         shares = torch.rand((count, poses), generator=generator, dtype=torch.float64)
@@ -238,7 +241,7 @@ class TripletAlignmentModule(Analysis):
 
 
 def _pixels(pitch: float, read_noise: float, window: float) -> Pixels | None:
-    """None for a pitch of zero."""
+    """Return the settings of the pixels; None for a pitch of zero, an ideal sensor."""
     if pitch != 0.0:
         return Pixels(pitch, read_noise, window)
     if read_noise != 0.0:
@@ -253,7 +256,13 @@ def _table_units(names: Sequence[str]) -> Tensor:
 
 
 def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
-    """(K, E·4 + Q), all elements' poses and the sensor's place, from those of one (K, 4 + Q)."""
+    """Return the poses of all elements and the sensor's place (K, E·4 + Q).
+
+    Args:
+        element: (K,), the number of the misaligned element.
+        true: (K, 4 + Q), its pose and the sensor's place.
+        elements: E.
+    """
     poses = true.new_zeros(len(true), elements, len(POSE))
     poses[torch.arange(len(true)), element] = true[:, : len(POSE)]
     return torch.cat([poses.flatten(1), true[:, len(POSE) :]], 1)
@@ -262,7 +271,7 @@ def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
 def _information_roots(
     models: Sequence[MomentModel], measured: MeasuredMoments, element: Tensor, true: Tensor
 ) -> Tensor:
-    """(K, P, P), each with the element that is off."""
+    """Return roots of the information (K, P, P), each for the element that is misaligned."""
     roots = true.new_zeros(len(true), true.shape[1], true.shape[1])
     for number, model in enumerate(models):
         mine = torch.nonzero(element == number)[:, 0]

@@ -41,7 +41,7 @@ _LEAST_ERROR = {"trace": 1e-10, "psf": None, "render": None}
 
 
 def speed_figures(rows: Sequence[Row], scenes: Sequence[str], parts: Sequence[str]) -> Figures:
-    """Return error against cost: `<part>_<scene>`, and for gradients of renders `gradient_<scene>`.
+    """Return error against cost: `<part>_<scene>`, and `gradient_<scene>` for renders.
 
     Args:
         rows: the table of measurements.

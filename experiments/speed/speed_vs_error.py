@@ -1,4 +1,4 @@
-"""How fast and how wrong, as one Lightning module: a test, and nothing to train."""
+"""Measurement of speed and error of traces, point spread functions and renders."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -33,10 +33,10 @@ _SUBJECT_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables
 
 
 class SpeedVsErrorModule(Analysis):
-    """Draws error against cost for traces, point spread functions and renders of several scenes.
+    """Measures error and cost of traces, point spread functions and renders of several scenes.
 
     Args:
-        lens: of the run; it is not looked at.
+        lens: the lens of the run; it is not used.
         experiment: name of the experiment.
         scenes: name → `lens` (a prescription), `values` (parameters to change), `depths` (mm),
             `wavelengths` (nm), `sensor`, and `variables`, patterns of what gradients are taken of.

@@ -109,7 +109,7 @@ def _yields(found: ToleranceAnalysis, name: str, weights: Tensor) -> Figure:
 def _by_unit(
     matrix: Tensor, labels: list[str], units: tuple[str, ...]
 ) -> dict[str, tuple[Tensor, list[str]]]:
-    """A panel for each unit: numbers of several units share no scale."""
+    """Return a panel for each unit, since numbers of several units share no scale."""
     panels = {}
     for unit in dict.fromkeys(units):
         columns = [p for p, other in enumerate(units) if other == unit]

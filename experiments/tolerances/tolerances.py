@@ -1,4 +1,4 @@
-"""Sensitivities and tolerances of a lens as one Lightning module: a test, and nothing to train."""
+"""Analysis of a lens's sensitivities and tolerances."""
 
 import copy
 import logging
@@ -38,7 +38,7 @@ QUANTILES = (0.5, 0.8, 0.9, 0.95, 0.98)
 
 
 class TolerancesModule(Analysis):
-    """Which errors of manufacture a lens minds, and how many of the lenses made are good enough.
+    """Finds a lens's sensitivities to errors of manufacture, and the yield under tolerances.
 
     Radii are √(Σ W·RMS²) over the spots, each spot (a field and a wavelength) about its own
     centroid.  Perturbed lenses are refocused for all spots together unless a name says otherwise.
@@ -164,7 +164,7 @@ class TolerancesModule(Analysis):
         )
 
     def _outcome(self, name: str, outcome: Outcome, refocused: bool) -> dict[str, float]:
-        """Quantiles, yields, and the lens as designed."""
+        """Return quantiles of RMS radii, yields, and the radii of the lens as designed."""
         found = outcome.found(refocused)
         s = self.analysis.sensitivities
         design = s.rms_refocused if refocused else s.rms
@@ -196,7 +196,7 @@ class TolerancesModule(Analysis):
         )
 
     def _weights(self, weights: Sequence[float] | None) -> Tensor:
-        """(S,), from the fields': every wavelength of a field counts alike."""
+        """Return weights of spots (S,) from those of fields; all wavelengths count alike."""
         if weights is not None:
             weights = torch.tensor(numbers_of("weights", weights, len(self.fields)))
             weights = weights.double().repeat_interleave(len(self.wavelengths))

@@ -11,6 +11,7 @@ from dolens.optics.aiming import aim
 from dolens.optimize import operand_values
 from dolens.prescriptions import lens_from_prescription
 from experiments.camera.operands import CameraOperands
+from experiments.running.run_settings import RunSettings
 from experiments.running.training import build_lens, run
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET
 
@@ -55,7 +56,7 @@ def test_a_camera_hands_its_scenes_distance_to_its_operands(composed, monkeypatc
         "trainer.max_epochs=1",
     ]
     cfg = composed(*asked)
-    module = instantiate(cfg.module)(lens=build_lens(cfg))
+    module = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
     order = module.lens.first_order()
     _, values = module.penalty(module.variables())
     expected = -float(order.efl / (700.0 + order.ffd))
@@ -93,7 +94,7 @@ def test_a_step_that_loses_a_chief_ray_is_taken_back(
         *optimizer,
         "operands=[{kind: chief_ray_angle, field: [0, -1.0e5], max: 60.0}]",
     )
-    lens = build_lens(cfg)
+    lens = build_lens(RunSettings.of(cfg))
     aimer = Unreachable(lens, 1e-9)
     monkeypatch.setattr("dolens.optimize.operands.aim", aimer)
     run(cfg)
