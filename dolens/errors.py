@@ -1,4 +1,15 @@
-"""The one exception that tells a user what is wrong with what they wrote."""
+"""The one exception that tells a user what is wrong with what they wrote, and checks that raise it.
+
+Every name that a user may misspell goes through `check_keys` or `check_choice`, so that each such
+message has the same form and offers the nearest allowed name.
+"""
+
+import difflib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 class InputError(ValueError):
@@ -7,3 +18,70 @@ class InputError(ValueError):
     The message is one line that names the file, surface or key, says what was wrong
     and what is allowed.  Command-line programs print it and exit with a non-zero status.
     """
+
+
+def check_keys(given: Iterable[object], allowed: Iterable[str], where: str) -> None:
+    """Refuse the first key that is not allowed.
+
+    Args:
+        given: keys that a user wrote, or a mapping with such keys.
+        allowed: all keys that there are.
+        where: what the keys are of; the message begins with it.
+
+    Raises:
+        InputError: a key that is not allowed; the message names the nearest one that is.
+    """
+    allowed = list(allowed)
+    for key in given:
+        if str(key) not in allowed:
+            raise InputError(
+                f"{where}: unknown key '{key}'{did_you_mean(str(key), allowed)} "
+                f"(allowed: {', '.join(allowed) or 'none'})"
+            )
+
+
+def check_choice(value: object, allowed: Iterable[str], where: str) -> None:
+    """Refuse a value that is not one of some words.
+
+    Args:
+        value: what a user wrote.
+        allowed: all words that there are.
+        where: the key; the message begins with it.
+
+    Raises:
+        InputError: another value; the message names the nearest allowed word.
+    """
+    allowed = list(allowed)
+    if value not in allowed:
+        raise InputError(
+            f"{where}: '{value}' is unknown{did_you_mean(str(value), allowed)} "
+            f"(allowed: {', '.join(allowed) or 'none'})"
+        )
+
+
+def did_you_mean(word: str, allowed: Iterable[str]) -> str:
+    """Return the end of a message about an unknown word: `; did you mean 'x'?`, or nothing."""
+    near = difflib.get_close_matches(word, list(allowed), n=1)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def call_with_settings(
+    make: Callable[..., T], settings: Mapping[str, Any], where: str, *first: object
+) -> T:
+    """Call a class or a function with settings that a user wrote.
+
+    Args:
+        make: what is called; the settings' keys are the names of its parameters.
+        settings: name → value.
+        where: what the settings are of; messages begin with it.
+        first: arguments that are not the user's; they stand for the first parameters.
+
+    Raises:
+        InputError: a key that is no parameter, or a parameter without a default that is missing.
+    """
+    parameters = list(inspect.signature(make).parameters.values())[len(first) :]
+    check_keys(settings, [parameter.name for parameter in parameters], where)
+    for parameter in parameters:
+        if parameter.default is parameter.empty and parameter.name not in settings:
+            raise InputError(f"{where}: '{parameter.name}' is missing")
+    return make(*first, **settings)

@@ -1,4 +1,4 @@
-"""What experiments make of their settings."""
+"""Checks of settings that experiments share."""
 
 from typing import Any
 
@@ -6,15 +6,15 @@ from dolens.errors import InputError
 
 
 def numbers_of(key: str, values: Any, count: int | None = None) -> list[float]:
-    """Numbers of a configuration, as floats.
+    """Return numbers of a configuration as floats.
 
     Args:
-        key: what messages call them.
+        key: their name, for messages.
         values: as they were given.
-        count: how many there must be; None: any.
+        count: the number that is needed; None: any.
 
     Raises:
-        InputError: something else, or another count.
+        InputError: a value is no number, or their count is another one.
     """
     try:
         numbers = [float(value) for value in values]

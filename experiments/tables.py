@@ -8,12 +8,12 @@ Row = Mapping[str, float | str]
 
 
 def write_table(path: Path, rows: Iterable[Row], digits: int | None = None) -> None:
-    """Write rows as CSV with all their keys for columns; nothing where there are no rows.
+    """Write rows as CSV with a column for each of their keys; write no file if there are none.
 
     Args:
         path: folders on the way are made.
         rows: name → number or text.
-        digits: of numbers; None: all that a number has.
+        digits: significant digits of numbers; None: all that a number has.
     """
     kept = list(rows)
     if not kept:

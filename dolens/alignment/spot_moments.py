@@ -11,7 +11,7 @@ from torch.func import jacfwd, jvp, vmap
 from dolens.alignment.moments import POWERS, shift_derivatives, weighted_sums
 from dolens.alignment.pixel_moments import Pixels, convolved, pixel_convolution
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
 from dolens.optics.trace import trace_surfaces, trace_to_plane
@@ -186,9 +186,8 @@ def moment_model(
         raise InputError(f"lens_dtype: moments of spots need float64, not {lens.dtype}")
     if bool(spots.centred.any()):
         raise InputError("spots: rays of the whole pupil are needed (symmetry=False)")
-    unknown = set(sensor) - set(SENSOR)
-    if unknown:
-        raise InputError(f"sensor: '{unknown.pop()}' is unknown; allowed: {', '.join(SENSOR)}")
+    for name in sensor:
+        check_choice(name, SENSOR, "sensor")
     nominal = {name: value.detach() for name, value in lens.variables(names).items()}
     names = tuple(names)
     start = torch.stack([nominal[name] for name in names])

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium
 
@@ -117,8 +117,4 @@ def unmodelled_of(settings: Mapping[str, Any] | None, key: str = "unmodelled") -
     Raises:
         InputError: an unknown key, or a number out of range.
     """
-    known = tuple(Unmodelled.__dataclass_fields__)
-    for name in settings or {}:
-        if name not in known:
-            raise InputError(f"{key}: unknown key '{name}' (allowed: {', '.join(known)})")
-    return Unmodelled(**(settings or {}))
+    return call_with_settings(Unmodelled, settings or {}, key)

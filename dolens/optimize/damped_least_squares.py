@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optimize.bounded_step import bounded_step, projected_step
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.residuals import Residuals, TensorResiduals
@@ -93,10 +93,8 @@ class DampedLeastSquares(torch.optim.Optimizer):
         gradient_tolerance: float = 1e-12,
         max_trials: int = 40,
     ) -> None:
-        if damping not in DAMPINGS:
-            raise InputError(f"damping must be one of {', '.join(DAMPINGS)}, not '{damping}'")
-        if bounds not in BOUNDS:
-            raise InputError(f"bounds must be one of {', '.join(BOUNDS)}, not '{bounds}'")
+        check_choice(damping, DAMPINGS, "damping")
+        check_choice(bounds, BOUNDS, "bounds")
         for name, value in (
             ("merit_tolerance", merit_tolerance),
             ("step_tolerance", step_tolerance),

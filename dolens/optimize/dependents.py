@@ -10,8 +10,9 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_lens_units
 from dolens.optics.paraxial import first_order, surface_matrix
 
 SOLVES = ("efl", "paraxial_focus", "best_focus")
@@ -35,7 +36,7 @@ class Pickup:
         name: the parameter that follows.
         source: the one that it follows, of the same shape.
         factor: without a unit.
-        offset: in the parameter's unit.
+        offset: in the lens's own unit of the parameter.
     """
 
     name: str
@@ -108,8 +109,8 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
 
     Args:
         name: the parameter that follows.
-        settings: `pickup` with `factor` and `offset`; or `solve` with `target` (of `efl`) or
-            `defocus` (of `paraxial_focus`).
+        settings: `pickup` with `factor` and `offset` (in the unit of files); or `solve` with
+            `target` (of `efl`) or `defocus` (of `paraxial_focus`), mm.
         lens: whose wavelength and object distance count.
 
     Returns:
@@ -118,9 +119,9 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
     Raises:
         InputError: unknown or missing settings, or a solve for a parameter that it cannot move.
     """
-    wavelength = lens.primary_wavelength
+    wavelength, where = lens.primary_wavelength, f"variable '{name}'"
     if "pickup" in settings:
-        _check(name, settings, ("pickup", "factor", "offset"))
+        check_keys(settings, ("pickup", "factor", "offset"), where)
         source = str(settings["pickup"])
         pair = {**lens.variables([name]), **lens.variables([source])}
         if source == name or set(pair) != {name, source}:
@@ -131,33 +132,22 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
             name,
             source,
             _number(name, settings, "factor", 1.0),
-            _number(name, settings, "offset", 0.0),
+            to_lens_units(name, _number(name, settings, "offset", 0.0)),
         )
     solve = settings["solve"]
     if solve == "efl":
-        _check(name, settings, ("solve", "target"))
+        check_keys(settings, ("solve", "target"), where)
         if not name.endswith(".curvature") or settings.get("target") is None:
             raise InputError(f"variable '{name}': solve 'efl' moves a curvature, to a target in mm")
         return FocalLength(name, _number(name, settings, "target", 0.0), wavelength)
-    if solve not in SOLVES:
-        raise InputError(
-            f"variable '{name}': solve '{solve}' is unknown (allowed: {', '.join(SOLVES)})"
-        )
+    check_choice(solve, SOLVES, f"{where}: solve")
     if name != "sensor_distance":
         raise InputError(f"variable '{name}': solve '{solve}' moves sensor_distance only")
     if solve == "best_focus":
-        _check(name, settings, ("solve",))
+        check_keys(settings, ("solve",), where)
         return None
-    _check(name, settings, ("solve", "defocus"))
+    check_keys(settings, ("solve", "defocus"), where)
     return ParaxialFocus(wavelength, lens.object_distance, _number(name, settings, "defocus", 0.0))
-
-
-def _check(name: str, settings: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
-    for key in settings:
-        if key not in allowed:
-            raise InputError(
-                f"variable '{name}': unknown key '{key}' (allowed: {', '.join(allowed)})"
-            )
 
 
 def _number(name: str, settings: Mapping[str, Any], key: str, default: float) -> float:

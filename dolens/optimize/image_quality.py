@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Status, TracedRays
@@ -99,8 +99,7 @@ class ImageQuality(ABC):
             ("reference", self.reference, REFERENCES),
             ("colours", self.colours, COLOURS),
         ):
-            if value not in allowed:
-                raise InputError(f"{what} must be one of {', '.join(allowed)}, not '{value}'")
+            check_choice(value, allowed, what)
         if self.reference == "chief" and self.spots.chief is None:
             raise InputError("reference 'chief': these rays hold no chief rays")
 

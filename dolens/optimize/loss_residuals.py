@@ -23,7 +23,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import check_choice
 from dolens.optics.lens import Lens
 from dolens.optimize.landing_points import LandingPoints
 from dolens.optimize.linear_model import LinearModel
@@ -76,10 +76,7 @@ class LossResiduals(LandingPoints):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.curvature not in CURVATURES:
-            raise InputError(
-                f"curvature must be one of {', '.join(CURVATURES)}, not '{self.curvature}'"
-            )
+        check_choice(self.curvature, CURVATURES, "curvature")
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None

@@ -13,7 +13,7 @@ from dolens.analysis.pupil_quadrature import (
     square_grid,
     with_chief_rays,
 )
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice
 from dolens.optics.lens import Lens
 from dolens.optimize.image_quality import ImageQuality
 from dolens.optimize.landing_losses import EncircledEnergy, Modulation, SpotSize
@@ -100,10 +100,7 @@ class MeritSettings:
         Raises:
             InputError: no fields or wavelengths, or an unknown sampling or option.
         """
-        if self.sampling not in SAMPLINGS:
-            raise InputError(
-                f"merit.sampling: '{self.sampling}' is unknown (allowed: {', '.join(SAMPLINGS)})"
-            )
+        check_choice(self.sampling, SAMPLINGS, "merit.sampling")
         fields, wavelengths = self.fields_of(lens), self.wavelengths_of(lens)
         options = _given(self.sampling_options)
         if self.sampling == "gaussian_quadrature":
@@ -115,10 +112,10 @@ class MeritSettings:
                 f"merit.sampling: '{self.sampling}' is for objects at infinity; lens "
                 f"'{lens.name}' has object_distance {lens.object_distance:g} mm"
             )
-        try:
-            rays = SAMPLINGS[self.sampling](lens, fields, wavelengths, **options)
-        except TypeError as error:
-            raise InputError(f"merit.sampling_options: {error}") from None
+        sampling = SAMPLINGS[self.sampling]
+        rays = call_with_settings(
+            sampling, options, "merit.sampling_options", lens, fields, wavelengths
+        )
         if self.reference == "chief":
             return with_chief_rays(lens, rays, lens.object_distance)
         return rays
@@ -146,21 +143,15 @@ class MeritSettings:
         """The term of the rays."""
         if self.quality is None:
             return None
-        allowed = (*RESIDUALS, *LOSSES)
-        if self.quality not in allowed:
-            raise InputError(
-                f"merit.quality: '{self.quality}' is unknown (allowed: {', '.join(allowed)})"
-            )
+        check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
         rays = self.rays(lens)
         common = (rays, self.weights(rays), self.reference, self.colours, self.most_vignetted)
-        options = _given(self.quality_options)
-        try:
-            if self.quality in RESIDUALS:
-                return RESIDUALS[self.quality](*common, **options)
-            curvature = options.pop("curvature", "directions")
-            return LossResiduals(*common, LOSSES[self.quality](**options), curvature)
-        except TypeError as error:
-            raise InputError(f"merit.quality_options: {error}") from None
+        options, where = _given(self.quality_options), "merit.quality_options"
+        if self.quality in RESIDUALS:
+            return call_with_settings(RESIDUALS[self.quality], options, where, *common)
+        curvature = options.pop("curvature", "directions")
+        loss = call_with_settings(LOSSES[self.quality], options, where)
+        return LossResiduals(*common, loss, curvature)
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,9 +9,9 @@ A surface gives `semi_diameter`, or `aperture` with a rectangle; `obscuration` i
 from collections.abc import Mapping
 from typing import Any
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Outline, Rectangle
-from dolens.prescriptions.checks import as_number, check_keys, require_mapping
+from dolens.prescriptions.checks import as_number, require_mapping
 
 APERTURE_KEYS = ("semi_diameter", "aperture", "obscuration")
 _RECTANGLE = ("half_width_x", "half_width_y")

@@ -26,7 +26,7 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
@@ -36,8 +36,6 @@ from dolens.prescriptions.checks import (
     as_integer,
     as_number,
     as_numbers,
-    check_keys,
-    did_you_mean,
     require_mapping,
 )
 from dolens.prescriptions.poses import element_rows, elements_from

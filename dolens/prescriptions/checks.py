@@ -1,8 +1,7 @@
 """Plain values are checked: each mistake is one line that says where and what is allowed."""
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
@@ -48,20 +47,3 @@ def require_mapping(value: object, where: str) -> None:
     """Raise `InputError` where a value is no mapping."""
     if not isinstance(value, Mapping):
         raise InputError(f"{where}: expected a mapping of keys to values, not {value!r}")
-
-
-def check_keys(mapping: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
-    """Raise `InputError` at the first key that is not allowed."""
-    allowed = list(allowed)
-    for key in mapping:
-        if str(key) not in allowed:
-            raise InputError(
-                f"{where}: unknown key '{key}'{did_you_mean(str(key), allowed)} "
-                f"(allowed: {', '.join(allowed)})"
-            )
-
-
-def did_you_mean(word: str, allowed: Iterable[str]) -> str:
-    """Return the end of a message about an unknown word: the allowed word that is like it."""
-    near = difflib.get_close_matches(word, list(allowed), n=1)
-    return f"; did you mean '{near[0]}'?" if near else ""

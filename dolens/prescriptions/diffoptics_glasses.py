@@ -2,8 +2,7 @@
 
 import re
 
-from dolens.errors import InputError
-from dolens.prescriptions.checks import did_you_mean
+from dolens.errors import InputError, did_you_mean
 
 # nd/Vd as diffoptics tabulates them (its index model counts them from 589.3 nm).
 DIFFOPTICS_GLASSES = {

@@ -21,8 +21,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from dolens.errors import InputError
-from dolens.prescriptions.checks import as_number, check_keys, require_mapping
+from dolens.errors import InputError, check_keys
+from dolens.prescriptions.checks import as_number, require_mapping
 from dolens.prescriptions.compare import require_same
 from dolens.prescriptions.decimals import curvature_in_text, number_in_text, reciprocal
 from dolens.prescriptions.diffoptics_glasses import diffoptics_material

@@ -21,11 +21,11 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.fields import Fields
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
-from dolens.prescriptions.checks import as_number, as_positive, check_keys, require_mapping
+from dolens.prescriptions.checks import as_number, as_positive, require_mapping
 
 PUPIL_KEYS = ("entrance_pupil_diameter", "f_number")
 SYSTEM_DATA_KEYS = (

@@ -25,7 +25,7 @@ class Restoration(nn.Module):
     may be None.  `pretrained` tells whether any of the network began with trained weights.
     """
 
-    needs_point_spread_function: ClassVar[bool]
+    needs_point_spread_function: ClassVar[bool] = False
     needs_field: bool = False
     pretrained: bool = False
 
@@ -55,8 +55,10 @@ class Restoration(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Return the floating-point type of the network's parameters."""
-        return next(self.parameters()).dtype
+        """Return the floating-point type of the parameters, or of the buffers if there are none."""
+        tensors = (*self.parameters(), *self.buffers())
+        found = (tensor.dtype for tensor in tensors if tensor.is_floating_point())
+        return next(found, torch.get_default_dtype())
 
 
 class ResidualRestoration(Restoration):

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
-from dolens.optics.elements import TILTS
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import unit_of
 
 DISTRIBUTIONS = ("uniform", "normal")
 _KEYS = ("half_range", "distribution", "relative")
@@ -133,24 +133,15 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
         nominal,
         factor * torch.tensor([rows[n][0] for n in names], dtype=torch.float64),
         torch.tensor(
-            [_unit(n, rows[n][2], float(v)) for n, v in zip(names, nominal, strict=True)],
+            [
+                float(v) if rows[n][2] else unit_of(n).factor
+                for n, v in zip(names, nominal, strict=True)
+            ],
             dtype=torch.float64,
         ),
-        tuple("%" if rows[n][2] else unit_name(n) for n in names),
+        tuple("%" if rows[n][2] else unit_of(n).name for n in names),
         torch.tensor([rows[n][1] for n in names]),
     )
-
-
-def unit_name(name: str) -> str:
-    """The unit that files give a parameter in; nothing where it depends on the surface."""
-    last = name.rsplit(".", 1)[-1]
-    if last in TILTS:
-        return "deg"
-    if last == "curvature":
-        return "1/mm"
-    if name.startswith(("elements.", "thicknesses.")) or name == "sensor_distance":
-        return "mm"
-    return ""
 
 
 def tightened(tolerances: Tolerances, factor: float) -> Tolerances:
@@ -163,18 +154,12 @@ def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
     where = f"tolerances.{pattern}"
     if not isinstance(given, Mapping):
         given = {"half_range": given}
-    for key in given:
-        if key not in _KEYS:
-            raise InputError(f"{where}: unknown key '{key}' (allowed: {', '.join(_KEYS)})")
+    check_keys(given, _KEYS, where)
     half_range = given.get("half_range")
     if not _is_number(half_range) or not 0.0 < half_range < math.inf:
         raise InputError(f"{where}: half_range must be a positive number, not {half_range!r}")
     distribution = given.get("distribution", "uniform")
-    if distribution not in DISTRIBUTIONS:
-        raise InputError(
-            f"{where}: distribution '{distribution}' is unknown "
-            f"(allowed: {', '.join(DISTRIBUTIONS)})"
-        )
+    check_choice(distribution, DISTRIBUTIONS, f"{where}: distribution")
     relative = given.get("relative", False)
     if not isinstance(relative, bool):
         raise InputError(f"{where}: relative must be true or false, not {relative!r}")
@@ -183,9 +168,3 @@ def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _unit(name: str, relative: bool, nominal: float) -> float:
-    if relative:
-        return nominal
-    return math.pi / 180.0 if name.rsplit(".", 1)[-1] in TILTS else 1.0

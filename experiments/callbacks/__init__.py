@@ -1,1 +1,1 @@
-"""Callbacks: pictures while training, and what to do when a run is interrupted."""
+"""Callbacks: figures and files of a run, and a notice when it is interrupted."""

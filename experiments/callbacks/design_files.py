@@ -1,4 +1,4 @@
-"""What a design leaves as tables and files besides its pictures."""
+"""Tables and files of a design besides its figures."""
 
 import logging
 from pathlib import Path
@@ -18,22 +18,23 @@ _ZEMAX_MODEL = "dfc"
 
 
 class DesignFiles(lightning.Callback):
-    """The prescription for other programs, and tables of the search.
+    """Writes the prescription for other programs, and tables of the search.
 
-    `lens/final.zmx`, whose glasses are always those of the index model `dfc`: a lens designed with
-    another one is a little different there, which the log then says; `history.csv`: a row of
-    numbers for every iteration; `operands.csv`: every operand's value at the end, and its
-    derivative by every variable.
+    - `lens/final.zmx`: its glasses are always those of the index model `dfc`.  A lens that was
+      designed with another one is a little different there, and the log says so.
+    - `history.csv`: a row of numbers for every iteration.
+    - `operands.csv`: every operand's value at the end, and its derivative with respect to every
+      variable.
 
     Args:
-        folder: of the run.
+        folder: the run folder.
     """
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
 
     def on_fit_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Write them."""
+        """Write the files when training ends."""
         module: DesignModule = pl_module
         write_table(self.folder / "history.csv", module.history)
         if module.merit is not None:
@@ -47,7 +48,7 @@ class DesignFiles(lightning.Callback):
 
 
 def _with_catalogue_lines(lens: Lens) -> Lens:
-    """The lens with the indices that a .zmx file means by nd and Vd."""
+    """Return the lens with the indices that a .zmx file means by nd and Vd."""
     if lens.index_model == _ZEMAX_MODEL:
         return lens
     logger.warning(

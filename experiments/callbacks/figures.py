@@ -1,16 +1,77 @@
-"""Figures on their way to TensorBoard."""
+"""Figures of an experiment, saved and logged."""
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import lightning
 from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 
+from dolens.errors import InputError
 from dolens.plotting import figure_to_image, save_figure
+from experiments.experiment import Experiment, Figures
+
+logger = logging.getLogger(__name__)
 
 
-def log_figure(trainer: lightning.Trainer, name: str, figure: Figure) -> None:
+class SaveFigures(lightning.Callback):
+    """Saves the figures of an experiment after its test, and logs those of its training.
+
+    `Experiment.figures` are saved as PNG files and logged to TensorBoard when the test ends;
+    `Experiment.training_figures` are logged after the validation of every n-th epoch and of the
+    last.  A figure that has the name of one of training is logged as `test_<name>`.  A figure that
+    cannot be drawn is named in the log, and the others are drawn.
+
+    Args:
+        folder: the folder for PNG files; it is made when needed.
+        every_n_epochs: the interval between epochs whose figures are logged.
+
+    Raises:
+        InputError: an interval below 1.
+    """
+
+    def __init__(self, folder: str | Path, every_n_epochs: int = 1) -> None:
+        if every_n_epochs < 1:
+            raise InputError(f"every_n_epochs: {every_n_epochs}; allowed: 1 or more")
+        self.folder = Path(folder)
+        self.every_n_epochs = every_n_epochs
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: Experiment) -> None:
+        """Log the figures of training, if it is their turn."""
+        last = trainer.current_epoch + 1 == trainer.max_epochs
+        due = last or trainer.current_epoch % self.every_n_epochs == 0
+        if due and not trainer.sanity_checking:
+            _keep(pl_module.training_figures, lambda name, figure: _log(trainer, name, figure))
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: Experiment) -> None:
+        """Save and log the figures of the test."""
+
+        def keep(name: str, figure: Figure) -> None:
+            save_figure(figure, self.folder / f"{name}.png")
+            of_training = name in pl_module.training_figures()
+            _log(trainer, f"test_{name}" if of_training else name, figure)
+
+        _keep(pl_module.figures, keep)
+
+
+def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -> None:
+    """Draw and keep figures one by one; log those that fail, so that the run is not lost."""
+    try:
+        functions = figures()
+    except Exception:
+        logger.exception("No figures")
+        return
+    for name, draw in functions.items():
+        try:
+            keep(name, draw())
+        except InputError as problem:
+            logger.warning("No figure '%s': %s", name, problem)
+        except Exception:
+            logger.exception("No figure '%s'", name)
+
+
+def _log(trainer: lightning.Trainer, name: str, figure: Figure) -> None:
     """Add a figure to every TensorBoard of a trainer, at its present step."""
     boards = [entry for entry in trainer.loggers if isinstance(entry, TensorBoardLogger)]
     if not boards:
@@ -18,10 +79,3 @@ def log_figure(trainer: lightning.Trainer, name: str, figure: Figure) -> None:
     image = figure_to_image(figure)
     for board in boards:
         board.experiment.add_image(name, image, global_step=trainer.global_step)
-
-
-def keep_figures(trainer: lightning.Trainer, folder: Path, figures: Mapping[str, Figure]) -> None:
-    """Write figures by name as PNG files, and log them."""
-    for name, figure in figures.items():
-        save_figure(figure, folder / f"{name}.png")
-        log_figure(trainer, name, figure)

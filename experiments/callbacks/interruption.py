@@ -1,4 +1,4 @@
-"""What a user is told when a run stops early."""
+"""A notice to the user when a run stops early."""
 
 import logging
 from pathlib import Path
@@ -9,12 +9,13 @@ logger = logging.getLogger(__name__)
 
 
 class InterruptionNotice(lightning.Callback):
-    """Says where the last checkpoint is, or else the best, and how to resume, when a run is
-    interrupted or fails.
+    """Logs how to resume a run that was interrupted or has failed.
+
+    It names the last checkpoint, or the best if there is no last one.
 
     Args:
-        folder: of the checkpoints.
-        command: what starts the same run again.
+        folder: the folder of the checkpoints.
+        command: the command that starts the same run again.
     """
 
     def __init__(self, folder: str | Path, command: str) -> None:

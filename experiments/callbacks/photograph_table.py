@@ -1,4 +1,4 @@
-"""The table of a test, photograph by photograph."""
+"""Scores of test photographs as tables."""
 
 from pathlib import Path
 
@@ -9,20 +9,19 @@ from experiments.tables import write_table
 
 
 class PhotographTable(lightning.Callback):
-    """`test_photographs.csv`: a row of scores for each test photograph and view.
+    """Writes `test_photographs.csv`, a row of scores for each test photograph and view.
 
-    Every other judge has a table of its own, `test_wave_photographs.csv`.
-
-    `scripts/compare.py` pairs runs by it.
+    Every judge has a table of its own besides, such as `test_wave_photographs.csv`.
+    `scripts/compare.py` pairs runs by these tables.
 
     Args:
-        folder: of the run.
+        folder: the run folder.
     """
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Write it."""
+        """Write the tables."""
         for stage, scores in getattr(pl_module, "test_scores", {}).items():
             write_table(self.folder / table_name(stage), scores.rows())

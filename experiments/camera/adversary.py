@@ -10,13 +10,13 @@ from dolens.reconstruction import RelativisticDiscriminators
 
 
 class Adversary(nn.Module):
-    """Discriminators and their own optimizer: a step of theirs for each of the network's.
+    """Trains discriminators with an optimizer of their own, a step for each of the network's.
 
     Lightning's automatic optimization knows the network's optimizer alone; this one is stepped by
     hand, and its state goes into the checkpoint by the camera module.
 
     Args:
-        discriminators: what judges.
+        discriminators: tell restored images from true ones.
         learning_rates: with `discriminator`; by default that of the `network`.
     """
 
@@ -31,7 +31,7 @@ class Adversary(nn.Module):
         self.optimizer = torch.optim.Adam(discriminators.parameters(), lr=rate, betas=(0.5, 0.99))
 
     def forward(self, real: Tensor, fake: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step of the discriminators, and what they add to the network's loss.
+        """Make one step of the discriminators, and return their term of the network's loss.
 
         Args:
             real: true images, (B, 3, H, W), display-encoded.

@@ -1,4 +1,4 @@
-"""What a camera knows of its own blur: point spread functions that are not quite the true ones.
+"""Calibrations of a camera that give point spread functions other than the true ones.
 
 A network that deconvolves is given the point spread functions of the very lens that made the image.
 A real one is given those of a calibration.  Each class here makes the functions of a calibration
@@ -20,7 +20,7 @@ from experiments.camera.views.base import Imaging
 
 
 class Calibration(Protocol):
-    """Makes the functions that a network is given instead of the exact ones."""
+    """Makes point spread functions that a network is given instead of the exact ones."""
 
     def functions(
         self,
@@ -30,11 +30,11 @@ class Calibration(Protocol):
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """(views, 3, K, K) for one batch.
+        """Return point spread functions (views, 3, K, K) for one batch.
 
         Args:
-            views: as of the camera.
-            lens: which took the images.
+            views: those of the camera.
+            lens: the lens that took the images.
             values: its variables.
             exact: (views, 3, K, K), its own functions.
             generator: on the CPU, for this batch.
@@ -42,7 +42,7 @@ class Calibration(Protocol):
 
 
 class OtherDepth:
-    """The target of the calibration stood at one distance of its own.
+    """Gives the functions of one plane, where the target of the calibration stood.
 
     Args:
         depth: mm in front of the first vertex.
@@ -61,12 +61,12 @@ class OtherDepth:
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """Those of the one plane."""
+        """Return the functions of the one plane."""
         return views.point_spread_functions(lens, values, depths=(self.depth,))
 
 
 class OtherSample:
-    """The calibration is of another lens of the series, off by its tolerances.
+    """Gives the functions of another lens of the series, off by its tolerances.
 
     Every batch gets another sample.
 
@@ -87,7 +87,7 @@ class OtherSample:
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """Those of a lens whose errors are drawn."""
+        """Return the functions of a lens whose errors are drawn."""
         tolerances = tolerances_from(lens, self.tolerances, self.factor)
         (errors,) = tolerances.draw(1, generator)
         stored = {name: parameter.detach() for name, parameter in lens.named_parameters()}
@@ -99,7 +99,7 @@ class OtherSample:
 
 
 class NoisyMeasurement:
-    """The functions were measured with a finite number of photons, once for all.
+    """Gives the exact functions with the noise of one measurement.
 
     Args:
         electrons: collected in the whole of each function and colour.
@@ -123,13 +123,17 @@ class NoisyMeasurement:
         exact: Tensor,
         generator: torch.Generator,
     ) -> Tensor:
-        """The exact ones with the noise of counting."""
+        """Return the exact functions with shot noise and read noise."""
         same = torch.Generator().manual_seed(self.seed)
         return noisy_point_spread_functions(exact, self.electrons, self.read_noise, same)
 
 
 def check(calibrations: Mapping[str, Calibration], lens: Lens) -> None:
-    """Raise `InputError` where a tolerance is none of the lens."""
+    """Check that the tolerances of calibrations are parameters of the lens.
+
+    Raises:
+        InputError: one is not.
+    """
     for calibration in calibrations.values():
         if isinstance(calibration, OtherSample):
             tolerances_from(lens, calibration.tolerances, calibration.factor)

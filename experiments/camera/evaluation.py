@@ -1,57 +1,30 @@
-"""What a camera is worth on photographs: by rays, by other judges, with a wrong calibration."""
+"""Scores of a camera on photographs: by its renderer, by other judges, with wrong calibrations."""
 
 import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
+from experiments.camera.base import Camera
 from experiments.camera.calibration import Calibration
 from experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
-from experiments.camera.views.base import Imaging, Views, seed_of
-
-
-class Camera(Protocol):
-    """What is measured."""
-
-    lens: Lens
-    views: Imaging
-
-    def variables(self) -> Mapping[str, Tensor]:
-        """The lens's variables as they are."""
-
-    def take(
-        self,
-        values: Mapping[str, Tensor],
-        batch: Tensor,
-        stage: str,
-        index: int,
-        judge: str | None = None,
-    ) -> tuple[Views, Tensor | None]:
-        """Images of textures, and point spread functions where the network asks for them."""
-
-    def restore(self, taken: Views, functions: Tensor | None) -> Tensor:
-        """(B, V, 3, H, W), display-encoded."""
-
-    def loss_over_views(self, restored: Tensor, truth: Tensor) -> Mapping[str, Tensor]:
-        """The loss as `total`."""
+from experiments.camera.views.base import Views, seed_of
 
 
 class Evaluation:
-    """Rows of numbers, one for each crop and view, and their means by name.
+    """Collects scores of crops and views, and averages them over photographs.
 
     A stage is `val` or `test`; it is done again by every judge of the views, whose numbers are
     called `test_<judge>/…`, and a test with every wrong calibration besides,
     `test/psnr_db_miscalibrated/<kind>`.  All see the same textures and the same noise.
 
     Args:
-        calibrations: name → the functions that a network is given instead of the exact ones.
+        calibrations: name → the calibration whose functions replace the exact ones.
     """
 
     def __init__(self, calibrations: Mapping[str, Calibration] | None = None) -> None:
@@ -94,7 +67,7 @@ class Evaluation:
             kept.setdefault(name, []).append(values)
 
     def scores(self, trainer: object, labels: Sequence[str]) -> dict[str, PhotographScores]:
-        """Scores by photograph of every stage that was measured; the rows are forgotten.
+        """Return the scores by photograph of every stage that was measured, and forget their rows.
 
         Args:
             trainer: whose data module may know the photographs.
@@ -109,7 +82,7 @@ class Evaluation:
         return found
 
     def costs(self) -> dict[str, float]:
-        """Seconds that a batch of images takes each judge: `cost/judge_<name>_s`."""
+        """Return the seconds that a batch takes each judge, as `cost/judge_<name>_s`."""
         return {
             f"cost/judge_{name}_s": statistics.median(values)
             for name, values in self._seconds.items()
@@ -117,9 +90,9 @@ class Evaluation:
 
 
 def means_of(scores: PhotographScores) -> dict[str, Tensor]:
-    """Means over photographs, each of which counts once: of all views, of each, and of the worst.
+    """Return means over photographs for all views together, for each view, and for the worst.
 
-    The loss has no value of its own for each view.
+    Each photograph counts once.  The loss has no value of its own for each view.
     """
     found: dict[str, Tensor] = {}
     for name, values in scores.metrics.items():
@@ -134,13 +107,13 @@ def means_of(scores: PhotographScores) -> dict[str, Tensor]:
 
 
 def without_loss(scores: PhotographScores) -> PhotographScores:
-    """What a table of photographs keeps."""
+    """Return the scores without the loss, which tables of photographs leave out."""
     kept = {name: values for name, values in scores.metrics.items() if name != "loss"}
     return replace(scores, metrics=kept)
 
 
 def _photographs(trainer: object, stage: str, count: int) -> Sequence[str]:
-    """The photograph of each of the first crops; a crop of its own where the data tell none."""
+    """Return the photograph of each crop; where the data know none, each crop counts as one."""
     data = getattr(trainer, "datamodule", None)
     if not hasattr(data, "evaluation_photographs"):
         return [str(number) for number in range(count)]
@@ -148,7 +121,7 @@ def _photographs(trainer: object, stage: str, count: int) -> Sequence[str]:
 
 
 def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:
-    """Numbers (B, V) by name."""
+    """Return scores (B, V) by name."""
     restored, truth = restored.clamp(0.0, 1.0), taken.truth
     loss = camera.loss_over_views(restored, truth.to(restored.dtype))
     row = {"loss": loss["total"].expand(truth.shape[:2])}

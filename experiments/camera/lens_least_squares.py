@@ -2,19 +2,18 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice
 from dolens.optics.lens import Lens
-from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operands import Operand
 from dolens.optimize.trusted_step import ray_moves, trusted_step
 from dolens.optimize.variables import DesignVariables
+from experiments.camera.operands import CameraOperands
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +25,7 @@ _LEAST_REACH = 0.02
 
 
 class CameraOptimizer:
-    """How a camera's parameters move: its network's by `network`, its lens's by it too or apart.
+    """Makes the optimizer of a camera's network, and chooses the one of its lens.
 
     Args:
         network: parameter groups → optimizer.
@@ -44,18 +43,20 @@ class CameraOptimizer:
         lens: str = "adam",
         least_squares: Mapping[str, Any] | None = None,
     ) -> None:
-        if lens not in ("adam", "dls"):
-            raise InputError(f"optimizer.lens: '{lens}' is unknown; allowed: adam, dls")
+        check_choice(lens, ("adam", "dls"), "optimizer.lens")
         self.network = network
-        self.lens_steps = LensLeastSquares(**(least_squares or {})) if lens == "dls" else None
+        self.lens_steps = None
+        if lens == "dls":
+            where = "optimizer.least_squares"
+            self.lens_steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
 
     def __call__(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-        """The optimizer of parameter groups."""
+        """Return the optimizer of parameter groups."""
         return self.network(groups)
 
 
 class LensLeastSquares:
-    """Moves a lens once for some steps of the network, by the gradient they have gathered.
+    """Moves a lens once for some steps of the network, by the gradient gathered in them.
 
     The step minimises the loss's linear model and the operands while rays move no farther than
     `reach`; see `trusted_step`.  Batches are small and differ, so that a trial on one of them would
@@ -99,7 +100,7 @@ class LensLeastSquares:
         self._slope = 0.0
 
     def is_due(self, steps: int) -> bool:
-        """Whether the lens moves after so many steps of the network."""
+        """Return whether the lens moves after so many steps of the network."""
         return steps % self.every == 0
 
     def gather(self, variables: DesignVariables) -> None:
@@ -116,11 +117,10 @@ class LensLeastSquares:
         variables: DesignVariables,
         spots: list[SpotRays],
         pitch: float,
-        operands: Sequence[Operand] = (),
+        operands: CameraOperands | None = None,
         share: float = 1.0,
-        object_distance: float | None = None,
     ) -> dict[str, float]:
-        """One step, by the gradient that was gathered; it is used up.
+        """Make one step by the gradient that was gathered, and forget that gradient.
 
         Args:
             lens: where the values are stored.
@@ -129,7 +129,6 @@ class LensLeastSquares:
             pitch: of the pixels, mm.
             operands: what the lens must be besides; the gradient is without them.
             share: of the reach, as a schedule has it.
-            object_distance: of the operands, mm in front of the first vertex; None for infinity.
 
         Returns:
             Numbers to log: `reach` (pixels), `slope_kept` by the last step, `moved` (RMS, pixels).
@@ -161,7 +160,7 @@ class LensLeastSquares:
             self.reach * share * pitch,
             lower.clamp(max=0.0),
             upper.clamp(min=0.0),
-            OperandModel.of(lens, variables, operands, object_distance) if operands else None,
+            None if operands is None else operands.model(lens, variables),
         )
         scaled.copy_(point + step)
         variables.project()
@@ -176,11 +175,11 @@ class LensLeastSquares:
         self._last, self._slope = None, 0.0
 
     def numbers(self) -> dict[str, float]:
-        """How many steps were taken, and how far rays may move now (pixels)."""
+        """Return how many steps were taken, and how far rays may move now (pixels)."""
         return {"lens_steps/taken": float(self.taken), "lens_steps/reach": self.reach}
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps, the gradient gathered so far included."""
+        """Return what a checkpoint keeps, the gradient gathered so far included."""
         return {
             "reach": self.reach,
             "taken": self.taken,
@@ -190,7 +189,7 @@ class LensLeastSquares:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Go on with it."""
+        """Go on with what a checkpoint kept."""
         self.reach, self.taken = float(state["reach"]), int(state["taken"])
         self._gathered, self._last = state["gathered"], state["last"]
         self._slope = float(state["slope"])

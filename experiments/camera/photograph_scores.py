@@ -1,4 +1,4 @@
-"""Scores of a test photograph by photograph: means, intervals, and the table that a run keeps."""
+"""Scores of a test by photograph: means, confidence intervals, and the table of a run."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from experiments.tables import Row
 
 
 def table_name(stage: str = "test") -> str:
-    """The table's name in a run folder: `test`, or `test_<judge>`."""
+    """Return the name of a stage's table in a run folder; a stage is `test` or `test_<judge>`."""
     return f"{stage}_photographs.csv"
 
 
@@ -26,7 +26,7 @@ _SEED = 0  # of resamples: the same run folder gives the same interval
 
 @dataclass(frozen=True)
 class PhotographScores:
-    """Mean scores over the crops of each photograph.
+    """Holds the mean scores over the crops of each photograph.
 
     Attributes:
         photographs: their names, P.
@@ -41,7 +41,7 @@ class PhotographScores:
     metrics: Mapping[str, Tensor]
 
     def rows(self) -> list[Row]:
-        """A row for each photograph and view."""
+        """Return a row for each photograph and view."""
         return [
             {
                 "photograph": photograph,
@@ -54,7 +54,7 @@ class PhotographScores:
         ]
 
     def numbers(self, stage: str) -> dict[str, float]:
-        """Counts, and 95 % intervals over photographs of each view, the mean and the worst."""
+        """Return counts, and 95 % intervals over photographs: each view, the mean and the worst."""
         numbers = {
             f"{stage}/photographs": float(len(self.photographs)),
             f"{stage}/crops": float(sum(self.crops)),
@@ -69,7 +69,7 @@ class PhotographScores:
 
 
 def statistics_of(views: Sequence[str]) -> dict[str, Callable[[Tensor], Tensor]]:
-    """What is reported of mean scores (R, V): "" for their mean, each view, and `worst`."""
+    """Return functions of mean scores (R, V): "" for their mean, each view, and `worst`."""
     found: dict[str, Callable[[Tensor], Tensor]] = {"": lambda means: means.mean(dim=-1)}
     for number, view in enumerate(views):
         found[view] = lambda means, number=number: means[..., number]
@@ -131,7 +131,7 @@ def read_scores(folder: Path, stage: str = "test") -> PhotographScores | None:
 
 
 def format_interval(interval: Interval, digits: int) -> str:
-    """An estimate with its sign and its interval, as `+0.50 [+0.31, +0.72]`."""
+    """Format an estimate with its sign and its interval, as `+0.50 [+0.31, +0.72]`."""
     if interval.low != interval.low:
         return f"{interval.estimate:+.{digits}f}"
     low, high = f"{interval.low:+.{digits}f}", f"{interval.high:+.{digits}f}"

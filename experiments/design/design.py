@@ -1,4 +1,4 @@
-"""Classical design as a Lightning module: a lens, its variables, a merit function, an optimizer."""
+"""Design of a lens by a merit function."""
 
 import copy
 import logging
@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -21,9 +20,10 @@ from dolens.optimize.merit import MeritValue
 from dolens.optimize.rims import fitted_semi_diameters
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
+from experiments.design.figures import design_figures
 from experiments.design.iteration import Progress, gradient_iteration, least_squares_iteration
 from experiments.design.tables import iteration_row, spot_labels, spot_table
-from experiments.running.checkpoints import refuse_another
+from experiments.experiment import Experiment, Figures
 
 logger = logging.getLogger(__name__)
 
@@ -34,8 +34,8 @@ _LOGGED_FIRST = 20
 _EDGE_RINGS = 40
 
 
-class DesignModule(lightning.LightningModule):
-    """Looks for the lens of the least merit.
+class DesignModule(Experiment):
+    """Searches for the lens of the least merit.
 
     A step is an iteration of the optimizer.  An epoch is a round: it begins by choosing the rays
     that pass the lens as it then is, and ends when the optimizer says that nothing is to be gained,
@@ -56,6 +56,7 @@ class DesignModule(lightning.LightningModule):
             stop's, is put where they pass.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
+        mtf_max_frequency: the end of the MTF curves in figures, cycles/mm; see `design_figures`.
 
     Attributes:
         initial: the lens where the search began.
@@ -78,10 +79,10 @@ class DesignModule(lightning.LightningModule):
         semi_diameters: str = "fixed",
         round_tolerance: float = 1e-3,
         seed: int = 0,
+        mtf_max_frequency: float | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment)
         self.automatic_optimization = False
-        self.lens = lens.requires_grad_(False)
         generator = torch.Generator().manual_seed(seed)
         values = start_values(lens, start or {}, generator)
         with torch.no_grad():
@@ -100,11 +101,12 @@ class DesignModule(lightning.LightningModule):
             self.published = lens_from_prescription(
                 {**published, **model}, lens.dtype, where="published", backend=lens.backend
             )
-        self.experiment, self.merit_settings = experiment, merit
+        self.merit_settings = merit
         self.evaluation = evaluation or replace(
             merit, quality="spots", quality_options={}, operands=()
         )
         self.optimizer, self.round_tolerance = optimizer, round_tolerance
+        self.mtf_max_frequency = mtf_max_frequency
         if semi_diameters not in SEMI_DIAMETERS:
             raise InputError(
                 f"semi_diameters: '{semi_diameters}' is unknown (allowed: "
@@ -130,16 +132,14 @@ class DesignModule(lightning.LightningModule):
 
     @property
     def initial(self) -> Lens:
-        """The lens where the search began."""
+        """Return the lens where the search began."""
         return self._initial[0]
 
     # ---------------------------------------------------------------- rounds
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """One group, with its bounds."""
-        v = self.variables
-        group = {"params": [v.scaled], "lower": v.lower.clone(), "upper": v.upper.clone()}
-        return self.optimizer([group])
+        """Return an optimizer of one group, which holds the variables and their bounds."""
+        return self.optimizer([self.variables.parameter_group()])
 
     def on_fit_start(self) -> None:
         """Start the clock."""
@@ -178,7 +178,7 @@ class DesignModule(lightning.LightningModule):
         return -1 if self._stopped else None
 
     def training_step(self, batch: Any, batch_idx: int) -> None:
-        """One iteration."""
+        """Make one iteration of the optimizer."""
         started = time.perf_counter()
         if self._left:
             self._between.append(started - self._left)
@@ -197,7 +197,7 @@ class DesignModule(lightning.LightningModule):
         self._left = done
 
     def on_train_epoch_end(self) -> None:
-        """Look at the lens with the rays that pass it now, and decide whether to go on."""
+        """Choose the rays that pass the lens now, and decide whether to go on."""
         before = float(self.best_merit)
         self.merit().write_to(self.lens)
         try:
@@ -229,12 +229,12 @@ class DesignModule(lightning.LightningModule):
         self._stopped, self._left = None, 0.0
 
     def on_fit_end(self) -> None:
-        """Leave the lens of the best round."""
+        """Put the variables back to the best round."""
         self._fit_seconds = time.perf_counter() - self._fit_started
         self._leave_best()
 
     def on_test_start(self) -> None:
-        """The same with a checkpoint's best round, where nothing was trained."""
+        """Put the variables to the best round of a checkpoint, if nothing was trained."""
         if not self._fit_seconds and math.isfinite(float(self.best_merit)):
             self._leave_best()
 
@@ -263,7 +263,9 @@ class DesignModule(lightning.LightningModule):
             self.lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
 
     def _check_light(self) -> None:
-        """A round takes its rays from the lens as it is; without this, every one could lose some.
+        """Check that no spot has lost too much light since the search began.
+
+        Each round takes its rays from the lens as it then is, so that every one could lose some.
 
         Raises:
             InputError: a spot has lost more of its light than it may.
@@ -292,13 +294,13 @@ class DesignModule(lightning.LightningModule):
 
     @property
     def rays(self) -> int:
-        """That one evaluation of the merit traces."""
+        """Return the number of rays of one evaluation of the merit."""
         quality = None if self.merit is None else self.merit.quality
         return 0 if quality is None else len(quality.spots.weight)
 
     @property
     def rays_launched(self) -> int:
-        """That were tried to find them."""
+        """Return the number of rays that were launched to find those that pass."""
         quality = None if self.merit is None else self.merit.quality
         return 0 if quality is None else quality.spots.launched
 
@@ -315,7 +317,7 @@ class DesignModule(lightning.LightningModule):
     # ---------------------------------------------------------------- evaluation
 
     def test_step(self, batch: Any, batch_idx: int) -> None:
-        """RMS spot radii before and after, and of the published design."""
+        """Log RMS spot radii before and after the design, and those of the published one."""
         final = spot_table(self.lens, self.evaluation)
         tables = {"initial": spot_table(self.initial, self.evaluation), "final": final}
         if self.published is not None:
@@ -336,7 +338,7 @@ class DesignModule(lightning.LightningModule):
         )
 
     def summary(self) -> dict[str, float]:
-        """Numbers about the whole run, for metrics.json."""
+        """Return the merit of the best round, and costs."""
         numbers = {"cost/iterations": float(len(self.history)), "cost/rays": float(self.rays)}
         numbers["cost/rays_launched"] = float(self.rays_launched)
         if math.isfinite(float(self.best_merit)):
@@ -351,26 +353,21 @@ class DesignModule(lightning.LightningModule):
             numbers["cost/trainer_s"] = statistics.median(self._between)
         return numbers
 
+    def figures(self) -> Figures:
+        """Return the layout, spots, ray fans, MTF, RMS curves and the history."""
+        evaluated = (self.lens, self.initial, self.evaluation)
+        return design_figures(*evaluated, self.history, self.mtf_max_frequency)
+
     # ---------------------------------------------------------------- checkpoints
 
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say which design it is, and what has been done."""
-        checkpoint["dolens"] = self.identity()
-        checkpoint["history"] = self.history
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return the history of iterations."""
+        return {"history": self.history}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint of another design.
-
-        Raises:
-            InputError: it is one.
-        """
-        refuse_another(checkpoint.get("dolens"), self.identity())
+    def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on with that history."""
         self.history = list(checkpoint.get("history", []))
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must have in common with this module, as plain values."""
-        return {
-            "experiment": self.experiment,
-            "lens": self.lens.name,
-            "variables": list(self.variables.names),
-        }
+        """Return the experiment, the lens and the names of the variables."""
+        return {**super().identity(), "variables": list(self.variables.names)}

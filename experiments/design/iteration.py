@@ -19,12 +19,12 @@ _HALVINGS = 30
 
 @dataclass
 class Cost:
-    """What an iteration took.
+    """Counts what an iteration costs.
 
     Attributes:
-        rays: traced, those of Jacobians and gradients too.
-        jacobian_s: seconds in Jacobians or gradients.
-        evaluations: of the merit.
+        rays: rays traced, also for Jacobians and gradients.
+        jacobian_s: seconds spent in Jacobians or gradients.
+        evaluations: evaluations of the merit.
     """
 
     rays: int = 0
@@ -34,7 +34,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Progress:
-    """What an iteration reached.
+    """Holds the result of an iteration.
 
     Attributes:
         value: the merit where it ended.
@@ -78,11 +78,11 @@ class CountedMerit:
 
     @property
     def rays(self) -> int:
-        """Of one evaluation."""
+        """Return the number of rays of one evaluation."""
         return 0 if self.merit.quality is None else len(self.merit.quality.spots.weight)
 
     def __call__(self) -> _CountedValue:
-        """The value at the variables."""
+        """Return the value at the variables."""
         value = self.merit()
         if value is not self._last:
             self._last = value
@@ -94,7 +94,7 @@ class CountedMerit:
 def least_squares_iteration(
     optimizer: DampedLeastSquares, step: Callable[..., Any], merit: MeritFunction
 ) -> Progress:
-    """A step that takes residuals.
+    """Make a step of an optimizer that takes residuals.
 
     Args:
         optimizer: knows what its last step did.
@@ -123,7 +123,7 @@ def gradient_iteration(
     merit: MeritFunction,
     variables: DesignVariables,
 ) -> Progress:
-    """A step that takes a gradient, put back within the bounds (S17).
+    """Make a step of an optimizer that takes a gradient, and project it onto the bounds (S17).
 
     Where it makes rays fail, half of it is taken, or a quarter, and so on.
     """

@@ -1,4 +1,4 @@
-"""What a design says of itself: spots of a lens, an iteration's numbers, operands."""
+"""Tables of a design: spots of a lens, numbers of an iteration, operands."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +17,7 @@ _DEFAULTS = {
 
 @dataclass(frozen=True)
 class SpotTable:
-    """RMS spot radii of a lens.
+    """Holds the RMS spot radii of a lens.
 
     Attributes:
         radii: label of the spot, as `0,14/588nm`, → µm, about its reference.
@@ -31,7 +31,7 @@ class SpotTable:
 
 
 def spot_table(lens: Lens, settings: MeritSettings, finer: bool = False) -> SpotTable:
-    """RMS spot radii of a lens, over the rays that pass it.
+    """Return the RMS spot radii of a lens, over the rays that pass it.
 
     Args:
         lens: initial, published or final.
@@ -48,13 +48,13 @@ def spot_table(lens: Lens, settings: MeritSettings, finer: bool = False) -> Spot
 
 
 def spot_labels(spots: SpotRays) -> list[str]:
-    """`x,y/588nm` of every spot."""
+    """Return the label of every spot, as `x,y/588nm`."""
     fields, waves = spots.fields.tolist(), spots.wavelengths.tolist()
     return [f"{x:g},{y:g}/{w:.0f}nm" for (x, y), w in zip(fields, waves, strict=True)]
 
 
 def iteration_row(progress: Progress, merit: MeritFunction, seconds: float) -> dict[str, float]:
-    """The numbers of an iteration, by the names that they are logged under."""
+    """Return the numbers of an iteration, by the names that they are logged under."""
     value, cost = progress.value, progress.cost
     row = {
         "train/merit": value.sum_of_squares(),
@@ -80,14 +80,14 @@ def iteration_row(progress: Progress, merit: MeritFunction, seconds: float) -> d
 
 
 def operand_table(merit: MeritFunction) -> list[dict[str, Any]]:
-    """A row for every operand: value, deviation, and derivatives by the variables.
+    """Return rows, one for every operand: value, deviation, derivatives by variable.
 
-    Derivatives are those of the value by each variable in its own unit.
+    Derivatives are those of the value with respect to each variable in the unit of files.
     """
     value = merit()
     if not value.operands:
         return []
-    slopes = (value.operand_derivatives() / merit.variables.scale.cpu()).tolist()
+    slopes = (value.operand_derivatives() / merit.variables.file_scale.cpu()).tolist()
     labels = merit.variables.labels()
     return [
         {
@@ -102,7 +102,7 @@ def operand_table(merit: MeritFunction) -> list[dict[str, Any]]:
 
 
 def _doubled(settings: MeritSettings) -> dict[str, Any]:
-    """Sampling options with twice the rays along each direction."""
+    """Return sampling options with twice the rays along each direction."""
     given = {key: value for key, value in settings.sampling_options.items() if value is not None}
     options = {**_DEFAULTS[settings.sampling], **given}
     counts = ("rings", "arms", "count")

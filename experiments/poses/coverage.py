@@ -1,25 +1,28 @@
-"""What becomes of poses and their bounds when a measurement has what the fit's model has not."""
+"""Coverage of pose bounds when measurements have effects that the fit's model lacks."""
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.coverage_figures import coverage_figure
 from experiments.poses.estimates import Estimates, probability
 from experiments.poses.misalignment import MisalignmentModule
 from experiments.poses.results import error_statistics
-from experiments.tables import Row, write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
-_DIGITS = 6
 
-
-class PoseCoverageModule(MisalignmentModule):
+class PoseCoverageModule(Analysis, MisalignmentModule):
     """Compares errors of poses with their bounds over many measurements, case by case.
 
     Nothing is fitted from afar.  Every measurement's estimate is found by Gauss-Newton steps from
@@ -43,9 +46,9 @@ class PoseCoverageModule(MisalignmentModule):
         super().__init__(**module)
         if draws < 2:
             raise InputError(f"draws: {draws}; allowed: 2 or more")
-        if not cases or self.measured is not None:
+        if not cases or self.observations.photograph is not None:
             raise InputError("cases: give at least one, and no photograph in `measurement`")
-        if self.unmodelled != Unmodelled():
+        if self.light.unmodelled != Unmodelled():
             raise InputError("unmodelled: effects are those of `cases` here; leave it at its zeros")
         self.draws, names = int(draws), [fit.name for fit in self.fits]
         self.cases: dict[str, tuple[Unmodelled, tuple[str, ...]]] = {}
@@ -54,10 +57,7 @@ class PoseCoverageModule(MisalignmentModule):
             fits = tuple(str(fit) for fit in settings.pop("fits", names))
             self.cases[name] = (unmodelled_of(settings, f"cases.{name}"), fits)
             for fit in fits:
-                if fit not in names:
-                    raise InputError(
-                        f"cases.{name}.fits: '{fit}' is unknown; allowed: {', '.join(names)}"
-                    )
+                check_choice(fit, names, f"cases.{name}.fits")
                 needed = self.fits[names.index(fit)].held_from
                 if needed is not None and needed not in fits:
                     raise InputError(f"cases.{name}.fits: '{fit}' holds what '{needed}' finds")
@@ -68,53 +68,61 @@ class PoseCoverageModule(MisalignmentModule):
                 raise InputError(f"fits.{names[number]}.truth: '{missing[0]}' is missing")
             with torch.no_grad():
                 true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
-                pose.scaled.copy_(true / pose.scale_in_units)
+                pose.scaled.copy_(true / pose.file_scale)
         self.found: dict[tuple[str, str], Estimates] = {}
         self.rows: list[Row] = []
         self.draw_rows: list[Row] = []
 
-    def configure_optimizers(self) -> None:  # type: ignore[override]
-        """Nothing is trained."""
-
     @torch.no_grad()
-    def test_step(self, batch: Any, batch_idx: int) -> None:
+    def analyse(self) -> dict[str, float]:
         """Estimate, case by case; tables are written after each."""
-        with torch.inference_mode(False), torch.no_grad():
-            for number, fit in enumerate(self.fits):
-                self._hold(number)
-                self.known[fit.name] = self._knowledge(number)
-            for case in self.cases:
-                self._work_out(case)
-                write_table(self.folder / "coverage.csv", self.rows, _DIGITS)
-                write_table(self.folder / "draws.csv", self.draw_rows, _DIGITS)
-        self.log_dict(self.summary(), batch_size=1)
+        for number, fit in enumerate(self.fits):
+            self._hold(number)
+            self.known[fit.name] = self._knowledge(number)
+        for case in self.cases:
+            self._work_out(case)
+            self.write_tables()
+        return self._metrics()
+
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `coverage`, a row for each variable, and `draws`, a row for each measurement."""
+        return {"coverage": self.rows, "draws": self.draw_rows}
+
+    def figures(self) -> Figures:
+        """Return `errors_over_bounds`."""
+        return {"errors_over_bounds": self._figure}
+
+    def _figure(self) -> Figure:
+        errors = {
+            case: {fit: self.over_bound(case, fit) for fit in fits}
+            for case, (_, fits) in self.cases.items()
+        }
+        title = f"{self.lens.name}: errors over bounds, {self.draws} measurements"
+        return coverage_figure(errors, [fit.name for fit in self.fits], title)
 
     def over_bound(self, case: str, fit: str) -> Tensor:
-        """(M, P): errors over their bounds, of the measurements whose estimates have settled."""
+        """Return errors over bounds (M, P), for the measurements whose estimates have settled."""
         found = self.found[case, fit]
         return self._every(case, fit)[found.settled]
 
     def _every(self, case: str, fit: str) -> Tensor:
-        """(draws, P): errors over their bounds."""
-        number = self._number(fit)
+        """Return errors over their bounds (draws, P), for all measurements."""
+        number = self.plan.number(fit)
         pose, truth = self.poses[number], self.truth(number)
         true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
         return (self.found[case, fit].values - true) * pose.units / self.known[fit].bounds
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
+    def _metrics(self) -> dict[str, float]:
         numbers: dict[str, float] = {}
         for row in self.rows:
             name = f"{row['case']}/{row['fit']}/{row['variable']}"
             numbers[f"pose_rms_error/{name}"] = float(row["rms_error"])
             numbers[f"pose_rms_over_bound/{name}"] = float(row["rms_over_bound"])
         for case, (_, fits) in self.cases.items():
-            if (case, fits[0]) not in self.found:
-                continue
             together = torch.cat([self.over_bound(case, fit).flatten() for fit in fits])
             for key, value in error_statistics(together).items():
                 numbers[f"coverage/{case}/{key}"] = value
-            freedom = sum(len(self.poses[self._number(fit)].names) for fit in fits)
+            freedom = sum(len(self.poses[self.plan.number(fit)].names) for fit in fits)
             total = torch.stack([self.found[case, fit].chi_squared for fit in fits]).sum(0)
             settled = torch.stack([self.found[case, fit].settled for fit in fits])
             numbers[f"coverage/{case}/chi_squared"] = float(total[settled.all(0)].mean()) / freedom
@@ -125,12 +133,13 @@ class PoseCoverageModule(MisalignmentModule):
 
     def _work_out(self, case: str) -> None:
         effects, fits = self.cases[case]
+        light = replace(self.light, unmodelled=effects)
         earlier: dict[str, Estimates] = {}
         for number, fit in enumerate(self.fits):
             if fit.name not in fits:
                 continue
             self._hold(number)
-            found = self._estimates(number, range(self.draws), effects, earlier)
+            found = self._estimates(number, range(self.draws), light, earlier)
             earlier[fit.name] = self.found[case, fit.name] = found
             self.rows += self._variable_rows(case, fit.name)
             freedom = len(self.poses[number].names)
@@ -170,8 +179,8 @@ class PoseCoverageModule(MisalignmentModule):
             )
 
     def _variable_rows(self, case: str, fit: str) -> list[Row]:
-        """Of coverage.csv: a row for each variable."""
-        pose = self.poses[self._number(fit)]
+        """Return rows of coverage.csv, one for each variable."""
+        pose = self.poses[self.plan.number(fit)]
         bounds = (self.known[fit].bounds / pose.units).tolist()
         rows: list[Row] = []
         for name, bound, off in zip(

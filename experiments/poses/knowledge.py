@@ -1,78 +1,46 @@
-"""How well a lens's pose can be known from one source or several, on one plane or several."""
+"""Cramér–Rao bounds of a lens's pose for arrangements of sources and planes."""
 
 import copy
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
-import lightning
 import torch
-from torch import Tensor
 
-from dolens.alignment.information import Knowledge, knowledge
+from dolens.alignment.information import knowledge
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
-from dolens.sensor.pixels import Sensor
-from experiments.poses.measurements import draw, repetitions, simulated_at
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.arrangement import UNSEEN, Arrangement
+from experiments.poses.bench import Bench, Light, draw, repetitions, simulate
+from experiments.poses.knowledge_figures import knowledge_figures
 from experiments.poses.results import spread_metrics
-from experiments.poses.settings import blur_for, slopes_imager, spot_imager
-from experiments.tables import Row, write_table
+from experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
 _KEYS = ("sources", "planes", "variables")
-_DIGITS = 6
-# A combination known worse than so many of its scales is not known at all.
-UNSEEN = 1e4
 
 
-@dataclass(frozen=True)
-class Arrangement:
-    """Sources and planes, and what they tell.
-
-    Attributes:
-        name: of the arrangement.
-        pose: the lens where it is; its variables are what is unknown.
-        known: of it.
-        spread: (P,), standard deviations of combinations of θ/scale, the worst known first.
-        combinations: (P, P), those, one a row.
-        estimates: (M, P), degrees and mm, from M measurements with other photons; None: none.
-    """
-
-    name: str
-    pose: Pose
-    known: Knowledge
-    spread: Tensor
-    combinations: Tensor
-    estimates: Tensor | None
-
-    @property
-    def bounds(self) -> Tensor:
-        """(P,), degrees and mm."""
-        return self.known.bounds / self.pose.units
-
-
-class PoseKnowledgeModule(lightning.LightningModule):
-    """Compares arrangements of sources and planes by what they tell of the same unknowns.
+class PoseKnowledgeModule(Analysis):
+    """Compares arrangements of sources and planes by their bounds of the same unknowns.
 
     Args:
         lens: as designed; its elements may have poses.
         experiment: name of the experiment.
+        folder: where tables go.
+        bench: wavelength and sensor; arrangements have sources and planes of their own.
+        light: light and noise; its photons are those of all images of an arrangement together.
         values: where the lens and the sources are, by name, degrees and mm.
         variables: name → settings of `Pose`: what is unknown.
         arrangements: name → `sources` (S, 3), mm; `planes`, mm; and `variables`, names that are
             unknown here besides those of all.
-        wavelength: nm.
-        sensor: the pixels.
-        photons: of all images of an arrangement together, behind the lens.
-        read_noise: RMS of a pixel, electrons.
-        imager: settings of `SpotImager`; see `spot_imager`.
-        slopes: those that differ for derivatives.
-        folder: where tables go.
+        images: settings of the model's images.
         monte_carlo: measurements with other photons, of each arrangement, whose estimates are
             compared with the bounds; 0 for none.
         seed: of simulations.
@@ -85,58 +53,50 @@ class PoseKnowledgeModule(lightning.LightningModule):
         self,
         lens: Lens,
         experiment: str,
+        folder: str,
+        bench: Bench,
+        light: Light,
         values: Mapping[str, float],
         variables: Mapping[str, Mapping[str, Any] | None],
         arrangements: Mapping[str, Mapping[str, Any]],
-        wavelength: float,
-        sensor: Sensor,
-        folder: str,
-        photons: int = 4_000_000,
-        read_noise: float = 2.0,
-        imager: Mapping[str, Any] | None = None,
-        slopes: Mapping[str, Any] | None = None,
+        images: ImageSettings,
         monte_carlo: int = 0,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         if lens.dtype != torch.float64:
             raise InputError(f"lens_dtype: poses are known in float64, not {lens.dtype}")
         if not variables or not arrangements:
             raise InputError("variables, arrangements: give at least one of each")
-        self.lens = lens.requires_grad_(False)
-        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
-        self.photons, self.read_noise = int(photons), float(read_noise)
+        self.seed = int(seed)
+        self.bench, self.light, self.images = bench, light, images
         self.monte_carlo = repetitions(monte_carlo)
-        self.sensor, self.wavelength = sensor, float(wavelength)
-        self.imager, self.slopes = dict(imager or {}), dict(slopes or {})
         self.poses = {
             name: self._pose(name, entry, values, variables) for name, entry in arrangements.items()
         }
         self.arrangements: list[Arrangement] = []
-        self._numbers: dict[str, float] = {}
-
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
 
     @torch.no_grad()
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Evaluate, log, and write the tables."""
-        with torch.inference_mode(False), torch.no_grad():
-            for number, (name, pose) in enumerate(self.poses.items()):
-                found = self._evaluate(number, name, pose)
-                self.arrangements.append(found)
-                self._numbers |= self._metrics(found)
-                logger.info("%s: %s", name, self._verdict(found))
-        write_table(self.folder / "bounds.csv", self.bound_rows(), _DIGITS)
-        write_table(self.folder / "combinations.csv", self.combination_rows(), _DIGITS)
-        self.log_dict(self.summary(), batch_size=1)
+    def analyse(self) -> dict[str, float]:
+        """Evaluate every arrangement."""
+        numbers: dict[str, float] = {}
+        for number, (name, pose) in enumerate(self.poses.items()):
+            found = self._evaluate(number, name, pose)
+            self.arrangements.append(found)
+            numbers |= self._metrics(found)
+            logger.info("%s: %s", name, self._verdict(found))
+        return numbers
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
-        return dict(self._numbers)
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `bounds` and `combinations`."""
+        return {"bounds": self.bound_rows(), "combinations": self.combination_rows()}
+
+    def figures(self) -> Figures:
+        """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
+        return knowledge_figures(self.arrangements, self.lens.name, int(self.light.photons))
 
     def bound_rows(self) -> list[Row]:
-        """Of bounds.csv: a row for each variable of each arrangement."""
+        """Return rows of bounds.csv, one for each variable of each arrangement."""
         rows: list[Row] = []
         for found in self.arrangements:
             names, correlations = found.pose.names, found.known.correlations
@@ -148,7 +108,7 @@ class PoseKnowledgeModule(lightning.LightningModule):
                     {
                         "arrangement": found.name,
                         "variable": name,
-                        "value": found.pose.found()[name],
+                        "value": found.pose.file_values()[name],
                         "bound": float(found.bounds[place]),
                         "most_like": names[other],
                         "correlation": float(correlations[place, other]),
@@ -157,7 +117,7 @@ class PoseKnowledgeModule(lightning.LightningModule):
         return rows
 
     def combination_rows(self) -> list[Row]:
-        """Of combinations.csv: a row for each combination, the worst known first."""
+        """Return rows of combinations.csv, one for each combination, the worst known first."""
         return [
             {
                 "arrangement": found.name,
@@ -175,24 +135,22 @@ class PoseKnowledgeModule(lightning.LightningModule):
         values: Mapping[str, float],
         variables: Mapping[str, Mapping[str, Any] | None],
     ) -> Pose:
-        """The lens where it is, and what is unknown in an arrangement."""
-        for key in entry:
-            if key not in _KEYS:
-                raise InputError(
-                    f"arrangements.{name}: unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-                )
+        """Return the lens where it is, with the unknowns of an arrangement as variables."""
+        check_keys(entry, _KEYS, f"arrangements.{name}")
         if not entry.get("sources"):
             raise InputError(
                 f"arrangements.{name}: sources are missing; give one (x, y, z) or more"
             )
-        place = Pose(copy.deepcopy(self.lens), entry["sources"], {}, entry.get("planes") or (0.0,))
+        bench = replace(self.bench, sources=entry["sources"], planes=entry.get("planes") or (0.0,))
+        place = bench.pose(copy.deepcopy(self.lens))
         place.put(values)
         return place.varying({**variables, **(entry.get("variables") or {})})
 
     def _evaluate(self, number: int, name: str, pose: Pose) -> Arrangement:
         measured = self._measurement(number, pose, 0)
-        own = spot_imager(measured, self.wavelength, self.imager)
-        slopes = slopes_imager(measured, self.wavelength, self.imager, self.slopes)
+        wavelength, settings = self.bench.wavelength, self.images
+        own = spot_imager(measured, wavelength, settings.imager)
+        slopes = slopes_imager(measured, wavelength, settings.imager, settings.slopes)
         known = knowledge(pose, own, measured, slopes, blur_for(measured, slopes))
         spread, combinations = known.combinations(pose.scale)
         estimates = None
@@ -207,14 +165,8 @@ class PoseKnowledgeModule(lightning.LightningModule):
 
     def _measurement(self, number: int, pose: Pose, seed: int) -> Measurement:
         count = len(pose.sources) * len(pose.planes)
-        return simulated_at(
-            pose,
-            self.wavelength,
-            self.sensor,
-            max(1, self.photons // count),
-            self.read_noise,
-            draw(self.seed, number, seed),
-        )
+        light = replace(self.light, photons=max(1, int(self.light.photons) // count))
+        return simulate(pose, self.bench, light, draw(self.seed, number, seed))
 
     def _metrics(self, found: Arrangement) -> dict[str, float]:
         numbers = {
@@ -224,14 +176,14 @@ class PoseKnowledgeModule(lightning.LightningModule):
         numbers[f"knowledge/{found.name}/worst"] = min(float(found.spread[0]), UNSEEN)
         numbers[f"knowledge/{found.name}/unseen"] = float((found.spread > UNSEEN).sum())
         if found.estimates is not None:
-            truth = found.pose.found()
+            truth = found.pose.file_values()
             numbers |= spread_metrics(
                 found.name, found.pose.names, found.estimates, found.bounds, truth
             )
         return numbers
 
     def _verdict(self, found: Arrangement) -> str:
-        """The combination that is known worst, in words."""
+        """Return the combination that is known worst, in words."""
         worst = found.combinations[0]
         order = worst.abs().argsort(descending=True)
         names = [

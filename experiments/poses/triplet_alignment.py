@@ -1,14 +1,12 @@
-"""Which element of a lens is misaligned, and by how much: one case, and many in one batch."""
+"""Identification of the misaligned element of a lens from its spots."""
 
 import copy
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -21,26 +19,28 @@ from dolens.alignment.element_fit import (
     named_element,
 )
 from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
-from dolens.alignment.pixel_moments import Pixels, grid_error
+from dolens.alignment.pixel_moments import Pixels
 from dolens.alignment.spot_moments import SENSOR, MomentModel, moment_model, one_thread
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import DEGREE, unit_factors, unit_of
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.poses.alignment_checks import one_exposure_error, sampling_error
+from experiments.poses.alignment_figures import Setup, alignment_figure
 from experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
 from experiments.settings import numbers_of
-from experiments.tables import write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
-_DIGITS = 9
-# Radians and mm as tables have them: degrees and µm.
-_DEGREES, _MICROMETRES = math.degrees(1.0), 1e3
-# Rings and arms with many rays in every pixel, and how many places of the grid are tried.
-_DENSE, _PLACES = (40, 120), 16
+# Rings and arms with many rays in every pixel.
+_DENSE = 40, 120
 
 
-class TripletAlignmentModule(lightning.LightningModule):
-    """Simulates spots of lenses with one element off, and finds which and by how much.
+class TripletAlignmentModule(Analysis):
+    """Simulates spots of lenses with one misaligned element, and finds the element and its pose.
 
     Where the sensor is counts as unknown: every hypothesis has the pose of one element and, where
     a range is not zero, the sensor's place across or along the axis.
@@ -73,6 +73,8 @@ class TripletAlignmentModule(lightning.LightningModule):
         InputError: a setting out of range, a lens with fewer elements, an unknown element.
     """
 
+    digits: ClassVar[int] = 9
+
     def __init__(
         self,
         lens: Lens,
@@ -97,8 +99,7 @@ class TripletAlignmentModule(lightning.LightningModule):
         iterations: int = 20,
         seed: int = 0,
     ) -> None:
-        super().__init__()
-        self.lens = lens.requires_grad_(False)
+        super().__init__(lens, experiment, folder)
         self.elements = list(lens.elements)
         if len(self.elements) < 2:
             raise InputError("lens.elements: two or more are needed to tell one from another")
@@ -113,7 +114,7 @@ class TripletAlignmentModule(lightning.LightningModule):
         ):
             if not 0.0 <= number < math.inf:
                 raise InputError(f"{key}: {number!r}; allowed: a positive number, or 0 if known")
-        self.experiment, self.folder, self.seed = experiment, Path(folder), int(seed)
+        self.seed = int(seed)
         self.fields = [numbers_of("fields", field, 2) for field in fields]
         self.wavelengths = numbers_of("wavelengths", wavelengths)
         if not self.fields or not self.wavelengths:
@@ -134,21 +135,22 @@ class TripletAlignmentModule(lightning.LightningModule):
         self.iterations = iterations
         self.alignment: Alignment | None = None
 
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
-
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Simulate, fit, log, and write the table."""
-        # Lightning tests in inference mode, which forward derivatives do not work in.
-        with torch.inference_mode(False), torch.no_grad(), one_thread():
+    @torch.no_grad()
+    def analyse(self) -> dict[str, float]:
+        """Simulate all cases, and fit them in one batch."""
+        with one_thread():
             self.alignment = self._align()
-        self.log_dict(self.summary(), batch_size=1)
-        write_table(self.folder / "alignment.csv", self.alignment.rows(), _DIGITS)
         logger.info("%s", self.alignment.verdict())
+        return self.alignment.summary()
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json; none before the test."""
-        return {} if self.alignment is None else self.alignment.summary()
+    def tables(self) -> dict[str, Iterable[Row]]:
+        """Return `alignment`: a row for each case, the demo first."""
+        return {"alignment": self.alignment.rows()}
+
+    def figures(self) -> Figures:
+        """Return `alignment`."""
+        setup = Setup(self.lens.name, len(self.fields), self.photons, self.pixels, self.sensor)
+        return {"alignment": lambda: alignment_figure(self.alignment, setup)}
 
     def _align(self) -> Alignment:
         lens = copy.deepcopy(self.lens).double()
@@ -164,11 +166,13 @@ class TripletAlignmentModule(lightning.LightningModule):
         element, true = self._cases(generator)
         errors = _of_whole_lens(element, true, len(names))
         measured = simulated_moments(simulation, errors, self.photons, generator)
-        checks = _sampling_error(whole, simulation, errors, measured)
+        checks = sampling_error(whole, simulation, errors, measured)
         if self.pixels is not None:
             dense = self._spots(lens, *_DENSE)
             model = moment_model(lens, dense, every, self.sensor, None, whole.size)
-            checks |= _grid_error(model, self.pixels, errors[:1], measured[torch.tensor([0])])
+            checks |= one_exposure_error(
+                model, self.pixels, errors[:1], measured[torch.tensor([0])]
+            )
 
         started = time.perf_counter()
         fits = [fit_element(model, measured, self.iterations) for model in models]
@@ -181,9 +185,7 @@ class TripletAlignmentModule(lightning.LightningModule):
         covariance = least_covariance(root)
         bound = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         known = least_covariance(root[:, : len(POSE), : len(POSE)])
-        units = torch.tensor(
-            [_DEGREES] * 2 + [_MICROMETRES] * (2 + len(self.sensor)), dtype=torch.float64
-        )
+        units = _table_units((*POSE, *self.sensor))
         return Alignment(
             elements=self.elements,
             columns=[*COLUMNS, *(SENSOR_COLUMNS[name] for name in self.sensor)],
@@ -202,7 +204,7 @@ class TripletAlignmentModule(lightning.LightningModule):
         )
 
     def _spots(self, lens: Lens, rings: int, arms: int) -> SpotRays:
-        """Rays of the lens as designed."""
+        """Return the rays of the lens as designed."""
         return gaussian_quadrature(
             lens,
             self.fields,
@@ -214,7 +216,10 @@ class TripletAlignmentModule(lightning.LightningModule):
         )
 
     def _cases(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Elements (1 + K,), and poses and places (1 + K, P) in radians and mm, the demo first."""
+        """Draw the cases: elements (1 + K,), poses and places (1 + K, P) in radians and mm.
+
+        The demo is the first.
+        """
         count, poses = self.misalignments, len(POSE)
         element = torch.randint(len(self.elements), (count,), generator=generator)
         shares = torch.rand((count, poses), generator=generator, dtype=torch.float64)
@@ -227,19 +232,16 @@ class TripletAlignmentModule(lightning.LightningModule):
         )
 
     def _demo(self, settings: Mapping[str, Any]) -> tuple[int, Tensor]:
-        unknown = set(settings) - {"element", *POSE}
-        if unknown:
-            raise InputError(f"demo: '{unknown.pop()}' is unknown; allowed: element, {POSE}")
+        check_keys(settings, ("element", *POSE), "demo")
         name = settings.get("element")
-        if name not in self.elements:
-            raise InputError(f"demo.element: '{name}'; allowed: {', '.join(self.elements)}")
+        check_choice(name, self.elements, "demo.element")
         pose = torch.tensor([float(settings.get(part, 0.0)) for part in POSE], dtype=torch.float64)
-        pose[:2] *= math.pi / 180.0
+        pose *= unit_factors(POSE)
         return self.elements.index(name), pose
 
 
 def _pixels(pitch: float, read_noise: float, window: float) -> Pixels | None:
-    """None for a pitch of zero."""
+    """Return the settings of the pixels; None for a pitch of zero, an ideal sensor."""
     if pitch != 0.0:
         return Pixels(pitch, read_noise, window)
     if read_noise != 0.0:
@@ -247,51 +249,29 @@ def _pixels(pitch: float, read_noise: float, window: float) -> Pixels | None:
     return None
 
 
+def _table_units(names: Sequence[str]) -> Tensor:
+    """Return what a number of the lens is multiplied by for a table in degrees and µm, (P,)."""
+    factors = [1.0 / unit_of(name).factor if unit_of(name) is DEGREE else 1e3 for name in names]
+    return torch.tensor(factors, dtype=torch.float64)
+
+
 def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
-    """(K, E·4 + Q), all elements' poses and the sensor's place, from those of one (K, 4 + Q)."""
+    """Return the poses of all elements and the sensor's place (K, E·4 + Q).
+
+    Args:
+        element: (K,), the number of the misaligned element.
+        true: (K, 4 + Q), its pose and the sensor's place.
+        elements: E.
+    """
     poses = true.new_zeros(len(true), elements, len(POSE))
     poses[torch.arange(len(true)), element] = true[:, : len(POSE)]
     return torch.cat([poses.flatten(1), true[:, len(POSE) :]], 1)
 
 
-def _sampling_error(
-    fitted: MomentModel, simulated: MomentModel, errors: Tensor, measured: MeasuredMoments
-) -> dict[str, float]:
-    """What two quadratures of the same pupil differ by, over the noise of the moments."""
-    difference = fitted.moments(errors, measured.origin) - simulated.moments(
-        errors, measured.origin
-    )
-    apart = measured.over_noise(difference)
-    return {
-        "alignment/sampling_error_over_noise": float(apart.square().mean().sqrt()),
-        "alignment/sampling_error_over_noise/largest": float(apart.abs().max()),
-    }
-
-
-def _grid_error(
-    dense: MomentModel, pixels: Pixels, errors: Tensor, measured: MeasuredMoments
-) -> dict[str, float]:
-    """What one exposure instead of many dithered ones would change, over the noise: of one lens
-    (1, P), over places of the grid on a lattice.
-    """
-    side = (torch.arange(math.isqrt(_PLACES)) + 0.5) / math.isqrt(_PLACES)
-    places = torch.cartesian_prod(side, side)
-    difference = grid_error(
-        dense.points(errors)[0],
-        dense.shares,
-        measured.origin[0],
-        dense.size,
-        pixels.pitch,
-        places,
-    )
-    apart = measured.over_noise(difference[:, None])
-    return {"alignment/pixel_grid_over_noise": float(apart.square().mean().sqrt())}
-
-
 def _information_roots(
     models: Sequence[MomentModel], measured: MeasuredMoments, element: Tensor, true: Tensor
 ) -> Tensor:
-    """(K, P, P), each with the element that is off."""
+    """Return roots of the information (K, P, P), each for the element that is misaligned."""
     roots = true.new_zeros(len(true), true.shape[1], true.shape[1])
     for number, model in enumerate(models):
         mine = torch.nonzero(element == number)[:, 0]

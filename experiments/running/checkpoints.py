@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from dolens.errors import InputError
+from experiments.experiment import Experiment, refuse_another
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ def _flat(node: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def checked_checkpoint(
-    path: str, module: lightning.LightningModule, settings: Mapping[str, Any], training: bool
+    path: str, module: Experiment, settings: Mapping[str, Any], training: bool
 ) -> str:
     """The path of a checkpoint that a run can take up; one warning names every other difference.
 
@@ -83,8 +84,7 @@ def checked_checkpoint(
         raise InputError(f"ckpt_path: {path} is not a safe checkpoint ({reason})") from None
     if not isinstance(checkpoint, Mapping) or "state_dict" not in checkpoint:
         raise InputError(f"ckpt_path: {path} holds no state of a module")
-    if callable(getattr(module, "identity", None)):
-        refuse_another(checkpoint.get("dolens"), module.identity())
+    refuse_another(checkpoint.get("dolens"), module.identity())
     written = checkpoint.get(SETTINGS)
     if not isinstance(written, Mapping):
         logger.warning(
@@ -96,26 +96,6 @@ def checked_checkpoint(
         _compare(written, settings, training)
     _refuse_other_shapes(checkpoint["state_dict"], module.state_dict())
     return path
-
-
-def refuse_another(found: Any, own: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint whose module says that it is another one.
-
-    Args:
-        found: what the checkpoint says of its module.
-        own: what this run's module says of itself.
-
-    Raises:
-        InputError: they differ; the message names the first difference.
-    """
-    if not isinstance(found, Mapping):
-        raise InputError("ckpt_path: this file is no checkpoint of a dolens experiment")
-    for key, value in own.items():
-        if found.get(key) != value:
-            raise InputError(
-                f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
-                f"{value!r}; resume with the experiment and settings that wrote it"
-            )
 
 
 def _compare(written: Mapping[str, Any], own: Mapping[str, Any], training: bool) -> None:

@@ -17,7 +17,7 @@ _POINTS, _TRUE_SAMPLES, _SIZE = 9, 160, 65
 def function_rows(
     subject: Subject, samples: Sequence[int], seconds: float
 ) -> list[dict[str, float | str]]:
-    """A row for each number of rays: error in grey levels on the probe, and time a function.
+    """Return a row for each number of rays: error in grey levels on the probe, time a function.
 
     Args:
         subject: the scene.

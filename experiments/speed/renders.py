@@ -33,7 +33,7 @@ _MANY, _WINDOW, _MARGIN = 128, 64, 48
 
 @dataclass(frozen=True)
 class Subject:
-    """A lens and what it looks at.
+    """Holds a lens, its scene and its sensor.
 
     Attributes:
         name: of the scene.
@@ -50,14 +50,14 @@ class Subject:
     variables: tuple[str, ...]
 
     def texture(self) -> Tensor:
-        """A probe image that covers the sensor."""
+        """Return a probe image that covers the sensor."""
         sensor = self.sensor
         return probe_image(sensor.height + 2 * _MARGIN, sensor.width + 2 * _MARGIN, seed=3)
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A way of rendering.
+    """Holds a renderer that is compared with others.
 
     Attributes:
         model: `rays`, `psf` or `auto`, and what tells its kind.
@@ -78,7 +78,7 @@ def render_contenders(
     fields: Sequence[int],
     tolerances: Sequence[float],
 ) -> list[Contender]:
-    """Rays of many numbers, functions on many grids, and the choices for tolerances.
+    """Return renderers by rays, by point spread functions, and by choice for tolerances.
 
     Args:
         subject: the scene.
@@ -111,7 +111,7 @@ def render_contenders(
 def render_rows(
     subject: Subject, contenders: Sequence[Contender], reference_samples: int, seconds: float
 ) -> tuple[list[dict[str, float | str]], Reference]:
-    """A row for each contender, and what errors were measured against.
+    """Return a row for each contender, and the judge of their errors.
 
     Args:
         subject: the scene.
@@ -163,7 +163,7 @@ def _is_slow(contender: Contender) -> bool:
 
 
 def _window(subject: Subject) -> tuple[Sensor, float]:
-    """A window in the middle, and how many times larger the sensor is."""
+    """Return a window in the middle, and how many times larger the sensor is."""
     sensor = subject.sensor
     height, width = min(_WINDOW, sensor.height), min(_WINDOW, sensor.width)
     top, left = (sensor.height - height) // 2, (sensor.width - width) // 2
@@ -174,7 +174,7 @@ def _window(subject: Subject) -> tuple[Sensor, float]:
 def _call(
     subject: Subject, contender: Contender, texture: Tensor, backward: bool
 ) -> Callable[[], Tensor]:
-    """A render, and its gradient with respect to the subject's variables."""
+    """Return a call that renders, and differentiates with respect to the subject's variables."""
     stored = {n: p.detach() for n, p in subject.lens.variables(list(subject.variables)).items()}
 
     def call() -> Tensor:
@@ -188,7 +188,7 @@ def _call(
 
 
 def _image(subject: Subject, contender: Contender, texture: Tensor, judge: Reference) -> Tensor:
-    """The contender's image; of rays, which are many, only the windows that are looked at."""
+    """Return the contender's image; with rays, which are many, only the windows that are used."""
     lens, scene = subject.lens, subject.scene
     renderer = _without_diffraction(contender.renderer)
     with torch.no_grad():
@@ -205,15 +205,17 @@ def _image(subject: Subject, contender: Contender, texture: Tensor, judge: Refer
 
 
 def _without_diffraction(renderer: Renderer) -> Renderer:
-    """What a renderer makes of rays alone, as the reference is of rays."""
+    """Return the renderer without diffraction, since the reference has none."""
     if isinstance(renderer, AutoRenderer):
         renderer = renderer.choice.renderer
     return without_diffraction(renderer)
 
 
 def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> dict[str, Agreement]:
-    """How well contenders' gradients agree with those of rays, by setting: of the squared error to
-    what a pinhole sees, with respect to the subject's variables in units of their magnitudes.
+    """Compare the contenders' gradients with those of rays, by setting.
+
+    They are gradients of the squared error to a pinhole's image, with respect to the subject's
+    variables in units of their magnitudes.
 
     All without diffraction; of contenders by many rays, which are slow, none is asked.
     """

@@ -1,19 +1,20 @@
-"""How fast and how wrong, as one Lightning module: a test, and nothing to train."""
+"""Measurement of speed and error of traces, point spread functions and renders."""
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import lightning
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import check_choice, check_keys
+from dolens.optics.parameter_units import to_lens_units
 from dolens.plotting import Point, pareto_front
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
+from experiments.speed.figures import speed_figures
 from experiments.speed.functions import function_rows
 from experiments.speed.renders import (
     Subject,
@@ -22,21 +23,20 @@ from experiments.speed.renders import (
     render_rows,
 )
 from experiments.speed.traces import trace_rows
-from experiments.tables import write_table
+from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
 PARTS = ("trace", "psf", "render")
-_DIGITS = 6
 _SUPPLEMENT = 7  # strata along each side of the pupil of the supplement's renders
 _SUBJECT_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
 
 
-class SpeedVsErrorModule(lightning.LightningModule):
-    """Draws error against cost for traces, point spread functions and renders of several scenes.
+class SpeedVsErrorModule(Analysis):
+    """Measures error and cost of traces, point spread functions and renders of several scenes.
 
     Args:
-        lens: of the run; it is not looked at.
+        lens: the lens of the run; it is not used.
         experiment: name of the experiment.
         scenes: name → `lens` (a prescription), `values` (parameters to change), `depths` (mm),
             `wavelengths` (nm), `sensor`, and `variables`, patterns of what gradients are taken of.
@@ -64,57 +64,36 @@ class SpeedVsErrorModule(lightning.LightningModule):
         rays: int = 100_000,
         seconds: float = 2.0,
     ) -> None:
-        super().__init__()
-        self.lens = lens
-        self.experiment = experiment
+        super().__init__(lens, experiment, folder)
         for part in parts:
-            if part not in PARTS:
-                raise InputError(f"parts: '{part}' is unknown (allowed: {', '.join(PARTS)})")
+            check_choice(part, PARTS, "parts")
         self.parts = tuple(parts)
         self.subjects = [_subject(name, entry) for name, entry in scenes.items()]
-        self.folder = Path(folder)
         self.pupil_samples = tuple(pupil_samples)
         self.fields = tuple(fields)
         self.tolerances = tuple(tolerances)
         self.reference_samples = reference_samples
         self.rays = rays
         self.seconds = seconds
-        self.rows: list[dict[str, float | str]] = []
-        self._numbers: dict[str, float] = {}
+        self.rows: list[Row] = []
+        self.numbers: dict[str, float] = {}
 
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
+    def analyse(self) -> dict[str, float]:
+        """Measure, and write the table after every scene and part."""
+        for subject in self.subjects:
+            for part in self.parts:
+                logger.info("%s: %s", subject.name, part)
+                self.rows += getattr(self, f"_{part}")(subject)
+                self.write_tables()
+        return self.numbers
 
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Measure, and write the table after every scene."""
-        with torch.inference_mode(False), torch.enable_grad():
-            for subject in self.subjects:
-                for part in self.parts:
-                    logger.info("%s: %s", subject.name, part)
-                    self.rows += getattr(self, f"_{part}")(subject)
-                    write_table(self.folder / "speed_vs_error.csv", self.rows, _DIGITS)
-        self.log_dict(self.summary(), batch_size=1)
+    def tables(self) -> dict[str, list[Row]]:
+        """Return `speed_vs_error`: a row for each scene, part and setting."""
+        return {"speed_vs_error": self.rows}
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json."""
-        return dict(self._numbers)
-
-    def points(self, scene: str, part: str, cost: str, error: str) -> dict[str, list[Point]]:
-        """Points of a scene and part by model, for a figure."""
-        families: dict[str, list[Point]] = {}
-        for row in self.rows:
-            if row["scene"] == scene and row["part"] == part:
-                model = str(row["model"])
-                if not math.isfinite(float(row[error])):
-                    continue
-                point = Point(str(row["setting"]), row[cost], row[error], model == "auto")
-                families.setdefault(model, []).append(point)
-        return families
-
-    def uncertainty(self, scene: str) -> float | None:
-        """Grey levels below which errors of a scene's renders are not known."""
-        rows = [r for r in self.rows if r["scene"] == scene and r["part"] == "render"]
-        return rows[0]["error_uncertainty"] if rows else None
+    def figures(self) -> Figures:
+        """Return error against cost for each scene and part."""
+        return speed_figures(self.rows, [s.name for s in self.subjects], self.parts)
 
     def _trace(self, subject: Subject) -> list[dict[str, float | str]]:
         return trace_rows(subject, ("reference", "cpu"), self.rays, self.seconds)
@@ -126,7 +105,7 @@ class SpeedVsErrorModule(lightning.LightningModule):
     def _render(self, subject: Subject) -> list[dict[str, float | str]]:
         contenders = render_contenders(subject, self.pupil_samples, self.fields, self.tolerances)
         rows, judge = render_rows(subject, contenders, self.reference_samples, self.seconds)
-        name, numbers = subject.name, self._numbers
+        name, numbers = subject.name, self.numbers
         agreements = gradient_agreements(subject, contenders)
         for row in rows:
             found = agreements.get(str(row["setting"]))
@@ -161,16 +140,12 @@ def _points(rows: Sequence[Mapping[str, Any]]) -> list[Point]:
 
 
 def _subject(name: str, entry: Mapping[str, Any]) -> Subject:
-    for key in entry:
-        if key not in _SUBJECT_KEYS:
-            raise InputError(
-                f"scenes.{name}: unknown key '{key}' (allowed: {', '.join(_SUBJECT_KEYS)})"
-            )
+    check_keys(entry, _SUBJECT_KEYS, f"scenes.{name}")
     lens = lens_from_prescription(entry["lens"], torch.float32, where=f"scenes.{name}.lens")
     with torch.no_grad():
         for pattern, value in (entry.get("values") or {}).items():
-            for parameter in lens.variables([pattern]).values():
-                parameter.fill_(value)
+            for key, parameter in lens.variables([pattern]).items():
+                parameter.fill_(to_lens_units(key, value))
     scene = PlanarScene(entry["depths"], entry["wavelengths"])
     sensor = Sensor(**entry["sensor"])
     names = tuple(lens.variables(list(entry["variables"])))

@@ -12,7 +12,7 @@ from torch.profiler import ProfilerActivity, profile
 def by_turns(
     calls: Mapping[str, Callable[[], object]], seconds: float, rounds: int = 3
 ) -> dict[str, float]:
-    """Median time of each call, s.
+    """Return the median time of each call, s.
 
     Calls run by turns, so that a phase in which the machine is slow meets all of them, each at
     least `rounds` times and on until `seconds` are spent.  A first turn is not counted.
@@ -31,7 +31,7 @@ def by_turns(
 
 
 def peak_megabytes(call: Callable[[], object]) -> float:
-    """The most memory that PyTorch's CPU tensors of a call hold at a time, MB.
+    """Return the peak memory of the CPU tensors of a call, MB.
 
     Added up from the allocator's own events; what a kernel keeps to itself is not among them.
     """

@@ -19,7 +19,7 @@ _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 def trace_rows(
     subject: Subject, backends: tuple[str, ...], rays: int, seconds: float
 ) -> list[dict[str, float | str]]:
-    """A row for each precision and backend: error of sensor points in µm, ns a ray and surface.
+    """Return a row for each precision and backend: error of sensor points, time a ray and surface.
 
     Args:
         subject: the lens.
@@ -54,8 +54,9 @@ def trace_rows(
 def _newton_rows(
     lens: Lens, given: Rays, subject: Subject, seconds: float
 ) -> list[dict[str, float | str]]:
-    """A row for each number of Newton's steps that is too small, up to the first that is enough;
-    none are counted that derivatives take besides.
+    """Return a row for each number of Newton's steps up to the first that is enough.
+
+    Steps that derivatives take besides are not counted.
 
     The rule that ends the iteration, √ε of the way, is not a setting of the library; its number of
     steps is held down here to see what the rule buys.
@@ -81,7 +82,7 @@ def _newton_rows(
 
 
 def _error(hit: TracedRays, true: TracedRays) -> float:
-    """The largest distance on the sensor along x or y, mm; infinite where no ray arrives."""
+    """Return the largest distance on the sensor along x or y, mm; infinite if no ray arrives."""
     both = hit.valid & true.valid
     moved = (hit.position.detach().double() - true.position.detach())[both].abs()
     return float(moved.max()) if moved.numel() else math.inf
@@ -95,7 +96,7 @@ def _row(
     seconds: tuple[float, float],
     rays: int,
 ) -> dict[str, float | str]:
-    """Of an error in mm, and seconds of all rays forward and with the gradient."""
+    """Return a row for an error in mm, and seconds of all rays forward and with the gradient."""
     forward, with_gradient = (1e9 * s / (rays * len(subject.lens.surfaces)) for s in seconds)
     return {
         "scene": subject.name,
@@ -116,7 +117,7 @@ def _lens(lens: Lens, dtype: torch.dtype, backend: str) -> Lens:
 
 @torch.no_grad()
 def _rays(lens: Lens, count: int) -> Rays:
-    """Parallel rays, a little off the axis, that fill the entrance pupil."""
+    """Return parallel rays, a little off the axis, that fill the entrance pupil."""
     pupil = lens.first_order().entrance_pupil
     generator = torch.Generator().manual_seed(0)
     disc = torch.rand(2, count, generator=generator, dtype=torch.float64) - 0.5

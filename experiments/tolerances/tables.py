@@ -12,7 +12,7 @@ _MOST = 12
 
 
 def sensitivity_rows(found: ToleranceAnalysis) -> Iterator[Row]:
-    """A row for every parameter and spot: derivatives, and RMS at the ends of the tolerance."""
+    """Yield a row for every parameter and spot: derivatives, and RMS at the tolerance's ends."""
     s, t, spots = found.sensitivities, found.tolerances, found.spots
     scale = 1e3 * per_unit(t)
     motion, rms = s.centroid_jacobian * scale, s.rms_jacobian * scale
@@ -37,7 +37,7 @@ def sensitivity_rows(found: ToleranceAnalysis) -> Iterator[Row]:
 
 
 def offender_rows(found: ToleranceAnalysis) -> Iterator[Row]:
-    """A row for every parameter, the one that adds most to the mean square radius first."""
+    """Yield a row for every parameter, the one that adds most to the mean square radius first."""
     s, t, c = found.sensitivities, found.tolerances, found.contributions
     increase, unfocused = 1e3 * s.increase(), 1e3 * s.increase(refocused=False)
     shift = 1e3 * s.largest_centroid_shift
@@ -59,7 +59,7 @@ def offender_rows(found: ToleranceAnalysis) -> Iterator[Row]:
 
 
 def monte_carlo_rows(found: ToleranceAnalysis) -> Iterator[Row]:
-    """A row for every lens: its spots before and after the compensator, and its errors."""
+    """Yield a row for every lens: its spots before and after the compensator, and its errors."""
     columns = {}
     for name, outcome in (("", found.traced), ("linear_", found.linear)):
         for stage, squares in (("", outcome.after), ("not_refocused_", outcome.before)):
@@ -81,13 +81,13 @@ def monte_carlo_rows(found: ToleranceAnalysis) -> Iterator[Row]:
 
 
 def per_unit(tolerances: Tolerances) -> torch.Tensor:
-    """(P,): the lens's units in one of the table's: π/180 in a degree, c/100 in a per cent."""
+    """Return the table's units in the lens's (P,): π/180 for a degree, c/100 for a per cent."""
     cents = [0.01 if unit == "%" else 1.0 for unit in tolerances.unit_names]
     return tolerances.unit * torch.tensor(cents, dtype=torch.float64)
 
 
 def offender_text(found: ToleranceAnalysis) -> str:
-    """The first rows of `offender_rows` for people to read."""
+    """Return the first rows of `offender_rows` as text."""
     heads = ("parameter", "tolerance", "share", "RMS rises, µm", "not refocused", "spot moves, µm")
     rows = [
         (

@@ -1,12 +1,10 @@
-"""Sensitivities and tolerances of a lens as one Lightning module: a test, and nothing to train."""
+"""Analysis of a lens's sensitivities and tolerances."""
 
 import copy
 import logging
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
 
-import lightning
 import torch
 from torch import Tensor
 
@@ -22,8 +20,11 @@ from dolens.tolerancing import (
     spot_weights,
     tolerances_from,
 )
+from experiments.analysis import Analysis
+from experiments.experiment import Figures
 from experiments.settings import numbers_of
-from experiments.tables import write_table
+from experiments.tables import Row
+from experiments.tolerances.figures import tolerance_figures
 from experiments.tolerances.tables import (
     monte_carlo_rows,
     offender_rows,
@@ -33,13 +34,11 @@ from experiments.tolerances.tables import (
 
 logger = logging.getLogger(__name__)
 
-# Of numbers in tables.
-_DIGITS = 9
 QUANTILES = (0.5, 0.8, 0.9, 0.95, 0.98)
 
 
-class TolerancesModule(lightning.LightningModule):
-    """Which errors of manufacture a lens minds, and how many of the lenses made are good enough.
+class TolerancesModule(Analysis):
+    """Finds a lens's sensitivities to errors of manufacture, and the yield under tolerances.
 
     Radii are √(Σ W·RMS²) over the spots, each spot (a field and a wavelength) about its own
     centroid.  Perturbed lenses are refocused for all spots together unless a name says otherwise.
@@ -61,6 +60,8 @@ class TolerancesModule(lightning.LightningModule):
         seed: of the lenses drawn.
     """
 
+    digits: ClassVar[int] = 9
+
     def __init__(
         self,
         lens: Lens,
@@ -78,12 +79,10 @@ class TolerancesModule(lightning.LightningModule):
         chunk_size: int | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__()
+        super().__init__(lens, experiment, folder)
         for key, number in (("lenses", lenses), ("chunk_size", chunk_size)):
             if number is not None and not (type(number) is int and number >= 1):
                 raise InputError(f"{key}: {number!r}; allowed: an integer of 1 or more")
-        self.lens = lens.requires_grad_(False)
-        self.experiment = experiment
         self.fields = [numbers_of("fields", field, 2) for field in fields]
         self.wavelengths = numbers_of("wavelengths", wavelengths)
         for key, given in (("fields", self.fields), ("wavelengths", self.wavelengths)):
@@ -91,34 +90,34 @@ class TolerancesModule(lightning.LightningModule):
                 raise InputError(f"{key}: none is given")
         self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
         self.weights = self._weights(weights)
-        self.folder = Path(folder)
         self.lenses, self.chunk_size = lenses, chunk_size
         self.rings, self.arms = rings, arms
         self.yield_at_um = numbers_of("yield_at_um", yield_at_um)
         self.seed = seed
         self.analysis: ToleranceAnalysis | None = None
 
-    def configure_optimizers(self) -> None:
-        """Nothing is trained."""
+    def analyse(self) -> dict[str, float]:
+        """Find sensitivities, draw lenses, and trace them."""
+        self.analysis = self._analyse()
+        numbers = self._metrics(self.analysis)
+        logger.info("Worst offenders, each alone and refocused:\n%s", offender_text(self.analysis))
+        logger.info("%s", self._verdict(numbers))
+        return numbers
 
-    def test_step(self, batch: Any, batch_idx: int) -> None:
-        """Analyse, log, and write the tables."""
-        # Lightning tests in inference mode, where the Jacobian has no graph to follow.
-        with torch.inference_mode(False), torch.enable_grad():
-            self.analysis = self._analyse()
-        self.log_dict(self.summary(), batch_size=1)
+    def tables(self) -> dict[str, Iterable[Row]]:
+        """Return `sensitivities`, `worst_offenders` and `monte_carlo`."""
         found = self.analysis
-        write_table(self.folder / "sensitivities.csv", sensitivity_rows(found), _DIGITS)
-        write_table(self.folder / "worst_offenders.csv", offender_rows(found), _DIGITS)
-        write_table(self.folder / "monte_carlo.csv", monte_carlo_rows(found), _DIGITS)
-        logger.info("Worst offenders, each alone and refocused:\n%s", offender_text(found))
-        logger.info("%s", self._verdict())
+        return {
+            "sensitivities": sensitivity_rows(found),
+            "worst_offenders": offender_rows(found),
+            "monte_carlo": monte_carlo_rows(found),
+        }
 
-    def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json; none before the test."""
-        found = self.analysis
-        if found is None:
-            return {}
+    def figures(self) -> Figures:
+        """Return the matrices, the yield curves and the worst offenders."""
+        return tolerance_figures(self.analysis, self.lens.name, self._spot_labels(), self.weights)
+
+    def _metrics(self, found: ToleranceAnalysis) -> dict[str, float]:
         increase = (1e3 * found.sensitivities.increase()).tolist()
         numbers = {
             f"sensitivity/rms_um/{name}": value
@@ -139,8 +138,8 @@ class TolerancesModule(lightning.LightningModule):
         numbers["cost/rays"] = float(self.lenses * len(found.spots.weight))
         return numbers
 
-    def spot_labels(self) -> list[str]:
-        """A label a spot: its field and wavelength."""
+    def _spot_labels(self) -> list[str]:
+        """Return the field and the wavelength of every spot."""
         spots = self.analysis.spots
         unit = "°" if self.lens.object_distance is None else " mm"
         pairs = zip(spots.fields.tolist(), spots.wavelengths.tolist(), strict=True)
@@ -165,7 +164,7 @@ class TolerancesModule(lightning.LightningModule):
         )
 
     def _outcome(self, name: str, outcome: Outcome, refocused: bool) -> dict[str, float]:
-        """Quantiles, yields, and the lens as designed."""
+        """Return quantiles of RMS radii, yields, and the radii of the lens as designed."""
         found = outcome.found(refocused)
         s = self.analysis.sensitivities
         design = s.rms_refocused if refocused else s.rms
@@ -181,8 +180,7 @@ class TolerancesModule(lightning.LightningModule):
             numbers[f"{name}/worst_yield_at_{limit:g}um"] = share_within(found.worst, 1e-3 * limit)
         return numbers
 
-    def _verdict(self) -> str:
-        n = self.summary()
+    def _verdict(self, n: Mapping[str, float]) -> str:
         parts = [
             f"{what} {n[f'{where}/rms_um/nominal']:.2f} as designed, median "
             f"{n[f'{where}/rms_um/p50']:.2f}, 90 % within {n[f'{where}/rms_um/p90']:.2f}"
@@ -198,7 +196,7 @@ class TolerancesModule(lightning.LightningModule):
         )
 
     def _weights(self, weights: Sequence[float] | None) -> Tensor:
-        """(S,), from the fields': every wavelength of a field counts alike."""
+        """Return weights of spots (S,) from those of fields; all wavelengths count alike."""
         if weights is not None:
             weights = torch.tensor(numbers_of("weights", weights, len(self.fields)))
             weights = weights.double().repeat_interleave(len(self.wavelengths))

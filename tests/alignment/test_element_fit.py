@@ -225,7 +225,7 @@ def test_bad_input_gives_one_clear_line(triplet, spots, models):
         simulated_moments(models[0], poses(1, 0), 0, None)
     with pytest.raises(InputError, match="lenses lose rays"):
         simulated_moments(models[0], poses(1, 0) * 500.0, 1e5, None)
-    with pytest.raises(InputError, match="sensor: 'sensor_z' is unknown; allowed: sensor_x"):
+    with pytest.raises(InputError, match="sensor: 'sensor_z' is unknown; did you mean 'sensor_y'"):
         moment_model(triplet, spots, element_names(triplet, "front"), ["sensor_z"])
     few = gaussian_quadrature(triplet, FIELDS[:1], [587.5618], 1, 4, symmetry=False)
     model = moment_model(triplet, few, element_names(triplet, "front"))

@@ -5,6 +5,7 @@ import json
 import math
 
 import pytest
+from tiny_experiment import figure_names
 
 from experiments.running.training import run
 
@@ -34,7 +35,7 @@ def test_a_run_names_the_elements_and_its_table_agrees_with_its_metrics(composed
     assert objective == metrics["alignment/named_right"] == 1.0
     assert metrics["alignment/converged"] == 1.0
     assert metrics["cost/batch_s"] > 0.0
-    assert (folder / "figures" / "alignment.png").stat().st_size > 10_000
+    assert figure_names(folder) == {"alignment"}
     demo, *rows = table(folder)
     assert len(rows) == 12 and {row["case"] for row in rows} == {str(k) for k in range(1, 13)}
     assert demo["true_element"] == demo["named_element"] == "middle"
@@ -89,8 +90,11 @@ def test_focus_alone_may_be_unknown(composed, tmp_path):
 
 PAIR = ("found", "true")
 BAD_INPUT = {
-    "element": (["demo.element=back"], "demo.element: 'back'; allowed: front, middle, rear"),
-    "key": (["+demo.roll=1"], "demo: 'roll' is unknown"),
+    "element": (
+        ["demo.element=back"],
+        "demo.element: 'back' is unknown (allowed: front, middle, rear",
+    ),
+    "key": (["+demo.roll=1"], "demo: unknown key 'roll'"),
     "count": (["misalignments=0"], "misalignments: 0; allowed: an integer of 1 or more"),
     "range": (["tilt_range=0"], "tilt_range: 0; allowed: a positive number"),
     "photons": (["photons=0"], "photons: 0.0; allowed: 1 or more"),

@@ -1,5 +1,7 @@
 """Experiments at a size that trains in seconds; the path is the same."""
 
+from pathlib import Path
+
 TINY = [
     "renderer.sensor.height=24",
     "renderer.sensor.width=24",
@@ -40,3 +42,10 @@ TINY_DOUBLET = [
     "loss.perceptual=none",
 ]
 FIXED_WINDOWS = ["renderer=psf_window", "renderer.fields=[1,1]", "renderer.size=15"]
+
+
+def figure_names(folder: Path) -> set[str]:
+    """The figures that a run left, none of them empty."""
+    files = list((folder / "figures").iterdir())
+    assert all(file.suffix == ".png" and file.stat().st_size > 5000 for file in files), files
+    return {file.stem for file in files}

@@ -206,8 +206,11 @@ def test_float32_variables_reach_their_own_precision():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"damping": "additive"}, "damping must be one of multiplicative, identity"),
-        ({"bounds": "soft"}, "bounds must be one of active, projected"),
+        (
+            {"damping": "additive"},
+            "damping: 'additive' is unknown \\(allowed: multiplicative, identity",
+        ),
+        ({"bounds": "soft"}, "bounds: 'soft' is unknown \\(allowed: active, projected"),
         ({"merit_tolerance": -1.0}, "merit_tolerance must be at least 0 and below 1"),
         ({"initial_damping": 0.0}, "initial_damping must be positive"),
         ({"max_trials": 0}, "max_trials must be at least 1"),

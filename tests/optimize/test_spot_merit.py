@@ -290,7 +290,7 @@ def test_chief_rays_weigh_nothing(triplet):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"kind": "efg", "target": 1.0}, "kind 'efg' is unknown"),
+        ({"kind": "efg", "target": 1.0}, "kind: 'efg' is unknown"),
         ({"kind": "efl"}, "give a target, or limits"),
         ({"kind": "efl", "target": 1.0, "min": 0.5}, "give a target, or limits"),
         ({"kind": "efl", "min": 2.0, "max": 1.0}, "min exceeds max"),
@@ -310,7 +310,7 @@ def test_bad_operands_are_refused(triplet, settings, said):
     [
         ({"surfaces.1.curvature": {"pickup": "surfaces.9.curvature"}}, "no parameter"),
         ({"surfaces.1.curvature": {"pickup": "surfaces.1.curvature"}}, "one other parameter"),
-        ({"surfaces.1.curvature": {"solve": "focus"}}, "solve 'focus' is unknown"),
+        ({"surfaces.1.curvature": {"solve": "focus"}}, "solve: 'focus' is unknown"),
         ({"surfaces.1.curvature": {"solve": "best_focus"}}, "moves sensor_distance only"),
         ({"thicknesses.1": {"solve": "efl", "target": 3.0}}, "moves a curvature"),
         ({"surfaces.1.curvature": {"solve": "efl"}}, "to a target"),

@@ -85,7 +85,7 @@ BAD = {
     "not a number": ({"thicknesses.1": math.nan}, "half_range must be a positive number"),
     "distribution": (
         {"thicknesses.1": {"half_range": 0.1, "distribution": "gauss"}},
-        "thicknesses.1: distribution 'gauss' is unknown (allowed: uniform, normal)",
+        "thicknesses.1: distribution: 'gauss' is unknown (allowed: uniform, normal)",
     ),
     "relative": (
         {"thicknesses.1": {"half_range": 0.1, "relative": "yes"}},

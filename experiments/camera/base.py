@@ -1,0 +1,134 @@
+"""A camera: a lens, the way it looks at a scene, and the network that restores its images."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optimize.variables import DesignVariables
+from experiments.camera.reconstruction import (
+    Loss,
+    check_reconstruction,
+    evaluating,
+    loss_over_views,
+    restoration_of,
+)
+from experiments.camera.views.base import Comparison, Imaging, Views
+from experiments.experiment import Experiment
+
+
+class Camera(Experiment):
+    """Images textures through a lens and a sensor, restores them, and compares them with the truth.
+
+    Args:
+        lens: the lens; its other parameters than the variables stay as they are.
+        experiment: name of the experiment.
+        views: image the textures.
+        network: restores the images; see `restoration_of`.
+        loss: compares restored and true images; see `loss_terms`.
+        variables: settings of `DesignVariables`.
+        view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
+
+    Raises:
+        InputError: a setting is out of range, or the network or the loss does not fit.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        experiment: str,
+        views: Imaging,
+        network: nn.Module,
+        loss: Loss,
+        variables: Mapping[str, Mapping[str, Any] | None],
+        view_norm: float,
+    ) -> None:
+        super().__init__(lens, experiment)
+        self.variables = DesignVariables(lens, variables)
+        self.variables.write_to(self.lens)
+        self.network = restoration_of(network)
+        self.loss = loss
+        self.views = views
+        if not view_norm >= 1.0:
+            raise InputError(f"view_norm must be at least 1, not {view_norm}")
+        self.view_norm = view_norm
+        size = (views.sensor.height, views.sensor.width)
+        check_reconstruction(self.network, self.loss, size, len(views.psf_labels()))
+
+    def restore(self, taken: Views, functions: Tensor | None) -> Tensor:
+        """Return restored images (B, V, 3, H, W), display-encoded.
+
+        Args:
+            taken: what the sensor gave.
+            functions: point spread functions, or None where the network asks for none.
+        """
+        field = None if taken.field is None else taken.field.flatten(0, 1)
+        restored = self.network(taken.raw.flatten(0, 1), functions, field)
+        return restored.unflatten(0, taken.raw.shape[:2])
+
+    def loss_over_views(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:
+        """Return the loss and its terms for images (B, V, 3, H, W)."""
+        return loss_over_views(self.loss, restored, truth, self.view_norm)
+
+    def take(
+        self,
+        values: Mapping[str, Tensor],
+        batch: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> tuple[Views, Tensor | None]:
+        """Image textures, and find point spread functions where the network asks for them.
+
+        Both are computed in the lens's own precision, whatever the trainer's is.
+
+        Args:
+            values: the lens's variables.
+            batch: textures (B, 3, h, w), linear light.
+            stage: `train`, `val` or `test`.
+            index: of the batch; with the stage and the seed it decides all random numbers.
+            judge: the renderer that makes the images; None: the camera's own.
+        """
+        with torch.autocast(self.device.type, enabled=False):
+            taken = self.views.take(self.lens, values, batch, stage, index, judge)
+            return taken, self.functions(values)
+
+    def functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
+        """Return point spread functions (views, 3, K, K); None if the network asks for none."""
+        if not self.network.needs_point_spread_function:
+            return None
+        return self.views.point_spread_functions(self.lens, values)
+
+    def comparison(self) -> Comparison | None:
+        """Return the loss as a function of images, for a renderer that compares gradients.
+
+        It is None where no variable of the lens is trained.
+        """
+        if not len(self.variables):
+            return None
+
+        def loss(taken: Views, values: Mapping[str, Tensor]) -> Tensor:
+            functions = self.functions(values)
+            # No statistics or dropout of its own may move while gradients are compared.
+            with evaluating(self.network):
+                restored = self.restore(taken, functions)
+            return self.loss_over_views(restored, taken.truth.to(restored.dtype))["total"]
+
+        return Comparison([self.variables.scaled], self.variables, loss)
+
+    def identity(self) -> dict[str, Any]:
+        """Return the experiment, the lens, the variables' names and the network's shapes."""
+        return {
+            **super().identity(),
+            "variables": list(self.variables.names),
+            "network": ", ".join(f"{n} {tuple(p.shape)}" for n, p in _shapes(self.network)),
+        }
+
+
+def _shapes(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    """Return the first and last parameters, which tell networks of other widths or kinds apart."""
+    parameters = list(module.named_parameters())
+    return iter([parameters[0], parameters[-1]]) if parameters else iter([])

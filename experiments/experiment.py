@@ -1,0 +1,131 @@
+"""The contract between a run and the Lightning module that it trains and tests."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import lightning
+from matplotlib.figure import Figure
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+# Name → a function that draws the figure.  Nothing is drawn until somebody wants to keep it.
+Figures = Mapping[str, Callable[[], Figure]]
+
+
+class Experiment(lightning.LightningModule):
+    """A lens and the work that is done with it.
+
+    A subclass adds Lightning's own methods (`training_step`, `test_step`, ...) and overrides the
+    methods below that it needs; each has a default.  A run uses them as follows:
+
+    - `lens` is written to lens/initial.yaml before the work and to lens/final.yaml after it.
+    - `summary()` adds numbers to metrics.json.
+    - `figures()` are drawn after the test, `training_figures()` during training.
+    - `identity()` is stored in each checkpoint, and a checkpoint with another one is refused.
+    - `checkpoint_state()` is stored in each checkpoint beside the weights.
+
+    Args:
+        lens: the lens; its parameters get `requires_grad=False`.
+        experiment: the name of the experiment, as in `experiment=<name>`.
+        folder: the run folder, for tables; None: the experiment writes none.
+
+    Attributes:
+        trains: whether there is anything to train; False makes `train=true` an error.
+    """
+
+    trains: ClassVar[bool] = True
+
+    def __init__(self, lens: Lens, experiment: str, folder: str | Path | None = None) -> None:
+        super().__init__()
+        self.lens = lens.requires_grad_(False)
+        self.experiment = experiment
+        self.folder = None if folder is None else Path(folder)
+
+    def summary(self) -> dict[str, float]:
+        """Return numbers about the whole run for metrics.json; called once, when it is done."""
+        return {}
+
+    def figures(self) -> Figures:
+        """Return the figures of a finished test: name of the file without suffix → function."""
+        return {}
+
+    def training_figures(self) -> Figures:
+        """Return the figures that are logged every few epochs, after validation."""
+        return {}
+
+    # ---------------------------------------------------------------- checkpoints
+
+    def identity(self) -> dict[str, Any]:
+        """Return what a checkpoint must have in common with this module, as plain values."""
+        return {"experiment": self.experiment, "lens": self.lens.name}
+
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return what a checkpoint holds besides weights and optimizers.
+
+        Returns:
+            Plain values and tensors, under keys that Lightning does not use.
+        """
+        return {}
+
+    def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
+        """Take up what `checkpoint_state` has stored.
+
+        Args:
+            checkpoint: the whole checkpoint.
+        """
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Store the identity and the state."""
+        checkpoint["dolens"] = self.identity()
+        checkpoint.update(self.checkpoint_state())
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint of another experiment before any weight is loaded.
+
+        Raises:
+            InputError: the identities differ.
+        """
+        refuse_another(checkpoint.get("dolens"), self.identity())
+        self.load_checkpoint_state(checkpoint)
+
+
+def check_experiment(module: Any, train: bool) -> None:
+    """Check that a run can use a module.
+
+    Args:
+        module: the object that the configuration's `module` has made.
+        train: whether the run is to train it.
+
+    Raises:
+        InputError: it is no `Experiment`, or it trains nothing and is to be trained.
+    """
+    kind = type(module).__name__
+    if not isinstance(module, Experiment):
+        raise InputError(
+            f"module: {kind} is no experiment; derive it from experiments.experiment.Experiment, "
+            "or from experiments.analysis.Analysis if it trains nothing"
+        )
+    if train and not module.trains:
+        raise InputError(f"train: {kind} trains nothing; set train=false")
+
+
+def refuse_another(found: Any, own: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint whose module says that it is another one.
+
+    Args:
+        found: what the checkpoint says of its module.
+        own: what this run's module says of itself.
+
+    Raises:
+        InputError: they differ; the message names the first difference.
+    """
+    if not isinstance(found, Mapping):
+        raise InputError("ckpt_path: this file is no checkpoint of a dolens experiment")
+    for key, value in own.items():
+        if found.get(key) != value:
+            raise InputError(
+                f"ckpt_path: the checkpoint's {key} is {found.get(key)!r}, this run's is "
+                f"{value!r}; resume with the experiment and settings that wrote it"
+            )

@@ -1,0 +1,144 @@
+"""The figure of elements named, and of errors of their poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from dolens.alignment.pixel_moments import Pixels
+from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from experiments.poses.alignment_result import COLUMNS, Alignment
+
+_PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Describes the simulated measurement, for titles and lines.
+
+    Attributes:
+        lens: the name of the lens.
+        fields: the number of fields.
+        photons: photons of each spot.
+        pixels: pixels of the sensor; None: an ideal one.
+        sensor: the parts of the sensor's place that are unknown.
+    """
+
+    lens: str
+    fields: int
+    photons: float
+    pixels: Pixels | None
+    sensor: Sequence[str]
+
+
+def alignment_figure(found: Alignment, setup: Setup) -> Figure:
+    """Draw elements misaligned against elements named, and errors beside their bounds.
+
+    Where the place of the sensor is unknown, its own errors are beside them.
+    """
+    unknown = bool(setup.sensor)
+    figure = Figure(figsize=(14.0 if unknown else 11.0, 3.6), layout="constrained")
+    left, *others = figure.subplots(1, 3 + unknown, width_ratios=(0.8, *[1.0] * (2 + unknown)))
+    _confusion(left, found)
+    for axes, (name, columns, unit) in zip(others, _PANELS, strict=False):
+        _errors(axes, found, name, columns, unit, unknown)
+    if unknown:
+        _sensor_errors(others[-1], found, setup.sensor)
+    photons = f"{setup.photons:_.0f}".replace("_", " ")
+    figure.suptitle(
+        f"{setup.lens}: {len(found.element) - 1} misalignments from {setup.fields} fields"
+        f", {photons} photons a spot{_sensor(setup)}",
+        fontsize=TITLE,
+    )
+    return figure
+
+
+def _sensor(setup: Setup) -> str:
+    """Return the pixels and the unknown parts of their place, for the title."""
+    pixels, unknown = setup.pixels, setup.sensor
+    text = ""
+    if pixels is not None:
+        text = f"; {1e3 * pixels.pitch:.3g} µm pixels, {pixels.read_noise:.3g} e⁻ read noise"
+    if unknown:
+        shift, focus = "sensor_x" in unknown, "sensor_distance" in unknown
+        what = " and ".join(["shift"] * shift + ["focus"] * focus)
+        text += f"; sensor's {what} unknown"
+    return text
+
+
+def _confusion(axes: Axes, found: Alignment) -> None:
+    names = found.elements
+    count = len(names)
+    # The demo is a case of its own, not of the batch.
+    pairs = (found.element * count + found.named)[1:]
+    table = torch.bincount(pairs, minlength=count * count).reshape(count, count)
+    share = table / table.sum(1, keepdim=True).clamp(min=1)
+    axes.imshow(share.numpy(), cmap="Blues", vmin=0.0, vmax=1.0)
+    for row in range(count):
+        for column in range(count):
+            pale = float(share[row, column]) > 0.5
+            text = str(int(table[row, column]))
+            colour = "white" if pale else "black"
+            axes.text(column, row, text, ha="center", va="center", color=colour, fontsize=TITLE)
+    axes.set_xticks(range(count), names, fontsize=SMALL)
+    axes.set_yticks(range(count), names, fontsize=SMALL)
+    axes.set_xlabel("element named", fontsize=SMALL + 1)
+    axes.set_ylabel("element misaligned", fontsize=SMALL + 1)
+
+
+def _errors(
+    axes: Axes, found: Alignment, name: str, columns: slice, unit: str, sensor_unknown: bool
+) -> None:
+    errors = found.errors(columns)
+    # The expected square of the error's length is the sum of the variances.
+    bound = found.bound[:, columns].norm(dim=1)
+    known = (found.bound[:, :4] / found.bound_ratio)[:, columns].norm(dim=1)
+    batch = torch.arange(len(errors)) > 0
+    for number, (element, colour) in enumerate(
+        zip(found.elements, colours(len(found.elements)), strict=True)
+    ):
+        mine = batch & (found.element == number)
+        if not bool(mine.any()):
+            continue
+        _spread(axes, errors[mine], bound[mine], colour, element)
+        if sensor_unknown:
+            median = float(known[mine].median())
+            axes.axvline(median, color=colour, linewidth=1.0, linestyle="--")
+    _finish(axes, f"error of the {name}, {unit}", sensor_unknown)
+
+
+def _sensor_errors(axes: Axes, found: Alignment, sensor: Sequence[str]) -> None:
+    """Draw the errors of all elements together: the length across the axis, and along it."""
+    pose = len(COLUMNS)
+    difference = (found.found - found.true)[1:, pose:]
+    bound = found.bound[1:, pose:]
+    along = torch.tensor([name == "sensor_distance" for name in sensor])
+    for chosen, colour, name in ((~along, "0.2", "shift"), (along, "0.6", "focus")):
+        if bool(chosen.any()):
+            errors = difference[:, chosen].norm(dim=1)
+            _spread(axes, errors, bound[:, chosen].norm(dim=1), colour, name)
+    _finish(axes, "error of the sensor's place, µm", False)
+
+
+def _spread(axes: Axes, errors: Tensor, bound: Tensor, colour: str, label: str) -> None:
+    """Draw how many of (K,) errors are below each, and the median of their bounds."""
+    ordered = errors.sort().values.clamp(min=1e-12)
+    share = 100.0 * torch.arange(1, len(ordered) + 1) / len(ordered)
+    axes.plot(ordered.numpy(), share.numpy(), color=colour, linewidth=1.5, label=label)
+    axes.axvline(float(bound.median()), color=colour, linewidth=1.0, linestyle=":")
+
+
+def _finish(axes: Axes, label: str, known: bool) -> None:
+    axes.plot([], [], color="0.4", linewidth=1.0, linestyle=":", label="bound on the RMS")
+    if known:
+        axes.plot([], [], color="0.4", linewidth=1.0, linestyle="--", label="with the sensor known")
+    axes.set_xscale("log")
+    axes.set_ylim(0.0, 101.0)
+    axes.set_xlabel(label, fontsize=SMALL + 1)
+    axes.set_ylabel("share of misalignments, %", fontsize=SMALL + 1)
+    ruled_axes(axes)
+    # Lines of bounds pass behind it.
+    axes.legend(framealpha=0.9, edgecolor="none", fontsize=SMALL, loc="upper left")

@@ -1,0 +1,166 @@
+"""Figures of Cramér–Rao bounds for arrangements of sources and planes."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dolens.plotting.corner import corner_figure
+from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from experiments.experiment import Figures
+from experiments.poses.arrangement import UNSEEN, Arrangement
+from experiments.poses.labels import variable_label
+
+_MARKERS = "osD^vP*X"
+
+
+def knowledge_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:
+    """Return `knowledge`, and `corner_<arrangement>` of those that tell all variables.
+
+    Args:
+        arrangements: what was found.
+        name: the name of the lens.
+        photons: of all images of an arrangement together.
+    """
+    figures = {"knowledge": partial(_overview, arrangements, name, photons)}
+    for found in arrangements:
+        if float(found.spread[0]) < UNSEEN:
+            figures[f"corner_{found.name}"] = partial(_corner, found, name)
+    return figures
+
+
+def _overview(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figure:
+    figure = Figure(figsize=(11.5, 7.4), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.8))
+    left, right = above.subplots(1, 2, width_ratios=(1.5, 1.0))
+    _bounds(left, arrangements)
+    _spectrum(right, arrangements)
+    axes = below.subplots(1, 1)
+    _worst(axes, arrangements, below)
+    figure.suptitle(
+        f"{name}: what images of {photons:.3g} photons in all tell of its pose",
+        fontsize=TITLE,
+    )
+    return figure
+
+
+def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
+    """Draw bounds of each variable over its scale, a mark for each arrangement."""
+    names = _names(arrangements)
+    units = {
+        n: u for f in arrangements for n, u in zip(f.pose.names, f.pose.unit_names, strict=True)
+    }
+    scales = {
+        n: float(s)
+        for f in arrangements
+        for n, s in zip(f.pose.names, f.pose.file_scale, strict=True)
+    }
+    far = 0.0
+    for found in arrangements:
+        for name, bound in zip(found.pose.names, found.bounds.tolist(), strict=True):
+            share = bound / scales[name]
+            far = max(far, share if share < UNSEEN else 0.0)
+    for number, (found, colour) in enumerate(_coloured(arrangements)):
+        for row, name in enumerate(names):
+            if name not in found.pose.names:
+                continue
+            share = float(found.bounds[found.pose.names.index(name)]) / scales[name]
+            seen = share < UNSEEN
+            offset = 0.13 * (number - 0.5 * (len(arrangements) - 1))
+            axes.plot(
+                share if seen else 8.0 * far,
+                row + offset,
+                _MARKERS[number % len(_MARKERS)] if seen else ">",
+                color=colour,
+                markersize=5 if seen else 7,
+                markerfacecolor=colour if seen else "none",
+            )
+    labels = [f"{variable_label(name)}\n(1 = {scales[name]:g} {units[name]})" for name in names]
+    axes.set_yticks(range(len(names)), labels, fontsize=SMALL)
+    axes.set_xscale("log")
+    axes.invert_yaxis()
+    axes.set_xlabel("bound over scale (▷: cannot be seen)", fontsize=SMALL + 1)
+    ruled_axes(axes)
+
+
+def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
+    """Draw standard deviations of combinations, from the worst known to the best."""
+    for number, (found, colour) in enumerate(_coloured(arrangements)):
+        spread = found.spread.clone()
+        unseen = int((spread > UNSEEN).sum())
+        spread[:unseen] = torch.nan
+        label = _label(found) if not unseen else f"{_label(found)} ({unseen} cannot be seen)"
+        axes.plot(
+            np.arange(1, len(spread) + 1),
+            spread.numpy(),
+            marker=_MARKERS[number % len(_MARKERS)],
+            color=colour,
+            linewidth=1.0,
+            markersize=5,
+            label=label,
+        )
+    axes.set_yscale("log")
+    axes.set_xlabel("combination, from the worst known to the best", fontsize=SMALL + 1)
+    axes.set_ylabel("standard deviation, of scales", fontsize=SMALL + 1)
+    ruled_axes(axes)
+    axes.legend(frameon=False, fontsize=SMALL)
+
+
+def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> None:
+    """Draw the parts of the worst known combination of each arrangement."""
+    names = _names(arrangements)
+    table = np.full((len(arrangements), len(names)), np.nan)
+    for row, found in enumerate(arrangements):
+        worst = found.combinations[0]
+        # Of one sign: its largest part is positive.
+        worst = worst * torch.sign(worst[worst.abs().argmax()])
+        for name, part in zip(found.pose.names, worst.tolist(), strict=True):
+            table[row, names.index(name)] = part
+    shown = axes.imshow(table, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto")
+    for row, column in np.argwhere(np.isfinite(table)):
+        value = table[row, column]
+        if abs(value) >= 0.005:
+            text = f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
+            pale = "white" if abs(value) > 0.6 else "black"
+            axes.text(column, row, text, ha="center", va="center", fontsize=SMALL, color=pale)
+    axes.set_facecolor("0.93")
+    labels = []
+    for found in arrangements:
+        spread = float(found.spread[0])
+        labels.append(
+            f"{_label(found)}\nσ = {spread:.2g}" if spread < UNSEEN else f"{_label(found)}\n∞"
+        )
+    axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
+    axes.set_xticks(range(len(names)), [variable_label(n) for n in names], fontsize=SMALL)
+    axes.set_title("the combination that each knows worst", fontsize=SMALL + 1)
+    figure.colorbar(shown, ax=axes, pad=0.01).ax.tick_params(labelsize=SMALL)
+
+
+def _corner(found: Arrangement, name: str) -> Figure:
+    units = found.pose.units
+    values = torch.tensor(list(found.pose.file_values().values()), dtype=torch.float64)
+    return corner_figure(
+        found.known.covariance / torch.outer(units, units),
+        [variable_label(name) for name in found.pose.names],
+        found.pose.unit_names,
+        values,
+        found.estimates,
+        values if found.estimates is not None else None,
+        f"{name}, {_label(found)}: Cramér–Rao",
+    )
+
+
+def _label(found: Arrangement) -> str:
+    return found.name.replace("_", " ")
+
+
+def _names(arrangements: Sequence[Arrangement]) -> list[str]:
+    """Return the names of all variables of all arrangements."""
+    return list(dict.fromkeys(name for f in arrangements for name in f.pose.names))
+
+
+def _coloured(arrangements: Sequence[Arrangement]) -> zip:
+    return zip(arrangements, colours(len(arrangements)), strict=True)

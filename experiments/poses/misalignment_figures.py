@@ -1,0 +1,142 @@
+"""Figures of poses that were fitted: images, convergence, and bounds."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Protocol
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from dolens.alignment.information import Knowledge
+from dolens.alignment.measurement import Measurement
+from dolens.alignment.pose import Pose
+from dolens.optics.lens import Lens
+from dolens.plotting.convergence import convergence_figure
+from dolens.plotting.corner import corner_figure
+from dolens.plotting.spot_fit import spot_fit_figure
+from dolens.rendering.spot_image import SpotImage
+from dolens.sensor.pixels import Sensor
+from experiments.experiment import Figures
+from experiments.poses.estimates import Estimates
+from experiments.poses.labels import variable_label
+from experiments.poses.settings import Fit, Stage
+from experiments.tables import Row
+
+
+class FittedPoses(Protocol):
+    """Describes poses that were fitted to measurements, one fit after another.
+
+    Attributes:
+        lens: as designed.
+        sensor: the pixels.
+        fits: settings of each fit.
+        poses: the pose of each fit, as it was found.
+        stages: of every fit.
+        initial: (P,), the variables where each fit began.
+        history: a row of numbers for every iteration.
+        known: name of a fit → the information in its measurement.
+        estimates: name of a fit → estimates from other measurements, where there are any.
+    """
+
+    lens: Lens
+    sensor: Sensor
+    fits: Sequence[Fit]
+    poses: Sequence[Pose]
+    stages: Sequence[Stage]
+    initial: Sequence[Tensor]
+    history: Sequence[Row]
+    known: Mapping[str, Knowledge]
+    estimates: Mapping[str, Estimates]
+
+    def truth(self, number: int) -> Mapping[str, float]:
+        """Return the true values of a fit's variables, as far as they are known."""
+
+    def measurement(self, number: int) -> Measurement:
+        """Return the measurement of a fit."""
+
+    def images(self, number: int, scaled: Tensor | None = None) -> Sequence[SpotImage]:
+        """Return the images of a fit's pose, or of other values of its variables."""
+
+
+def misalignment_figures(fitted: FittedPoses) -> Figures:
+    """Return `spots`, and for each fit `convergence_<fit>` and `corner_<fit>`.
+
+    A fit that made no iteration has no convergence.
+    """
+    figures = {"spots": partial(_spots, fitted)}
+    for number, fit in enumerate(fitted.fits):
+        if any(row["fit"] == fit.name for row in fitted.history):
+            figures[f"convergence_{fit.name}"] = partial(_convergence, fitted, number)
+        figures[f"corner_{fit.name}"] = partial(_corner, fitted, number)
+    return figures
+
+
+def _spots(fitted: FittedPoses) -> Figure:
+    measured, initial, final, labels = [], [], [], []
+    for number, fit in enumerate(fitted.fits):
+        measurement = fitted.measurement(number)
+        shares = measurement.shares
+        measured.append(shares)
+        for kept, scaled in ((initial, fitted.initial[number]), (final, None)):
+            images = enumerate(fitted.images(number, scaled))
+            kept.append(torch.stack([measurement.as_seen(image, s)[0] for s, image in images]))
+        sources = [f", source {source + 1}" for source in range(len(shares))]
+        labels += [f"fit {fit.name}{source if len(shares) > 1 else ''}" for source in sources]
+    return spot_fit_figure(
+        torch.cat(measured),
+        torch.cat(initial),
+        torch.cat(final),
+        labels,
+        fitted.sensor.pixel_pitch,
+        f"{fitted.lens.name}: measured and modelled images",
+    )
+
+
+def _convergence(fitted: FittedPoses, number: int) -> Figure:
+    fit, pose = fitted.fits[number], fitted.poses[number]
+    rows = [row for row in fitted.history if row["fit"] == fit.name]
+    stages = [
+        (optimizer, len(list(group)))
+        for (_, optimizer), group in itertools.groupby(
+            rows, key=lambda row: (row["stage"], row["optimizer"])
+        )
+    ]
+    values = {
+        variable_label(name): ([float(row[name]) for row in rows], unit)
+        for name, unit in zip(pose.names, pose.unit_names, strict=True)
+    }
+    truth = fitted.truth(number)
+    losses = {stage.loss for stage in fitted.stages}
+    return convergence_figure(
+        [float(row["loss"]) for row in rows],
+        values,
+        stages,
+        {variable_label(name): truth[name] for name in pose.names if name in truth},
+        f"{fitted.lens.name}: convergence of fit {fit.name}",
+        "loss: S21, then χ² of a pixel" if len(losses) > 1 else "loss",
+    )
+
+
+def _corner(fitted: FittedPoses, number: int) -> Figure:
+    fit, pose = fitted.fits[number], fitted.poses[number]
+    units = pose.units.cpu()
+    covariance = fitted.known[fit.name].covariance.cpu() / torch.outer(units, units)
+    found = torch.tensor([pose.file_values()[name] for name in pose.names], dtype=torch.float64)
+    truth = fitted.truth(number)
+    true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
+    estimates = fitted.estimates.get(fit.name)
+    points = None if estimates is None else estimates.values
+    # Estimates scatter about the truth, where that is known; the truth lies about one estimate.
+    about_truth = points is not None and bool(true.isfinite().all())
+    return corner_figure(
+        covariance,
+        [variable_label(name) for name in pose.names],
+        pose.unit_names,
+        true if about_truth else found,
+        points,
+        true if truth else None,
+        f"{fitted.lens.name}: how well fit {fit.name} knows its pose (Cramér–Rao)",
+    )

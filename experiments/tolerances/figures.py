@@ -1,0 +1,120 @@
+"""Figures of a tolerance analysis."""
+
+from collections.abc import Sequence
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from dolens.plotting.tolerances import (
+    matrix_figure,
+    offenders_figure,
+    parameter_label,
+    yield_figure,
+)
+from dolens.tolerancing import ToleranceAnalysis
+from experiments.experiment import Figures
+from experiments.tolerances.tables import per_unit
+
+_MOST_OFFENDERS = 20
+_UNIT_WORDS = {"deg": "µm per degree", "mm": "µm per mm", "%": "µm per %", "1/mm": "µm per 1/mm"}
+
+
+def tolerance_figures(
+    found: ToleranceAnalysis, name: str, spots: Sequence[str], weights: Tensor
+) -> Figures:
+    """Return Jacobians as matrices, yield curves, and the worst offenders.
+
+    Args:
+        found: the analysis.
+        name: the name of the lens, for titles.
+        spots: labels of its S spots.
+        weights: (S,), weights of the spots, of sum 1.
+    """
+    s, t, c = found.sensitivities, found.tolerances, found.contributions
+    spots = list(spots)
+    blocks = [("x", len(spots)), ("y", len(spots))]
+    motion = s.centroid_jacobian.transpose(0, 1).flatten(0, 1)
+    labels = [parameter_label(parameter) for parameter in t.names]
+    with_tolerance = [f"{label}  {t.label(p)}" for p, label in enumerate(labels)]
+    scale = 1e3 * per_unit(t)
+    first = c.order[:_MOST_OFFENDERS]
+    ends = s.rms_at_ends_refocused.square() - s.rms_refocused.square()
+    return {
+        "centroid_jacobian": lambda: matrix_figure(
+            _by_unit(motion * scale, labels, t.unit_names),
+            spots * 2,
+            blocks,
+            f"{name}: how spots move (Jacobian of their centroids)",
+        ),
+        "centroid_by_tolerance": lambda: matrix_figure(
+            {"µm": (1e3 * motion * s.steps, with_tolerance)},
+            spots * 2,
+            blocks,
+            f"{name}: how far a whole tolerance moves spots",
+        ),
+        "rms_jacobian": lambda: matrix_figure(
+            _by_unit(s.rms_jacobian * scale, labels, t.unit_names),
+            spots,
+            title=f"{name}: Jacobian of the spots' RMS radii",
+        ),
+        "rms_by_tolerance": lambda: matrix_figure(
+            {
+                "growth of RMS to first order, not refocused, µm": (
+                    1e3 * s.rms_jacobian * s.steps,
+                    with_tolerance,
+                ),
+                "RMS² at the worse end less that as designed, refocused, µm²": (
+                    1e6 * ends.amax(0).T,
+                    with_tolerance,
+                ),
+            },
+            spots,
+            title=f"{name}: what a whole tolerance does to the spots' RMS radii",
+        ),
+        "yield": lambda: _yields(found, name, weights),
+        "worst_offenders": lambda: offenders_figure(
+            [with_tolerance[p] for p in first],
+            c.share[first].tolist(),
+            {
+                "refocused": s.increase()[first].tolist(),
+                "not refocused": s.increase(refocused=False)[first].tolist(),
+            },
+            f"{name}: worst offenders",
+        ),
+    }
+
+
+def _yields(found: ToleranceAnalysis, name: str, weights: Tensor) -> Figure:
+    outcomes = {
+        f"{how}, {stage}": outcome.found(stage == "refocused")
+        for stage in ("refocused", "not refocused")
+        for how, outcome in (("Monte Carlo", found.traced), ("linear", found.linear))
+    }
+    design = found.sensitivities.rms_refocused.square()
+    mean, worst = "RMS radius over all spots", "RMS radius of the worst spot"
+    return yield_figure(
+        {
+            mean: {label: radii.rms for label, radii in outcomes.items()},
+            worst: {label: radii.worst for label, radii in outcomes.items()},
+        },
+        {
+            mean: float((design @ weights).sqrt()),
+            worst: float(design[weights > 0.0].amax().sqrt()),
+        },
+        f"{name}: {len(found.errors)} lenses drawn from the tolerances",
+    )
+
+
+def _by_unit(
+    matrix: Tensor, labels: list[str], units: tuple[str, ...]
+) -> dict[str, tuple[Tensor, list[str]]]:
+    """Return a panel for each unit, since numbers of several units share no scale."""
+    panels = {}
+    for unit in dict.fromkeys(units):
+        columns = [p for p, other in enumerate(units) if other == unit]
+        panels[_UNIT_WORDS.get(unit, "µm per unit")] = (
+            matrix[:, torch.tensor(columns)],
+            [labels[p] for p in columns],
+        )
+    return panels
