@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError
+from experiments.running.renaming import explained
 from experiments.running.training import run
 
 
@@ -23,15 +24,19 @@ def main(cfg: DictConfig) -> float:
         sys.exit(one_line(error.__cause__ if isinstance(error.__cause__, InputError) else error))
 
 
-def one_line(error: BaseException) -> str:
+def one_line(problem: object) -> str:
     """The message of a user's mistake, on one line."""
-    return "error: " + " ".join(str(error).split())
+    return "error: " + " ".join(str(problem).split())
 
 
 if __name__ == "__main__":
     # Let errors through to here: a user's mistake is one line, a fault keeps its whole traceback.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    if {"--help", "-h"} & set(sys.argv) and not any("experiment=" in a for a in sys.argv):
+        sys.argv.append("~experiment")  # what there is to choose from can be shown without a choice
     try:
         main()
-    except (HydraException, OmegaConfBaseException) as error:
+    except HydraException as error:
+        sys.exit(one_line(explained(error, sys.argv[1:])))
+    except OmegaConfBaseException as error:
         sys.exit(one_line(error))

@@ -3,7 +3,8 @@
     python scripts/reproduce.py outputs/wavefront_coding/<date_time> [--into FOLDER]
 
 The overrides come from `.hydra/overrides.yaml`, the expected numbers from `metrics.json`.  When the
-code is not the commit that `run.json` names, the script says so and goes on.
+code is not the commit that `run.json` names, the script says so and goes on; settings that have
+other names since then are translated, and each is named.
 """
 
 import argparse
@@ -13,6 +14,8 @@ import sys
 from pathlib import Path
 
 import yaml
+
+from experiments.running.renaming import translated
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,6 +38,9 @@ def main() -> int:
     ).stdout.strip()
     if commit != here:
         print(f"note: the run was made by commit {commit}, this is {here}")
+    overrides, changes = translated([forced(override) for override in overrides])
+    for change in changes:
+        print(f"note: {change}")
     command = [sys.executable, str(ROOT / "train.py"), *overrides, f"hydra.run.dir={into}"]
     done = subprocess.run(command, cwd=ROOT, check=False)
     if done.returncode:
@@ -51,6 +57,13 @@ def main() -> int:
             print(f"{name}: {value} then, {found.get(name)} now")
     print("reproduced" if not differing else f"{differing} metrics differ")
     return int(differing > 0)
+
+
+def forced(override: str) -> str:
+    """An override that adds a setting, so that it also stands where the setting is there now."""
+    key = override.removeprefix("+").partition("=")[0]
+    is_setting = override[:1] == "+" != override[1:2] and not (ROOT / "conf" / key).is_dir()
+    return f"+{override}" if is_setting and "@" not in key else override
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ def knowledge(
         own = own / own.norm()
         along = (derivatives * own).sum((-2, -1), keepdim=True)
         rows.append(blurred(derivatives - along * own, blur).flatten(1))
-    return Knowledge(pose.names, exposure * shares, noise, torch.cat(rows, 1).T, blur)
+    return Knowledge(tuple(pose.names), exposure * shares, noise, torch.cat(rows, 1).T, blur)
 
 
 def covariance_of(root: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
 """Ray intercepts on the sensor are computed for many fields and wavelengths, by points of the stop.
 
 Aiming a ray at a point of the stop costs far more than tracing it.  A few dozen rays are therefore
-aimed, the points where they start are fitted by a polynomial in the stop coordinates, and thousands
-start where the polynomial says.  Each is exactly a ray of its field: what the fit leaves is where
-it crosses the stop, by some 1e-4 of the stop's semi-diameter or less.
+aimed, their starting points are fitted by a polynomial in the stop coordinates, and thousands of
+rays start at values of the polynomial.  Each is exactly a ray of its field.  The error of the fit
+moves its crossing of the stop by some 1e-4 of the stop's semi-diameter or less.
 """
 
 import copy
@@ -40,8 +40,8 @@ class RayIntercepts:
         wavelengths: (W,), nm.
         points: (F, W, N, 2), mm, double precision; NaN where a ray does not pass.
         valid: (F, W, N), bool.
-        chief: (F, 2), mm, where the chief rays of the reference wavelength land, whether apertures
-            clip them or not; NaN where one does not reach the sensor.
+        chief: (F, 2), mm, intercepts of the chief rays of the reference wavelength, whether
+            apertures clip them or not; NaN where one does not reach the sensor.
     """
 
     fields: Tensor

@@ -25,7 +25,7 @@ class SpotDiagram:
     """A `SpotDiagram` holds spots of F fields and W wavelengths by N points of the stop, in double
     precision on the CPU.
 
-    What no light reaches is NaN.
+    Values of fields or wavelengths that no light reaches are NaN.
 
     Attributes:
         fields: (F, 2), degrees or mm.
@@ -36,7 +36,7 @@ class SpotDiagram:
         valid: (F, W, N), bool.
         weight: (N,), share of a ray in the light through the stop; zero for rays on its rim.
         wavelength_weight: (W,), shares of the wavelengths in polychromatic values.
-        chief: (F, 2), mm, where the chief ray of the reference wavelength lands.
+        chief: (F, 2), mm, intercept of the chief ray of the reference wavelength.
         centroid: (F, W, 2), mm.
         rms: (F, W), mm, √(Σ w·|p - p̄|²) about the spot's own centroid.
         geo: (F, W), mm, the largest |p - p̄|; over the rim of the stop too, but no nearer to an edge

@@ -6,12 +6,14 @@ degrees.  This module alone converts between the two.
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from dolens.optics.elements import DISPLACEMENTS, TILTS
+
+Value = TypeVar("Value", float, Tensor)
 
 
 class Unit(NamedTuple):
@@ -44,20 +46,19 @@ def unit_of(name: str) -> Unit:
     """Return the unit of a parameter in files and configuration.
 
     Args:
-        name: as `surfaces.1.curvature`, `elements.front.tilt_x` or `sources.1.z`; a pattern, too,
-            whose last part names the parameter.
+        name: as `surfaces.1.curvature`, `elements.front.tilt_x` or `sources.1.z`.
     """
     first, _, _ = name.partition(".")
     _, _, last = name.rpartition(".")
     return _UNIT_OF_GROUP.get(first) or _UNIT_OF.get(last, UNNAMED)
 
 
-def to_lens_units(name: str, value: float) -> float:
+def to_lens_units(name: str, value: Value) -> Value:
     """Convert a parameter's value from files (degrees, mm) to the lens's own unit (radians, mm)."""
     return value * unit_of(name).factor
 
 
-def to_file_units(name: str, value: float) -> float:
+def to_file_units(name: str, value: Value) -> Value:
     """Convert a parameter's value from the lens's own unit (radians, mm) to that of files."""
     return value / unit_of(name).factor
 
@@ -74,7 +75,7 @@ def file_value(name: str, value: float) -> float | None:
     Returns:
         None where rounding skips the value, so that no number of degrees stands for it.
     """
-    guess = to_file_units(name, value)
+    guess = value * (1.0 / unit_of(name).factor)
     for candidate in (guess, math.nextafter(guess, -math.inf), math.nextafter(guess, math.inf)):
         if to_lens_units(name, candidate) == value:
             return candidate

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_lens_units
 from dolens.optics.paraxial import first_order, surface_matrix
 
 SOLVES = ("efl", "paraxial_focus", "best_focus")
@@ -35,7 +36,7 @@ class Pickup:
         name: the parameter that follows.
         source: the one that it follows, of the same shape.
         factor: without a unit.
-        offset: in the parameter's unit.
+        offset: in the lens's own unit of the parameter.
     """
 
     name: str
@@ -108,8 +109,8 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
 
     Args:
         name: the parameter that follows.
-        settings: `pickup` with `factor` and `offset`; or `solve` with `target` (of `efl`) or
-            `defocus` (of `paraxial_focus`).
+        settings: `pickup` with `factor` and `offset` (in the unit of files); or `solve` with
+            `target` (of `efl`) or `defocus` (of `paraxial_focus`), mm.
         lens: whose wavelength and object distance count.
 
     Returns:
@@ -131,7 +132,7 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
             name,
             source,
             _number(name, settings, "factor", 1.0),
-            _number(name, settings, "offset", 0.0),
+            to_lens_units(name, _number(name, settings, "offset", 0.0)),
         )
     solve = settings["solve"]
     if solve == "efl":

@@ -3,7 +3,6 @@
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -11,29 +10,12 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.image_quality import ImageQuality, QualityValues, without_edges
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operands import Operand, UnreachableField, View
+from dolens.optimize.operand_values import OperandValue, OperandValues, evaluate_operands
+from dolens.optimize.operands import Operand, UnreachableField
 from dolens.optimize.variables import DesignVariables
-
-
-@dataclass(frozen=True)
-class OperandValue:
-    """An operand at a point of the search.
-
-    Attributes:
-        label: its kind, and which gap or field.
-        value: in its own unit.
-        deviation: from its target, or beyond its limits.
-        weight: of the deviation.
-    """
-
-    label: str
-    value: float
-    deviation: float
-    weight: float
 
 
 class MeritFunction:
@@ -108,10 +90,7 @@ class MeritValue:
             self._found = _operands(merit, self._sensor if merit.variables.best_focus else None)
         self.operands: list[OperandValue] | None = None
         if self._found is not None:
-            self.operands = [
-                OperandValue(label, value.item(), operand.deviation(value).item(), operand.weight)
-                for operand, label, value in self._found
-            ]
+            self.operands = self._found.numbers()
 
     @torch.no_grad()
     def write_to(self, lens: Lens) -> None:
@@ -144,8 +123,8 @@ class MeritValue:
             if merit.variables.best_focus:
                 values["sensor_distance"] = merit.lens.sensor_distance.detach()
             parts.append(merit.quality.loss(merit.opened, values))
-        for operand, _, value in _operands(merit) or []:
-            parts.append((operand.weight * operand.deviation(value)).square().reshape(()))
+        found = _operands(merit)
+        parts += found.penalties() if found is not None else []
         return torch.stack([part.double() for part in parts]).sum()
 
     def linear_model(self) -> LinearModel:
@@ -157,10 +136,8 @@ class MeritValue:
             models.append(model.of_variables(matrix))
             self._focus = None if of_lens is None else of_lens @ matrix
         if self.operands:
-            owners, _, values = zip(*self._found, strict=True)
-            found = torch.stack([value.detach().reshape(()).double().cpu() for value in values])
-            model = OperandModel(owners, found, self.operand_derivatives())
-            models.append(model.near(found.new_zeros(model.derivatives.shape[1])))
+            model = OperandModel.of(self._found, self.operand_derivatives())
+            models.append(model.near(model.values.new_zeros(model.derivatives.shape[1])))
         return LinearModel.join(models)
 
     def operand_derivatives(self) -> Tensor:
@@ -176,31 +153,19 @@ class MeritValue:
     @cached_property
     def _operand_rows(self) -> Tensor:
         """(n, P + 1): of every operand by the variables and, last, by the sensor's distance."""
-        scaled = self._merit.variables.scaled
-        if not self._found:
-            return scaled.new_zeros(0, scaled.numel() + 1).double().cpu()
-        with torch.enable_grad():
-            values = torch.stack([value.reshape(()) for _, _, value in self._found])
-            return jacobian_of(values, [scaled, self._sensor]).double().cpu()
+        leaves = [self._merit.variables.scaled, self._sensor]
+        return (self._found or OperandValues((), (), ())).derivatives(leaves)
 
 
-def _operands(
-    merit: MeritFunction, sensor_distance: Tensor | None = None
-) -> list[tuple[Operand, str, Tensor]] | None:
-    """Every operand with its labels and values; None where one cannot be evaluated."""
-    if not merit.operands:
-        return []
-    lens, parameters = merit.lens, merit.variables()
+def _operands(merit: MeritFunction, sensor_distance: Tensor | None = None) -> OperandValues | None:
+    """Return the operands' values; None where one cannot be evaluated."""
+    parameters = merit.variables()
     if sensor_distance is not None:
         parameters["sensor_distance"] = sensor_distance
-    view = View(
-        lens.system(parameters), lens.primary_wavelength, lens.object_distance, merit.crossings
-    )
+    lens = merit.lens
     try:
-        return [
-            (operand, label, value)
-            for operand in merit.operands
-            for label, value in operand.values(view).items()
-        ]
+        return evaluate_operands(
+            merit.operands, lens, parameters, lens.object_distance, merit.crossings
+        )
     except UnreachableField:
         return None

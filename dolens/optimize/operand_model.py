@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
-from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.linear_model import LinearModel
-from dolens.optimize.operands import Operand, View
+from dolens.optimize.operand_values import OperandValues, evaluate_operands
+from dolens.optimize.operands import Operand
 from dolens.optimize.variables import DesignVariables
 
 
@@ -28,16 +28,16 @@ class OperandModel:
     derivatives: Tensor
 
     @staticmethod
-    def of(
+    def at(
         lens: Lens,
         variables: DesignVariables,
         operands: Sequence[Operand],
         object_distance: float | None,
     ) -> "OperandModel":
-        """At the variables' values.
+        """Return the model at the variables' values.
 
         Args:
-            lens: that they belong to.
+            lens: the lens that they belong to.
             variables: u.
             operands: none is allowed.
             object_distance: mm in front of the first vertex; None for infinity.
@@ -45,16 +45,14 @@ class OperandModel:
         Raises:
             UnreachableField: a chief ray does not reach the stop.
         """
-        if not operands:
-            empty = torch.zeros(0, dtype=torch.float64)
-            return OperandModel((), empty, empty.new_zeros(0, variables.scaled.numel()))
         with torch.enable_grad():
-            view = View(lens.system(variables()), lens.primary_wavelength, object_distance)
-            found = [(entry, v) for entry in operands for v in entry.values(view).values()]
-            values = torch.stack([value.reshape(()) for _, value in found])
-            derivatives = jacobian_of(values, [variables.scaled])
-        owners = tuple(entry for entry, _ in found)
-        return OperandModel(owners, values.detach().double().cpu(), derivatives.double().cpu())
+            found = evaluate_operands(operands, lens, variables(), object_distance)
+        return OperandModel.of(found, found.derivatives([variables.scaled]))
+
+    @staticmethod
+    def of(found: OperandValues, derivatives: Tensor) -> "OperandModel":
+        """Return the model of n values with these derivatives (n, P)."""
+        return OperandModel(found.operands, found.vector(), derivatives)
 
     def gradient(self, step: Tensor) -> Tensor:
         """Of Σ (weight·deviation)² after a step, by the variables, (P,)."""

@@ -42,14 +42,14 @@ class UnreachableField(ArithmeticError):
 
 
 @dataclass(frozen=True)
-class View:
-    """A lens at the values of a search, as operands see it.
+class LensProperties:
+    """Properties of a lens at a point of a search, each computed once for all operands.
 
     Attributes:
         system: with a graph to the variables.
         wavelength: nm, the reference wavelength.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        crossings: where the chief rays of the last view crossed the front; this one leaves its own
+        crossings: where chief rays crossed the front at an earlier point; this point's are stored
             there for the next.
     """
 
@@ -119,9 +119,9 @@ class Operand:
     field: tuple[float, float] = (0.0, 0.0)
     gaps: tuple[int, ...] | None = None
 
-    def values(self, view: View) -> dict[str, Tensor]:
+    def values(self, lens: LensProperties) -> dict[str, Tensor]:
         """Label → value, a scalar with a graph, in the property's own unit."""
-        return KINDS[self.kind](self, view)
+        return KINDS[self.kind](self, lens)
 
     def deviation(self, value: Tensor) -> Tensor:
         """What is amiss: value - target, or the part of it beyond the limits, with its sign."""
@@ -181,9 +181,9 @@ def _number(value: object, what: str) -> float:
 # -------------------------------------------------------------------- first order
 
 
-def _first_order(name: str) -> Callable[[Operand, View], dict[str, Tensor]]:
-    def value(operand: Operand, view: View) -> dict[str, Tensor]:
-        return {operand.kind: getattr(view.first_order, name)}
+def _first_order(name: str) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
+    def value(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
+        return {operand.kind: getattr(lens.first_order, name)}
 
     return value
 
@@ -191,17 +191,17 @@ def _first_order(name: str) -> Callable[[Operand, View], dict[str, Tensor]]:
 # -------------------------------------------------------------------- lengths
 
 
-def _total_track(operand: Operand, view: View) -> dict[str, Tensor]:
+def _total_track(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
     """From the first vertex to the sensor, mm."""
-    return {"total_track": view.system.vertices[-1]}
+    return {"total_track": lens.system.vertices[-1]}
 
 
-def _gaps(operand: Operand, view: View, glass: bool) -> Sequence[int]:
+def _gaps(operand: Operand, lens: LensProperties, glass: bool) -> Sequence[int]:
     """Numbers of the gaps that an operand means: its own, or all those of glass, or of air."""
     if operand.gaps is not None:
         return operand.gaps
-    indices = view.system.indices(view.wavelength)
-    gaps = range(1, len(view.system.thicknesses) + 1)
+    indices = lens.system.indices(lens.wavelength)
+    gaps = range(1, len(lens.system.thicknesses) + 1)
     return [gap for gap in gaps if (float(indices[gap]) > _GLASS) == glass]
 
 
@@ -209,23 +209,23 @@ def _gaps(operand: Operand, view: View, glass: bool) -> Sequence[int]:
 _GLASS = 1.1
 
 
-def _at_centre(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
-    def values(operand: Operand, view: View) -> dict[str, Tensor]:
+def _at_centre(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
+    def values(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
         return {
-            f"{operand.kind}/{gap}": view.system.thicknesses[gap - 1]
-            for gap in _gaps(operand, view, glass)
+            f"{operand.kind}/{gap}": lens.system.thicknesses[gap - 1]
+            for gap in _gaps(operand, lens, glass)
         }
 
     return values
 
 
-def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
-    def values(operand: Operand, view: View) -> dict[str, Tensor]:
+def _at_edge(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
+    def values(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
         """Along the axis from rim to rim, each surface at the edge of its own aperture."""
         found = {}
-        for gap in _gaps(operand, view, glass):
-            at_centre = view.system.thicknesses[gap - 1]
-            front, back = view.rim_sags[gap - 1], view.rim_sags[gap]
+        for gap in _gaps(operand, lens, glass):
+            at_centre = lens.system.thicknesses[gap - 1]
+            front, back = lens.rim_sags[gap - 1], lens.rim_sags[gap]
             found[f"{operand.kind}/{gap}"] = at_centre + back - front
         return found
 
@@ -235,21 +235,21 @@ def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
 # -------------------------------------------------------------------- real chief rays
 
 
-def _chief_ray_angle(operand: Operand, view: View) -> dict[str, Tensor]:
+def _chief_ray_angle(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
     """Between the chief ray and the sensor's normal, degrees."""
-    ray = view.chief_ray(operand.field)
+    ray = lens.chief_ray(operand.field)
     across = torch.hypot(ray.l, ray.m)
     return {_labelled(operand): torch.rad2deg(torch.atan2(across, ray.n))}
 
 
-def _distortion(operand: Operand, view: View) -> dict[str, Tensor]:
+def _distortion(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
     """How far the chief ray lands from its paraxial image height, per cent of this height."""
-    ray = view.chief_ray(operand.field)
-    field = torch.tensor(operand.field, dtype=view.system.dtype, device=view.system.device)
-    if view.object_distance is None:
-        ideal = view.first_order.efl * torch.tan(torch.deg2rad(field))
+    ray = lens.chief_ray(operand.field)
+    field = torch.tensor(operand.field, dtype=lens.system.dtype, device=lens.system.device)
+    if lens.object_distance is None:
+        ideal = lens.first_order.efl * torch.tan(torch.deg2rad(field))
     else:
-        ideal = view.first_order.magnification * field
+        ideal = lens.first_order.magnification * field
     along = ideal.detach() / ideal.detach().norm()
     height, real = (ideal * along).sum(), ray.x * along[0] + ray.y * along[1]
     return {_labelled(operand): 100.0 * (real - height) / height}
@@ -261,7 +261,7 @@ def _labelled(operand: Operand) -> str:
 
 
 # Each gives label → value of an operand: mm, degrees or per cent.
-KINDS: dict[str, Callable[[Operand, View], dict[str, Tensor]]] = {
+KINDS: dict[str, Callable[[Operand, LensProperties], dict[str, Tensor]]] = {
     "efl": _first_order("efl"),
     "bfd": _first_order("bfd"),
     "f_number": _first_order("f_number"),

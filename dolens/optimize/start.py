@@ -8,8 +8,10 @@ from torch import Tensor
 
 from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_lens_units
 
 _KEYS = ("multiply", "add", "relative", "absolute")
+_WITHOUT_UNIT = ("multiply", "relative")
 
 
 def start_values(
@@ -20,7 +22,8 @@ def start_values(
     Args:
         lens: whose parameters are named.
         settings: pattern → a number; or `multiply` and `add`, applied in this order; or `relative`
-            and `absolute`, standard deviations of normal errors, of the parameter and in its unit.
+            and `absolute`, standard deviations of normal errors, as a share of the parameter and in
+            its unit.  Numbers are in the units of files, degrees for tilts.
             Later patterns go on from what earlier ones made.
         generator: of the errors.
 
@@ -32,8 +35,12 @@ def start_values(
     """
     found: dict[str, Tensor] = {}
     for pattern, change in settings.items():
-        numbers = _numbers(pattern, change)
+        written = _numbers(pattern, change)
         for name, parameter in lens.variables([pattern]).items():
+            numbers = {
+                key: value if key in _WITHOUT_UNIT else to_lens_units(name, value)
+                for key, value in written.items()
+            }
             value = found.get(name, parameter.detach().clone())
             if "value" in numbers:
                 found[name] = torch.full_like(value, numbers["value"])

@@ -29,7 +29,7 @@ def matrix_figure(
     scale.
 
     Args:
-        panels: what the numbers are, with their unit → matrix (R, C) and names of its columns.
+        panels: title with unit → matrix (R, C) and names of its columns.
         rows: R labels, shared by all panels.
         groups: name and number of rows of each block of rows, from the top; lines part them.
         title: above all.
@@ -85,7 +85,7 @@ def yield_figure(
     Args:
         panels: what the radius is → label → RMS of every lens, mm, ascending, infinite where a
             lens fails.  Labels in pairs share a colour: the second of each is dashed.
-        nominal: what the radius is → that of the lens as designed, mm.
+        nominal: kind of radius → that of the designed lens, mm.
         title: above all.
     """
     figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")

@@ -75,8 +75,8 @@ def lens_from_prescription(
         prescription: as the module's docstring shows.
         dtype: precision of the lens.
         index_model: used instead of the prescription's own.
-        where: what messages call this prescription, usually its file.
-        backend: what traces: auto, reference, cpu or cuda.
+        where: name of the prescription in messages, usually its file.
+        backend: auto, reference, cpu or cuda.
 
     Raises:
         InputError: one line that names `where`, the surface and the key.

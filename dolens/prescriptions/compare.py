@@ -25,8 +25,8 @@ def require_same(
     Args:
         wanted: the prescription to be written.
         found: the same, read again from what would be written.
-        kind: what messages call the format, for example `.zmx`.
-        where: what messages call the prescription.
+        kind: name of the format in messages, for example `.zmx`.
+        where: name of the prescription in messages.
         medium: names that mean the same medium in this format become one.
         assumed: keys that the format never leaves out; allowed to appear where none was wanted.
 

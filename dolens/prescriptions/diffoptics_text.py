@@ -46,7 +46,7 @@ def prescription_from_diffoptics(text: str, where: str = "lens") -> dict[str, An
 
     Args:
         text: the file's content.
-        where: what messages call it, usually its path.
+        where: name in messages, usually its path.
 
     Raises:
         InputError: one line that names `where`, the line, and what is allowed.
@@ -146,7 +146,7 @@ def _header(line: str, place: str) -> dict[str, Any]:
     try:
         header = json.loads(extra)
     except (ValueError, RecursionError):
-        raise InputError(f"{place}: what stands behind # is not valid JSON") from None
+        raise InputError(f"{place}: the text behind # is not valid JSON") from None
     check_keys(header, (*_HEADER_KEYS, "surfaces"), place)
     shapes = header.get("surfaces", {})
     require_mapping(shapes, f"{place}: surfaces")

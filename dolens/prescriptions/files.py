@@ -74,7 +74,7 @@ def load_lens(
         path: the file; its suffix says which format it is in.
         dtype: precision of the lens.
         index_model: dfc, do or paper, instead of the file's own.
-        backend: what traces: auto, reference, cpu or cuda.
+        backend: auto, reference, cpu or cuda.
 
     Raises:
         InputError: the file is missing, not valid, or no prescription; the message is one line

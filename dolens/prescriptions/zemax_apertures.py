@@ -25,7 +25,7 @@ def read_apertures(block: Block, factor: Fraction, place: str) -> tuple[dict[str
     Args:
         block: its lines by operand.
         factor: mm in a unit of the file.
-        place: what messages call it.
+        place: name in messages.
 
     Returns:
         `semi_diameter` or `aperture`, and `obscuration`, as a prescription's row has them (nothing

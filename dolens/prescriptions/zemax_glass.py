@@ -51,7 +51,7 @@ def read_glass(words: Sequence[str], catalogues: Sequence[str] | None, place: st
     Args:
         words: name, kind of solve (1 is a model), pick-up, nd, Vd, ...; none is air.
         catalogues: the arguments of GCAT; None where the file has none.
-        place: what messages call the surface.
+        place: name of the surface in messages.
 
     Returns:
         `air`, nd/Vd, a constant index (a model whose Vd is 0), or maker and name.

@@ -41,7 +41,7 @@ def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:
 
     Args:
         text: the file's content, decoded (see `decode_zemax`).
-        where: what messages call it, usually its path.
+        where: name in messages, usually its path.
 
     Returns:
         A prescription with index model `dfc`: nd, Vd and indices relative to air are Zemax's own.

@@ -30,7 +30,7 @@ class Architecture:
         first_convolution: its name among the layers.
         mean: of the sRGB values its weights were trained with, by colour.
         standard_deviation: likewise.
-        published: where trained weights are, those of width 1.
+        published: the trained weights, those of width 1.
     """
 
     layers: Callable[[float], nn.Sequential]

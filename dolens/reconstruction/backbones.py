@@ -132,7 +132,7 @@ def load_backbone(
         name: "mobilenet_v2" or "googlenet".
         in_channels, stages, width_multiplier: see `Backbone`.
         weights: "imagenet" requires trained weights; "auto" starts at random, with a warning,
-            where they cannot be had; "none" starts at random.
+            where they are not available; "none" starts at random.
         weights_file: file of trained weights; see `PublishedWeights.load`.
 
     Raises:

@@ -69,8 +69,8 @@ class RestorationLoss(nn.Module):
         tv_weight: α₂.
         perceptual_weight: α₃; at 0 no VGG-16 weights are looked for.
         perceptual: "vgg16" requires the perceptual term; "auto" leaves it out, with a warning,
-            where VGG-16's weights cannot be had; "vgg16_edges" requires it with weights that were
-            trained on to find edges, whose features are larger; "none" leaves it out.
+            where VGG-16's weights are not available; "vgg16_edges" requires it with weights
+            that were trained further to find edges, whose features are larger; "none" omits it.
         vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`, `load_edge_weights`.
         l1_weight: of the mean absolute error; at 0 it is not computed.
 

@@ -31,7 +31,7 @@ class VGG16Features(nn.Module):
     quarter of the resolution.
 
     Args:
-        weights: what `load_vgg16_weights` or `load_edge_weights` returns; copied as float32.
+        weights: from `load_vgg16_weights` or `load_edge_weights`; copied as float32.
         mean: of R, G, B in [0, 1], which the weights were trained with; default: ImageNet's.
         standard_deviation: likewise.
 

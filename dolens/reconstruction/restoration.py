@@ -41,7 +41,7 @@ class Restoration(nn.Module):
             raw: sensor image in linear light, (B, 3, H, W).
             point_spread_functions: (D, 3, K, K) for D depths, K odd, each centred on the pixel
                 (K//2, K//2) and of unit sum where the lens loses no light; or None.
-            field: where on the sensor each pixel lies, (B, 2, H, W): x and y over half the
+            field: position of each pixel on the sensor, (B, 2, H, W): x and y over half the
                 sensor's diagonal, so that its corners have radius 1; or None.
 
         Returns:
@@ -49,13 +49,13 @@ class Restoration(nn.Module):
             lens may stand before a float32 network, and gradients reach it.
 
         Raises:
-            InputError: what the network needs is None or of another shape.
+            InputError: an argument that the network needs is None or of another shape.
         """
         raise NotImplementedError
 
     @property
     def dtype(self) -> torch.dtype:
-        """Return the floating-point type of the parameters, or else of the buffers."""
+        """Return the floating-point type of the parameters, or of the buffers if there are none."""
         tensors = (*self.parameters(), *self.buffers())
         found = (tensor.dtype for tensor in tensors if tensor.is_floating_point())
         return next(found, torch.get_default_dtype())
@@ -132,7 +132,7 @@ class FeaturePyramidRestoration(ResidualRestoration):
         pyramid_channels: of the pyramid, a multiple of 4; see `FeaturePyramid`.
         field_coordinates: whether it is told where on the sensor a pixel lies.
         weights: "imagenet" requires trained weights for the backbone; "auto" starts at random,
-            with a warning, where they cannot be had; "none" starts at random.
+            with a warning, where they are not available; "none" starts at random.
         weights_file: a file of them; None for the torch cache, then torchvision's download.
 
     Raises:

@@ -35,11 +35,11 @@ class PublishedWeights:
 
     Attributes:
         network: whose weights they are.
-        purpose: what they are wanted for.
-        url: where torchvision publishes them.
-        megabytes: what a download costs.
+        purpose: of the weights, for messages.
+        url: torchvision's address of the file.
+        megabytes: size of the download.
         key: the configuration key that names a file of one's own, `group.argument`.
-        prefix: what the wanted parameters' names begin with in the whole network's state dict.
+        prefix: beginning of the wanted parameters' names in the whole network's state dict.
     """
 
     network: str

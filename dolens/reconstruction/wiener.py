@@ -5,10 +5,9 @@ arguments.
 import math
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional
-
-from dolens.fft_lengths import fast_fft_length
 
 
 def wiener_deconvolve(
@@ -55,8 +54,8 @@ def wiener_deconvolve(
     channels, height, width = image.shape[-3:]
     _check(channels, point_spread_function, margin)
     size = point_spread_function.shape[-1]
-    rows = fast_fft_length(max(height + 2 * margin, size))
-    columns = fast_fft_length(max(width + 2 * margin, size))
+    rows = next_fast_len(max(height + 2 * margin, size), real=True)
+    columns = next_fast_len(max(width + 2 * margin, size), real=True)
 
     point_spread_function = point_spread_function.to(image.dtype)
     ratio = torch.as_tensor(noise_to_signal, dtype=image.dtype, device=image.device)

@@ -4,9 +4,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
-from dolens.fft_lengths import even_fft_length
 from dolens.rendering.patches import Coordinates, Patch, PatchLayout
 from dolens.rendering.psf import splat
 from dolens.rendering.spline_lookup import spline_lookup
@@ -159,7 +159,7 @@ class _Tile:
         self.first = (top - reach, left - reach)
         # Texels up to a length that transforms are fast at cost less than zeros in their place;
         # what they do to the image lies outside of what is seen.
-        self.transform = (even_fft_length(height + size - 1), even_fft_length(width + size - 1))
+        self.transform = (transform_length(height + size - 1), transform_length(width + size - 1))
         self.rows = _clamped(top - reach, self.transform[0], textures.shape[-2], textures)
         self.columns = _clamped(left - reach, self.transform[1], textures.shape[-1], textures)
 
@@ -272,3 +272,8 @@ def _bounds(coordinate: Tensor) -> tuple[int, int]:
 def _clamped(start: int, count: int, size: int, like: Tensor) -> Tensor:
     """Indices of `count` texels from `start` on, those of the edge beyond it."""
     return (torch.arange(count, device=like.device) + start).clamp(0, size - 1)
+
+
+def transform_length(length: int) -> int:
+    """The least even number of factors 2, 3 and 5 that is not below: real FFTs of it are fast."""
+    return 2 * next_fast_len(-(-length // 2), real=True)

@@ -78,9 +78,7 @@ def patches(height: int, width: int, rows: int, columns: int, like: Tensor) -> l
             f"renderer: fields must be from 1 to {height} rows and 1 to {width} columns, "
             f"not {rows}, {columns}"
         )
-    vertical, horizontal = (
-        _sides(length, count, like) for length, count in ((height, rows), (width, columns))
-    )
+    vertical, horizontal = _sides(height, rows, like), _sides(width, columns, like)
     return [
         Patch(top, bottom, left, right, down[:, None] * across)
         for top, bottom, down in vertical

@@ -10,7 +10,7 @@ def noisy_point_spread_functions(
     """Return point spread functions with simulated photon noise and read noise.
 
     A function h of sum Σh is measured with N electrons in the whole of it: pixel i counts a Poisson
-    number n_i of mean N·h_i/Σh, and a normal number of the read noise is added.  What is given back
+    number n_i of mean N·h_i/Σh, and a normal number of the read noise is added.  The result
     is Σh·n_i/Σn, so that the measured function has the same sum.  Nothing is cut at zero.
 
     Args:

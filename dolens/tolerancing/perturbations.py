@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice, check_keys
-from dolens.optics.elements import TILTS
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import unit_of
 
 DISTRIBUTIONS = ("uniform", "normal")
 _KEYS = ("half_range", "distribution", "relative")
@@ -133,24 +133,15 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
         nominal,
         factor * torch.tensor([rows[n][0] for n in names], dtype=torch.float64),
         torch.tensor(
-            [_unit(n, rows[n][2], float(v)) for n, v in zip(names, nominal, strict=True)],
+            [
+                float(v) if rows[n][2] else unit_of(n).factor
+                for n, v in zip(names, nominal, strict=True)
+            ],
             dtype=torch.float64,
         ),
-        tuple("%" if rows[n][2] else unit_name(n) for n in names),
+        tuple("%" if rows[n][2] else unit_of(n).name for n in names),
         torch.tensor([rows[n][1] for n in names]),
     )
-
-
-def unit_name(name: str) -> str:
-    """The unit that files give a parameter in; nothing where it depends on the surface."""
-    last = name.rsplit(".", 1)[-1]
-    if last in TILTS:
-        return "deg"
-    if last == "curvature":
-        return "1/mm"
-    if name.startswith(("elements.", "thicknesses.")) or name == "sensor_distance":
-        return "mm"
-    return ""
 
 
 def tightened(tolerances: Tolerances, factor: float) -> Tolerances:
@@ -177,9 +168,3 @@ def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _unit(name: str, relative: bool, nominal: float) -> float:
-    if relative:
-        return nominal
-    return math.pi / 180.0 if name.rsplit(".", 1)[-1] in TILTS else 1.0

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -11,10 +11,9 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError, call_with_settings, check_choice
 from dolens.optics.lens import Lens
-from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operands import Operand
 from dolens.optimize.trusted_step import ray_moves, trusted_step
 from dolens.optimize.variables import DesignVariables
+from experiments.camera.operands import CameraOperands
 
 logger = logging.getLogger(__name__)
 
@@ -118,9 +117,8 @@ class LensLeastSquares:
         variables: DesignVariables,
         spots: list[SpotRays],
         pitch: float,
-        operands: Sequence[Operand] = (),
+        operands: CameraOperands | None = None,
         share: float = 1.0,
-        object_distance: float | None = None,
     ) -> dict[str, float]:
         """Make one step by the gradient that was gathered, and forget that gradient.
 
@@ -131,7 +129,6 @@ class LensLeastSquares:
             pitch: of the pixels, mm.
             operands: what the lens must be besides; the gradient is without them.
             share: of the reach, as a schedule has it.
-            object_distance: of the operands, mm in front of the first vertex; None for infinity.
 
         Returns:
             Numbers to log: `reach` (pixels), `slope_kept` by the last step, `moved` (RMS, pixels).
@@ -163,7 +160,7 @@ class LensLeastSquares:
             self.reach * share * pitch,
             lower.clamp(max=0.0),
             upper.clamp(min=0.0),
-            OperandModel.of(lens, variables, operands, object_distance) if operands else None,
+            None if operands is None else operands.model(lens, variables),
         )
         scaled.copy_(point + step)
         variables.project()

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_file_units
 from dolens.optimize.variables import DesignVariables
 from experiments.camera.lens_least_squares import LensLeastSquares
 from experiments.camera.operands import CameraOperands
@@ -78,9 +79,8 @@ class LensSteps:
                     self.variables,
                     self._spots,
                     self._pitch,
-                    self.operands.entries,
+                    self.operands,
                     share,
-                    self.operands.object_distance,
                 )
         self.variables.project()
         self.operands.take_back_if_unreachable(
@@ -115,10 +115,10 @@ class LensSteps:
 
 
 def variable_numbers(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return variables as metrics: a number as it is, an array by its root mean square."""
+    """Return variables as metrics in the units of files: a number as it is, an array by its RMS."""
     numbers = {}
     for name, value in values.items():
-        number = value.detach().float()
+        number = to_file_units(name, value.detach()).float()
         if number.dim() == 0:
             numbers[f"variables/{name}"] = number
         else:

@@ -27,7 +27,7 @@ class TrainingCrops(Dataset):
     is therefore a function of (seed, i), and has no length to speak of.
 
     Args:
-        photographs: what to cut from; may decode on demand.
+        photographs: to cut from; may decode on demand.
         size: (height, width) of an item in texels.
         seed: of the run.
         scale_range: (smallest, largest) photograph pixels per texel.
@@ -91,7 +91,7 @@ class EvaluationCrops(Dataset):
     A photograph gives `count` crops, or as many as it holds without overlap, at least one.
 
     Args:
-        photographs: what to cut from; may decode on demand, here once where `count` is above 1.
+        photographs: to cut from; may decode on demand, here once where `count` is above 1.
         size: (height, width) of an item in texels.
         count: crops of each photograph at most.
         scale: photograph pixels per texel.

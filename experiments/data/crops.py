@@ -48,7 +48,7 @@ def random_crop(
     the crop fits into it, with one warning that names it.
 
     Args:
-        photo: where to cut.
+        photo: the photograph to cut from.
         size: (height, width) of the crop in texels.
         seed: of the run, not negative.
         index: the global number of the sample, not negative.
@@ -98,7 +98,7 @@ def centred_crops(
     `random_crop`.
 
     Args:
-        photo: where to cut.
+        photo: the photograph to cut from.
         size: (height, width) of a crop in texels.
         count: how many.
         scale: photograph pixels along the side of one texel.
@@ -143,7 +143,7 @@ def crops_that_fit(photo: Photograph, size: tuple[int, int], scale: float = 1.0)
     """Count the crops that a photograph holds side by side, without overlap; at least 1.
 
     Args:
-        photo: where to cut.
+        photo: the photograph to cut from.
         size: (height, width) of a crop in texels.
         scale: photograph pixels along the side of one texel.
 

@@ -22,7 +22,7 @@ class FolderPhotographs(Sequence[Photograph]):
     processes of a loader, so that `unreadable` is complete in the process that made this.
 
     Args:
-        folder: what messages name when nothing can be read.
+        folder: named in the message when nothing can be read.
         paths: the files, in the order of their numbers.
         cache_bytes: decoded pixels kept in memory, in each process; the latest photograph is
             kept whatever its size.

@@ -24,7 +24,7 @@ def with_occluders(
         nearest: mm in front of the first vertex.
         farthest: mm.
         count: ellipses in each image.
-        generator: what they are drawn from, on the CPU.
+        generator: of the random numbers, on the CPU.
 
     Returns:
         (B, C + 1, H, W), as `LayeredScene` takes them: the depth is the last channel.

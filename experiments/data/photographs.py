@@ -170,7 +170,7 @@ def read_photograph(path: str | Path, name: str | None = None) -> Photograph:
 
     Args:
         path: the file.
-        name: what messages call it; the path when not given.
+        name: name in messages; the path when not given.
 
     Raises:
         InputError: the file is missing, or cannot be decoded, or holds floating-point pixels.

@@ -20,7 +20,7 @@ class RgbdFolderDataModule(ImageFolderDataModule):
 
     Args:
         root: the folder, searched recursively; split as `ImageFolderDataModule` says.
-        depth_suffix: what a depth map's name has after the photograph's.
+        depth_suffix: ending of a depth map's name after the photograph's.
         depth_unit: mm per unit of the maps' numbers: 1 for millimetres (Kinect), 1000 for metres,
             0.2 for the TUM benchmark's 5000 a metre.
         **settings: those of `ImageFolderDataModule`.

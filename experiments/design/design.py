@@ -139,9 +139,7 @@ class DesignModule(Experiment):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return an optimizer of one group, which holds the variables and their bounds."""
-        v = self.variables
-        group = {"params": [v.scaled], "lower": v.lower.clone(), "upper": v.upper.clone()}
-        return self.optimizer([group])
+        return self.optimizer([self.variables.parameter_group()])
 
     def on_fit_start(self) -> None:
         """Start the clock."""

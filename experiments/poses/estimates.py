@@ -15,6 +15,7 @@ from dolens.alignment.spot_loss import SpotMerit
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
+from experiments.poses.settings import Fit
 
 # One linear step is exact enough within so many bounds; longer ones are followed by others.
 _NEAR = 5.0
@@ -45,6 +46,26 @@ class Held:
         """Of one measurement, degrees and mm."""
         found = (self.found[measurement] / self.units).tolist()
         return dict(zip(self.names, found, strict=True))
+
+
+def held_numbers(fit: Fit, before: Pose, found: "Estimates", truth: Mapping[str, float]) -> Held:
+    """Return the numbers that a fit holds.
+
+    Args:
+        fit: that holds them.
+        before: the pose of the fit that found them.
+        found: its estimates, of the same measurements.
+        truth: by name, degrees and mm.
+    """
+    places = [before.names.index(name) for name in fit.held]
+    units = before.units[places]
+    return Held(
+        fit.held,
+        units,
+        (before.scale * before.scaled.detach())[places],
+        found.values[:, places] * units,
+        torch.tensor([truth.get(n, torch.nan) for n in fit.held]).double() * units,
+    )
 
 
 @dataclass(frozen=True)
@@ -128,7 +149,7 @@ def _estimate(
         there.put(held.values(place))
     there.scaled.copy_((at + moved) / pose.scale)
     loss = NoiseWeightedLoss(measurement, imager, slopes, known.blur)
-    optimizer = DampedLeastSquares([there.scaled], initial_damping=_DAMPING)
+    optimizer = DampedLeastSquares([there.parameter_group()], initial_damping=_DAMPING)
     every = torch.ones(len(pose.names), dtype=torch.bool)
     theta = at + moved
     for _ in range(_ITERATIONS):

@@ -51,7 +51,7 @@ def optimizer_of(stage: Stage, pose: Pose) -> torch.optim.Optimizer:
     """Of a stage's iterations."""
     if stage.optimizer == "adam":
         return torch.optim.Adam([pose.scaled], lr=stage.learning_rate)
-    return DampedLeastSquares([pose.scaled], initial_damping=stage.damping)
+    return DampedLeastSquares([pose.parameter_group()], initial_damping=stage.damping)
 
 
 def iterate(
@@ -90,4 +90,5 @@ def iterate(
     residuals.square().sum().backward()
     pose.scaled.grad.mul_(chosen)
     step()
+    pose.project()
     return loss.terms(residuals.detach())

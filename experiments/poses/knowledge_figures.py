@@ -56,7 +56,7 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
     scales = {
         n: float(s)
         for f in arrangements
-        for n, s in zip(f.pose.names, f.pose.scale_in_units, strict=True)
+        for n, s in zip(f.pose.names, f.pose.file_scale, strict=True)
     }
     far = 0.0
     for found in arrangements:
@@ -141,7 +141,7 @@ def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> N
 
 def _corner(found: Arrangement, name: str) -> Figure:
     units = found.pose.units
-    values = torch.tensor(list(found.pose.found().values()), dtype=torch.float64)
+    values = torch.tensor(list(found.pose.file_values().values()), dtype=torch.float64)
     return corner_figure(
         found.known.covariance / torch.outer(units, units),
         [variable_label(name) for name in found.pose.names],

@@ -124,7 +124,7 @@ def _corner(fitted: FittedPoses, number: int) -> Figure:
     fit, pose = fitted.fits[number], fitted.poses[number]
     units = pose.units.cpu()
     covariance = fitted.known[fit.name].covariance.cpu() / torch.outer(units, units)
-    found = torch.tensor([pose.found()[name] for name in pose.names], dtype=torch.float64)
+    found = torch.tensor([pose.file_values()[name] for name in pose.names], dtype=torch.float64)
     truth = fitted.truth(number)
     true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
     estimates = fitted.estimates.get(fit.name)

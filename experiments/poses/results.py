@@ -3,14 +3,51 @@
 import math
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
 from dolens.alignment.information import Knowledge
 from dolens.alignment.pose import Pose
+from experiments.poses.settings import Stage
 from experiments.tables import Row
 
 # Of a normal distribution, 95 % lies within so many standard deviations.
 _WITHIN = 1.959964
+
+
+def history_row(
+    fit: str,
+    place: int,
+    stage: Stage,
+    pose: Pose,
+    terms: Mapping[str, Tensor],
+    optimizer: torch.optim.Optimizer,
+    seconds: float,
+) -> dict[str, float | str]:
+    """Return a row of history.csv: an iteration, with the values that it reached.
+
+    Args:
+        fit: its name.
+        place: number of the stage, from 0.
+        stage: its settings.
+        pose: after the iteration.
+        terms: of the loss, by name.
+        optimizer: of the stage, whose damping is told where it has one.
+        seconds: that the iteration took.
+    """
+    row: dict[str, float | str] = {
+        "fit": fit,
+        "stage": place + 1,
+        "optimizer": stage.optimizer,
+        "loss": float(sum(terms.values())),
+        **{f"loss/{name}": float(value) for name, value in terms.items()},
+        **pose.file_values(),
+        "seconds": seconds,
+    }
+    last = getattr(optimizer, "last", None)
+    if last is not None:
+        row["damping"] = last.damping
+    return row
 
 
 def pose_rows(
@@ -29,11 +66,11 @@ def pose_rows(
         `true`, `initial`, `found`, `error`, `bound`, and `own_bound`, which would be the bound if
         all that the fit holds were exact.
     """
-    begun = (initial * pose.scale_in_units).tolist()
+    begun = (initial * pose.file_scale).tolist()
     bounds = (known.bounds / pose.units).tolist()
     own = (known.own_covariance.diagonal().sqrt() / pose.units).tolist()
     rows: list[Row] = []
-    for place, (name, value) in enumerate(pose.found().items()):
+    for place, (name, value) in enumerate(pose.file_values().items()):
         true = truth.get(name, math.nan)
         rows.append(
             {

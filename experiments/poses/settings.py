@@ -1,7 +1,8 @@
 """What a pose fit is made of: what is to be found, and by which stages."""
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,6 +18,19 @@ _SPACINGS, _FINEST = 1.2, 16
 # Derivatives are differences of what crosses a pixel's edges: by so much wider are their patches.
 _SLOPES_WIDENED = 2.0
 _RAYS_OF_A_SLOPE, _LEAST_BLUR = 450.0, 0.5
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """Settings of the images that a pose is compared by.
+
+    Attributes:
+        imager: settings of `SpotImager` besides sensor and wavelength; see `spot_imager`.
+        slopes: those that differ for derivatives.
+    """
+
+    imager: Mapping[str, Any] = field(default_factory=dict)
+    slopes: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -73,6 +87,76 @@ class Fit:
     truth: Mapping[str, float]
     held: tuple[str, ...] = ()
     held_from: str | None = None
+
+
+@dataclass(frozen=True)
+class FitPlan:
+    """Which poses are fitted, and how.
+
+    Attributes:
+        fits: in their order; a fit may hold what an earlier one found.
+        stages: of each fit, in turn.
+        imager: settings of `SpotImager` besides sensor and wavelength; see `spot_imager`.
+        centroid_weight: μ of S21, 1/mm².
+    """
+
+    fits: tuple[Fit, ...]
+    stages: tuple[Stage, ...]
+    imager: Mapping[str, Any] = field(default_factory=dict)
+    centroid_weight: float = 1.0
+
+    def number(self, name: str) -> int:
+        """Return the number of a fit by its name."""
+        return [fit.name for fit in self.fits].index(name)
+
+    def stage_at(self, iteration: int) -> int:
+        """Return the number of the stage that an iteration of a fit belongs to."""
+        ends = itertools.accumulate(stage.iterations for stage in self.stages)
+        return next((i for i, end in enumerate(ends) if iteration < end), len(self.stages) - 1)
+
+    def check_imagers(self, sensor: Sensor, wavelength: float) -> None:
+        """Refuse a mistake in the images of the last stage before the first one begins.
+
+        Raises:
+            InputError: an unknown key, or a number out of range.
+        """
+        for stage in self.stages:
+            plain_imager(sensor, wavelength, self.imager, stage.imager, stage.slopes)
+
+
+def fit_plan(
+    fits: Mapping[str, Mapping[str, Any]],
+    stages: Sequence[Mapping[str, Any]],
+    imager: Mapping[str, Any] | None = None,
+    centroid_weight: float = 1.0,
+) -> FitPlan:
+    """Return a plan from its settings.
+
+    Args:
+        fits: name → `variables`, `truth`, and `held: {from, variables}`.
+        stages: settings of `Stage`, in turn.
+        imager: see `FitPlan`.
+        centroid_weight: see `FitPlan`.
+
+    Raises:
+        InputError: an unknown key, no fit, no stage, or a fit that holds what none before it finds.
+    """
+    plan = FitPlan(
+        tuple(fit_of(name, settings) for name, settings in fits.items()),
+        tuple(stage_of(settings) for settings in stages),
+        dict(imager or {}),
+        float(centroid_weight),
+    )
+    if not plan.stages or not plan.fits:
+        raise InputError("misalignment: give at least one fit and one stage")
+    for number, fit in enumerate(plan.fits):
+        earlier = [before.name for before in plan.fits[:number]]
+        if fit.held_from is not None and fit.held_from not in earlier:
+            raise InputError(
+                f"fits.{fit.name}.held.from: '{fit.held_from}' is no earlier fit; allowed: "
+                f"{', '.join(earlier) or 'none'}"
+            )
+    return plan
 
 
 def stage_of(settings: Mapping[str, Any]) -> Stage:

@@ -15,71 +15,70 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError
+from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
 from experiments.callbacks.interruption import InterruptionNotice
 from experiments.experiment import Experiment, check_experiment
 from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
+from experiments.running.configuration import checked
 from experiments.running.resolvers import register_resolvers
 from experiments.running.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
-from experiments.running.unread_settings import refuse_unread
+from experiments.running.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
 
 register_resolvers()
 
-# The top-level keys that `run` itself takes; all others must be read by one of these.
-TAKEN = (
-    *("lens", "module", "data", "callbacks", "logger", "trainer"),
-    *("seed", "backend", "lens_dtype", "threads", "matmul_precision"),
-    *("train", "test", "ckpt_path", "objective"),
-)
-
-_DTYPES = {"float32": torch.float32, "float64": torch.float64}
-
 
 def run(cfg: DictConfig) -> float:
-    """Train, test, and write the run folder; return the objective that the config names."""
+    """Train, test, and write the run folder; return the objective that the config names.
+
+    Args:
+        cfg: the composed configuration, as Hydra gives it to the job.
+
+    Raises:
+        InputError: what the configuration asks for cannot be done; see `checked`.
+    """
     started = time.perf_counter()
     folder = Path(HydraConfig.get().runtime.output_dir)
-    refuse_subprocess_ddp_in_sweep(cfg)
-    refuse_unread(cfg, TAKEN)
-    settings = settings_of(cfg)  # before Hydra resolves in place what it instantiates
-    if str(cfg.objective).startswith("test/") and not cfg.test:
-        raise InputError(f"objective: '{cfg.objective}' needs test=true, or name another metric")
-    if cfg.threads:
-        torch.set_num_threads(cfg.threads)
+    cfg = checked(cfg)
+    settings = RunSettings.of(cfg)
+    refuse_subprocess_ddp_in_sweep(settings)
+    written = settings_of(cfg)  # before Hydra resolves in place what it instantiates
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
     # The basic launcher runs a sweep's jobs in one process: seed at each start.
-    lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    torch.set_float32_matmul_precision(cfg.matmul_precision)
-    lens = build_lens(cfg)
-    module = instantiate(cfg.module)(lens=lens)
-    check_experiment(module, cfg.train)
-    checkpoint = cfg.ckpt_path
+    lightning.seed_everything(settings.seed, workers=True, verbose=False)
+    torch.set_float32_matmul_precision(settings.matmul_precision)
+    lens = build_lens(settings)
+    module = instantiate(settings.module)(lens=lens)
+    check_experiment(module, settings.train)
+    checkpoint = settings.ckpt_path
     if checkpoint is not None:
-        refuse_idle_checkpoint(cfg, module)
-        checkpoint = checked_checkpoint(checkpoint, module, settings, cfg.train)
-    data = instantiate(cfg.data)
-    callbacks = [instantiate(c) for c in (cfg.callbacks or {}).values() if c]
+        refuse_idle_checkpoint(settings, module)
+        checkpoint = checked_checkpoint(checkpoint, module, written, settings.train)
+    data = instantiate(settings.data)
+    callbacks = [instantiate(entry) for entry in (settings.callbacks or {}).values() if entry]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
-    callbacks.append(SettingsInCheckpoints(settings))
-    loggers = [instantiate(entry) for entry in (cfg.logger or {}).values() if entry]
-    trainer: lightning.Trainer = instantiate(cfg.trainer, callbacks=callbacks, logger=loggers)
+    callbacks.append(SettingsInCheckpoints(written))
+    loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
+    trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
     (folder / "lens").mkdir(exist_ok=True)
     (folder / ".hydra").mkdir(exist_ok=True)
-    OmegaConf.save(cfg_without_hydra(cfg), folder / ".hydra" / "resolved.yaml", resolve=True)
+    OmegaConf.save(cfg, folder / ".hydra" / "resolved.yaml", resolve=True)
     save_lens(lens, folder / "lens" / "initial.yaml")
     device = str(trainer.strategy.root_device)
-    info = describe_run(cfg.seed, device, cfg.lens_dtype, sys.argv)
+    info = describe_run(settings.seed, device, settings.lens_dtype, sys.argv)
     write_json(folder / "run.json", {**info, "status": "running"})
     status = "failed"
     try:
-        if cfg.train:
+        if settings.train:
             trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
         metrics: dict[str, Any] = dict(trainer.callback_metrics)
-        if cfg.test:
+        if settings.test:
             # The weights as the last step left them: every run is judged after the same work.
             # Where nothing was trained, they are the checkpoint's.
-            trained = None if cfg.train else checkpoint
+            trained = None if settings.train else checkpoint
             trainer.test(module, data, ckpt_path=trained, weights_only=True, verbose=False)
             metrics.update(trainer.callback_metrics)
         status = "finished"
@@ -101,37 +100,30 @@ def run(cfg: DictConfig) -> float:
             entry.log_hyperparams(hyperparameters(cfg), numbers, step=trainer.global_step)
         entry.finalize("success")
     logger.info("Run folder: %s", folder)
-    if cfg.objective not in numbers:
+    objective = settings.objective
+    if objective not in numbers:
         raise InputError(
-            f"objective: '{cfg.objective}' is not among the metrics ({', '.join(numbers)})"
+            f"objective: '{objective}' is not among the metrics ({', '.join(numbers)})"
         )
-    logger.info("%s = %.4g", cfg.objective, numbers[cfg.objective])
-    return numbers[cfg.objective]
+    logger.info("%s = %.4g", objective, numbers[objective])
+    return numbers[objective]
 
 
-def cfg_without_hydra(cfg: DictConfig) -> DictConfig:
-    """The configuration less Hydra's own node, which only some callers leave in it."""
-    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-
-
-def build_lens(cfg: DictConfig) -> Any:
-    """The lens of the configuration; prescriptions are plain data and instantiate nothing."""
-    if cfg.lens_dtype not in _DTYPES:
-        raise InputError(f"lens_dtype: '{cfg.lens_dtype}' is unknown; allowed: float32, float64")
-    prescription = OmegaConf.to_container(cfg.lens, resolve=True)
+def build_lens(settings: RunSettings) -> Lens:
+    """Return the lens of a run; prescriptions are plain data and instantiate nothing."""
     where = f"lens={HydraConfig.get().runtime.choices.get('lens')}"
     return lens_from_prescription(
-        prescription, _DTYPES[cfg.lens_dtype], where=where, backend=cfg.backend
+        settings.prescription(), settings.dtype, where=where, backend=settings.backend
     )
 
 
-def refuse_idle_checkpoint(cfg: DictConfig, module: Experiment) -> None:
+def refuse_idle_checkpoint(settings: RunSettings, module: Experiment) -> None:
     """Refuse a checkpoint that nothing would load.
 
     Raises:
         InputError: the run neither trains nor tests, or its module trains nothing.
     """
-    if not (cfg.train or cfg.test):
+    if not (settings.train or settings.test):
         raise InputError("ckpt_path: train=false test=false loads no checkpoint; leave it out")
     if not module.trains:
         raise InputError(
@@ -155,10 +147,10 @@ def summary_of(module: Experiment) -> dict[str, float]:
         return {}
 
 
-def refuse_subprocess_ddp_in_sweep(cfg: DictConfig) -> None:
+def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
     """Ranks started as subprocesses would train different samples of a sweep; refuse."""
     multirun = HydraConfig.get().mode is not None and HydraConfig.get().mode.name == "MULTIRUN"
-    if multirun and "ddp" in str(cfg.trainer.get("strategy", "auto")):
+    if multirun and "ddp" in str(settings.trainer.get("strategy", "auto")):
         raise InputError("trainer.strategy: ddp starts processes and cannot be swept with -m")
 
 
@@ -176,7 +168,7 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
             flat[name] = str(node)
 
     # What `module` holds refers to the other groups and would only repeat them.
-    left_out = ("hydra", "module", "views", "lens", "callbacks", "logger", "trainer")
+    left_out = ("module", "views", "lens", "callbacks", "logger", "trainer")
     chosen = [key for key in cfg if key not in left_out]
     visit(OmegaConf.to_container(OmegaConf.masked_copy(cfg, chosen), resolve=True), "")
     return {"experiment": HydraConfig.get().runtime.choices.get("experiment"), **flat}

@@ -1,8 +1,8 @@
 """Settings that a user or an experiment makes and that nothing reads are errors.
 
-Whether a setting is read is tried out: the parts of the configuration that a run takes are resolved
-with it and without it.  A setting whose absence changes nothing is not read, whichever way an
-interpolation might have led to it.
+Whether a setting is read is tried out: the parts of the configuration that a run reads (the fields
+of `RunSettings`) are resolved with it and without it.  A setting whose absence changes nothing is
+not read, whichever way an interpolation might have led to it.
 """
 
 import copy
@@ -32,13 +32,13 @@ def refuse_unread(cfg: DictConfig, taken: Sequence[str]) -> None:
     so are settings without content: null, [] and {}.
 
     Args:
-        cfg: the composed configuration, as Hydra gives it to the job.
-        taken: top-level keys that the run itself takes.
+        cfg: the composed configuration without Hydra's own part.
+        taken: top-level keys that the run itself reads.
 
     Raises:
         InputError: the first such setting.
     """
-    own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    own = cfg.copy()
     OmegaConf.set_struct(own, False)
     before = _resolved(own, taken)
     if any(part is _BROKEN for part in before):

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from dolens.errors import check_choice, check_keys
+from dolens.optics.parameter_units import to_lens_units
 from dolens.plotting import Point, pareto_front
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
@@ -143,8 +144,8 @@ def _subject(name: str, entry: Mapping[str, Any]) -> Subject:
     lens = lens_from_prescription(entry["lens"], torch.float32, where=f"scenes.{name}.lens")
     with torch.no_grad():
         for pattern, value in (entry.get("values") or {}).items():
-            for parameter in lens.variables([pattern]).values():
-                parameter.fill_(value)
+            for key, parameter in lens.variables([pattern]).items():
+                parameter.fill_(to_lens_units(key, value))
     scene = PlanarScene(entry["depths"], entry["wavelengths"])
     sensor = Sensor(**entry["sensor"])
     names = tuple(lens.variables(list(entry["variables"])))

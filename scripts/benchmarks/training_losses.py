@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dolens.optics.lens import Lens
 from dolens.rendering.gradient_check import Loss
+from experiments.running.run_settings import RunSettings
 from experiments.running.training import build_lens
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,7 +42,7 @@ def training_losses() -> Iterator[tuple[str, Lens, Loss, list[str]]]:
             overrides = [f"experiment={name}", *overrides]
             cfg = compose("train", overrides, return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)
-            lens = build_lens(cfg)
+            lens = build_lens(RunSettings.of(cfg))
             module = instantiate(cfg.module)(lens=lens).double()
         module.eval()  # no statistics that move from call to call
         yield f"{name}, its training loss", lens, _loss(module), list(module.variables.names)

@@ -55,22 +55,46 @@ def fitted(loss, fit, iterations=15):
     optimizer = DampedLeastSquares([fit.scaled])
     for _ in range(iterations):
         optimizer.step(lambda: SpotResiduals(loss, fit, chosen))
-    return fit.found()
+    return fit.file_values()
 
 
 def test_degrees_outside_and_radians_inside(singlet):
     one = pose(singlet, tilt_x=3.0, shift_z=0.5)
-    assert float(one.values()[TILT].detach()) == pytest.approx(math.radians(3.0))
-    assert one.found()[TILT] == pytest.approx(3.0)
+    assert float(one()[TILT].detach()) == pytest.approx(math.radians(3.0))
+    assert one.file_values()[TILT] == pytest.approx(3.0)
     one.store()
     assert float(one.lens.elements["lens"].tilt_x) == pytest.approx(math.radians(3.0))
+
+
+def test_a_pose_is_bounded_and_linked_as_a_design_is(singlet):
+    """Patterns name its variables; a fit keeps to bounds, which are degrees; a pickup follows."""
+    settings = {
+        "elements.lens.tilt_[xy]": {"lower": -1.0, "upper": 1.0},
+        SHIFT: {"initial": 0.25},
+        "elements.lens.decenter_x": {"pickup": SHIFT, "factor": -2.0},
+    }
+    one = Pose(copy.deepcopy(singlet), SOURCE, settings)
+    assert list(one.names) == [TILT, "elements.lens.tilt_y", SHIFT]
+    assert float(one()["elements.lens.decenter_x"].detach()) == -0.5
+    loss = SpotLoss(seen(singlet, tilt_x=3.0), IMAGER, 1.0)
+    optimizer = DampedLeastSquares([one.parameter_group()])
+    chosen = torch.tensor([True, False, False])
+    for _ in range(8):
+        optimizer.step(lambda: SpotResiduals(loss, one, chosen))
+    assert one.file_values()[TILT] == pytest.approx(1.0, abs=1e-12)
+    again = one.varying(one.settings)
+    assert again.file_values() == pytest.approx(one.file_values(), rel=1e-15)
+    assert again.upper.tolist() == one.upper.tolist()
+    again.store()
+    assert float(again.lens.elements["lens"].decenter_x) == -0.5
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"sources.2.x": None}, "sources.<1 to 1>"),
-        ({"elements.lens.*": None}, "not one number"),
+        ({"sensor_distance": {"solve": "best_focus"}}, "of merit functions"),
+        ({TILT: {"initial": 3.0, "upper": 2.0}}, "initial value 3 is outside its bounds"),
         ({TILT: {"size": 1.0}}, "unknown key 'size'"),
         ({TILT: {"scale": 0.0}}, "scale must be positive"),
     ],
@@ -282,7 +306,7 @@ def weighted_fit(one, imager, measured, iterations=3):
         loss = NoiseWeightedLoss(measured, imager).weighted_at(one)
         optimizer.restart()
         optimizer.step(SpotMerit(loss, one, chosen))
-    return one.found()
+    return one.file_values()
 
 
 def test_noise_weighted_jacobian_is_that_of_differences(singlet):
@@ -359,12 +383,12 @@ def test_sources_shift_as_one_target(singlet):
     """By a variable of their own, once however often it is put."""
     names = {"sources.*.x": {"initial": 0.5}, "sources.2.z": None}
     two = Pose(singlet, [[0.0, 0.0, -864.0], [3.0, 1.0, -700.0]], names)
-    assert two.found() == {"sources.*.x": 0.5, "sources.2.z": -700.0}
+    assert two.file_values() == {"sources.*.x": 0.5, "sources.2.z": -700.0}
     for _ in range(2):
         two.put({"sources.*.x": 0.5, "sources.2.z": -710.0})
     assert two.places.tolist() == [[0.5, 0.0, -864.0], [3.5, 1.0, -710.0]]
     other = two.varying({"sources.*.x": None})
-    assert other.found() == {"sources.*.x": 0.5}
+    assert other.file_values() == {"sources.*.x": 0.5}
     given = Pose(singlet, [[0.5, 0.0, -864.0], [3.5, 1.0, -710.0]], {})
     with torch.no_grad():
         pairs = zip(other.images(IMAGER), given.images(IMAGER), strict=True)

@@ -273,7 +273,7 @@ def test_estimates_end_where_a_fit_from_afar_does(singlet, effects):
         optimizer.restart()
         optimizer.step(SpotMerit(loss, fit, chosen))
     bounds = known.bounds / one.units
-    by_fit = torch.tensor(list(fit.found().values()), dtype=torch.float64)
+    by_fit = torch.tensor(list(fit.file_values().values()), dtype=torch.float64)
     off = (by_fit - torch.tensor(list(names.values()), dtype=torch.float64)) / bounds
     far = float(off.abs().max())
     assert far > 5.0
@@ -291,7 +291,7 @@ def test_errors_of_what_is_held_have_no_part_in_an_images_own_chi_squared(single
     true.store()
     measured = seen(true.lens, photons=100_000, read_noise=2.0)
     alone = knowledge(both, imager, measured).holding(4, torch.zeros(1, 1, dtype=torch.float64))
-    names = one.found()
+    names = one.file_values()
     at = one.lens.sensor_distance.detach().reshape(1)
     unit = torch.ones(1, dtype=torch.float64)
 

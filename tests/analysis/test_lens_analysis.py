@@ -55,7 +55,7 @@ def hyperbola_slopes(height):
     return height / (FOCAL - sag)
 
 
-def test_even_points_fill_the_disc_evenly():
+def test_pupil_points_fill_the_disc_uniformly():
     points, weight = uniform_pupil_points(1000)
     assert float(weight.sum()) == pytest.approx(1.0)
     inner = points[weight > 0.0]

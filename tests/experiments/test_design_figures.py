@@ -6,6 +6,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from dolens.optimize import MeritSettings
 from experiments.design.figures import pupil_note
+from experiments.running.run_settings import RunSettings
 from experiments.running.training import build_lens
 
 
@@ -13,7 +14,7 @@ from experiments.running.training import build_lens
 def figures(composed):
     """Of the aspheric singlet as it begins; its merit has another pupil than its stop."""
     cfg = composed("experiment=asphere")
-    return instantiate(cfg.module)(lens=build_lens(cfg)).figures()
+    return instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg))).figures()
 
 
 def title_of(figure):

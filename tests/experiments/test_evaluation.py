@@ -11,6 +11,7 @@ from tiny_experiment import TINY, TINY_NETWORK
 
 from dolens.rendering.psf import axial_point_spread_functions
 from experiments.camera.calibration import NoisyMeasurement, OtherDepth, OtherSample
+from experiments.running.run_settings import RunSettings
 from experiments.running.training import build_lens, run
 
 QUICK = ["trainer.max_epochs=1", "callbacks.pictures=null"]
@@ -25,7 +26,7 @@ def metrics_of(tmp_path, folder="run"):
 
 def camera(composed, *overrides):
     cfg = composed(*WAVEFRONT_CODING, *overrides)
-    lens = build_lens(cfg)
+    lens = build_lens(RunSettings.of(cfg))
     return lens, instantiate(cfg.module)(lens=lens)
 
 

@@ -64,7 +64,7 @@ def test_planes_part_what_one_image_cannot_and_a_common_shift_is_never_seen(comp
 
 
 BAD_INPUT = {
-    "key": (["+arrangements.one_source.plane=[0]"], "unknown key 'plane' (allowed: sources"),
+    "key": (["+arrangements.one_source.plane=[0]"], "unknown key 'plane'; did you mean 'planes'?"),
     "sources": (
         ["arrangements.one_source.sources=[]"],
         "arrangements.one_source: sources are missing; give one",

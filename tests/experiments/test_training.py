@@ -21,8 +21,8 @@ from tiny_experiment import TINY, TINY_DOUBLET, TINY_NETWORK, figure_names
 from dolens import load_lens
 from dolens.errors import InputError
 from dolens.sensor.readout import Readout
-from experiments.running.training import TAKEN, run
-from experiments.running.unread_settings import refuse_unread
+from experiments.running.configuration import checked
+from experiments.running.training import run
 
 EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experiment").glob("*.yaml"))
 UNTESTED = ["test=false", "objective=train/loss"]
@@ -58,7 +58,7 @@ def test_every_experiment_composes_and_resolves(composed, name, tmp_path):
     assert cfg.module.experiment == name
     if name.startswith("wavefront_coding"):
         assert cfg.lens.surfaces["5"].type == "xy_polynomial"
-    refuse_unread(cfg, TAKEN)  # no experiment sets what nothing reads
+    checked(cfg)  # no experiment sets what nothing reads, or what no class takes
 
 
 def test_a_run_leaves_the_whole_run_folder(composed, tmp_path):

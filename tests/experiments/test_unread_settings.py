@@ -3,8 +3,8 @@
 import pytest
 
 from dolens.errors import InputError
-from experiments.running.training import TAKEN
-from experiments.running.unread_settings import refuse_unread
+from experiments.running.configuration import checked
+from experiments.running.run_settings import RunSettings
 
 UNREAD = {
     "a group": (["experiment=asphere", "discriminator=double_scale"], "discriminator="),
@@ -41,21 +41,80 @@ READ = {
 def test_what_nothing_reads_is_one_line(composed, case):
     overrides, named = UNREAD[case]
     with pytest.raises(InputError, match=f"^{named}") as caught:
-        refuse_unread(composed(*overrides), TAKEN)
+        checked(composed(*overrides))
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("case", READ)
 def test_what_is_read_is_allowed(composed, case):
-    refuse_unread(composed("experiment=wavefront_coding", *READ[case]), TAKEN)
+    checked(composed("experiment=wavefront_coding", *READ[case]))
 
 
 def test_a_key_of_an_experiment_whose_module_does_not_take_it(composed):
     cfg = composed("experiment=large_fov_doublet_spots", "~module.merit")
     with pytest.raises(InputError, match=r"^merit: nothing in experiment="):
-        refuse_unread(cfg, TAKEN)
+        checked(cfg)
+
+
+UNKNOWN = {
+    "beside a network": ("+network.widht=3", "network: unknown key 'widht'; did you mean 'width'?"),
+    "beside data": ("+data.batch_sise=3", "data: unknown key 'batch_sise'; did you mean"),
+    "of a sensor within a renderer": (
+        "+renderer.sensor.pitch=1",
+        "renderer.sensor: unknown key 'pitch'; did you mean 'pixel_pitch'?",
+    ),
+    "of a module": ("+module.view_nrom=2", "module: unknown key 'view_nrom'; did you mean"),
+    "of a callback": ("+callbacks.pictures.dpi=9", "callbacks.pictures: unknown key 'dpi'"),
+    "of an optimizer": (
+        "+optimizer.network.lrate=1",
+        "optimizer.network: unknown key 'lrate'; did you mean",
+    ),
+    "a class that is not there": (
+        "network._target_=dolens.reconstruction.UNett",
+        r"network._target_: 'dolens.reconstruction.UNett' cannot be found",
+    ),
+    "a class that makes itself from a lens file": (
+        "+lens.elements.front._target_=os.system",
+        "lens: a prescription is data and makes nothing",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", UNKNOWN)
+def test_a_key_that_no_class_takes_is_one_line_with_the_nearest(composed, case):
+    override, message = UNKNOWN[case]
+    with pytest.raises(InputError) as caught:
+        checked(composed("experiment=wavefront_coding", override))
+    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+
+
+def test_the_published_lens_is_data_too(composed):
+    with pytest.raises(InputError, match=r"^published: a prescription is data and makes nothing"):
+        checked(composed("experiment=asphere", "+published._target_=os.system"))
+
+
+SETTINGS = {
+    "a seed": ("seed=first", "seed: 'first'; allowed: an integer"),
+    "threads": ("threads=1.5", "threads: 1.5; allowed: an integer, or null"),
+    "a switch": ("train=never", "train: 'never'; allowed: true or false"),
+    "products": ("matmul_precision=hihg", "matmul_precision: 'hihg' is unknown; did you mean"),
+    "a lens's precision": ("lens_dtype=float16", "lens_dtype: 'float16' is unknown"),
+}
+
+
+@pytest.mark.parametrize("case", SETTINGS)
+def test_a_bad_setting_of_the_run_is_one_line(composed, case):
+    override, message = SETTINGS[case]
+    with pytest.raises(InputError) as caught:
+        RunSettings.of(composed("experiment=asphere", override))
+    assert str(caught.value).startswith(message)
 
 
 def test_a_run_refuses_before_any_work(refused, tmp_path):
     refused("discriminator=double_scale", *UNREAD["a group"][0])
     assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_no_base_is_offered_as_an_experiment(root):
+    """Files that several experiments build on lie where no group has them."""
+    assert not [path for path in (root / "conf/experiment").iterdir() if path.is_dir()]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operands import Operand, View, operand
+from dolens.optimize.operands import LensProperties, Operand, operand
 from dolens.optimize.trusted_step import ray_moves, trusted_step
 from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import lens_from_prescription
@@ -207,14 +207,14 @@ def test_a_steep_limit_stops_a_step_that_would_break_it(root):
     def rim(step):
         changed = variables.scaled.detach() + step
         values = {"surfaces.1.curvature": changed[0] * 0.001}
-        view = View(lens.system(values), lens.primary_wavelength, None)
+        view = LensProperties(lens.system(values), lens.primary_wavelength, None)
         return float(min(entry.values(view).values()))
 
     # What bends the first surface more thins its rim.
     gradient = torch.tensor([-1e-3]).double()
     free = trusted_step(gradient, moves, 0.03, *unbounded(1))
     held = trusted_step(
-        gradient, moves, 0.03, *unbounded(1), OperandModel.of(lens, variables, [entry], None)
+        gradient, moves, 0.03, *unbounded(1), OperandModel.at(lens, variables, [entry], None)
     )
     assert rim(free) < -0.03
     assert rim(held) == pytest.approx(-0.015, abs=1e-3)

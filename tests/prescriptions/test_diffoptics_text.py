@@ -151,7 +151,7 @@ BAD = {
                              "line 6: an X row has b and ten coefficients, not 10"),
     "constant": (replaced("AIR  0.5 0 ", "AIR  0.5 7 ", PLATE),
                  "line 6: the constant term must be 0, not 7"),
-    "broken header": (replaced(COLUMNS, COLUMNS + ' # {"stop": '), "line 2: what stands behind #"),
+    "broken header": (replaced(COLUMNS, COLUMNS + ' # {"stop": '), "line 2: the text behind #"),
     "unknown header": (replaced(COLUMNS, COLUMNS + ' # {"stopp": 1}'),
                        "line 2: unknown key 'stopp'; did you mean 'stop'?"),
     "no such surface": (replaced(COLUMNS, COLUMNS + ' # {"surfaces": {"9": {}}}'),

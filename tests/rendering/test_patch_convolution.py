@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.rendering.patch_convolution import convolve_patches
+from dolens.rendering.patch_convolution import convolve_patches, transform_length
 from dolens.rendering.patches import Coordinates, PatchLayout, node_positions, patches
 from dolens.rendering.plane_blur import uniform_image
 from dolens.rendering.psf import splat
@@ -139,3 +139,14 @@ def test_gradients_are_those_of_the_sum(looked, shapes, backend):
         return convolve_patches(textures, kernels, layout)
 
     assert torch.autograd.gradcheck(image, (textures, kernels))
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 31, 97, 211, 320, 641])
+def test_transforms_are_of_lengths_with_small_factors(length):
+    found = transform_length(length)
+    assert length <= found <= 1.25 * length + 2
+    rest = found
+    for factor in (2, 3, 5):
+        while rest % factor == 0:
+            rest //= factor
+    assert rest == 1

@@ -1,0 +1,34 @@
+"""A composed configuration, checked before any work is done."""
+
+from omegaconf import DictConfig, OmegaConf
+
+from experiments.running.dropped_entries import without_dropped
+from experiments.running.renaming import refuse_renamed
+from experiments.running.run_settings import RunSettings
+from experiments.running.target_keys import refuse_targets_in_lenses, refuse_unknown_keys
+from experiments.running.unread_settings import refuse_unread
+
+# What Hydra makes; the lens is made by `dolens.prescriptions`, from data alone.
+_MADE = ("module", "data", "callbacks", "logger", "trainer")
+
+
+def checked(cfg: DictConfig) -> DictConfig:
+    """Return the configuration that a run works with.
+
+    It is the composed one without Hydra's own part, and without the entries that an experiment
+    drops.
+
+    Args:
+        cfg: as Hydra gives it to the job; it stays as it is.
+
+    Raises:
+        InputError: an old name, an entry dropped that no parent has, a `_target_` in a lens, a key
+            that a class does not take, or a setting that nothing reads.
+    """
+    own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    refuse_renamed(own)
+    own = without_dropped(own)
+    refuse_targets_in_lenses(own)
+    refuse_unknown_keys(own, _MADE)
+    refuse_unread(own, RunSettings.names())
+    return own

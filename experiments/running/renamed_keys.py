@@ -1,0 +1,97 @@
+"""The table of all names of the configuration that have changed; `renaming` reads it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key that has another name now, or is gone.
+
+    Attributes:
+        old: its dotted path; one `*` stands for anything, as in `variables.*.most`.
+        new: its path now, with the same `*`; None: it is gone.
+        values: old value → value now, where these have changed too.
+        instead: what to do where the key is gone; a clause.
+    """
+
+    old: str
+    new: str | None
+    values: Mapping[str, str] = field(default_factory=dict)
+    instead: str = ""
+
+
+@dataclass(frozen=True)
+class Renamed:
+    """All names that have changed.
+
+    Attributes:
+        keys: keys with another name, or none.
+        values: key → old value → value now, of keys that keep their name.
+        options: group → old option → option now, of Hydra's groups (`conf/<group>/<option>.yaml`).
+        targets: old `_target_` → `_target_` now.
+    """
+
+    keys: Sequence[Key] = ()
+    values: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    options: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    targets: Mapping[str, str] = field(default_factory=dict)
+
+
+RENAMED = Renamed(
+    keys=(
+        Key("optimizer.network.lr", None, instead="learning_rates.network is the rate"),
+        Key("module.rings", "module.pupil.rings"),
+        Key("module.arms", "module.pupil.arms"),
+        Key("module.simulation_rings", "module.simulation_pupil.rings"),
+        Key("module.simulation_arms", "module.simulation_pupil.arms"),
+    ),
+    targets={
+        "dolens.imaging.choice.auto_renderer.AutoRenderer": (
+            "dolens.rendering.auto.auto_renderer.AutoRenderer"
+        ),
+        "dolens.imaging.layers.LayeredScene.evenly_spaced": (
+            "dolens.scene.layered.LayeredScene.evenly_spaced"
+        ),
+        "dolens.imaging.psf_renderer.PsfRenderer": "dolens.rendering.psf_renderer.PsfRenderer",
+        "dolens.imaging.ray_renderer.RayRenderer": "dolens.rendering.ray_renderer.RayRenderer",
+        "dolens.imaging.readout.Readout": "dolens.sensor.readout.Readout",
+        "dolens.imaging.readout.Readout.at_light": "dolens.sensor.readout.Readout.at_light",
+        "dolens.imaging.scene.PlanarScene": "dolens.scene.planar.PlanarScene",
+        "dolens.imaging.sensor.Sensor": "dolens.sensor.pixels.Sensor",
+        "experiments.calibration.NoisyMeasurement": (
+            "experiments.camera.calibration.NoisyMeasurement"
+        ),
+        "experiments.calibration.OtherDepth": "experiments.camera.calibration.OtherDepth",
+        "experiments.calibration.OtherSample": "experiments.camera.calibration.OtherSample",
+        "experiments.camera.CameraModule": "experiments.camera.camera.CameraModule",
+        "experiments.design.DesignModule": "experiments.design.design.DesignModule",
+        "experiments.lens_least_squares.CameraOptimizer": (
+            "experiments.camera.lens_least_squares.CameraOptimizer"
+        ),
+        "experiments.misalignment.MisalignmentModule": (
+            "experiments.poses.misalignment.MisalignmentModule"
+        ),
+        "experiments.pose_accuracy.PoseAccuracyModule": (
+            "experiments.poses.accuracy.PoseAccuracyModule"
+        ),
+        "experiments.pose_coverage.PoseCoverageModule": (
+            "experiments.poses.coverage.PoseCoverageModule"
+        ),
+        "experiments.pose_knowledge.PoseKnowledgeModule": (
+            "experiments.poses.knowledge.PoseKnowledgeModule"
+        ),
+        "experiments.speed_vs_error.SpeedVsErrorModule": (
+            "experiments.speed.speed_vs_error.SpeedVsErrorModule"
+        ),
+        "experiments.tolerances.TolerancesModule": (
+            "experiments.tolerances.tolerances.TolerancesModule"
+        ),
+        "experiments.triplet_alignment.TripletAlignmentModule": (
+            "experiments.poses.triplet_alignment.TripletAlignmentModule"
+        ),
+        "experiments.views.depths.DepthViews": "experiments.camera.views.depths.DepthViews",
+        "experiments.views.fields.FieldViews": "experiments.camera.views.fields.FieldViews",
+        "experiments.views.layers.LayerViews": "experiments.camera.views.layers.LayerViews",
+    },
+)

@@ -1,0 +1,102 @@
+"""The settings that a run reads, as one typed object."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from dolens.errors import InputError, check_choice
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+_PRECISIONS = ("highest", "high", "medium")
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """The top-level keys of a configuration that a run reads; one field each.
+
+    A run reads nothing else: any other key must be referred to by one of these, or it is an error
+    (see `refuse_unread`).  A new key of a run is a new field.
+
+    Attributes:
+        lens: the prescription.
+        module: makes the `Experiment` from its lens.
+        data: makes the data module.
+        trainer: makes the trainer.
+        callbacks: name → what makes a callback, or None.
+        logger: name → what makes a logger, or None.
+        seed: the seed of all random numbers.
+        backend: what traces rays; see `dolens.load_lens`.
+        lens_dtype: `float32` or `float64`.
+        threads: torch's threads; None leaves torch's own choice.
+        matmul_precision: `highest`, `high` or `medium`.
+        train: whether to train.
+        test: whether to test.
+        ckpt_path: a checkpoint to resume from, or None.
+        objective: the name of the metric that the run returns.
+
+    Raises:
+        InputError: a value that is not allowed.
+    """
+
+    lens: DictConfig
+    module: DictConfig
+    data: DictConfig
+    trainer: DictConfig
+    callbacks: DictConfig | None
+    logger: DictConfig | None
+    seed: int
+    backend: str
+    lens_dtype: str
+    threads: int | None
+    matmul_precision: str
+    train: bool
+    test: bool
+    ckpt_path: str | None
+    objective: str
+
+    def __post_init__(self) -> None:
+        check_choice(self.lens_dtype, DTYPES, "lens_dtype")
+        check_choice(self.matmul_precision, _PRECISIONS, "matmul_precision")
+        for key in ("train", "test"):
+            _check_type(key, getattr(self, key), bool, "true or false")
+        _check_type("seed", self.seed, int, "an integer")
+        if self.threads is not None:
+            _check_type("threads", self.threads, int, "an integer, or null")
+        if self.objective.startswith("test/") and not self.test:
+            raise InputError(
+                f"objective: '{self.objective}' needs test=true, or name another metric"
+            )
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the keys that a run reads."""
+        return tuple(field.name for field in fields(cls))
+
+    @classmethod
+    def of(cls, cfg: DictConfig) -> "RunSettings":
+        """Read them from a composed configuration.
+
+        Raises:
+            InputError: a key is missing, or a value is not allowed.
+        """
+        missing = [name for name in cls.names() if name not in cfg]
+        if missing:
+            raise InputError(f"{missing[0]}: is missing from the configuration")
+        return cls(**{name: cfg[name] for name in cls.names()})
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The lens's precision."""
+        return DTYPES[self.lens_dtype]
+
+    def prescription(self) -> dict[str, Any]:
+        """Return the lens as plain data."""
+        return OmegaConf.to_container(self.lens, resolve=True)
+
+
+def _check_type(key: str, value: Any, kind: type, allowed: str) -> None:
+    # A bool is an int to Python, and none to a user.
+    if type(value) is not kind:
+        raise InputError(f"{key}: {value!r}; allowed: {allowed}")

@@ -1,0 +1,131 @@
+"""Keys beside a `_target_` that its class does not take are errors, before anything is made."""
+
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from dolens.errors import InputError, check_keys
+
+_HYDRAS = ("_target_", "_partial_", "_convert_", "_recursive_", "_args_")
+# A value that is another part of the configuration as a whole, as `network: ${network}`.
+_REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
+
+
+class Target(NamedTuple):
+    """A mapping that Hydra makes something of.
+
+    Attributes:
+        path: where it stands, as a user names it.
+        name: what it makes, as `torch.optim.Adam`.
+        keys: the arguments that it gives.
+    """
+
+    path: str
+    name: str
+    keys: tuple[str, ...]
+
+
+def refuse_unknown_keys(cfg: DictConfig, parts: Sequence[str]) -> None:
+    """Refuse keys beside a `_target_` that are no arguments of it.
+
+    Args:
+        cfg: the composed configuration.
+        parts: top-level keys that Hydra makes something of.
+
+    Raises:
+        InputError: the first such key, with the nearest argument that there is; or a target that
+            does not exist.
+    """
+    for target in targets(OmegaConf.to_container(cfg, resolve=False), parts):
+        allowed = arguments_of(located(target))
+        if allowed is not None:
+            check_keys(target.keys, allowed, target.path)
+
+
+def refuse_targets_in_lenses(cfg: DictConfig) -> None:
+    """Refuse a `_target_` in a prescription: lens files are data, and make nothing.
+
+    Raises:
+        InputError: the first one.
+    """
+    plain = OmegaConf.to_container(cfg, resolve=False)
+    for group in HydraConfig.get().runtime.choices:
+        name, _, package = str(group).partition("@")
+        if name != "lens":
+            continue
+        lens = _at(plain, package or name)
+        if any(key in _HYDRAS for mapping in _mappings(lens) for key in mapping):
+            raise InputError(
+                f"{package or name}: a prescription is data and makes nothing; '_target_' and its "
+                "like are not allowed"
+            )
+
+
+def targets(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[Target]:
+    """Yield all targets of some parts of a configuration, each once.
+
+    Args:
+        plain: the configuration, not resolved.
+        parts: top-level keys; what they refer to as a whole (`${network}`) belongs to them.
+    """
+    seen: set[str] = set()
+
+    def visit(path: str, node: Any) -> Iterator[Target]:
+        reference = _REFERENCE.fullmatch(node) if isinstance(node, str) else None
+        if reference:
+            path, node = reference[1], _at(plain, reference[1])
+        if path in seen or not isinstance(node, dict | list):
+            return
+        seen.add(path)
+        if isinstance(node, dict) and isinstance(node.get("_target_"), str):
+            given = tuple(str(key) for key in node if key not in _HYDRAS)
+            yield Target(path, node["_target_"], given)
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            yield from visit(f"{path}.{key}", value)
+
+    for part in parts:
+        yield from visit(part, plain.get(part))
+
+
+def located(target: Target) -> Any:
+    """Return the class or function of a target.
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        return pkgutil.resolve_name(target.name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"{target.path}._target_: '{target.name}' cannot be found ({error})"
+        ) from None
+
+
+def arguments_of(make: Callable[..., Any]) -> list[str] | None:
+    """Return the names of the arguments that something takes; None where it takes any."""
+    try:
+        parameters = inspect.signature(make).parameters.values()
+    except (TypeError, ValueError):  # of some classes that are written in C
+        return None
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return None
+    return [p.name for p in parameters if p.kind not in (p.POSITIONAL_ONLY, p.VAR_POSITIONAL)]
+
+
+def _at(plain: Any, path: str) -> Any:
+    """What lies at a path; None where there is nothing."""
+    for key in path.split("."):
+        plain = plain.get(key) if isinstance(plain, dict) else None
+    return plain
+
+
+def _mappings(node: Any) -> Iterator[Mapping[str, Any]]:
+    if isinstance(node, dict):
+        yield node
+    for value in node.values() if isinstance(node, dict) else node if type(node) is list else ():
+        yield from _mappings(value)

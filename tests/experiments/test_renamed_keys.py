@@ -1,0 +1,144 @@
+"""A setting that has another name now says so, and an old run's overrides are translated."""
+
+import subprocess
+import sys
+
+import pytest
+from hydra.errors import HydraException
+
+from dolens.errors import InputError
+from experiments.running.configuration import checked
+from experiments.running.renamed_keys import RENAMED, Key, Renamed
+from experiments.running.renaming import explained, refuse_renamed, translated
+from experiments.running.target_keys import Target, located
+from experiments.running.training import run
+
+CAMERA = "experiment=wavefront_coding"
+# Names that never were, so that the test says what a table can say.
+TABLE = Renamed(
+    keys=(
+        Key("sharpness.rays", "merit.quality", values={"few": "spots", "waves": "wavefront"}),
+        Key("sharpness.gone", None, instead="leave it out"),
+        Key("variables.*.step", "variables.*.scale"),
+        Key("lens_precision", "lens_dtype"),
+    ),
+    values={"merit.reference": {"middle": "centroid"}},
+    options={"renderer": {"montecarlo": "rays"}},
+    targets={"old.place.Adam": "torch.optim.Adam"},
+)
+
+OLD = {
+    "a key": ("+lens_precision=float64", "lens_precision: .* called lens_dtype now"),
+    "a key, with its values": (
+        "+sharpness.rays=waves",
+        "sharpness.rays: .* called merit.quality now, and 'waves' is 'wavefront'",
+    ),
+    "a key that is gone": (
+        "+sharpness.gone=3",
+        "sharpness.gone: there is no such setting any more: leave it out",
+    ),
+    "a key below any name": (
+        "variables={surfaces.1.conic: {step: 3}}",
+        r"variables.surfaces.1.conic.step: .* variables.surfaces.1.conic.scale now",
+    ),
+    "a value": ("merit.reference=middle", "merit.reference: 'middle' is called 'centroid' now"),
+    "a class": (
+        "optimizer.many._target_=old.place.Adam",
+        "optimizer.many._target_: 'old.place.Adam' is called 'torch.optim.Adam' now",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", OLD)
+def test_an_old_name_in_a_configuration_is_one_line_with_the_new_one(composed, case):
+    override, message = OLD[case]
+    with pytest.raises(InputError, match=f"^{message}") as caught:
+        refuse_renamed(composed("experiment=asphere", override), TABLE)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("lens_precision=float64", "called lens_dtype now"),
+        ("renderer=montecarlo", "renderer=montecarlo is called renderer=rays now"),
+        ("merit.sampling_optoins.count=3", "did you mean 'sampling_options'"),
+    ],
+)
+def test_hydra_s_refusal_of_an_old_name_is_explained(composed, override, message):
+    with pytest.raises(HydraException) as caught:
+        composed("experiment=asphere", override)
+    assert message in explained(caught.value, ["-m", "experiment=asphere", override], TABLE)
+
+
+def test_a_key_that_a_class_takes_is_no_old_name(composed):
+    """A user's own optimizer may have an argument that another one has no longer."""
+    table = Renamed(keys=(Key("optimizer.many.eps", "optimizer.many.epsilon"),))
+    refuse_renamed(composed("experiment=asphere", "+optimizer.many.eps=1e-8"), table)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("+lens_precision=float64", ["++lens_dtype=float64"]),
+        ("~lens_precision", ["~lens_dtype"]),
+        ("lens_precision=float32,float64", ["lens_dtype=float32,float64"]),
+        ("sharpness.rays=few", ["merit.quality=spots"]),
+        ("sharpness.gone=3", []),
+        ("++sharpness={gone: 3, blur: 1.5}", ["++sharpness={blur:1.5}"]),
+        ("++sharpness={rays: few}", ["++sharpness={}", "++merit.quality=spots"]),
+        (
+            "variables={surfaces.1.conic: {step: 3, upper: null}}",
+            ["variables={surfaces.1.conic:{scale:3,upper:null}}"],
+        ),
+        ("merit.reference=middle", ["merit.reference=centroid"]),
+        ("renderer=montecarlo", ["renderer=rays"]),
+        (
+            "optimizer={_target_: old.place.Adam, lr: 0.1, betas: [0.9, 0.99], name: 'it''s'}",
+            ["optimizer={_target_:torch.optim.Adam,lr:0.1,betas:[0.9,0.99],name:its}"],
+        ),
+    ],
+)
+def test_an_old_override_is_translated(old, new):
+    found, notes = translated([old], TABLE)
+    assert found == new
+    assert len(notes) >= 1 and all("\n" not in note for note in notes)
+    assert translated(found, TABLE) == (found, [])
+
+
+def test_what_has_kept_its_name_is_left_as_it_was_typed():
+    kept = ["experiment=asphere", "+a={b: [1, 'two words']}", "~c", "seed=0,1", "+lens@d=nikon"]
+    assert translated(kept) == (kept, [])
+
+
+def test_every_class_of_the_table_exists():
+    for new in RENAMED.targets.values():
+        located(Target("table", new, ()))
+
+
+def test_the_rate_that_nothing_read_names_the_one_that_is(composed):
+    with pytest.raises(InputError, match=r"optimizer.network.lr: .* learning_rates.network is"):
+        checked(composed(CAMERA, "+optimizer.network.lr=0.1"))
+
+
+def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(composed, root, tmp_path):
+    """The script, on a run folder whose overrides have the names of before."""
+    kept = [
+        "experiment=cooke_sensitivity",
+        "fields=[[0,0]]",
+        "wavelengths=[587.5618]",
+        "lenses=20",
+        "callbacks.pictures=null",
+        "+trainer.enable_progress_bar=false",
+    ]
+    run(composed(*kept, "module.pupil.rings=3", "module.pupil.arms=6"))
+    folder = tmp_path / "run"
+    old = [*kept, "module.rings=3", "+module.arms=6"]
+    (folder / ".hydra/overrides.yaml").write_text("\n".join(f"- '{text}'" for text in old))
+    script = [sys.executable, str(root / "scripts/reproduce.py"), str(folder)]
+    done = subprocess.run(script, capture_output=True, text=True, cwd=root, timeout=500)
+    assert done.returncode == 0, done.stderr
+    for name in ("rings", "arms"):
+        note = f"note: module.{name}: this setting is called module.pupil.{name} now"
+        assert note in done.stdout.splitlines()
+    assert done.stdout.splitlines()[-1] == "reproduced"
