@@ -52,7 +52,5 @@ class ChromaticFocus(Analysis):
             [row["bfd_mm"] for row in self.rows],
             marker="o",
         )
-        axes.set(
-            xlabel="wavelength, nm", ylabel="back focal distance, mm", title=self.lens.name
-        )
+        axes.set(xlabel="wavelength, nm", ylabel="back focal distance, mm", title=self.lens.name)
         return figure
