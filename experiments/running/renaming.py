@@ -46,7 +46,7 @@ class Change(NamedTuple):
 def refuse_renamed(cfg: DictConfig, renamed: Renamed = RENAMED) -> None:
     """Refuse old names in a composed configuration.
 
-    A key that a class beside it takes is no old name, whatever the table says.
+    A key that the class beside it takes is that class's own, and not the old name of another one.
 
     Raises:
         InputError: the first old name; the message has the new one.
@@ -54,7 +54,9 @@ def refuse_renamed(cfg: DictConfig, renamed: Renamed = RENAMED) -> None:
     plain = OmegaConf.to_container(cfg, resolve=False)
     for path, value, holder in _settings("", plain, {}):
         change = _change(path, value, renamed)
-        if change is not None and not _is_taken(path, holder):
+        if change is None:
+            continue
+        if change.new in (None, path) or not _is_taken(path, holder):
             raise InputError(change.message())
 
 

@@ -94,8 +94,8 @@ def test_a_key_that_a_class_takes_is_no_old_name(composed):
         ("merit.reference=middle", ["merit.reference=centroid"]),
         ("renderer=montecarlo", ["renderer=rays"]),
         (
-            "optimizer={_target_: old.place.Adam, lr: 0.1, betas: [0.9, 0.99], name: 'it''s'}",
-            ["optimizer={_target_:torch.optim.Adam,lr:0.1,betas:[0.9,0.99],name:its}"],
+            "optimizer={_target_: old.place.Adam, betas: [0.9, 0.99], name: 'two words'}",
+            ["optimizer={_target_:torch.optim.Adam,betas:[0.9,0.99],name:'two words'}"],
         ),
     ],
 )
