@@ -16,6 +16,11 @@ from experiments.running.renamed_keys import RENAMED, Key, Renamed
 from experiments.running.target_keys import Target, arguments_of, located
 
 
+# Text that the command line takes without quotes, and that it would not take for text.
+_PLAIN = re.compile(r"[A-Za-z_][\w./-]*")
+_WORDS = ("true", "false", "null", "nan", "inf")
+
+
 class Change(NamedTuple):
     """A setting as it was written, and as it is written now.
 
@@ -167,12 +172,12 @@ def _rewritten(path: str, node: Any, changes: Mapping[str, Change]) -> Any:
 def _text(value: Any) -> str:
     """A value as the command line takes it."""
     if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_text(part)}" for key, part in value.items()) + "}"
+        return "{" + ",".join(f"{_text(key)}:{_text(part)}" for key, part in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ",".join(map(_text, value)) + "]"
     if value is None:
         return "null"
-    if isinstance(value, str) and not re.fullmatch(r"[\w./-]+", value):
+    if isinstance(value, str) and (not _PLAIN.fullmatch(value) or value.lower() in _WORDS):
         return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
     return str(value)
 
