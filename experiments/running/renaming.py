@@ -15,7 +15,6 @@ from dolens.errors import InputError, did_you_mean
 from experiments.running.renamed_keys import RENAMED, Key, Renamed
 from experiments.running.target_keys import Target, arguments_of, located
 
-
 # Text that the command line takes without quotes, and that it would not take for text.
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*")
 _WORDS = ("true", "false", "null", "nan", "inf")
@@ -172,7 +171,7 @@ def _rewritten(path: str, node: Any, changes: Mapping[str, Change]) -> Any:
 def _text(value: Any) -> str:
     """A value as the command line takes it."""
     if isinstance(value, dict):
-        return "{" + ",".join(f"{_text(key)}:{_text(part)}" for key, part in value.items()) + "}"
+        return "{" + ",".join(f"{key}:{_text(part)}" for key, part in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ",".join(map(_text, value)) + "]"
     if value is None:

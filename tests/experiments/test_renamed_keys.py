@@ -92,8 +92,8 @@ def test_a_key_that_a_class_takes_is_no_old_name(composed):
             ["variables={surfaces.1.conic:{scale:3,upper:null}}"],
         ),
         (
-            "sharpness={rays: few, list: ['30', true, 'null'], '5': 1}",
-            ["sharpness={list:['30',True,'null'],'5':1}", "++merit.quality=spots"],
+            "sharpness={rays: few, list: ['30', true, 'null'], 5: 1}",
+            ["sharpness={list:['30',True,'null'],5:1}", "++merit.quality=spots"],
         ),
         ("merit.reference=middle", ["merit.reference=centroid"]),
         ("renderer=montecarlo", ["renderer=rays"]),
