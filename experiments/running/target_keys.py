@@ -107,14 +107,21 @@ def located(target: Target) -> Any:
 
 
 def arguments_of(make: Callable[..., Any]) -> list[str] | None:
-    """Return the names of the arguments that something takes; None where it takes any."""
-    try:
-        parameters = inspect.signature(make).parameters.values()
-    except (TypeError, ValueError):  # of some classes that are written in C
-        return None
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return None
-    return [p.name for p in parameters if p.kind not in (p.POSITIONAL_ONLY, p.VAR_POSITIONAL)]
+    """Return the names of the arguments that something takes; None where it takes any.
+
+    What a class takes as `**options` is taken to be for the class that it derives from.
+    """
+    found: list[str] = []
+    calls = [part.__init__ for part in make.__mro__[:-1]] if isinstance(make, type) else [make]
+    for call in calls:
+        try:
+            parameters = list(inspect.signature(call).parameters.values())
+        except (TypeError, ValueError):  # of some classes that are written in C
+            return None
+        found += [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            return [name for name in dict.fromkeys(found) if name != "self"]
+    return None
 
 
 def _at(plain: Any, path: str) -> Any:
