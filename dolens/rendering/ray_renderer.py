@@ -6,6 +6,7 @@ images of their own, and PyTorch's operations, the reference that they must equa
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ from dolens.optics.system import OpticalSystem
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.moving_view import MovingView, moving_view
 from dolens.rendering.pixel_rays import PixelRays
-from dolens.rendering.protocol import Unprepared
+from dolens.rendering.protocol import Renderer, SensorWindow
 from dolens.rendering.pupil.exit_pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
 from dolens.rendering.pupil.light_edges import edge_map
 from dolens.rendering.pupil.moving_pupil import depends_on_parameters
@@ -33,7 +34,7 @@ _SEED_RANGE = 2**63 - 1
 
 
 @dataclass(frozen=True)
-class RayRenderer(Unprepared):
+class RayRenderer(Renderer):
     """Monte Carlo rendering: jittered points of each pixel, a stratified sampling of the pupil.
 
     Each pixel sends `pupil_samples`² rays: one from a random point of the pixel through a random
@@ -59,6 +60,9 @@ class RayRenderer(Unprepared):
     gradient_fraction: float = 1.0
     pixel_area: bool = True
 
+    model: ClassVar[str] = "rays"
+    monte_carlo: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         if self.pupil_samples < 1 or self.chunk_rays < 1:
             raise InputError("renderer: pupil_samples and chunk_rays must be at least 1")
@@ -67,29 +71,25 @@ class RayRenderer(Unprepared):
         if self.gradient_fraction < 1.0 and not self.replay:
             raise InputError("renderer: gradient_fraction below 1 needs replay")
 
-    def rays_per_image(self, scene: Scene) -> int:
+    def rays_per_image(self, scene: Scene, sensor: Sensor | None = None) -> int:
         """Rays traced through the lens for one render, all wavelengths together."""
-        pixels = self.sensor.height * self.sensor.width
-        return pixels * self.pupil_samples**2 * len(scene.wavelengths)
+        sensor = sensor or self.sensor
+        return sensor.height * sensor.width * self.pupil_samples**2 * len(scene.wavelengths)
 
     def render_windows(
         self,
         lens: Lens,
         scene: Scene,
         textures: Tensor,
-        windows: Sequence[Sensor],
-        centres: Sequence[tuple[float, float]],
+        windows: Sequence[SensorWindow],
         seed: int,
         values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """Image each texture on a window of its own; as `PsfRenderer.render_windows`.
-
-        Returns:
-            (W, images, C, height, width).
-        """
+        """Image each texture on a window of its own; see `Renderer.render_windows`."""
         axial, images = self.axial_pupil(lens, scene, values), []
-        for i, (window, centre) in enumerate(zip(windows, centres, strict=True)):
-            renderer, placed = replace(self, sensor=window), replace(scene, texture_centre=centre)
+        for i, window in enumerate(windows):
+            renderer = self.on(window.sensor)
+            placed = replace(scene, texture_centre=window.texture_centre)
             texture = textures[i : i + 1]
             images.append(renderer.render(lens, placed, texture, seed + i, values, axial))
         return torch.cat(images)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from dolens.rendering.auto.probe import grey_levels
+from dolens.rendering.auto.probes import grey_levels
 from dolens.rendering.auto.survey import spread_pixels, survey
 from dolens.rendering.imaging_system import ImagingSystem
 from experiments.speed.renders import Subject

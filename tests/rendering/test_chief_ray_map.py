@@ -9,6 +9,7 @@ from dolens.rendering import chief_ray_map as module
 from dolens.rendering.chief_ray_map import chief_ray_maps, distortion
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points
+from dolens.rendering.protocol import SensorWindow
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.exit_pupil import axial_exit_pupil
 from dolens.scene.planar import PlanarScene
@@ -85,9 +86,8 @@ def test_windows_rendered_together_are_those_rendered_one_by_one(root, registrat
         "illumination": illumination,
         "jitter": False,
     }
-    together = PsfRenderer(sensor, **settings).render_windows(
-        lens, scene, textures, windows, centres, 1
-    )
+    shown = [SensorWindow(*pair) for pair in zip(windows, centres, strict=True)]
+    together = PsfRenderer(sensor, **settings).render_windows(lens, scene, textures, shown, 1)
     for i, window in enumerate(windows):
         placed = PlanarScene(scene.depths, scene.wavelengths, centres[i])
         alone = PsfRenderer(window, **settings).render(lens, placed, textures[i : i + 1], 1)

@@ -11,7 +11,7 @@ from dolens.diffraction.psf import wave_kernels
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
 from dolens.prescriptions.build import prescription_of
-from dolens.rendering.auto.probe import probe_texture
+from dolens.rendering.auto.probes import probe_texture
 from dolens.rendering.gradient_check import gradient_rows
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer

@@ -12,7 +12,7 @@ from dolens.errors import InputError
 from dolens.optics.elements import Element, ElementState
 from dolens.optics.trace import trace_surfaces
 from dolens.prescriptions import lens_from_prescription
-from dolens.rendering.auto.probe import probe_image
+from dolens.rendering.auto.probes import probe_image
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_grid import field_point_spread_functions

@@ -1,32 +1,33 @@
 """What a scene needs of a renderer, found from a few probe rays, in grey levels."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diffraction_limit
-from dolens.rendering.auto.finding import Finding
-from dolens.rendering.auto.grid import (
+from dolens.rendering.auto.field_grid import (
     REGISTRATIONS,
     SAMPLES,
     WINDOW_SHARE,
+    Finding,
     choose_fields,
     window_finding,
 )
-from dolens.rendering.auto.probe import blurred_grey_levels, grey_levels
+from dolens.rendering.auto.probes import blurred_grey_levels, grey_levels
 from dolens.rendering.auto.survey import Pixels, Survey, spread_pixels, survey
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.planar import PlanarScene
+from dolens.sensor.pixels import Sensor
 
 # Points of the sensor where functions are compared.
 _POINTS = 24
 _PUPIL_SAMPLES = (6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64)
 # The share of the tolerance that each simplification may take; with those of
-# `grid` their squares add up to less than 1.
+# `field_grid` their squares add up to less than 1.
 _SAMPLING, _SHARING, _DIFFRACTION, _PRECISION = 0.5, 0.25, 0.3, 0.1
 # Near an optimum the gradients of colours, and of depths, cancel; one in place of all turns their
 # sum: a cosine of 0.3 with the rays' gradient was measured, in images a quarter grey level off.
@@ -37,6 +38,8 @@ _WAVES = 4
 _MOST_SAMPLES = 1 << 28
 # Pixels by which windows grow, for diffraction; the last is for comparison.
 _MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
+# Models of diffraction, from the least to the most exact.
+_DIFFRACTION_MODELS = ("none", "limit", "wave")
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,38 @@ def plan(single: ImagingSystem, double: ImagingSystem, requirements: Requirement
     findings.append(finding)
     dtype = torch.float32 if finding.chosen == "single" else torch.float64
     return Plan(renderer, dtype, tuple(findings), without)
+
+
+def union(plans: Mapping[str, Plan], sensor: Sensor) -> Plan:
+    """The plan for windows of a sensor that is as demanding as the most demanding window's.
+
+    Args:
+        plans: by the windows' names, all centred on chief rays.
+        sensor: the whole one.
+    """
+    parts = [found.renderer for found in plans.values()]
+    renderer = PsfRenderer(
+        sensor,
+        tuple(max(part.fields[side] for part in parts) for side in (0, 1)),
+        max(part.pupil_samples for part in parts),
+        max(part.size for part in parts),
+        illumination="map" if any(p.illumination == "map" for p in parts) else "functions",
+        colours="each" if any(p.colours == "each" for p in parts) else "one",
+        diffraction=max((part.diffraction for part in parts), key=_DIFFRACTION_MODELS.index),
+    )
+    chosen = (
+        f"{renderer.fields[0]}×{renderer.fields[1]} fields, {renderer.pupil_samples}² rays, "
+        f"{renderer.size} pixels, colours {renderer.colours}, diffraction {renderer.diffraction}"
+    )
+    error = max(found.expected_error for found in plans.values())
+    finding = Finding("windows", chosen, error, f"the most demanding of {', '.join(plans)}")
+    double = any(found.dtype == torch.float64 for found in plans.values())
+    return Plan(
+        renderer,
+        torch.float64 if double else torch.float32,
+        (finding,),
+        max(found.without_diffraction for found in plans.values()),
+    )
 
 
 def _shared_depths(functions: Tensor, scene: PlanarScene, tolerance: float) -> Finding:

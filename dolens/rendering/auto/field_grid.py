@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from dolens.errors import InputError
-from dolens.rendering.auto.cost import psf_cost
-from dolens.rendering.auto.finding import Finding
-from dolens.rendering.auto.probe import MEAN, grey_levels
+from dolens.rendering.auto.costs import psf_cost
+from dolens.rendering.auto.probes import MEAN, grey_levels
 from dolens.rendering.auto.survey import Survey, survey
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.patches import node_positions, triangle_weights
@@ -22,6 +21,26 @@ FIELDS_SHARE, WINDOW_SHARE = 0.6, 0.25
 REGISTRATIONS = ("pinhole", "chief_rays")
 _GRIDS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25)
 _LARGEST = 511  # window, pixels
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One decision of a plan.
+
+    Attributes:
+        what: the setting that was decided on.
+        chosen: its value.
+        error: the error that it leaves, grey levels on the probe.
+        because: the reason.
+    """
+
+    what: str
+    chosen: str
+    error: float
+    because: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.chosen} ({self.error:.2g} grey levels; {self.because})"
 
 
 @dataclass(frozen=True)
