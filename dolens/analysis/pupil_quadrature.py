@@ -72,6 +72,8 @@ def square_grid(
         fields: (x, y), degrees.
         wavelengths: nm.
         count: points along each side.
+
+    Rarely needed:
         half_width: mm; None: the first surface's semi-diameter r₁, plus what its rim's sag moves
             the beam of a field aside, tan(field)·sag(r₁).
 
@@ -129,6 +131,8 @@ def gaussian_quadrature(
         rings: radii.
         arms: azimuths of the whole pupil, an even number.
         object_distance: mm in front of the first vertex; None for an object at infinity.
+
+    Rarely needed:
         symmetry: whether a part of the pupil may stand for its mirror images, where the lens has
             the symmetry.
 

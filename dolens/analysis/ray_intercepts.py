@@ -101,6 +101,8 @@ def trace_ray_intercepts(
         wavelengths: (W,), nm.
         pupil: (N, 2), x and y on the stop over its semi-diameter, in the unit disc.
         object_distance: mm in front of the first vertex; None for an object at infinity.
+
+    Rarely needed:
         exact: aim every ray, rather than to fit a few.
 
     Raises:

@@ -15,6 +15,8 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 120) -> None:
     Args:
         figure: any figure.
         path: its suffix (.png, .pdf, .svg) chooses the format.
+
+    Rarely needed:
         dpi: pixels per inch of the figure's size.
     """
     path = Path(path)
@@ -27,6 +29,8 @@ def figure_to_image(figure: Figure, dpi: float = 80) -> Tensor:
 
     Args:
         figure: any figure; its own resolution is left as it was.
+
+    Rarely needed:
         dpi: pixels per inch of the figure's size.
 
     Returns:

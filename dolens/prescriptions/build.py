@@ -75,6 +75,8 @@ def lens_from_prescription(
         prescription: as the module's docstring shows.
         dtype: precision of the lens.
         index_model: used instead of the prescription's own.
+
+    Rarely needed:
         where: name of the prescription in messages, usually its file.
         backend: auto, reference, cpu or cuda.
 

@@ -74,6 +74,8 @@ def load_lens(
         path: the file; its suffix says which format it is in.
         dtype: precision of the lens.
         index_model: dfc, do or paper, instead of the file's own.
+
+    Rarely needed:
         backend: auto, reference, cpu or cuda.
 
     Raises:

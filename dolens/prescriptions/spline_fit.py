@@ -34,6 +34,8 @@ def fit_b_spline(
         sag: mm; of any shape, or (rows, columns) on the grid of y and x.
         knots_x: mm, 4 more than there are to be coefficients along x (see `clamped_knots`).
         knots_y: mm, along y.
+
+    Rarely needed:
         smoothing: mm², at least 0.
 
     Returns:

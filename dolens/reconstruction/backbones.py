@@ -133,6 +133,8 @@ def load_backbone(
         in_channels, stages, width_multiplier: see `Backbone`.
         weights: "imagenet" requires trained weights; "auto" starts at random, with a warning,
             where they are not available; "none" starts at random.
+
+    Rarely needed:
         weights_file: file of trained weights; see `PublishedWeights.load`.
 
     Raises:

@@ -36,6 +36,8 @@ class FeaturePyramid(nn.Module):
         backbone: gives the features and takes the image's channels.
         out_channels: channels of the output.
         pyramid_channels: P, a multiple of 4.
+
+    Rarely needed:
         zero_output: start with a last convolution of zeros, so that the output is zero and a
             residual network that adds it to its input begins as the identity.
 

@@ -57,6 +57,8 @@ def bootstrap_interval(
         scores: (S, P, K): seed, photograph, and whatever the statistic takes, such as views.
         statistic: maps mean scores (R, K) to (R,).
         generator: draws the resamples; on the CPU.
+
+    Rarely needed:
         level: confidence level, between 0 and 1.
         resamples: how many.
 
@@ -103,6 +105,8 @@ def gain_interval(
             same order.
         statistic: maps mean scores (R, K) to (R,).
         generator: draws the resamples.
+
+    Rarely needed:
         level: confidence level, between 0 and 1.
         resamples: how many.
 

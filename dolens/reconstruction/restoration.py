@@ -128,11 +128,13 @@ class FeaturePyramidRestoration(ResidualRestoration):
     Args:
         backbone: "mobilenet_v2" or "googlenet", the Inception network.
         stages: of the backbone, from 2 to 5; 5, as in the original, sees at 1/32.
-        width_multiplier: of a MobileNetV2's channels; trained weights are published for 1.
         pyramid_channels: of the pyramid, a multiple of 4; see `FeaturePyramid`.
         field_coordinates: whether it is told where on the sensor a pixel lies.
         weights: "imagenet" requires trained weights for the backbone; "auto" starts at random,
             with a warning, where they are not available; "none" starts at random.
+
+    Rarely needed:
+        width_multiplier: of a MobileNetV2's channels; trained weights are published for 1.
         weights_file: a file of them; None for the torch cache, then torchvision's download.
 
     Raises:

@@ -22,6 +22,8 @@ class UNet(nn.Module):
         out_channels: channels of the output.
         width: channels of the first stage.
         depth: number of halvings.
+
+    Rarely needed:
         zero_output: start with a last convolution of zeros, so that the output is zero and a
             residual network that adds it to its input begins as the identity.
 

@@ -50,11 +50,13 @@ class CropDataModule(lightning.LightningDataModule):
             log-uniformly.
         evaluation_crops_per_photograph: crops of each validation and test photograph at most;
             they do not overlap, so that a small photograph gives fewer.
+        seed: of the training crops.
+
+    Rarely needed:
         evaluation_scale: photograph pixels per texel in validation and test.
         flip_horizontal: mirror half of the training crops left and right.
         flip_vertical: mirror half of the training crops top and bottom.
         num_workers: processes that cut crops; 0 cuts them in the training process.
-        seed: of the training crops.
 
     Raises:
         InputError: an argument is out of range; the line names it.

@@ -30,16 +30,18 @@ class ImageFolderDataModule(CropDataModule):
 
     Args:
         root: the folder, searched recursively.
-        extensions: endings of the files to take; case is ignored.
         validation_fraction: share of the files for validation, above 0.
         test_fraction: share of the files for test, above 0.
         evaluation_limit: the most photographs to use in validation, and in test; chosen by
             their hash.  None: all.
+        **crops: the arguments of `CropDataModule`.
+
+    Rarely needed:
+        extensions: endings of the files to take; case is ignored.
         verify: look at every file's header at set-up and leave out those that are no images.
             False leaves it to decoding, where the next readable file takes the place of an
             unreadable one: what to choose for very many files.
         cache_bytes: decoded pixels kept in memory, in each split and process.
-        **crops: the arguments of `CropDataModule`.
 
     Raises:
         InputError: an argument is out of range; at set-up, the folder is missing, empty, holds
