@@ -1,4 +1,6 @@
-"""How well a pose can be known: Fisher information, bounds, correlations, what cannot be seen."""
+"""Fisher information bounds the errors of a pose: bounds, correlations, and directions that no
+image shows.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,7 +18,7 @@ from dolens.rendering.spot_image import SpotImager
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What images can tell of P numbers θ.
+    """Holds the Fisher information that images carry on P numbers θ.
 
     Attributes:
         names: of θ.
@@ -41,18 +43,19 @@ class Knowledge:
 
     @cached_property
     def root(self) -> Tensor:
-        """R (P, P), triangular, with RᵀR the information."""
+        """Return R (P, P), triangular, where RᵀR is the information."""
         return torch.linalg.qr(self.weighted, mode="r").R
 
     @property
     def fisher(self) -> Tensor:
-        """(P, P), the images' information in θ's own units, exposures taken as unknown."""
+        """Return the images' Fisher information (P, P) in θ's own units, exposures taken as
+        unknown.
+        """
         return self.root.T @ self.root
 
     @cached_property
     def own_covariance(self) -> Tensor:
-        """(P, P), its inverse: the least of any unbiased estimate (Cramér and Rao) from these
-        images, all other numbers being exact.
+        """Return the Cramér–Rao bound (P, P) from these images, all other numbers being exact.
 
         With G it is the covariance of the estimate that `correction` makes, (A⁺G)(A⁺G)ᵀ for noise
         of unit variance, which is a little more than the least.
@@ -66,21 +69,21 @@ class Knowledge:
 
     @cached_property
     def _inverse(self) -> Tensor:
-        """A⁺ (P, S·height·width)."""
+        """Return A⁺ (P, S·height·width)."""
         return torch.linalg.pinv(self.weighted)
 
     def _blurred(self, rows: Tensor) -> Tensor:
-        """(..., S·height·width), convolved."""
+        """Return rows (..., S·height·width), convolved."""
         return blurred(rows.unflatten(-1, self.noise.shape), self.blur).flatten(-3)
 
     @property
     def covariance(self) -> Tensor:
-        """(P, P), the same with what is inherited."""
+        """Return the covariance (P, P) with what the nuisance parameters propagate."""
         own = self.own_covariance
         return own if self.inherited is None else own + self.inherited
 
     def holding(self, count: int, covariance: Tensor) -> "Knowledge":
-        """Of the first numbers alone, the last ones being held as they were found elsewhere.
+        """Return the information on the first numbers alone; the last ones are nuisance parameters.
 
         With A and B the columns of both, θ is off by -(AᵀA)⁻¹AᵀB times what those held are off.
 
@@ -98,8 +101,9 @@ class Knowledge:
         )
 
     def correction(self, measurement: Measurement) -> Tensor:
-        """(P,), by which θ moves to another measurement of the same mask: one step of weighted
-        least squares, efficient where the pose is right to a few bounds.
+        """Return the step (P,) by which θ moves to another measurement of the same mask.
+
+        It is one step of weighted least squares, efficient where the pose is right to a few bounds.
 
         What the expected images lack of those measured, over the noise and convolved with G, is
         explained; pixels that are not trusted lack nothing.
@@ -110,16 +114,18 @@ class Knowledge:
 
     @property
     def bounds(self) -> Tensor:
-        """(P,), standard deviations in θ's units, with what is inherited."""
+        """Return standard deviations (P,) in θ's units, with what the nuisance parameters
+        propagate.
+        """
         return self.covariance.diagonal().sqrt()
 
     @property
     def correlations(self) -> Tensor:
-        """(P, P)."""
+        """Return the correlation matrix (P, P)."""
         return self.covariance / torch.outer(self.bounds, self.bounds)
 
     def combinations(self, scales: Tensor) -> tuple[Tensor, Tensor]:
-        """Which combinations of θ/scale are known how well.
+        """Return the eigenvectors of the information in θ/scale, and their standard deviations.
 
         Returns:
             Standard deviations, from the worst known to the best, in units of the scales, and the
@@ -137,7 +143,7 @@ def knowledge(
     slopes: SpotImager | None = None,
     blur: float = 0.0,
 ) -> Knowledge:
-    """What a measurement can tell of a pose's variables, at the pose.
+    """Return the Fisher information that a measurement carries on a pose's variables, at the pose.
 
     A pixel of λ expected electrons has the variance λ + σ², σ the read noise; a share of light i
     has λ = N·i with N, the exposure of its source, unknown as well.  With A the derivatives of all
@@ -175,7 +181,9 @@ def knowledge(
 
 
 def covariance_of(root: Tensor) -> Tensor:
-    """(RᵀR)⁻¹ of a triangular R (P, P); what R does not see has a variance beyond all measure."""
+    """Return (RᵀR)⁻¹ of a triangular R (P, P); directions that R does not see have a huge
+    variance.
+    """
     norms = torch.linalg.vector_norm(root, dim=0).clamp(min=torch.finfo(root.dtype).tiny ** 0.5)
     norms = torch.maximum(norms, 1e-12 * norms.max())
     _, values, vectors = torch.linalg.svd(root / norms)

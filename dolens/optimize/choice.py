@@ -1,4 +1,4 @@
-"""Which optimizer, by the number of variables."""
+"""The number of variables decides which optimizer a design takes."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -17,7 +17,8 @@ def by_number_of_variables(
     few: Callable[[ParameterGroups], torch.optim.Optimizer],
     many: Callable[[ParameterGroups], torch.optim.Optimizer],
 ) -> torch.optim.Optimizer:
-    """An optimizer whose step costs what the problem's size allows (supplement, Section II A).
+    """Return an optimizer whose step costs what the problem's size allows (supplement, Section II
+    A).
 
     A step of damped least squares factors a matrix with a column for each variable; one of Adam
     costs a gradient, whatever their number.

@@ -1,4 +1,4 @@
-"""Losses of the points where rays land: modulation, encircled energy, spot size."""
+"""Losses of the ray intercepts measure modulation, encircled energy or spot size."""
 
 import math
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from dolens.optimize.loss_residuals import Spots
 
 @dataclass(frozen=True)
 class SpotSize:
-    """Σ W·(RMS radius)², µm²: the classical merit function, as a loss."""
+    """Sums W·(RMS radius)², µm²: the classical merit function, as a loss."""
 
     def __call__(self, points: Tensor, spots: Spots) -> Tensor:
-        """Of points (2, N), mm from their groups' references."""
+        """Return the loss of ray intercepts (2, N), mm from their groups' references."""
         squares = _over_groups(spots.weight * points.square().sum(0), spots)
         return 1e6 * (spots.group_weights * squares).sum()
 
 
 @dataclass(frozen=True)
 class Modulation:
-    """Σ W·(target - MTF)², mean over frequencies, sagittal and tangential lines.
+    """Sums W·(target - MTF)², mean over frequencies, sagittal and tangential lines.
 
     The geometric modulation transfer function of a spot of landing points p with weights w is
     |Σ w·exp(-2πi·ν·p·e)| for lines across e (Smith, Modern Optical Engineering, 11.9).
@@ -46,13 +46,13 @@ class Modulation:
             raise InputError("target: give one number, or one for each frequency")
 
     def __call__(self, points: Tensor, spots: Spots) -> Tensor:
-        """Of points (2, N), mm from their groups' references."""
+        """Return the loss of ray intercepts (2, N), mm from their groups' references."""
         target = torch.as_tensor(self.target, dtype=points.dtype, device=points.device)
         missed = target.expand(len(self.frequencies))[:, None, None] - self.transfer(points, spots)
         return (spots.group_weights * missed.square()).sum() / (2 * len(self.frequencies))
 
     def transfer(self, points: Tensor, spots: Spots) -> Tensor:
-        """(F, 2, G): MTF of lines across x and across y."""
+        """Return the MTF (F, 2, G) of lines across x and across y."""
         frequency = torch.tensor(self.frequencies, dtype=points.dtype, device=points.device)
         phase = 2.0 * math.pi * frequency[:, None, None] * points
         real = _over_groups(spots.weight * phase.cos(), spots)
@@ -63,7 +63,7 @@ class Modulation:
 
 @dataclass(frozen=True)
 class EncircledEnergy:
-    """Σ W·(share of a spot's light outside a circle about its reference)².
+    """Sums W·(share of a spot's light outside a circle about its reference)².
 
     The circle's edge is smooth: light at distance ρ counts as inside by 1/(1 + exp((ρ - r)/s)).
 
@@ -83,7 +83,7 @@ class EncircledEnergy:
             raise InputError("radius_um and softness_um: allowed: positive, µm")
 
     def __call__(self, points: Tensor, spots: Spots) -> Tensor:
-        """Of points (2, N), mm from their groups' references."""
+        """Return the loss of ray intercepts (2, N), mm from their groups' references."""
         distance = 1e3 * (points.square().sum(0) + 1e-18).sqrt()
         softness = self.softness_um or 0.25 * self.radius_um
         outside = torch.sigmoid((distance - self.radius_um) / softness)
@@ -91,6 +91,6 @@ class EncircledEnergy:
 
 
 def _over_groups(values: Tensor, spots: Spots) -> Tensor:
-    """Sums (..., G) of values (..., N)."""
+    """Return sums (..., G) of values (..., N) over each group."""
     sums = values.new_zeros((*values.shape[:-1], len(spots.group_weights)))
     return sums.index_add(-1, spots.group, values)

@@ -1,4 +1,4 @@
-"""Least squares for any loss of the points where rays land.
+"""Any loss of the ray intercepts can be minimised by least squares.
 
 A loss L(p) of landing points p has the gradient g = ∂L/∂p for each ray.  With rows √(κ·w)·J and
 residuals g/(2·√(κ·w)) the step of damped least squares minimises
@@ -35,7 +35,7 @@ _LEAST_MOVE = 1e-10
 
 @dataclass(frozen=True)
 class Spots:
-    """Rays by spots, as a loss of landing points sees them.
+    """Assigns rays to the groups that share a reference, for losses of ray intercepts.
 
     Attributes:
         weight: (N,), share of every ray in its group; they sum to one over each.
@@ -49,16 +49,16 @@ class Spots:
 
 
 class LandingPointLoss(Protocol):
-    """A smooth scalar of where rays land, twice differentiable."""
+    """Computes a smooth scalar of the ray intercepts, twice differentiable."""
 
     def __call__(self, points: Tensor, spots: Spots) -> Tensor:
-        """Of deviations (2, N), mm, from their groups' references."""
+        """Return the loss of deviations (2, N), mm, from their groups' references."""
         ...
 
 
 @dataclass(frozen=True)
 class LossResiduals(LandingPoints):
-    """A loss of the landing points as the rays' residuals.
+    """Gives a loss of the ray intercepts a linear model, so that least squares minimises it.
 
     Args:
         landing_loss: of deviations from the reference.
@@ -81,7 +81,7 @@ class LossResiduals(LandingPoints):
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
     ) -> tuple[LinearModel, Tensor | None]:
-        """R and b; ‖b‖² is not the loss, whose value a merit function asks for apart."""
+        """Return R and b; ‖b‖² is not the loss, whose value a merit function asks for apart."""
         rows = self._rows(lens, names)
         points, jacobian = rows[0], rows[1:].flatten(1).T
         root = self.ray_weights.sqrt().repeat(2)
@@ -117,7 +117,7 @@ class LossResiduals(LandingPoints):
         return LinearModel(float(right @ right), rows, right), None
 
     def _derivatives(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """∂L/∂p (2, N), and the product of ∂²L/∂p² with displacements (D, 2, N) of the rays."""
+        """Return ∂L/∂p (2, N), and the product of ∂²L/∂p² with rays' displacements (D, 2, N)."""
         points = points.detach().requires_grad_()
         with torch.enable_grad():
             (gradient,) = torch.autograd.grad(self._loss(points), points, create_graph=True)

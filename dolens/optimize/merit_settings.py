@@ -1,4 +1,4 @@
-"""A merit function as a configuration describes it."""
+"""A configuration describes a merit function by these settings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ LOSSES = {"spot_size": SpotSize, "modulation": Modulation, "encircled_energy": E
 
 @dataclass(frozen=True)
 class MeritSettings:
-    """Which spots of a lens count, and what else it should be.
+    """Describes the spots of a lens that count, and the operands that constrain it.
 
     Attributes:
         fields: (x, y), degrees or mm; None: the lens's own.
@@ -72,7 +72,7 @@ class MeritSettings:
     operands: Sequence[Mapping[str, Any]] = ()
 
     def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
-        """(x, y) of every field that counts, degrees or mm.
+        """Return (x, y) of every field that counts, degrees or mm.
 
         Raises:
             InputError: neither the settings nor the lens name any.
@@ -84,7 +84,7 @@ class MeritSettings:
         return lens.fields.points
 
     def wavelengths_of(self, lens: Lens) -> Sequence[float]:
-        """Of every colour that counts, nm.
+        """Return every wavelength that counts, nm.
 
         Raises:
             InputError: neither the settings nor the lens name any.
@@ -95,7 +95,7 @@ class MeritSettings:
         return wavelengths
 
     def rays(self, lens: Lens) -> SpotRays:
-        """The rays of all spots that pass the lens as it is now.
+        """Return the rays of all spots that pass the lens as it is now.
 
         Raises:
             InputError: no fields or wavelengths, or an unknown sampling or option.
@@ -121,7 +121,7 @@ class MeritSettings:
         return rays
 
     def weights(self, rays: SpotRays) -> Tensor:
-        """(S,), of every spot; they sum to one."""
+        """Return the weight (S,) of every spot; they sum to one."""
         number = len(rays.wavelengths.unique())
         of_fields = _weights("field_weights", self.field_weights, rays.count // number)
         of_waves = _weights("wavelength_weights", self.wavelength_weights, number)
@@ -129,7 +129,7 @@ class MeritSettings:
         return weights / weights.sum()
 
     def build(self, lens: Lens, variables: DesignVariables) -> MeritFunction:
-        """The merit function, over rays that pass the lens as it is now.
+        """Return the merit function, over rays that pass the lens as it is now.
 
         Raises:
             InputError: an unknown quality or option, or nothing that counts.
@@ -140,7 +140,7 @@ class MeritSettings:
         return MeritFunction(lens, variables, self.image_quality(lens), operands)
 
     def image_quality(self, lens: Lens) -> ImageQuality | None:
-        """The term of the rays."""
+        """Return the rays' term over rays that pass the lens as it is now; None without one."""
         if self.quality is None:
             return None
         check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
@@ -155,7 +155,7 @@ class MeritSettings:
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Without those that are None, which stand for a default."""
+    """Return the options without those that are None, which stand for a default."""
     return {key: value for key, value in options.items() if value is not None}
 
 

@@ -1,4 +1,5 @@
-"""What a lens should be besides sharp: focal lengths, thicknesses, angles, distortion.
+"""Operands constrain properties of a lens besides sharpness: focal lengths, thicknesses, angles,
+distortion.
 
 An operand is a property of the lens, one number or several of a kind, with a target or with limits.
 A target t contributes (weight·(v - t))² to the merit function, a limit only the part of v that is
@@ -26,7 +27,8 @@ _KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
 
 
 class UnreachableField(ArithmeticError):
-    """The chief ray of a field does not reach the stop: the lens cannot be judged.
+    """Says that the chief ray of a field does not reach the stop, so that the lens cannot be
+    judged.
 
     Args:
         field: (x, y), degrees or mm.
@@ -43,7 +45,7 @@ class UnreachableField(ArithmeticError):
 
 @dataclass(frozen=True)
 class LensProperties:
-    """Properties of a lens at a point of a search, each computed once for all operands.
+    """Computes properties of a lens at a point of a search, each once for all operands.
 
     Attributes:
         system: with a graph to the variables.
@@ -61,17 +63,17 @@ class LensProperties:
 
     @cached_property
     def first_order(self) -> FirstOrder:
-        """Computed once for all operands."""
+        """Return first-order properties, computed once for all operands."""
         return first_order(self.system, self.wavelength, self.object_distance)
 
     @cached_property
     def rim_sags(self) -> list[Tensor]:
-        """Sag (mm) of every surface at the edge of its own aperture."""
+        """Return the sag (mm) of every surface at the edge of its own aperture."""
         like = self.system.vertices[-1]
         return [surface.rim_sag(like) for surface in self.system.surfaces]
 
     def chief_ray(self, field: tuple[float, float]) -> Components:
-        """The real chief ray of a field on the sensor plane, aimed once for all operands.
+        """Return the real chief ray of a field on the sensor plane, aimed once for all operands.
 
         Raises:
             UnreachableField: it does not reach the stop.
@@ -99,7 +101,7 @@ class LensProperties:
 
 @dataclass(frozen=True)
 class Operand:
-    """A property of a lens with a target or limits.
+    """Wants a property of a lens at a target or within limits.
 
     Attributes:
         kind: a name in `KINDS`.
@@ -120,11 +122,11 @@ class Operand:
     gaps: tuple[int, ...] | None = None
 
     def values(self, lens: LensProperties) -> dict[str, Tensor]:
-        """Label → value, a scalar with a graph, in the property's own unit."""
+        """Return label → value, a scalar with a graph, in the property's own unit."""
         return KINDS[self.kind](self, lens)
 
     def deviation(self, value: Tensor) -> Tensor:
-        """What is amiss: value - target, or the part of it beyond the limits, with its sign."""
+        """Return value - target, or the part of the value beyond the limits, with its sign."""
         if self.target is not None:
             return value - self.target
         below = 0.0 if self.low is None else (value - self.low).clamp(max=0.0)
@@ -133,7 +135,7 @@ class Operand:
 
 
 def operand(settings: Mapping[str, Any], lens: Lens) -> Operand:
-    """An operand as a configuration gives it.
+    """Return the operand that a configuration describes.
 
     Args:
         settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`.
@@ -192,12 +194,14 @@ def _first_order(name: str) -> Callable[[Operand, LensProperties], dict[str, Ten
 
 
 def _total_track(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-    """From the first vertex to the sensor, mm."""
+    """Return the distance from the first vertex to the sensor, mm."""
     return {"total_track": lens.system.vertices[-1]}
 
 
 def _gaps(operand: Operand, lens: LensProperties, glass: bool) -> Sequence[int]:
-    """Numbers of the gaps that an operand means: its own, or all those of glass, or of air."""
+    """Return the numbers of the gaps that an operand means: its own, or all those of glass, or of
+    air.
+    """
     if operand.gaps is not None:
         return operand.gaps
     indices = lens.system.indices(lens.wavelength)
@@ -221,7 +225,9 @@ def _at_centre(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Ten
 
 def _at_edge(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
     def values(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-        """Along the axis from rim to rim, each surface at the edge of its own aperture."""
+        """Return distances along the axis from rim to rim, each surface at the edge of its own
+        aperture.
+        """
         found = {}
         for gap in _gaps(operand, lens, glass):
             at_centre = lens.system.thicknesses[gap - 1]
@@ -236,14 +242,14 @@ def _at_edge(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tenso
 
 
 def _chief_ray_angle(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-    """Between the chief ray and the sensor's normal, degrees."""
+    """Return the angle between the chief ray and the sensor's normal, degrees."""
     ray = lens.chief_ray(operand.field)
     across = torch.hypot(ray.l, ray.m)
     return {_labelled(operand): torch.rad2deg(torch.atan2(across, ray.n))}
 
 
 def _distortion(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-    """How far the chief ray lands from its paraxial image height, per cent of this height."""
+    """Return the chief ray's distance from its paraxial image height, per cent of this height."""
     ray = lens.chief_ray(operand.field)
     field = torch.tensor(operand.field, dtype=lens.system.dtype, device=lens.system.device)
     if lens.object_distance is None:

@@ -1,4 +1,4 @@
-"""A step of damped least squares for a lens whose loss only its gradient is known of.
+"""This step of damped least squares needs no more of a lens's loss than its gradient.
 
 A network's loss L has the gradient g_k = ∂L/∂p_k with respect to the landing point p_k of each ray.
 With residuals g_k/(2√(κ w_k)) and rows √(κ w_k)·J_k, the rays' own derivatives by the variables,
@@ -40,7 +40,7 @@ _CLOSE, _TURNS = 1e-6, 80
 def ray_moves(
     lens: Lens, variables: DesignVariables, spots: list[SpotRays], damping: float
 ) -> Tensor:
-    """A triangular matrix R (P, P) with |Rδ|² = Σ w |J δ|², mm²: how far a step moves rays.
+    """Return a triangular matrix R (P, P) with |Rδ|² = Σ w |J δ|², mm²: how far a step moves rays.
 
     Moves count from the centroid of each spot, since an image as a whole may move; spots count
     alike.  Where variables undo one another, Σ damping·(d_j δ_j)² keeps R regular, with d_j what
@@ -78,8 +78,8 @@ def trusted_step(
     upper: Tensor,
     operands: OperandModel | None = None,
 ) -> Tensor:
-    """The step δ (P,) within bounds that lowers g·δ + Σ (operands' residuals)² most while |Rδ|,
-    how far rays move, is no more than `reach`.
+    """Return the step δ (P,) within bounds that lowers g·δ + Σ (operands' residuals)² most while
+    rays move by |Rδ| ≤ `reach`.
 
     Without operands and bounds it is δ = -reach · M⁻¹g/√(gᵀM⁻¹g) with M = RᵀR.
 
@@ -128,7 +128,7 @@ def trusted_step(
 
 
 def _in_rays(gradient: Tensor, moves: Tensor) -> Tensor:
-    """R⁻ᵀg, of which the rays' residuals are a multiple."""
+    """Return R⁻ᵀg, of which the rays' residuals are a multiple."""
     return torch.linalg.solve_triangular(moves.T, gradient[:, None], upper=False)[:, 0]
 
 
@@ -140,7 +140,7 @@ def _damped(
     upper: Tensor,
     operands: OperandModel | None,
 ) -> Tensor:
-    """The step that minimises g·δ + κ|Rδ|² + Σ (operands' residuals)² within bounds."""
+    """Return the step that minimises g·δ + κ|Rδ|² + Σ (operands' residuals)² within bounds."""
     root = damping**0.5
     rays = LinearModel(0.0, root * moves, 0.5 / root * _in_rays(gradient, moves))
     negligible = 1e-12 * rays.column_norms.square()
@@ -170,7 +170,7 @@ def _damped(
 
 
 def _root(slope: Callable[[float], float]) -> float:
-    """Where a function that rises from below zero to above it on [0, 1] vanishes."""
+    """Return the zero of a function that rises from below zero to above it on [0, 1]."""
     low, high = 0.0, 1.0
     while high - low > 1e-9 * high and high > 1e-18:
         middle = 0.5 * (low + high)

@@ -1,4 +1,4 @@
-"""What becomes of a lens when it is made: sensitivities, tolerances, yield."""
+"""This package predicts what manufacturing does to a lens: sensitivities, tolerances, yield."""
 
 from dolens.tolerancing.analysis import Outcome, ToleranceAnalysis, analyse_tolerances
 from dolens.tolerancing.linear_spots import LinearSpots, linear_spots

@@ -1,4 +1,4 @@
-"""Poses that other measurements lead to, without fitting each from its beginning."""
+"""Other measurements lead to poses that are found without fitting each from its beginning."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ _ITERATIONS, _DAMPING, _SMALL, _PART = 12, 1e-6, 0.1, 0.02
 
 @dataclass(frozen=True)
 class Held:
-    """Numbers that a fit holds as an earlier one found them, in θ's units (radians, mm).
+    """Holds values of nuisance parameters that an earlier fit found, in θ's units (radians, mm).
 
     Attributes:
         names: H of them.
@@ -43,13 +43,13 @@ class Held:
     true: Tensor
 
     def values(self, measurement: int) -> dict[str, float]:
-        """Of one measurement, degrees and mm."""
+        """Return the values of one measurement, degrees and mm."""
         found = (self.found[measurement] / self.units).tolist()
         return dict(zip(self.names, found, strict=True))
 
 
 def held_numbers(fit: Fit, before: Pose, found: "Estimates", truth: Mapping[str, float]) -> Held:
-    """Return the numbers that a fit holds.
+    """Return the nuisance parameters that a fit takes from an earlier one.
 
     Args:
         fit: that holds them.
@@ -70,7 +70,7 @@ def held_numbers(fit: Fit, before: Pose, found: "Estimates", truth: Mapping[str,
 
 @dataclass(frozen=True)
 class Estimates:
-    """Poses that M measurements lead to.
+    """Holds poses that M measurements lead to.
 
     Attributes:
         values: (M, P), degrees and mm.
@@ -131,7 +131,7 @@ def _estimate(
     held: Held | None,
     place: int,
 ) -> tuple[Tensor, bool]:
-    """θ (P,), and whether it has settled.
+    """Return θ (P,), and whether it has settled.
 
     One step of weighted least squares with the derivatives of the pose is all that an error of some
     bounds needs.  Where it is longer, the measurement is fitted: by damped least squares, with
@@ -169,6 +169,6 @@ def _estimate(
 
 
 def probability(chi_squared: Tensor, freedom: int) -> Tensor:
-    """The chance that a χ² variable of so many degrees of freedom is larger still."""
+    """Return the chance that a χ² variable of so many degrees of freedom is larger still."""
     half = torch.full_like(chi_squared, 0.5 * freedom)
     return torch.special.gammaincc(half, 0.5 * chi_squared)
