@@ -13,13 +13,13 @@ from dolens.analysis.pupil_quadrature import (
     square_grid,
     with_chief_rays,
 )
-from dolens.errors import InputError, call_with_settings, check_choice
+from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.optics.lens import Lens
 from dolens.optimize.image_quality import ImageQuality
 from dolens.optimize.landing_losses import EncircledEnergy, Modulation, SpotSize
-from dolens.optimize.loss_residuals import LossResiduals
+from dolens.optimize.loss_residuals import LandingPointLoss, LossResiduals
 from dolens.optimize.merit import MeritFunction
-from dolens.optimize.operands import operand
+from dolens.optimize.operands import Operand, operand
 from dolens.optimize.spot_residuals import SpotResiduals
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
@@ -49,13 +49,15 @@ class MeritSettings:
         sampling_options: what that function takes: `rings` and `arms`, or `count` and `half_width`;
             None leaves one at its default, in all options.
         quality: `spots`: RMS radii, µm; `wavefront`: RMS wavefront errors, wavelengths; a loss of
-            landing points: `modulation`, `encircled_energy` or `spot_size`; None: operands alone.
-        quality_options: of a loss, see `dolens.optimize.landing_losses`, and its `curvature`, see
-            `dolens.optimize.loss_residuals`.
+            ray intercepts: `modulation`, `encircled_energy`, `spot_size`, or an object that is
+            called as `LandingPointLoss` is; None: operands alone.
+        quality_options: of a loss by name, see `dolens.optimize.landing_losses`; and the
+            `curvature` of any loss, see `dolens.optimize.loss_residuals`.
         reference: deviations count from the spot's `centroid` or its `chief` ray.
         colours: wavelengths have references `apart`, or one for each field `together`.
         most_vignetted: share of a spot that apertures may clip; see `ImageQuality`.
-        operands: settings of each, as `dolens.optimize.operands.operand` takes them.
+        operands: each by its settings, as `dolens.optimize.operands.operand` takes them, or as an
+            object.
     """
 
     fields: Sequence[Sequence[float]] | None = None
@@ -64,12 +66,12 @@ class MeritSettings:
     wavelength_weights: Sequence[float] | None = None
     sampling: str = "gaussian_quadrature"
     sampling_options: Mapping[str, Any] = field(default_factory=dict)
-    quality: str | None = "spots"
+    quality: str | LandingPointLoss | None = "spots"
     quality_options: Mapping[str, Any] = field(default_factory=dict)
     reference: str = "centroid"
     colours: str = "apart"
     most_vignetted: float = 0.2
-    operands: Sequence[Mapping[str, Any]] = ()
+    operands: Sequence[Mapping[str, Any] | Operand] = ()
 
     def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
         """Return (x, y) of every field that counts, degrees or mm.
@@ -106,7 +108,9 @@ class MeritSettings:
         if self.sampling == "gaussian_quadrature":
             options.setdefault("object_distance", lens.object_distance)
             # A loss sees all of a spot, not one half that stands for both.
-            options.setdefault("symmetry", self.quality not in LOSSES)
+            options.setdefault(
+                "symmetry", not callable(self.quality) and self.quality not in LOSSES
+            )
         elif lens.object_distance is not None:
             raise InputError(
                 f"merit.sampling: '{self.sampling}' is for objects at infinity; lens "
@@ -143,15 +147,20 @@ class MeritSettings:
         """Return the rays' term over rays that pass the lens as it is now; None without one."""
         if self.quality is None:
             return None
-        check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
+        own_loss = self.quality if callable(self.quality) else None
+        if own_loss is None:
+            check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
         rays = self.rays(lens)
         common = (rays, self.weights(rays), self.reference, self.colours, self.most_vignetted)
         options, where = _given(self.quality_options), "merit.quality_options"
-        if self.quality in RESIDUALS:
+        if own_loss is None and self.quality in RESIDUALS:
             return call_with_settings(RESIDUALS[self.quality], options, where, *common)
         curvature = options.pop("curvature", "directions")
-        loss = call_with_settings(LOSSES[self.quality], options, where)
-        return LossResiduals(*common, loss, curvature)
+        if own_loss is None:
+            loss = call_with_settings(LOSSES[self.quality], options, where)
+            return LossResiduals(*common, loss, curvature)
+        check_keys(options, ("curvature",), where)
+        return LossResiduals(*common, own_loss, curvature)
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ class OperandModel:
     Attributes:
         operands: of each value its own; one that has several values is there several times.
         values: v (n,), each in its own unit.
-        derivatives: V (n, P), by the variables.
+        derivatives: V (n, P), with respect to the variables.
     """
 
     operands: tuple[Operand, ...]

@@ -103,23 +103,41 @@ class LensProperties:
 class Operand:
     """Wants a property of a lens at a target or within limits.
 
+    A subclass with another `values` is a new operand; `_target_` names it in a configuration.
+
     Attributes:
-        kind: a name in `KINDS`.
-        target: what it should be; None where only limits are given.
-        low: the least that costs nothing; None for no limit.
-        high: the most that costs nothing.
+        kind: a name in `KINDS`; of a subclass, its label.
+        target: what the property should be; None where only limits are given.
+        min: the least that costs nothing; None for no limit.
+        max: the most that costs nothing.
         weight: factor of the residual: merit counts (weight·deviation)².
         field: (x, y) of the chief ray, degrees or mm, of operands that have one.
         gaps: numbers of the gaps, of operands that have them; None for all of their kind.
+
+    Raises:
+        InputError: no target and no limit, or both; limits that exclude each other; a weight that
+            is not positive; or a field that is not x and y.
     """
 
     kind: str
     target: float | None = None
-    low: float | None = None
-    high: float | None = None
+    min: float | None = None
+    max: float | None = None
     weight: float = 1.0
     field: tuple[float, float] = (0.0, 0.0)
     gaps: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        where = f"operand '{self.kind}'"
+        limits = self.min is not None or self.max is not None
+        if limits == (self.target is not None):
+            raise InputError(f"{where}: give a target, or limits (min, max), one of the two")
+        if None not in (self.min, self.max) and self.min > self.max:
+            raise InputError(f"{where}: min exceeds max")
+        if not self.weight > 0.0:
+            raise InputError(f"{where}: weight must be positive, not {self.weight:g}")
+        if len(self.field) != 2:
+            raise InputError(f"{where}: field is x and y, not {self.field}")
 
     def values(self, lens: LensProperties) -> dict[str, Tensor]:
         """Return label → value, a scalar with a graph, in the property's own unit."""
@@ -129,48 +147,41 @@ class Operand:
         """Return value - target, or the part of the value beyond the limits, with its sign."""
         if self.target is not None:
             return value - self.target
-        below = 0.0 if self.low is None else (value - self.low).clamp(max=0.0)
-        above = 0.0 if self.high is None else (value - self.high).clamp(min=0.0)
+        below = 0.0 if self.min is None else (value - self.min).clamp(max=0.0)
+        above = 0.0 if self.max is None else (value - self.max).clamp(min=0.0)
         return below + above
 
 
-def operand(settings: Mapping[str, Any], lens: Lens) -> Operand:
+def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     """Return the operand that a configuration describes.
 
     Args:
-        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`.
+        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`; or an operand,
+            which is returned as it is.
         lens: that it is meant for.
 
     Raises:
-        InputError: an unknown key or kind, no target and no limit, or both, a weight that is not
-            positive, or a gap that the lens does not have.
+        InputError: an unknown key or kind, a value that `Operand` refuses, or a gap that the lens
+            does not have.
     """
+    if isinstance(settings, Operand):
+        return settings
     kind = settings.get("kind")
     check_choice(kind, KINDS, "operand: kind")
     check_keys(settings, _KEYS, f"operand '{kind}'")
-    numbers = {
-        key: None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
+    target, low, high = (
+        None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
         for key in ("target", "min", "max")
-    }
-    limits = numbers["min"] is not None or numbers["max"] is not None
-    if limits == (numbers["target"] is not None):
-        raise InputError(f"operand '{kind}': give a target, or limits (min, max), one of the two")
-    if None not in (numbers["min"], numbers["max"]) and numbers["min"] > numbers["max"]:
-        raise InputError(f"operand '{kind}': min exceeds max")
+    )
     weight = _number(settings.get("weight", 1.0), f"{kind}: weight")
-    if not weight > 0.0:
-        raise InputError(f"operand '{kind}': weight must be positive, not {weight:g}")
     field = tuple(_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0))
-    if len(field) != 2:
-        raise InputError(f"operand '{kind}': field is x and y, not {field}")
-    gaps = settings.get("gaps")
-    count = len(lens.thicknesses)
+    gaps, count = settings.get("gaps"), len(lens.thicknesses)
     if gaps is not None:
         gaps = tuple(int(gap) for gap in gaps)
         for gap in gaps:
             if not 1 <= gap <= count:
                 raise InputError(f"operand '{kind}': the lens has gaps 1 to {count}, not {gap}")
-    return Operand(kind, numbers["target"], numbers["min"], numbers["max"], weight, field, gaps)
+    return Operand(kind, target, low, high, weight, field, gaps)
 
 
 def _number(value: object, what: str) -> float:

@@ -68,7 +68,7 @@ def contributions(
         shift = -mixed[0, 0] / steep
         points = points + shift * (mixed + mixed.T) + shift.square() * tangents
         mixed = mixed + shift * tangents
-        # Half the derivative of RMS² by the focus, as the errors change it: zero for the design.
+        # Half of ∂RMS²/∂focus, as the errors change it: zero for the design.
         focus = torch.cat([mixed[:1, 0], mixed[1:, 0] + mixed[0, 1:]])
         points = points - torch.outer(focus, focus) / steep
     gradient, curvature = points[0, 1:], points.diagonal()[1:]
