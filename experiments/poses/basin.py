@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
@@ -70,7 +70,7 @@ class Basin:
         true, generator = self.true, torch.Generator().manual_seed(self.seed)
         measured = simulate(true, self.bench, self.light, generator)
         imager = spot_imager(measured, self.bench.wavelength, self.imager)
-        bounds = knowledge(true, imager, measured).bounds
+        bounds = fisher_information(true, imager, measured).bounds
         across, up = self.along.values()
         for weight in self.centroid_weights:
             # The grid's rows from below, as `table` takes them.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import Knowledge
+from dolens.alignment.information import FisherInformation
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
@@ -31,7 +31,7 @@ class Held:
     Attributes:
         names: H of them.
         units: (H,), θ's units in those of settings.
-        at: (H,), in the pose that knowledge is of.
+        at: (H,), in the pose that the information is on.
         found: (M, H), as the earlier fit found them in each of M measurements.
         true: (H,); NaN where no truth is known.
     """
@@ -89,7 +89,7 @@ class Estimates:
 @torch.no_grad()
 def estimates(
     pose: Pose,
-    known: Knowledge,
+    information: FisherInformation,
     imager: SpotImager,
     measured: Callable[[int], Measurement],
     draws: Sequence[int],
@@ -100,8 +100,8 @@ def estimates(
     """Find the pose of each of M measurements, from one pose that is near all of them.
 
     Args:
-        pose: of which there is knowledge.
-        known: of the pose.
+        pose: near all of the measurements'.
+        information: on the pose.
         imager: makes its images.
         measured: a measurement by its number.
         draws: M numbers.
@@ -112,11 +112,11 @@ def estimates(
     true = torch.tensor([truth.get(name, torch.nan) for name in pose.names], dtype=torch.float64)
     values, chi, settled = [], [], []
     for place, draw in enumerate(draws):
-        theta, done = _estimate(pose, known, imager, slopes, measured(draw), held, place)
+        theta, done = _estimate(pose, information, imager, slopes, measured(draw), held, place)
         error = theta - true * pose.units
         if held is not None:
-            error = error - known.inheritance @ (held.found[place] - held.true)
-        chi.append(error @ torch.linalg.solve(known.own_covariance, error))
+            error = error - information.nuisance_sensitivity @ (held.found[place] - held.true)
+        chi.append(error @ torch.linalg.solve(information.own_covariance, error))
         values.append(theta / pose.units)
         settled.append(done)
     return Estimates(torch.stack(values), torch.stack(chi), torch.tensor(settled))
@@ -124,7 +124,7 @@ def estimates(
 
 def _estimate(
     pose: Pose,
-    known: Knowledge,
+    information: FisherInformation,
     imager: SpotImager,
     slopes: SpotImager | None,
     measurement: Measurement,
@@ -140,15 +140,15 @@ def _estimate(
     at = pose.scale * pose.scaled.detach()
     moved = torch.zeros_like(at)
     if held is not None:
-        moved = known.inheritance @ (held.found[place] - held.at)
-    step = known.correction(measurement)
-    if float(((moved + step).abs() / known.bounds).max()) <= _NEAR:
+        moved = information.nuisance_sensitivity @ (held.found[place] - held.at)
+    step = information.correction(measurement)
+    if float(((moved + step).abs() / information.bounds).max()) <= _NEAR:
         return at + moved + step, True
     there = copy.deepcopy(pose)
     if held is not None:
         there.put(held.values(place))
     there.scaled.copy_((at + moved) / pose.scale)
-    loss = NoiseWeightedLoss(measurement, imager, slopes, known.blur)
+    loss = NoiseWeightedLoss(measurement, imager, slopes, information.blur)
     optimizer = DampedLeastSquares([there.parameter_group()], initial_damping=_DAMPING)
     every = torch.ones(len(pose.names), dtype=torch.bool)
     theta = at + moved
@@ -160,7 +160,7 @@ def _estimate(
             # No light reaches the sensor from there.
             return before, False
         theta = pose.scale * there.scaled.detach()
-        last, way = ((d / known.bounds).abs().max() for d in (theta - before, theta - at))
+        last, way = ((d / information.bounds).abs().max() for d in (theta - before, theta - at))
         if float(last) < max(_SMALL, _PART * float(way)):
             return theta, True
         # Weights are new in the next one.

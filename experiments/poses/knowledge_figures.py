@@ -87,7 +87,7 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
 
 
 def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
-    """Draw standard deviations of combinations, from the worst known to the best."""
+    """Draw standard deviations along the eigenvectors, from the largest to the smallest."""
     for number, (found, colour) in enumerate(_coloured(arrangements)):
         spread = found.spread.clone()
         unseen = int((spread > UNSEEN).sum())
@@ -103,7 +103,7 @@ def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
             label=label,
         )
     axes.set_yscale("log")
-    axes.set_xlabel("combination, from the worst known to the best", fontsize=SMALL + 1)
+    axes.set_xlabel("eigenvector, from the largest variance to the smallest", fontsize=SMALL + 1)
     axes.set_ylabel("standard deviation, of scales", fontsize=SMALL + 1)
     ruled_axes(axes)
     axes.legend(frameon=False, fontsize=SMALL)
@@ -114,7 +114,7 @@ def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> N
     names = _names(arrangements)
     table = np.full((len(arrangements), len(names)), np.nan)
     for row, found in enumerate(arrangements):
-        worst = found.combinations[0]
+        worst = found.eigenvectors[0]
         # Of one sign: its largest part is positive.
         worst = worst * torch.sign(worst[worst.abs().argmax()])
         for name, part in zip(found.pose.names, worst.tolist(), strict=True):
@@ -143,7 +143,7 @@ def _corner(found: Arrangement, name: str) -> Figure:
     units = found.pose.units
     values = torch.tensor(list(found.pose.file_values().values()), dtype=torch.float64)
     return corner_figure(
-        found.known.covariance / torch.outer(units, units),
+        found.information.covariance / torch.outer(units, units),
         [variable_label(name) for name in found.pose.names],
         found.pose.unit_names,
         values,

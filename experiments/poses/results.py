@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import Knowledge
+from dolens.alignment.information import FisherInformation
 from dolens.alignment.pose import Pose
 from experiments.poses.settings import Stage
 from experiments.tables import Row
@@ -51,7 +51,11 @@ def history_row(
 
 
 def pose_rows(
-    fit: str, pose: Pose, initial: Tensor, known: Knowledge, truth: Mapping[str, float]
+    fit: str,
+    pose: Pose,
+    initial: Tensor,
+    information: FisherInformation,
+    truth: Mapping[str, float],
 ) -> list[Row]:
     """Return a row for each variable, in degrees and mm.
 
@@ -59,7 +63,7 @@ def pose_rows(
         fit: its name.
         pose: what was found.
         initial: (P,), the point u where it began.
-        known: of the pose.
+        information: on the pose.
         truth: by name; NaN stands for what is not known.
 
     Returns:
@@ -67,8 +71,8 @@ def pose_rows(
         all that the fit holds were exact.
     """
     begun = (initial * pose.file_scale).tolist()
-    bounds = (known.bounds / pose.units).tolist()
-    own = (known.own_covariance.diagonal().sqrt() / pose.units).tolist()
+    bounds = (information.bounds / pose.units).tolist()
+    own = (information.own_covariance.diagonal().sqrt() / pose.units).tolist()
     rows: list[Row] = []
     for place, (name, value) in enumerate(pose.file_values().items()):
         true = truth.get(name, math.nan)

@@ -54,7 +54,7 @@ def test_an_operand_of_one_s_own_counts_and_is_brought_within_its_limit(triplet)
     optimizer = DampedLeastSquares([variables.parameter_group()])
     for _ in range(20):
         optimizer.step(merit)
-    assert merit().operands[0].value == pytest.approx(ratio - 0.05, abs=1e-9)
+    assert merit().operands[0].value <= ratio - 0.05 + 1e-9
 
 
 def test_an_operand_says_what_is_wrong_with_its_limits():
