@@ -23,7 +23,7 @@ from dolens.optics.rays import Status, TracedRays
 from dolens.optimize.linear_model import LinearModel
 
 REFERENCES = ("centroid", "chief")
-COLOURS = ("apart", "together")
+SPECTRA = ("monochromatic", "polychromatic")
 
 
 def without_edges(lens: Lens) -> Lens:
@@ -77,9 +77,9 @@ class ImageQuality(ABC):
         spots: the rays, with chief rays where those are the reference.
         weights: (S,), W of each spot.
         reference: deviations count from the spot's `centroid` or from its `chief` ray.
-        colours: `apart`: every wavelength has a reference of its own; `together`: one for all of a
-            field, so that lateral colour counts.
-        most_vignetted: share of a spot that apertures may clip before the lens counts as failed: a
+        reference_spectrum: `monochromatic`: every wavelength has a reference of its own;
+            `polychromatic`: one for all of a field, so that lateral colour counts.
+        max_vignetting: share of a spot that apertures may clip before the lens counts as failed: a
             search would else buy sharpness with light.
 
     Raises:
@@ -89,8 +89,8 @@ class ImageQuality(ABC):
     spots: SpotRays
     weights: Tensor
     reference: str = "centroid"
-    colours: str = "apart"
-    most_vignetted: float = 0.2
+    reference_spectrum: str = "monochromatic"
+    max_vignetting: float = 0.2
 
     # Factor of deviations in the merit, and the unit that they then have.
     scale: ClassVar[float] = 1.0
@@ -101,7 +101,7 @@ class ImageQuality(ABC):
     def __post_init__(self) -> None:
         for what, value, allowed in (
             ("reference", self.reference, REFERENCES),
-            ("colours", self.colours, COLOURS),
+            ("reference_spectrum", self.reference_spectrum, SPECTRA),
         ):
             check_choice(value, allowed, what)
         if self.reference == "chief" and self.spots.chief is None:
@@ -142,7 +142,7 @@ class ImageQuality(ABC):
 
     def is_usable(self, values: QualityValues) -> bool:
         """Return whether every ray arrives, and apertures clip no more than they may."""
-        return not values.failed and values.vignetted <= self.most_vignetted
+        return not values.failed and values.vignetted <= self.max_vignetting
 
     def slopes(self, values: QualityValues) -> Tensor:
         """Return the derivatives (N, K) of the deviations with respect to the sensor's distance."""
@@ -228,7 +228,7 @@ class ImageQuality(ABC):
     def group(self) -> Tensor:
         """Return the number of each ray's reference group (N,), int64: its spot, or its field."""
         spots = self.spots
-        if self.colours == "apart":
+        if self.reference_spectrum == "monochromatic":
             return spots.spot
         _, field = spots.fields.unique(dim=0, return_inverse=True)
         return field.to(spots.spot.device)[spots.spot]
@@ -265,7 +265,7 @@ class ImageQuality(ABC):
         of the middle wavelength.
         """
         spots = self.spots
-        if self.colours == "apart":
+        if self.reference_spectrum == "monochromatic":
             return spots.chief[spots.spot]
         group_of_spot = torch.zeros_like(spots.chief)
         group_of_spot[spots.spot] = self.group

@@ -54,8 +54,9 @@ class MeritSettings:
         quality_options: of a loss by name, see `dolens.optimize.landing_losses`; and the
             `curvature` of any loss, see `dolens.optimize.loss_residuals`.
         reference: deviations count from the spot's `centroid` or its `chief` ray.
-        colours: wavelengths have references `apart`, or one for each field `together`.
-        most_vignetted: share of a spot that apertures may clip; see `ImageQuality`.
+        reference_spectrum: `monochromatic`: each wavelength has a reference of its own; or
+            `polychromatic`: one for all wavelengths of a field.
+        max_vignetting: share of a spot that apertures may clip; see `ImageQuality`.
         operands: each by its settings, as `dolens.optimize.operands.operand` takes them, or as an
             object.
     """
@@ -69,8 +70,8 @@ class MeritSettings:
     quality: str | LandingPointLoss | None = "spots"
     quality_options: Mapping[str, Any] = field(default_factory=dict)
     reference: str = "centroid"
-    colours: str = "apart"
-    most_vignetted: float = 0.2
+    reference_spectrum: str = "monochromatic"
+    max_vignetting: float = 0.2
     operands: Sequence[Mapping[str, Any] | Operand] = ()
 
     def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
@@ -151,7 +152,13 @@ class MeritSettings:
         if own_loss is None:
             check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
         rays = self.rays(lens)
-        common = (rays, self.weights(rays), self.reference, self.colours, self.most_vignetted)
+        common = (
+            rays,
+            self.weights(rays),
+            self.reference,
+            self.reference_spectrum,
+            self.max_vignetting,
+        )
         options, where = _given(self.quality_options), "merit.quality_options"
         if own_loss is None and self.quality in RESIDUALS:
             return call_with_settings(RESIDUALS[self.quality], options, where, *common)

@@ -114,7 +114,7 @@ class DesignModule(Experiment):
             )
         self.follow = semi_diameters == "follow"
         if self.follow:
-            self.merit_settings = replace(merit, most_vignetted=1.0)
+            self.merit_settings = replace(merit, max_vignetting=1.0)
         if not 0.0 <= round_tolerance < 1.0:
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
         self.merit: MeritFunction | None = None
@@ -163,7 +163,7 @@ class DesignModule(Experiment):
             if not math.isfinite(float(self.best_merit)):
                 raise InputError(
                     "the search cannot begin: rays fail, or apertures clip more than "
-                    "merit.most_vignetted of a spot"
+                    "merit.max_vignetting of a spot"
                 )
         logger.info(
             "%d variables, %d rays of %d launched, merit %.6g",
@@ -273,13 +273,13 @@ class DesignModule(Experiment):
         quality = self.merit.quality
         if quality is None or self.follow:
             return
-        least = self.initial_light * (1.0 - quality.most_vignetted)
+        least = self.initial_light * (1.0 - quality.max_vignetting)
         lost = quality.spots.light < least.to(quality.spots.light)
         if bool(lost.any()):
             label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
             raise InputError(
-                f"spot {label} has lost more than merit.most_vignetted = "
-                f"{quality.most_vignetted:g} of the light that it had at first"
+                f"spot {label} has lost more than merit.max_vignetting = "
+                f"{quality.max_vignetting:g} of the light that it had at first"
             )
 
     def _keep_if_better(self, value: MeritValue) -> None:

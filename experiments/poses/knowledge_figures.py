@@ -110,7 +110,7 @@ def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
 
 
 def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> None:
-    """Draw the parts of the worst known combination of each arrangement."""
+    """Draw the parts of the eigenvector of largest variance of each arrangement."""
     names = _names(arrangements)
     table = np.full((len(arrangements), len(names)), np.nan)
     for row, found in enumerate(arrangements):
@@ -135,7 +135,7 @@ def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> N
         )
     axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
     axes.set_xticks(range(len(names)), [variable_label(n) for n in names], fontsize=SMALL)
-    axes.set_title("the combination that each knows worst", fontsize=SMALL + 1)
+    axes.set_title("the eigenvector of largest variance", fontsize=SMALL + 1)
     figure.colorbar(shown, ax=axes, pad=0.01).ax.tick_params(labelsize=SMALL)
 
 

@@ -38,8 +38,14 @@ class Renamed:
     targets: Mapping[str, str] = field(default_factory=dict)
 
 
+_SPECTRA = {"apart": "monochromatic", "together": "polychromatic"}
+
 RENAMED = Renamed(
     keys=(
+        Key("merit.colours", "merit.reference_spectrum", values=_SPECTRA),
+        Key("evaluation.colours", "evaluation.reference_spectrum", values=_SPECTRA),
+        Key("merit.most_vignetted", "merit.max_vignetting"),
+        Key("evaluation.most_vignetted", "evaluation.max_vignetting"),
         Key("optimizer.network.lr", None, instead="learning_rates.network is the rate"),
         Key("module.rings", "module.pupil.rings"),
         Key("module.arms", "module.pupil.arms"),

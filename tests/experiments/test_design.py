@@ -147,7 +147,7 @@ def test_a_checkpoint_of_another_design_is_refused(composed, tmp_path):
         ("merit.sampling=grid", "merit.sampling: 'grid' is unknown"),
         ("merit.sampling_options.rings=3", "merit.sampling_options: .*'rings'"),
         ("merit.quality_options.radius_um=3", "merit.quality_options: .*'radius_um'"),
-        ("merit.colours=both", "colours: 'both' is unknown"),
+        ("merit.reference_spectrum=both", "reference_spectrum: 'both' is unknown"),
         ("merit.field_weights=[1.0,2.0]", "merit.field_weights: give 1 numbers"),
         ("variables=null", "variables: there are none"),
         ("semi_diameters=free", "semi_diameters: 'free' is unknown"),
