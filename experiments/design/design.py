@@ -12,12 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
+from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
 from dolens.optimize.merit import MeritValue
-from dolens.optimize.rims import fitted_semi_diameters
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
 from experiments.design.figures import design_figures
@@ -27,7 +27,7 @@ from experiments.experiment import Experiment, Figures
 
 logger = logging.getLogger(__name__)
 
-SEMI_DIAMETERS = ("fixed", "follow")
+SEMI_DIAMETERS = ("fixed", "automatic")
 # So many iterations are logged one by one; history.csv holds all.
 _LOGGED_FIRST = 20
 # Rings of the quadrature that tells where the edges of the beams are.
@@ -51,7 +51,7 @@ class DesignModule(Experiment):
         start: settings of `start_values`; None begins at the prescription.
         published: a prescription to compare with, or None.
         evaluation: what RMS spot radii are reported of; None: the merit's own rays.
-        semi_diameters: `fixed`: light passes where the prescription lets it; or `follow`: the rays
+        semi_diameters: `fixed`: light passes where the prescription lets it; or `automatic`: the rays
             that pass the lens where the search begins are kept, and in the end every edge, and the
             stop's, is put where they pass.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
@@ -107,13 +107,9 @@ class DesignModule(Experiment):
         )
         self.optimizer, self.round_tolerance = optimizer, round_tolerance
         self.mtf_max_frequency = mtf_max_frequency
-        if semi_diameters not in SEMI_DIAMETERS:
-            raise InputError(
-                f"semi_diameters: '{semi_diameters}' is unknown (allowed: "
-                f"{', '.join(SEMI_DIAMETERS)})"
-            )
-        self.follow = semi_diameters == "follow"
-        if self.follow:
+        check_choice(semi_diameters, SEMI_DIAMETERS, "semi_diameters")
+        self.automatic_semi_diameters = semi_diameters == "automatic"
+        if self.automatic_semi_diameters:
             self.merit_settings = replace(merit, max_vignetting=1.0)
         if not 0.0 <= round_tolerance < 1.0:
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
@@ -243,11 +239,11 @@ class DesignModule(Experiment):
             self.variables.scaled.copy_(self.best)
             self.variables.write_to(self.lens)
             self.lens.sensor_distance.copy_(self.best_focus)
-        if self.follow:
+        if self.automatic_semi_diameters:
             self._fit_edges()
 
     def _build(self, lens: Lens) -> MeritFunction:
-        if not self.follow:
+        if not self.automatic_semi_diameters:
             return self.merit_settings.build(lens, self.variables)
         # The rays of the start serve every round.
         return self.merit or self.merit_settings.build(self.initial, self.variables)
@@ -271,7 +267,7 @@ class DesignModule(Experiment):
             InputError: a spot has lost more of its light than it may.
         """
         quality = self.merit.quality
-        if quality is None or self.follow:
+        if quality is None or self.automatic_semi_diameters:
             return
         least = self.initial_light * (1.0 - quality.max_vignetting)
         lost = quality.spots.light < least.to(quality.spots.light)

@@ -52,6 +52,7 @@ RENAMED = Renamed(
         Key("module.simulation_rings", "module.simulation_pupil.rings"),
         Key("module.simulation_arms", "module.simulation_pupil.arms"),
     ),
+    values={"semi_diameters": {"follow": "automatic"}},
     targets={
         "dolens.imaging.choice.auto_renderer.AutoRenderer": (
             "dolens.rendering.auto.auto_renderer.AutoRenderer"

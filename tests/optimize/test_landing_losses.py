@@ -10,10 +10,10 @@ from dolens import load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
+from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
 from dolens.optimize.choice import by_number_of_variables
 from dolens.optimize.landing_losses import EncircledEnergy, Modulation
 from dolens.optimize.loss_residuals import Spots
-from dolens.optimize.rims import fitted_semi_diameters
 
 
 def disc(radius_mm, rings=60, arms=64):
