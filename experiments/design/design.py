@@ -51,9 +51,9 @@ class DesignModule(Experiment):
         start: settings of `start_values`; None begins at the prescription.
         published: a prescription to compare with, or None.
         evaluation: what RMS spot radii are reported of; None: the merit's own rays.
-        semi_diameters: `fixed`: light passes where the prescription lets it; or `automatic`: the rays
-            that pass the lens where the search begins are kept, and in the end every edge, and the
-            stop's, is put where they pass.
+        semi_diameters: `fixed`: light passes where the prescription lets it; or `automatic`: the
+            rays that pass the lens where the search begins are kept, and in the end every edge, and
+            the stop's, is put where they pass.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
         mtf_max_frequency: the end of the MTF curves in figures, cycles/mm; see `design_figures`.

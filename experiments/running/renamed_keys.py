@@ -46,6 +46,7 @@ RENAMED = Renamed(
         Key("evaluation.colours", "evaluation.reference_spectrum", values=_SPECTRA),
         Key("merit.most_vignetted", "merit.max_vignetting"),
         Key("evaluation.most_vignetted", "evaluation.max_vignetting"),
+        Key("optimizer.most", "optimizer.max_variables"),
         Key("optimizer.network.lr", None, instead="learning_rates.network is the rate"),
         Key("module.rings", "module.pupil.rings"),
         Key("module.arms", "module.pupil.arms"),

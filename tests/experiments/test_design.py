@@ -153,7 +153,7 @@ def test_a_checkpoint_of_another_design_is_refused(composed, tmp_path):
         ("semi_diameters=free", "semi_diameters: 'free' is unknown"),
         ("start={surfaces.1.radius: 20}", "surfaces.1.radius"),
         ("start={surfaces.1.conic: {times: 2}}", "unknown key 'times'"),
-        ("optimizer.most=-1", "optimizer.most: -1"),
+        ("optimizer.max_variables=-1", "optimizer.max_variables: -1"),
         ("data.iterations=0", "data.iterations: 0; allowed"),
         ("merit.wavelengths=[]", "merit.wavelengths: lens '.*' names none"),
     ],
