@@ -46,6 +46,8 @@ RENAMED = Renamed(
         Key("evaluation.colours", "evaluation.reference_spectrum", values=_SPECTRA),
         Key("merit.most_vignetted", "merit.max_vignetting"),
         Key("evaluation.most_vignetted", "evaluation.max_vignetting"),
+        Key("optimizer.least_squares.reach", "optimizer.least_squares.trust_radius"),
+        Key("optimizer.least_squares.most", "optimizer.least_squares.max_trust_radius"),
         Key("optimizer.most", "optimizer.max_variables"),
         Key("optimizer.network.lr", None, instead="learning_rates.network is the rate"),
         Key("module.rings", "module.pupil.rings"),

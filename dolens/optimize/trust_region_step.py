@@ -70,23 +70,23 @@ def ray_moves(
     return torch.linalg.qr(damped, mode="r").R
 
 
-def trusted_step(
+def trust_region_step(
     gradient: Tensor,
     moves: Tensor,
-    reach: float,
+    trust_radius: float,
     lower: Tensor,
     upper: Tensor,
     operands: OperandModel | None = None,
 ) -> Tensor:
     """Return the step δ (P,) within bounds that lowers g·δ + Σ (operands' residuals)² most while
-    rays move by |Rδ| ≤ `reach`.
+    rays move by |Rδ| ≤ `trust_radius`.
 
-    Without operands and bounds it is δ = -reach · M⁻¹g/√(gᵀM⁻¹g) with M = RᵀR.
+    Without operands and bounds it is δ = -trust_radius · M⁻¹g/√(gᵀM⁻¹g) with M = RᵀR.
 
     Args:
         gradient: g = ∂L/∂u, (P,), without the operands' share.
         moves: R of `ray_moves`.
-        reach: RMS, mm, above 0.
+        trust_radius: RMS, mm, above 0.
         lower: (P,), at most zero: bounds of δ.
         upper: (P,), at least zero.
         operands: where δ = 0; None for none.
@@ -98,13 +98,13 @@ def trusted_step(
         model = operands.near(still)
         slope = gradient + 2.0 * model.root.T @ model.right
     # What is minimised is convex, so that |R⁻ᵀ slope|·|Rδ| ≥ -slope·δ ≥ κ|Rδ|².
-    enough = float(_in_rays(slope, moves).norm()) / reach
+    enough = float(_in_rays(slope, moves).norm()) / trust_radius
     if not enough > 0.0:
         return still
 
     def at(damping: float) -> tuple[Tensor, float]:
         step = _damped(gradient, moves, damping, lower, upper, operands)
-        return step, float((moves @ step).norm()) / reach
+        return step, float((moves @ step).norm()) / trust_radius
 
     low, high = math.log(_LEAST_DAMPING * enough), math.log(enough)
     step, moved = at(math.exp(low))
