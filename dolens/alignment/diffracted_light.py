@@ -17,7 +17,7 @@ from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
 
 _RAYS, _DEGREE = 48, 16
-# Light that diffraction spreads farther beyond the rays' landing points is lost: widths of the
+# Light that diffraction spreads farther beyond the ray intercepts is lost: widths of the
 # fringes at an edge, and pixels.
 _FRINGES, _PIXELS = 8.0, 2.0
 # Copies of the image meet the window at 1.
@@ -110,7 +110,7 @@ def diffracted_light(
     points = source.double() + moved * torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     system = lens.system()
     beams = pupil_wavefront(system, ObjectPoints.at(points), wavelength, None, _RAYS, math.inf)
-    middles = beams.centre + _mean_landing(beams)
+    middles = beams.centre + _mean_intercept(beams)
     movement = ((middles[1:] - middles[0]) / moved).mT
     front = pupil_wavefront(
         system, ObjectPoints.at(points[:1]), wavelength, beams.centre[:1], _RAYS, math.inf
@@ -149,7 +149,7 @@ def diffracted_light(
     )
 
 
-def _mean_landing(front: Wavefront) -> Tensor:
+def _mean_intercept(front: Wavefront) -> Tensor:
     """Return the mean ray intercept (N, 2), mm from the spheres' centres."""
     flux = (front.amplitude * front.weight)[..., None]
     return (flux * front.landing).sum((1, 2)) / flux.sum((1, 2)).clamp(min=1e-300)

@@ -113,7 +113,7 @@ def least_covariance(root: Tensor) -> Tensor:
     return inverse @ inverse.mT
 
 
-def named_element(chi_squared: Sequence[Tensor] | Tensor) -> tuple[Tensor, Tensor]:
+def most_likely_element(chi_squared: Sequence[Tensor] | Tensor) -> tuple[Tensor, Tensor]:
     """Return the element that explains each measurement best, and its posterior probability.
 
     Hypotheses have equally many parameters and equal priors; a hypothesis's share is

@@ -100,7 +100,7 @@ class SpotLoss:
         return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
 
 
-class SpotResiduals:
+class ImageResiduals:
     """Holds the residuals at the variables' values, as `DampedLeastSquares` takes them."""
 
     def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
@@ -119,7 +119,7 @@ class SpotResiduals:
             return LinearModel.of_rows(*self._loss.jacobian(self._pose, self._chosen))
 
 
-class SpotMerit:
+class ImageMerit:
     """Evaluates the residuals wherever the variables are, as a closure; the last point's are kept.
 
     Args:
@@ -130,11 +130,11 @@ class SpotMerit:
 
     def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
         self._of = (loss, pose, chosen)
-        self._last: SpotResiduals | None = None
+        self._last: ImageResiduals | None = None
 
-    def __call__(self) -> SpotResiduals:
+    def __call__(self) -> ImageResiduals:
         """Return the residuals where the variables are."""
         point = self._of[1].scaled.detach()
         if self._last is None or not torch.equal(self._last.point, point):
-            self._last = SpotResiduals(*self._of)
+            self._last = ImageResiduals(*self._of)
         return self._last

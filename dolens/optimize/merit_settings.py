@@ -16,11 +16,11 @@ from dolens.analysis.pupil_quadrature import (
 from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.optics.lens import Lens
 from dolens.optimize.image_quality import ImageQuality
-from dolens.optimize.landing_losses import EncircledEnergy, Modulation, SpotSize
-from dolens.optimize.loss_residuals import LandingPointLoss, LossResiduals
+from dolens.optimize.loss_residuals import LossResiduals, RayInterceptLoss
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import Operand, operand
-from dolens.optimize.spot_residuals import SpotResiduals
+from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation, SpotSize
+from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
@@ -30,7 +30,7 @@ SAMPLINGS: dict[str, Callable[..., SpotRays]] = {
 }
 # Residuals of rays, and losses of the points where they land.
 RESIDUALS: dict[str, type[ImageQuality]] = {
-    "spots": SpotResiduals,
+    "spots": RayInterceptResiduals,
     "wavefront": WavefrontResiduals,
 }
 LOSSES = {"spot_size": SpotSize, "modulation": Modulation, "encircled_energy": EncircledEnergy}
@@ -50,8 +50,8 @@ class MeritSettings:
             None leaves one at its default, in all options.
         quality: `spots`: RMS radii, µm; `wavefront`: RMS wavefront errors, wavelengths; a loss of
             ray intercepts: `modulation`, `encircled_energy`, `spot_size`, or an object that is
-            called as `LandingPointLoss` is; None: operands alone.
-        quality_options: of a loss by name, see `dolens.optimize.landing_losses`; and the
+            called as `RayInterceptLoss` is; None: operands alone.
+        quality_options: of a loss by name, see `dolens.optimize.ray_intercept_losses`; and the
             `curvature` of any loss, see `dolens.optimize.loss_residuals`.
         reference: deviations count from the spot's `centroid` or its `chief` ray.
         reference_spectrum: `monochromatic`: each wavelength has a reference of its own; or
@@ -67,7 +67,7 @@ class MeritSettings:
     wavelength_weights: Sequence[float] | None = None
     sampling: str = "gaussian_quadrature"
     sampling_options: Mapping[str, Any] = field(default_factory=dict)
-    quality: str | LandingPointLoss | None = "spots"
+    quality: str | RayInterceptLoss | None = "spots"
     quality_options: Mapping[str, Any] = field(default_factory=dict)
     reference: str = "centroid"
     reference_spectrum: str = "monochromatic"

@@ -1,6 +1,6 @@
 """This step of damped least squares needs no more of a lens's loss than its gradient.
 
-A network's loss L has the gradient g_k = ∂L/∂p_k with respect to the landing point p_k of each ray.
+A network's loss L has the gradient g_k = ∂L/∂p_k with respect to the intercept p_k of each ray.
 With residuals g_k/(2√(κ w_k)) and rows √(κ w_k)·J_k, the rays' own derivatives with respect to the
 variables, least squares minimises
 

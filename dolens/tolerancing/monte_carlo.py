@@ -82,12 +82,12 @@ def trace_perturbed(
         return trace_to_plane(system, at_last, system.vertices[-1], wavelength, 1.0)
 
     # Sums are formed about the design's centroids, so that squares of distances lose no digits.
-    design = _landing(traced(start).ray)
+    design = _intercepts(traced(start).ray)
     means = (torch.stack(design) @ shares)[:, spots.spot].unbind()
 
     def moments(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         trace = traced(values)
-        x, y, u, v = (c - m for c, m in zip(_landing(trace.ray), means, strict=True))
+        x, y, u, v = (c - m for c, m in zip(_intercepts(trace.ray), means, strict=True))
         sums = torch.stack([x, y, u, v, x * x + y * y, x * u + y * v, u * u + v * v]) @ shares
         goes_on, inside = _smallest_margins(trace)
         failed = ~(goes_on > 0.0)
@@ -132,7 +132,7 @@ def _in_chunks(
     return [torch.cat(part) for part in zip(*parts, strict=True)]
 
 
-def _landing(ray: Components) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _intercepts(ray: Components) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the ray intercepts x and y on the sensor, mm, and the tangents l/n and m/n."""
     return ray.x, ray.y, ray.l / ray.n, ray.m / ray.n
 

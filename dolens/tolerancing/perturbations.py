@@ -146,7 +146,7 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
     )
 
 
-def tightened(tolerances: Tolerances, factor: float) -> Tolerances:
+def scaled_tolerances(tolerances: Tolerances, factor: float) -> Tolerances:
     """Return the tolerances with every half-range multiplied by a factor."""
     return replace(tolerances, half_range=factor * tolerances.half_range)
 

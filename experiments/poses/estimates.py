@@ -11,7 +11,7 @@ from dolens.alignment.information import FisherInformation
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotMerit
+from dolens.alignment.spot_loss import ImageMerit
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
@@ -155,7 +155,7 @@ def _estimate(
     for _ in range(_ITERATIONS):
         before = theta
         try:
-            optimizer.step(SpotMerit(loss.weighted_at(there), there, every))
+            optimizer.step(ImageMerit(loss.weighted_at(there), there, every))
         except InputError:
             # No light reaches the sensor from there.
             return before, False

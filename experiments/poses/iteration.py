@@ -9,7 +9,7 @@ from torch import Tensor
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import ImageLoss, SpotLoss, SpotMerit
+from dolens.alignment.spot_loss import ImageLoss, ImageMerit, SpotLoss
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
 from experiments.poses.settings import Stage, blur_for, slopes_imager, spot_imager
@@ -81,7 +81,7 @@ def iterate(
     )
     weighted = loss.weighted_at(pose)
     if isinstance(optimizer, DampedLeastSquares):
-        merit = SpotMerit(weighted, pose, chosen)
+        merit = ImageMerit(weighted, pose, chosen)
         if weighted is not loss:
             # Its weights are new, so what had nothing to gain may have.
             optimizer.restart()

@@ -14,7 +14,7 @@ from dolens.alignment.measurement import Measurement, simulated
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.photograph import read_measurement, read_measurements
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotLoss, SpotMerit, SpotResiduals
+from dolens.alignment.spot_loss import ImageMerit, ImageResiduals, SpotLoss
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.prescriptions import lens_from_prescription
@@ -54,7 +54,7 @@ def fitted(loss, fit, iterations=15):
     chosen = torch.ones(len(fit.names), dtype=torch.bool)
     optimizer = DampedLeastSquares([fit.scaled])
     for _ in range(iterations):
-        optimizer.step(lambda: SpotResiduals(loss, fit, chosen))
+        optimizer.step(lambda: ImageResiduals(loss, fit, chosen))
     return fit.file_values()
 
 
@@ -80,7 +80,7 @@ def test_a_pose_is_bounded_and_linked_as_a_design_is(singlet):
     optimizer = DampedLeastSquares([one.parameter_group()])
     chosen = torch.tensor([True, False, False])
     for _ in range(8):
-        optimizer.step(lambda: SpotResiduals(loss, one, chosen))
+        optimizer.step(lambda: ImageResiduals(loss, one, chosen))
     assert one.file_values()[TILT] == pytest.approx(1.0, abs=1e-12)
     again = one.varying(one.settings)
     assert again.file_values() == pytest.approx(one.file_values(), rel=1e-15)
@@ -307,7 +307,7 @@ def weighted_fit(one, imager, measured, iterations=3):
     for _ in range(iterations):
         loss = NoiseWeightedLoss(measured, imager).weighted_at(one)
         optimizer.restart()
-        optimizer.step(SpotMerit(loss, one, chosen))
+        optimizer.step(ImageMerit(loss, one, chosen))
     return one.file_values()
 
 

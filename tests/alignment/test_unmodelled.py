@@ -12,7 +12,7 @@ from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import simulated
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotMerit
+from dolens.alignment.spot_loss import ImageMerit
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
@@ -271,7 +271,7 @@ def test_estimates_end_where_a_fit_from_afar_does(singlet, effects):
     for _ in range(6):
         loss = NoiseWeightedLoss(measured, imager).weighted_at(fit)
         optimizer.restart()
-        optimizer.step(SpotMerit(loss, fit, chosen))
+        optimizer.step(ImageMerit(loss, fit, chosen))
     bounds = information.bounds / one.units
     by_fit = torch.tensor(list(fit.file_values().values()), dtype=torch.float64)
     off = (by_fit - torch.tensor(list(names.values()), dtype=torch.float64)) / bounds

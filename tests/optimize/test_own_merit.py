@@ -7,8 +7,8 @@ import torch
 
 from dolens import InputError, load_lens
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
-from dolens.optimize.landing_losses import SpotSize
 from dolens.optimize.operands import Operand
+from dolens.optimize.ray_intercept_losses import SpotSize
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class TelephotoRatio(Operand):
 class MeanSquare:
     """The spots' size again, by a user's class."""
 
-    def __call__(self, points, spots):
-        squares = spots.weight * points.square().sum(0)
-        groups = squares.new_zeros(len(spots.group_weights)).index_add(0, spots.group, squares)
-        return 1e6 * (spots.group_weights * groups).sum()
+    def __call__(self, points, groups):
+        squares = groups.weight * points.square().sum(0)
+        sums = squares.new_zeros(len(groups.group_weights)).index_add(0, groups.group, squares)
+        return 1e6 * (groups.group_weights * sums).sum()
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_an_operand_says_what_is_wrong_with_its_limits():
 def test_a_loss_of_one_s_own_is_minimised_as_one_with_a_name(triplet):
     """Value, gradient and least-squares step are those of the built-in loss of the same formula."""
     named, own = (merit_of(triplet, quality=q)[0] for q in ("spot_size", MeanSquare()))
-    assert isinstance(named.quality.landing_loss, SpotSize)
+    assert isinstance(named.quality.intercept_loss, SpotSize)
     assert own().sum_of_squares() == pytest.approx(named().sum_of_squares(), rel=1e-12)
     gradients = [merit().linear_model().gradient for merit in (own, named)]
     assert torch.allclose(*gradients, rtol=1e-9)

@@ -31,7 +31,7 @@ def spots_of(lens):
     return [gaussian_quadrature(lens, [(0, 0), (0, 14)], LINES, 4, 8, symmetry=False)]
 
 
-def landing(lens, spots):
+def intercepts(lens, spots):
     """Points about their spots' centroids, with the roots of their weights: (N, 2)."""
     (part,) = spots
     points = lens.trace(part.rays).position[:, :2]
@@ -57,11 +57,11 @@ def test_rays_move_as_far_as_they_may_whatever_the_variables_units(triplet):
     moves = ray_moves(triplet, variables, spots, 1e-9)
     gradient = torch.tensor([0.3, -2.0, 5.0]).double()
     found = trust_region_step(gradient, moves, trust_radius, *unbounded(3))
-    before = landing(triplet, spots)
+    before = intercepts(triplet, spots)
     with torch.no_grad():
         variables.scaled += found
     variables.write_to(triplet)
-    moved = (landing(triplet, spots) - before).norm()
+    moved = (intercepts(triplet, spots) - before).norm()
     assert float(moved) == pytest.approx(trust_radius, rel=1e-3)
     assert float(gradient @ found) < 0.0
 
@@ -77,7 +77,7 @@ def test_of_the_squared_spot_radius_it_is_gauss_and_newton_s_step(triplet):
         kept = {n: changed[n].clone() for n in names}
         for name, value in values.items():
             changed[name].data.copy_(value.detach())
-        found = landing(triplet, spots).reshape(-1)
+        found = intercepts(triplet, spots).reshape(-1)
         for name in names:
             changed[name].data.copy_(kept[name])
         return found

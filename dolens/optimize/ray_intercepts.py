@@ -11,7 +11,7 @@ from dolens.optics.rays import TracedRays
 from dolens.optimize.image_quality import ImageQuality
 
 
-class LandingPoints(ImageQuality):
+class RayInterceptQuality(ImageQuality):
     """Measures image quality by ray intercepts: x and y on the sensor, mm, from the centroid or the
     chief ray.
     """

@@ -7,14 +7,14 @@ from torch import Tensor
 
 from dolens.optics.jacobian import normal_equations
 from dolens.optics.lens import Lens
-from dolens.optimize.landing_points import LandingPoints
 from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.ray_intercepts import RayInterceptQuality
 
 # More derivatives than this are summed on the way and never stored (400 MB).
 MOST_STORED = 50_000_000
 
 
-class SpotResiduals(LandingPoints):
+class RayInterceptResiduals(RayInterceptQuality):
     """Gives residuals √(W_s·w_i)·(p_i - p̄_s) of every ray i of every spot s, in µm, x and y apart.
 
     Their sum of squares is Σ W_s·(RMS radius)².  p̄ is the spot's centroid, or where its chief ray
