@@ -1,4 +1,4 @@
-"""A lens, point sources and the sensor's planes, and which of their numbers are to be found."""
+"""A pose holds a lens, point sources and the sensor's planes, and varies some of their numbers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,7 +16,7 @@ _COORDINATES = ("x", "y", "z")
 
 
 class Pose(DesignVariables):
-    """Design variables of a lens and its sources, with the images that they give.
+    """Varies numbers of a lens and its sources, and gives the images that follow.
 
     Names are those of the lens's parameters (`elements.lens.tilt_x`, `elements.lens.decenter_x`,
     `sensor_distance`), `sources.<n>.x`, `.y`, `.z`, and `sources.*.x`, `.y`, `.z`, by which all
@@ -72,12 +72,12 @@ class Pose(DesignVariables):
 
     @property
     def lens(self) -> Lens:
-        """The lens as it was given."""
+        """Return the lens as it was given."""
         return self._of[0]
 
     @property
     def settings(self) -> dict[str, dict[str, Any]]:
-        """Settings of its variables, with their present values as initial ones."""
+        """Return settings of the variables, with their present values as initial ones."""
         columns = (self.file_scale, self.file_scale * self.lower, self.file_scale * self.upper)
         found: dict[str, dict[str, Any]] = {}
         for (name, value), scale, lower, upper in zip(
@@ -88,7 +88,7 @@ class Pose(DesignVariables):
 
     @property
     def places(self) -> Tensor:
-        """(S, 3), mm, the sources where they stand, but for θ."""
+        """Return the sources (S, 3), mm, where they stand, but for θ."""
         return self.sources + self.shift
 
     def varying(self, variables: Mapping[str, Mapping[str, Any] | None]) -> "Pose":

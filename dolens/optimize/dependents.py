@@ -1,4 +1,4 @@
-"""Parameters that follow from others: pickups and solves.
+"""Pickups and solves make parameters of a lens follow from others.
 
 A pickup copies another parameter; a solve holds a first-order property at its value.  Both are
 functions of the values that are varied, differentiable, so that a search knows of them.
@@ -19,18 +19,20 @@ SOLVES = ("efl", "paraxial_focus", "best_focus")
 
 
 class Dependent(Protocol):
-    """A parameter as a function of the others."""
+    """Computes a parameter from the others."""
 
     name: str
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """From the lens and the values that are known so far, by name."""
+        """Return the parameter's value, from the lens and the values that are known so far, by
+        name.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Pickup:
-    """factor · another parameter + offset, as two radii that must be equal.
+    """Copies another parameter: factor · parameter + offset, as two radii that must be equal.
 
     Attributes:
         name: the parameter that follows.
@@ -45,7 +47,7 @@ class Pickup:
     offset: float = 0.0
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """From the source's own value."""
+        """Return the value that follows from the source's."""
         source = values.get(self.source)
         if source is None:
             source = lens.variables([self.source])[self.source].detach()
@@ -54,7 +56,7 @@ class Pickup:
 
 @dataclass(frozen=True)
 class FocalLength:
-    """The curvature of a surface that gives the lens its focal length.
+    """Solves for the curvature of a surface that gives the lens its focal length.
 
     Power is linear in the curvature of any one surface, P(c) = P(0) + c·(P(1) - P(0)), because it
     enters one matrix of the product; so two evaluations solve for it.
@@ -70,7 +72,7 @@ class FocalLength:
     wavelength: float
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """c where P(c) = 1/EFL, 1/mm."""
+        """Return the curvature c for which P(c) = 1/EFL, 1/mm."""
         stored = lens.variables([self.name])[self.name].detach()
 
         def power(curvature: float) -> Tensor:
@@ -84,7 +86,7 @@ class FocalLength:
 
 @dataclass(frozen=True)
 class ParaxialFocus:
-    """The sensor at the paraxial image of the axis.
+    """Puts the sensor at the paraxial image of the axis.
 
     Attributes:
         wavelength: nm.
@@ -98,14 +100,14 @@ class ParaxialFocus:
     name: str = "sensor_distance"
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """From the last vertex, mm."""
+        """Return the distance of the sensor from the last vertex, mm."""
         system = lens.system({n: v for n, v in values.items() if n != self.name})
         image = first_order(system, self.wavelength, self.object_distance).image
         return image - system.vertices[len(system.surfaces) - 1] + self.defocus
 
 
 def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent | None:
-    """A pickup or a solve as a configuration gives it.
+    """Return the pickup or the solve that a configuration describes.
 
     Args:
         name: the parameter that follows.

@@ -1,4 +1,4 @@
-"""The merit function of a design: its spots and its operands, as residuals of least squares."""
+"""The merit function of a design gives its spots and its operands as residuals of least squares."""
 
 import copy
 import math
@@ -19,7 +19,7 @@ from dolens.optimize.variables import DesignVariables
 
 
 class MeritFunction:
-    """How sharp a lens is + Σ (weight·deviation of an operand)².
+    """Sums image quality and Σ (weight·deviation of an operand)².
 
     The first is Σ W_s·(RMS radius of spot s, µm)², or what else an `ImageQuality` sums up.
 
@@ -52,7 +52,7 @@ class MeritFunction:
         self._last: tuple[Tensor, MeritValue] | None = None
 
     def __call__(self) -> "MeritValue":
-        """The merit at the variables' values; what a `DampedLeastSquares` takes as closure."""
+        """Return the merit at the variables' values; `DampedLeastSquares` takes it as closure."""
         point = self.variables.scaled.detach()
         # A step begins where the last trial of the one before it ended.
         if self._last is None or not torch.equal(self._last[0], point):
@@ -61,7 +61,7 @@ class MeritFunction:
 
 
 class MeritValue:
-    """A merit function where its variables are; it is not to outlive their next move.
+    """Evaluates a merit function at its variables; it is not to outlive their next move.
 
     Attributes:
         quality: values of the rays, or None without them.
@@ -99,7 +99,7 @@ class MeritValue:
         lens.sensor_distance.fill_(self.sensor_distance)
 
     def sum_of_squares(self) -> float:
-        """The merit; `inf` where rays fail or a chief ray cannot be found."""
+        """Return the merit; `inf` where rays fail or a chief ray cannot be found."""
         if self.operands is None:
             return math.inf
         total = sum((item.weight * item.deviation) ** 2 for item in self.operands)
@@ -110,7 +110,7 @@ class MeritValue:
         return total
 
     def loss(self) -> Tensor:
-        """The merit with a graph to the variables, for an optimizer that takes gradients.
+        """Return the merit with a graph to the variables, for an optimizer that takes gradients.
 
         A best focus has no graph: there the sharpness does not change with the focus.  Operands
         that do are seen as if the sensor stood still.
@@ -128,7 +128,7 @@ class MeritValue:
         return torch.stack([part.double() for part in parts]).sum()
 
     def linear_model(self) -> LinearModel:
-        """R and b in the variables u."""
+        """Return R and b in the variables u."""
         merit, models = self._merit, []
         if merit.quality is not None:
             names, matrix = merit.variables.derivatives()
@@ -141,7 +141,8 @@ class MeritValue:
         return LinearModel.join(models)
 
     def operand_derivatives(self) -> Tensor:
-        """(n, P): of every operand's value by the variables u, in the order of `operands`.
+        """Return the derivatives (n, P) of every operand's value with respect to the variables u,
+        in the order of `operands`.
 
         Once the linear model is known the sensor moves with a best focus; before, it stands still.
         """
@@ -152,7 +153,9 @@ class MeritValue:
 
     @cached_property
     def _operand_rows(self) -> Tensor:
-        """(n, P + 1): of every operand by the variables and, last, by the sensor's distance."""
+        """Return the derivatives (n, P + 1) of every operand with respect to the variables and,
+        last, to the sensor's distance.
+        """
         leaves = [self._merit.variables.scaled, self._sensor]
         return (self._found or OperandValues((), (), ())).derivatives(leaves)
 

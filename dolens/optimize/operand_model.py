@@ -1,4 +1,4 @@
-"""Operands near a point, as residuals that are linear in the variables between their limits."""
+"""Near a point, operands give residuals that are linear in the variables between their limits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from dolens.optimize.variables import DesignVariables
 
 @dataclass(frozen=True)
 class OperandModel:
-    """Values v + V·δ of operands at a step δ (P,).  Double precision, CPU.
+    """Predicts values v + V·δ of operands after a step δ (P,).  Double precision, CPU.
 
     Attributes:
         operands: of each value its own; one that has several values is there several times.
         values: v (n,), each in its own unit.
-        derivatives: V (n, P), by the variables.
+        derivatives: V (n, P), with respect to the variables.
     """
 
     operands: tuple[Operand, ...]
@@ -55,12 +55,14 @@ class OperandModel:
         return OperandModel(found.operands, found.vector(), derivatives)
 
     def gradient(self, step: Tensor) -> Tensor:
-        """Of Σ (weight·deviation)² after a step, by the variables, (P,)."""
+        """Return the gradient (P,) of Σ (weight·deviation)² with respect to the variables, after a
+        step.
+        """
         weight, deviations = self._at(step)
         return 2.0 * self.derivatives.T @ (weight.square() * deviations)
 
     def near(self, step: Tensor) -> LinearModel:
-        """Residuals of the targets, and of the limits that are broken after a step.
+        """Return residuals of the targets, and of the limits that are broken after a step.
 
         A limit that is kept there has no slope.  The model is of steps from v, not from there.
         """

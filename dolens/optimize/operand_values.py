@@ -1,4 +1,4 @@
-"""The operands of a lens evaluated together: for a merit function, a loss and a step alike."""
+"""Operands of a lens are evaluated together, for a merit function, a loss and a step alike."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from dolens.optimize.operands import LensProperties, Operand
 
 @dataclass(frozen=True)
 class OperandValue:
-    """An operand at a point of the search.
+    """Holds an operand's value at a point of the search.
 
     Attributes:
         label: its kind, and which gap or field.
@@ -30,7 +30,7 @@ class OperandValue:
 
 @dataclass(frozen=True)
 class OperandValues:
-    """Values of operands, with a graph to the parameters that they were computed from.
+    """Holds values of operands, with a graph to the parameters that they were computed from.
 
     An operand with several values, as the thicknesses of all gaps, is here once for each of them.
 

@@ -1,4 +1,5 @@
-"""What a lens should be besides sharp: focal lengths, thicknesses, angles, distortion.
+"""Operands constrain properties of a lens besides sharpness: focal lengths, thicknesses, angles,
+distortion.
 
 An operand is a property of the lens, one number or several of a kind, with a target or with limits.
 A target t contributes (weight·(v - t))² to the merit function, a limit only the part of v that is
@@ -26,7 +27,8 @@ _KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
 
 
 class UnreachableField(ArithmeticError):
-    """The chief ray of a field does not reach the stop: the lens cannot be judged.
+    """Says that the chief ray of a field does not reach the stop, so that the lens cannot be
+    judged.
 
     Args:
         field: (x, y), degrees or mm.
@@ -43,7 +45,7 @@ class UnreachableField(ArithmeticError):
 
 @dataclass(frozen=True)
 class LensProperties:
-    """Properties of a lens at a point of a search, each computed once for all operands.
+    """Computes properties of a lens at a point of a search, each once for all operands.
 
     Attributes:
         system: with a graph to the variables.
@@ -61,17 +63,17 @@ class LensProperties:
 
     @cached_property
     def first_order(self) -> FirstOrder:
-        """Computed once for all operands."""
+        """Return first-order properties, computed once for all operands."""
         return first_order(self.system, self.wavelength, self.object_distance)
 
     @cached_property
     def rim_sags(self) -> list[Tensor]:
-        """Sag (mm) of every surface at the edge of its own aperture."""
+        """Return the sag (mm) of every surface at the edge of its own aperture."""
         like = self.system.vertices[-1]
         return [surface.rim_sag(like) for surface in self.system.surfaces]
 
     def chief_ray(self, field: tuple[float, float]) -> Components:
-        """The real chief ray of a field on the sensor plane, aimed once for all operands.
+        """Return the real chief ray of a field on the sensor plane, aimed once for all operands.
 
         Raises:
             UnreachableField: it does not reach the stop.
@@ -99,76 +101,87 @@ class LensProperties:
 
 @dataclass(frozen=True)
 class Operand:
-    """A property of a lens with a target or limits.
+    """Wants a property of a lens at a target or within limits.
+
+    A subclass with another `values` is a new operand; `_target_` names it in a configuration.
 
     Attributes:
-        kind: a name in `KINDS`.
-        target: what it should be; None where only limits are given.
-        low: the least that costs nothing; None for no limit.
-        high: the most that costs nothing.
+        kind: a name in `KINDS`; of a subclass, its label.
+        target: what the property should be; None where only limits are given.
+        min: the least that costs nothing; None for no limit.
+        max: the most that costs nothing.
         weight: factor of the residual: merit counts (weight·deviation)².
         field: (x, y) of the chief ray, degrees or mm, of operands that have one.
         gaps: numbers of the gaps, of operands that have them; None for all of their kind.
+
+    Raises:
+        InputError: no target and no limit, or both; limits that exclude each other; a weight that
+            is not positive; or a field that is not x and y.
     """
 
     kind: str
     target: float | None = None
-    low: float | None = None
-    high: float | None = None
+    min: float | None = None
+    max: float | None = None
     weight: float = 1.0
     field: tuple[float, float] = (0.0, 0.0)
     gaps: tuple[int, ...] | None = None
 
+    def __post_init__(self) -> None:
+        where = f"operand '{self.kind}'"
+        limits = self.min is not None or self.max is not None
+        if limits == (self.target is not None):
+            raise InputError(f"{where}: give a target, or limits (min, max), one of the two")
+        if None not in (self.min, self.max) and self.min > self.max:
+            raise InputError(f"{where}: min exceeds max")
+        if not self.weight > 0.0:
+            raise InputError(f"{where}: weight must be positive, not {self.weight:g}")
+        if len(self.field) != 2:
+            raise InputError(f"{where}: field is x and y, not {self.field}")
+
     def values(self, lens: LensProperties) -> dict[str, Tensor]:
-        """Label → value, a scalar with a graph, in the property's own unit."""
+        """Return label → value, a scalar with a graph, in the property's own unit."""
         return KINDS[self.kind](self, lens)
 
     def deviation(self, value: Tensor) -> Tensor:
-        """What is amiss: value - target, or the part of it beyond the limits, with its sign."""
+        """Return value - target, or the part of the value beyond the limits, with its sign."""
         if self.target is not None:
             return value - self.target
-        below = 0.0 if self.low is None else (value - self.low).clamp(max=0.0)
-        above = 0.0 if self.high is None else (value - self.high).clamp(min=0.0)
+        below = 0.0 if self.min is None else (value - self.min).clamp(max=0.0)
+        above = 0.0 if self.max is None else (value - self.max).clamp(min=0.0)
         return below + above
 
 
-def operand(settings: Mapping[str, Any], lens: Lens) -> Operand:
-    """An operand as a configuration gives it.
+def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
+    """Return the operand that a configuration describes.
 
     Args:
-        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`.
+        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`; or an operand,
+            which is returned as it is.
         lens: that it is meant for.
 
     Raises:
-        InputError: an unknown key or kind, no target and no limit, or both, a weight that is not
-            positive, or a gap that the lens does not have.
+        InputError: an unknown key or kind, a value that `Operand` refuses, or a gap that the lens
+            does not have.
     """
+    if isinstance(settings, Operand):
+        return settings
     kind = settings.get("kind")
     check_choice(kind, KINDS, "operand: kind")
     check_keys(settings, _KEYS, f"operand '{kind}'")
-    numbers = {
-        key: None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
+    target, low, high = (
+        None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
         for key in ("target", "min", "max")
-    }
-    limits = numbers["min"] is not None or numbers["max"] is not None
-    if limits == (numbers["target"] is not None):
-        raise InputError(f"operand '{kind}': give a target, or limits (min, max), one of the two")
-    if None not in (numbers["min"], numbers["max"]) and numbers["min"] > numbers["max"]:
-        raise InputError(f"operand '{kind}': min exceeds max")
+    )
     weight = _number(settings.get("weight", 1.0), f"{kind}: weight")
-    if not weight > 0.0:
-        raise InputError(f"operand '{kind}': weight must be positive, not {weight:g}")
     field = tuple(_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0))
-    if len(field) != 2:
-        raise InputError(f"operand '{kind}': field is x and y, not {field}")
-    gaps = settings.get("gaps")
-    count = len(lens.thicknesses)
+    gaps, count = settings.get("gaps"), len(lens.thicknesses)
     if gaps is not None:
         gaps = tuple(int(gap) for gap in gaps)
         for gap in gaps:
             if not 1 <= gap <= count:
                 raise InputError(f"operand '{kind}': the lens has gaps 1 to {count}, not {gap}")
-    return Operand(kind, numbers["target"], numbers["min"], numbers["max"], weight, field, gaps)
+    return Operand(kind, target, low, high, weight, field, gaps)
 
 
 def _number(value: object, what: str) -> float:
@@ -192,12 +205,14 @@ def _first_order(name: str) -> Callable[[Operand, LensProperties], dict[str, Ten
 
 
 def _total_track(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-    """From the first vertex to the sensor, mm."""
+    """Return the distance from the first vertex to the sensor, mm."""
     return {"total_track": lens.system.vertices[-1]}
 
 
 def _gaps(operand: Operand, lens: LensProperties, glass: bool) -> Sequence[int]:
-    """Numbers of the gaps that an operand means: its own, or all those of glass, or of air."""
+    """Return the numbers of the gaps that an operand means: its own, or all those of glass, or of
+    air.
+    """
     if operand.gaps is not None:
         return operand.gaps
     indices = lens.system.indices(lens.wavelength)
@@ -221,7 +236,9 @@ def _at_centre(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Ten
 
 def _at_edge(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
     def values(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-        """Along the axis from rim to rim, each surface at the edge of its own aperture."""
+        """Return distances along the axis from rim to rim, each surface at the edge of its own
+        aperture.
+        """
         found = {}
         for gap in _gaps(operand, lens, glass):
             at_centre = lens.system.thicknesses[gap - 1]
@@ -236,14 +253,14 @@ def _at_edge(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tenso
 
 
 def _chief_ray_angle(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-    """Between the chief ray and the sensor's normal, degrees."""
+    """Return the angle between the chief ray and the sensor's normal, degrees."""
     ray = lens.chief_ray(operand.field)
     across = torch.hypot(ray.l, ray.m)
     return {_labelled(operand): torch.rad2deg(torch.atan2(across, ray.n))}
 
 
 def _distortion(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
-    """How far the chief ray lands from its paraxial image height, per cent of this height."""
+    """Return the chief ray's distance from its paraxial image height, per cent of this height."""
     ray = lens.chief_ray(operand.field)
     field = torch.tensor(operand.field, dtype=lens.system.dtype, device=lens.system.device)
     if lens.object_distance is None:

@@ -1,4 +1,4 @@
-"""Where a search begins, when that is not where the prescription is."""
+"""A search may begin elsewhere than at the prescription."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,7 @@ _WITHOUT_UNIT = ("multiply", "relative")
 def start_values(
     lens: Lens, settings: Mapping[str, float | Mapping[str, Any]], generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Parameters of a lens to begin with; the lens is not changed.
+    """Return parameters of a lens to begin with; the lens is not changed.
 
     Args:
         lens: whose parameters are named.

@@ -1,4 +1,4 @@
-"""Design variables: parameters of a lens, scaled, bounded and named, as an optimizer takes them."""
+"""Design variables are parameters of a lens, scaled, bounded and named for an optimizer."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -17,7 +17,7 @@ _KEYS = ("scale", "initial", "lower", "upper")
 
 
 class DesignVariables(nn.Module):
-    """Chosen lens parameters θ, held as u = θ/scale so that optimizers see numbers near one.
+    """Holds chosen lens parameters θ as u = θ/scale, so that optimizers see numbers near one.
 
     A parameter that is an array (the coefficients of a B-spline) counts as many variables, with
     one scale and the same bounds for all its elements.
@@ -126,7 +126,7 @@ class DesignVariables(nn.Module):
 
     @property
     def unit_names(self) -> list[str]:
-        """P units of files, `deg` or `mm`; nothing where one depends on the surface."""
+        """Return P units of files, `deg` or `mm`; nothing where one depends on the surface."""
         return [
             unit_of(name).name
             for name, shape in zip(self.names, self._shapes, strict=True)
@@ -135,7 +135,7 @@ class DesignVariables(nn.Module):
 
     @property
     def file_scale(self) -> Tensor:
-        """(P,), the scales as the settings have them, in the units of files."""
+        """Return the scales (P,) as the settings have them, in the units of files."""
         return self.scale / self.units
 
     def file_values(self) -> dict[str, float]:
@@ -203,7 +203,7 @@ class DesignVariables(nn.Module):
             parameter.copy_(values[name])
 
     def _of_lens(self, names: Iterable[str]) -> list[str]:
-        """Those of some names that are the lens's parameters."""
+        """Return those of some names that are the lens's parameters."""
         return [name for name in names if name not in self._others]
 
 

@@ -65,7 +65,7 @@ class LensSteps:
             optimizer: of the network, after its step.
             before: the lens's variables before it.
             steps: that the network has made.
-            share: of the reach of least squares, as the schedule has it.
+            share: of the trust radius of least squares, as the schedule has it.
 
         Returns:
             Numbers of a step of least squares; empty without one.
@@ -90,7 +90,7 @@ class LensSteps:
         return found
 
     def _forget_last_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Drop what led to the last step: Adam's momentum, the reach of least squares."""
+        """Drop what led to the last step: Adam's momentum, the trust radius of least squares."""
         optimizer.state.pop(self.variables.scaled, None)
         if self.least_squares is not None:
             self.least_squares.reject()

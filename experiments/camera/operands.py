@@ -90,7 +90,7 @@ class CameraOperands:
             lens: that they belong to.
             variables: u after the step; set to `before` where it is undone.
             before: u before it.
-            forget: called then, to drop what led there: momentum, or a reach that was too long.
+            forget: called then, to drop what led there: momentum, or too long a trust radius.
         """
         problem = self._problem(lens, variables())
         if problem is None:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.spot_loss import SpotLoss
 from dolens.errors import InputError, call_with_settings, check_choice, check_keys
@@ -146,15 +146,15 @@ class PoseAccuracyModule(Analysis):
         for number, level in enumerate(self.by_photons.levels):
             seeds = range(1000 * number, 1000 * number + self.by_photons.measurements)
             measured = [self._measurement(level, seed) for seed in seeds]
-            known = knowledge(self.true, self.imager, measured[0], self.slopes)
+            information = fisher_information(self.true, self.imager, measured[0], self.slopes)
             inverse = self._s21_inverse(measured[0])
             errors = {
-                "noise_weighted": torch.stack([known.correction(m) for m in measured]),
+                "noise_weighted": torch.stack([information.correction(m) for m in measured]),
                 "s21": torch.stack([self._s21_step(m, self.imager, inverse) for m in measured]),
             }
             for estimator, found in errors.items():
                 rms = found.square().mean(0).sqrt()
-                self._add("photons", estimator, level, rms, known.bounds)
+                self._add("photons", estimator, level, rms, information.bounds)
             logger.info("%.3g photons: %s", level, self._last_ratios())
 
     def _measurement(self, photons: int, seed: int) -> Measurement:
@@ -168,7 +168,7 @@ class PoseAccuracyModule(Analysis):
         """Find the errors that few rays make."""
         reference_photons, photons = self.by_rays.reference_photons, int(self.light.photons)
         reference = self._measurement(reference_photons, 999_999)
-        exact = knowledge(self.true, self.imager, reference, self.slopes)
+        exact = fisher_information(self.true, self.imager, reference, self.slopes)
         # Bounds and weights are those of the light that is quoted.
         share = photons / reference_photons
         quoted = replace(
@@ -176,9 +176,9 @@ class PoseAccuracyModule(Analysis):
             images=share * reference.images,
             read_noise=self.light.read_noise,
         )
-        known = knowledge(self.true, self.imager, quoted, self.slopes)
+        information = fisher_information(self.true, self.imager, quoted, self.slopes)
         inverse = self._s21_inverse(reference)
-        floor = float((exact.bounds / known.bounds).square().mean().sqrt())
+        floor = float((exact.bounds / information.bounds).square().mean().sqrt())
         self.numbers["pose_error/reference_over_bound"] = floor
         for (name, imager), count in (
             (entry, count) for entry in self.imagers.items() for count in self.by_rays.counts
@@ -190,12 +190,12 @@ class PoseAccuracyModule(Analysis):
                 started = time.perf_counter()
                 shares = torch.stack([image.image for image in self.true.images(own)])
                 seconds.append(time.perf_counter() - started)
-                modelled = replace(known, expected=shares)
+                modelled = replace(information, expected=shares)
                 found["noise_weighted"].append(modelled.correction(quoted))
                 found["s21"].append(self._s21_step(reference, own, inverse))
             for estimator, steps in found.items():
                 rms = torch.stack(steps).square().mean(0).sqrt()
-                self._add(f"rays/{name}", estimator, count, rms, known.bounds, min(seconds))
+                self._add(f"rays/{name}", estimator, count, rms, information.bounds, min(seconds))
             logger.info("%s, %.3g rays: %s", name, count, self._last_ratios())
 
     # ---------------------------------------------------------------- where it starts

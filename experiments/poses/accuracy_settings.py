@@ -1,4 +1,4 @@
-"""Settings of the measurements that tell what limits a pose fit."""
+"""These settings describe the measurements that tell what limits a pose fit."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from dolens.sensor.pixels import Sensor
 
 @dataclass(frozen=True)
 class ComparedImages:
-    """Settings of the images that a pose is compared by.
+    """Gives settings of the images that a pose is compared by.
 
     Attributes:
         imagers: name → settings of `SpotImager`; the first is used where rays are not the question.
@@ -32,7 +32,7 @@ class ComparedImages:
 
 @dataclass(frozen=True)
 class PhotonLevels:
-    """Measurements with more and more light.
+    """Describes measurements with more and more light.
 
     Attributes:
         levels: photons of a source.
@@ -53,7 +53,7 @@ class PhotonLevels:
 
 @dataclass(frozen=True)
 class RayCounts:
-    """Images by more and more rays.
+    """Describes images by more and more rays.
 
     Attributes:
         counts: rays of a source.
@@ -77,7 +77,7 @@ class RayCounts:
 
 @dataclass(frozen=True)
 class BasinSettings:
-    """Fits by the same stages from starts whose errors in two variables make a grid.
+    """Describes fits by the same stages from starts whose errors in two variables make a grid.
 
     Attributes:
         along: two variables' names → errors of their starts, degrees or mm; the first is drawn

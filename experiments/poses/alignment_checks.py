@@ -1,4 +1,4 @@
-"""Checks of a simulated alignment: what sampling and the pixels' grid do, over the noise."""
+"""Checks of a simulated alignment compare sampling and the pixels' grid with the noise."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""From how far off a pose fit converges: fits from a grid of starts."""
+"""Fits from a grid of starts show from how far off a pose fit converges."""
 
 import itertools
 import logging
@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
@@ -70,7 +70,7 @@ class Basin:
         true, generator = self.true, torch.Generator().manual_seed(self.seed)
         measured = simulate(true, self.bench, self.light, generator)
         imager = spot_imager(measured, self.bench.wavelength, self.imager)
-        bounds = knowledge(true, imager, measured).bounds
+        bounds = fisher_information(true, imager, measured).bounds
         across, up = self.along.values()
         for weight in self.centroid_weights:
             # The grid's rows from below, as `table` takes them.
@@ -88,7 +88,7 @@ class Basin:
     def _row(
         self, measured: Measurement, bounds: Tensor, weight: float, errors: tuple[float, float]
     ) -> Row:
-        """Of a fit whose start is off by two errors, degrees or mm."""
+        """Return a row of a fit whose start is off by two errors, degrees or mm."""
         started, true = time.perf_counter(), self.true
         truth = true.scale * true.scaled.detach()
         start = truth.clone()
@@ -111,7 +111,7 @@ class Basin:
         }
 
     def _fit(self, pose: Pose, measured: Measurement, weight: float) -> int:
-        """Iterations that were made."""
+        """Fit, and return how many iterations were made."""
         count = 0
         try:
             for stage in self.stages:
@@ -125,7 +125,7 @@ class Basin:
         return count
 
     def summary(self) -> dict[str, float]:
-        """The share of starts that converge, by centroid weight."""
+        """Return the share of starts that converge, by centroid weight."""
         numbers = {}
         for weight in self.centroid_weights:
             mine = [row["converged"] for row in self.rows if row["centroid_weight"] == weight]
@@ -133,7 +133,9 @@ class Basin:
         return numbers
 
     def table(self, weight: float) -> Tensor:
-        """Errors over bounds (second, first) of the grid with this centroid weight; NaN: lost."""
+        """Return errors over bounds (second, first) of the grid with this centroid weight; NaN:
+        lost.
+        """
         across, up = self.along.values()
         mine = [row["error_over_bound"] for row in self.rows if row["centroid_weight"] == weight]
         return torch.tensor(mine, dtype=torch.float64).reshape(len(up), len(across))

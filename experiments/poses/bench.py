@@ -1,4 +1,4 @@
-"""The bench of a pose experiment: sources, sensor, light and noise, and simulated measurements."""
+"""A bench holds sources and a sensor; its light gives simulated measurements."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from dolens.sensor.pixels import Sensor
 
 @dataclass(frozen=True)
 class Bench:
-    """Point sources in front of a lens, and the sensor behind it.
+    """Places point sources in front of a lens, and the sensor behind it.
 
     Attributes:
         wavelength: nm.
@@ -33,7 +33,7 @@ class Bench:
 
     @property
     def images(self) -> int:
-        """How many images a measurement has: one of each source on each plane."""
+        """Return how many images a measurement has: one of each source on each plane."""
         return len(self.sources) * len(self.planes)
 
     def pose(
@@ -50,7 +50,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class Light:
-    """Light and noise of simulated measurements.
+    """Describes light and noise of simulated measurements.
 
     Attributes:
         photons: of each image, behind the lens; those beyond the sensor's edge are among them.

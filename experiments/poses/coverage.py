@@ -78,7 +78,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         """Estimate, case by case; tables are written after each."""
         for number, fit in enumerate(self.fits):
             self._hold(number)
-            self.known[fit.name] = self._knowledge(number)
+            self.information[fit.name] = self._information(number)
         for case in self.cases:
             self._work_out(case)
             self.write_tables()
@@ -110,7 +110,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         number = self.plan.number(fit)
         pose, truth = self.poses[number], self.truth(number)
         true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
-        return (self.found[case, fit].values - true) * pose.units / self.known[fit].bounds
+        return (self.found[case, fit].values - true) * pose.units / self.information[fit].bounds
 
     def _metrics(self) -> dict[str, float]:
         numbers: dict[str, float] = {}
@@ -181,7 +181,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
     def _variable_rows(self, case: str, fit: str) -> list[Row]:
         """Return rows of coverage.csv, one for each variable."""
         pose = self.poses[self.plan.number(fit)]
-        bounds = (self.known[fit].bounds / pose.units).tolist()
+        bounds = (self.information[fit].bounds / pose.units).tolist()
         rows: list[Row] = []
         for name, bound, off in zip(
             pose.names, bounds, self.over_bound(case, fit).unbind(-1), strict=True

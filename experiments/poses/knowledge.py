@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError, check_keys
@@ -88,8 +88,8 @@ class PoseKnowledgeModule(Analysis):
         return numbers
 
     def tables(self) -> dict[str, list[Row]]:
-        """Return `bounds` and `combinations`."""
-        return {"bounds": self.bound_rows(), "combinations": self.combination_rows()}
+        """Return `bounds` and `eigenvectors`."""
+        return {"bounds": self.bound_rows(), "eigenvectors": self.eigenvector_rows()}
 
     def figures(self) -> Figures:
         """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
@@ -99,7 +99,7 @@ class PoseKnowledgeModule(Analysis):
         """Return rows of bounds.csv, one for each variable of each arrangement."""
         rows: list[Row] = []
         for found in self.arrangements:
-            names, correlations = found.pose.names, found.known.correlations
+            names, correlations = found.pose.names, found.information.correlations
             for place, name in enumerate(names):
                 others = correlations[place].abs().clone()
                 others[place] = -1.0
@@ -116,16 +116,16 @@ class PoseKnowledgeModule(Analysis):
                 )
         return rows
 
-    def combination_rows(self) -> list[Row]:
-        """Return rows of combinations.csv, one for each combination, the worst known first."""
+    def eigenvector_rows(self) -> list[Row]:
+        """Return rows of eigenvectors.csv, the one with the largest variance first."""
         return [
             {
                 "arrangement": found.name,
                 "standard_deviation": float(spread),
-                **dict(zip(found.pose.names, combination.tolist(), strict=True)),
+                **dict(zip(found.pose.names, vector.tolist(), strict=True)),
             }
             for found in self.arrangements
-            for spread, combination in zip(found.spread, found.combinations, strict=True)
+            for spread, vector in zip(found.spread, found.eigenvectors, strict=True)
         ]
 
     def _pose(
@@ -151,17 +151,17 @@ class PoseKnowledgeModule(Analysis):
         wavelength, settings = self.bench.wavelength, self.images
         own = spot_imager(measured, wavelength, settings.imager)
         slopes = slopes_imager(measured, wavelength, settings.imager, settings.slopes)
-        known = knowledge(pose, own, measured, slopes, blur_for(measured, slopes))
-        spread, combinations = known.combinations(pose.scale)
+        information = fisher_information(pose, own, measured, slopes, blur_for(measured, slopes))
+        spread, eigenvectors = information.eigenvectors(pose.scale)
         estimates = None
         if self.monte_carlo:
             theta = pose.scale * pose.scaled.detach()
             moved = [
-                known.correction(self._measurement(number, pose, seed))
+                information.correction(self._measurement(number, pose, seed))
                 for seed in range(1, self.monte_carlo + 1)
             ]
             estimates = (theta + torch.stack(moved)) / pose.units
-        return Arrangement(name, pose, known, spread, combinations, estimates)
+        return Arrangement(name, pose, information, spread, eigenvectors, estimates)
 
     def _measurement(self, number: int, pose: Pose, seed: int) -> Measurement:
         count = len(pose.sources) * len(pose.planes)
@@ -183,8 +183,8 @@ class PoseKnowledgeModule(Analysis):
         return numbers
 
     def _verdict(self, found: Arrangement) -> str:
-        """Return the combination that is known worst, in words."""
-        worst = found.combinations[0]
+        """Return the eigenvector with the largest variance, in words."""
+        worst = found.eigenvectors[0]
         order = worst.abs().argsort(descending=True)
         names = [
             f"{float(worst[i]):+.2f} {found.pose.names[int(i)]}"

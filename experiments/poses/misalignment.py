@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dolens.alignment.information import Knowledge, knowledge
+from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
@@ -93,7 +93,7 @@ class MisalignmentModule(Experiment):
         self.initial = [pose.scaled.detach().clone() for pose in self.poses]
         self.history: list[dict[str, float | str]] = []
         self.results: list[Row] = []
-        self.known: dict[str, Knowledge] = {}
+        self.information: dict[str, FisherInformation] = {}
         self.estimates: dict[str, Estimates] = {}
         self.seconds: dict[str, float] = {}
 
@@ -173,10 +173,10 @@ class MisalignmentModule(Experiment):
         """Find errors and bounds of every fit; log them, and write the tables."""
         for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
             self._hold(number)
-            known = self._knowledge(number)
-            self.known[fit.name] = known
+            information = self._information(number)
+            self.information[fit.name] = information
             truth = self.truth(number)
-            rows = pose_rows(fit.name, pose, self.initial[number], known, truth)
+            rows = pose_rows(fit.name, pose, self.initial[number], information, truth)
             self.log_dict(pose_metrics(rows))
             if self.monte_carlo and self.observations.photograph is None:
                 draws = range(1, self.monte_carlo + 1)
@@ -184,7 +184,7 @@ class MisalignmentModule(Experiment):
                 self.estimates[fit.name] = found
                 values = found.values[found.settled]
                 self.log(f"pose_unsettled/{fit.name}", float(len(draws) - len(values)))
-                spread = (fit.name, pose.names, values, known.bounds / pose.units, truth)
+                spread = (fit.name, pose.names, values, information.bounds / pose.units, truth)
                 if len(values) > 1:
                     self.log_dict(spread_metrics(*spread))
                 rows = spread_columns(rows, *spread[1:])
@@ -204,18 +204,18 @@ class MisalignmentModule(Experiment):
             self.stages[-1], self.measurement(number), self.wavelength, self.plan.imager
         )
 
-    def _knowledge(self, number: int) -> Knowledge:
+    def _information(self, number: int) -> FisherInformation:
         """Return the information on a fit's pose, with the uncertainty of what it holds."""
         fit, pose, measurement = self.fits[number], self.poses[number], self.measurement(number)
         own, finest = self._slopes(number), self.finest(number)
         if fit.held_from is None:
-            return knowledge(pose, finest, measurement, *own)
+            return fisher_information(pose, finest, measurement, *own)
         both = pose.varying({**pose.settings, **dict.fromkeys(fit.held)})
-        before = self.known[fit.held_from]
+        before = self.information[fit.held_from]
         places = [before.names.index(name) for name in fit.held]
         covariance = before.covariance[places][:, places]
-        known = knowledge(both, finest, measurement, *own)
-        return known.holding(len(pose.names), covariance)
+        information = fisher_information(both, finest, measurement, *own)
+        return information.with_nuisance_parameters(len(pose.names), covariance)
 
     def _estimates(
         self, number: int, draws: Sequence[int], light: Light, earlier: Mapping[str, Estimates]
@@ -235,7 +235,7 @@ class MisalignmentModule(Experiment):
             held = held_numbers(fit, before, earlier[fit.held_from], truth)
         return estimates(
             pose,
-            self.known[fit.name],
+            self.information[fit.name],
             self.finest(number),
             lambda draw: self.observations.simulated(number, draw, light),
             draws,

@@ -1,4 +1,4 @@
-"""What pose fits are to explain: a photograph, or a simulated measurement of each fit."""
+"""A run's fits are to explain a photograph, or a simulated measurement each."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,8 @@ from experiments.poses.settings import Fit
 
 
 class Observations:
-    """The measurements of a run's fits, and the true numbers behind them where they are known.
+    """Gives the measurements of a run's fits, and the true numbers behind them where they are
+    known.
 
     Args:
         lens: as designed.

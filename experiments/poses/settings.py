@@ -1,4 +1,4 @@
-"""What a pose fit is made of: what is to be found, and by which stages."""
+"""The settings of a pose fit say what is to be found, and by which stages."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ _RAYS_OF_A_SLOPE, _LEAST_BLUR = 450.0, 0.5
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """Settings of the images that a pose is compared by.
+    """Gives settings of the images that a pose is compared by.
 
     Attributes:
         imager: settings of `SpotImager` besides sensor and wavelength; see `spot_imager`.
@@ -35,7 +35,7 @@ class ImageSettings:
 
 @dataclass(frozen=True)
 class Stage:
-    """Some iterations by one optimizer.
+    """Describes some iterations by one optimizer.
 
     Attributes:
         optimizer: `adam` or `dls`.
@@ -73,7 +73,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Fit:
-    """One pose to find.
+    """Describes one pose to find.
 
     Attributes:
         name: what it is called.
@@ -91,7 +91,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class FitPlan:
-    """Which poses are fitted, and how.
+    """Lists the poses that are fitted, and the stages of each fit.
 
     Attributes:
         fits: in their order; a fit may hold what an earlier one found.
@@ -160,7 +160,7 @@ def fit_plan(
 
 
 def stage_of(settings: Mapping[str, Any]) -> Stage:
-    """A stage as a configuration gives it.
+    """Return the stage that a configuration describes.
 
     Raises:
         InputError: an unknown key, or a number out of range.
@@ -174,7 +174,7 @@ def stage_of(settings: Mapping[str, Any]) -> Stage:
 def plain_imager(
     sensor: Sensor, wavelength: float, *settings: Mapping[str, Any]
 ) -> tuple[SpotImager, bool]:
-    """What settings make before there is a measurement, and whether its patches are `auto`.
+    """Return the imager before there is a measurement, and whether its patches are `auto`.
 
     Raises:
         InputError: an unknown key, or a number out of range.
@@ -192,7 +192,7 @@ def spot_imager(
     *settings: Mapping[str, Any],
     widened: float = 1.0,
 ) -> SpotImager:
-    """What models a measurement's images.
+    """Return the imager that models a measurement's images.
 
     `subpixels: auto` makes a ray's patch of light 1.2 times as wide as rays are apart where the
     measured light is: narrower ones let the rays' pattern show as moiré, wider ones blur rims.
@@ -216,13 +216,15 @@ def spot_imager(
 def slopes_imager(
     measurement: Measurement, wavelength: float, *settings: Mapping[str, Any]
 ) -> SpotImager:
-    """The same for derivatives, with `auto` patches twice as wide."""
+    """Return the imager for derivatives, whose `auto` patches are twice as wide."""
     return spot_imager(measurement, wavelength, *settings, widened=_SLOPES_WIDENED)
 
 
 def blur_for(measurement: Measurement, imager: SpotImager) -> float:
-    """Pixels by which derivatives are averaged so that 450 rays make each, 0 where less than half a
-    pixel would do: a Gaussian of the deviation b averages 4π·b² pixels and one more.
+    """Return the pixels by which derivatives are averaged so that 450 rays make each.
+
+    It is 0 where less than half a pixel would do: a Gaussian of the deviation b averages 4π·b²
+    pixels and one more.
 
     With 37 rays a pixel (the fit at 30° with 800 000) derivatives by two patterns of rays agree so
     to some per cent, where without it they seem to tell three times as much as they do.
@@ -233,12 +235,14 @@ def blur_for(measurement: Measurement, imager: SpotImager) -> float:
 
 
 def _rays_a_pixel(measurement: Measurement, imager: SpotImager) -> float:
-    """Where the measured light is; the lens lets 1/reach² of the disc through that rays aim at."""
+    """Return the rays that reach a pixel where the measured light is; the lens lets 1/reach² of the
+    disc through that rays aim at.
+    """
     return imager.rays / imager.reach**2 / float(measurement.lit_pixels.max())
 
 
 def fit_of(name: str, settings: Mapping[str, Any]) -> Fit:
-    """A fit as a configuration gives it.
+    """Return the fit that a configuration describes.
 
     Raises:
         InputError: an unknown key.

@@ -15,7 +15,7 @@ from dolens.alignment.element_fit import (
     fit_element,
     information_root,
     least_covariance,
-    named_element,
+    most_likely_element,
 )
 from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
 from dolens.alignment.spot_moments import MomentModel, moment_model, one_thread
@@ -128,7 +128,7 @@ class TripletAlignmentModule(Analysis):
 
         started = time.perf_counter()
         fits = [fit_element(model, measured, self.iterations) for model in models]
-        named, share = named_element([fit.chi_squared for fit in fits])
+        named, share = most_likely_element([fit.chi_squared for fit in fits])
         seconds = time.perf_counter() - started
         rows = torch.arange(len(true))
         found = torch.stack([fit.errors for fit in fits])[named, rows]

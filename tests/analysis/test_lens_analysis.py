@@ -16,7 +16,7 @@ from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
 from dolens.optics.paraxial import chief_ray_magnification
-from dolens.optimize.spot_residuals import SpotResiduals
+from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.prescriptions import lens_from_prescription
 
 LINES = (656.2725, 587.5618, 486.1327)
@@ -146,7 +146,7 @@ def test_spots_of_the_triplet_are_those_of_gauss_s_quadrature(root):
     fields = [(0.0, 0.0), (0.0, 10.0), (0.0, 20.0)]
     spots = spot_diagram(lens, fields, LINES[2:], rays=6000)
     rays = gaussian_quadrature(lens, fields, LINES[2:], rings=6, arms=24)
-    expected = SpotResiduals(rays, torch.ones(rays.count)).values(lens).rms
+    expected = RayInterceptResiduals(rays, torch.ones(rays.count)).values(lens).rms
     assert float(spots.rms[0]) == pytest.approx(float(expected[0]), rel=1e-4)
     assert spots.rms[:, 0].tolist() == pytest.approx(expected.tolist(), rel=1e-2)
     assert torch.all(spots.geo > spots.rms)

@@ -17,7 +17,7 @@ from dolens.optimize import DesignVariables, MeritSettings
 from dolens.optimize.bounded_step import damped_step
 from dolens.optimize.image_quality import without_edges
 from dolens.optimize.merit_settings import LOSSES
-from dolens.optimize.spot_residuals import SpotResiduals
+from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
 LINES = (656.2725, 587.5618, 486.1327)
@@ -137,8 +137,8 @@ CASES = {
     "grid": {"sampling": "square_grid", "sampling_options": {"count": 15}},
     "weights": {"field_weights": [1.0, 3.0], "wavelength_weights": [1.0, 2.0, 0.5]},
     "operands": {"operands": OPERANDS},
-    "colours together": {"colours": "together"},
-    "chief ray of the field": {"colours": "together", "reference": "chief"},
+    "polychromatic reference": {"reference_spectrum": "polychromatic"},
+    "chief ray of the field": {"reference_spectrum": "polychromatic", "reference": "chief"},
     "wavefront": {"quality": "wavefront"},
     "wavefront about the chief ray": {"quality": "wavefront", "reference": "chief"},
     "modulation": {"quality": "modulation", "quality_options": {"frequencies": [20.0, 50.0]}},
@@ -280,11 +280,11 @@ def test_chief_rays_weigh_nothing(triplet):
     with_chief = with_chief_rays(triplet, spots)
     assert with_chief.weight[with_chief.chief].tolist() == [0.0] * 6
     assert rms_radii(triplet, with_chief) == pytest.approx(rms_radii(triplet, spots), rel=1e-12)
-    chief = SpotResiduals(with_chief, torch.ones(6).double() / 6, "chief").values(triplet)
-    centroid = SpotResiduals(spots, torch.ones(6).double() / 6).values(triplet)
+    chief = RayInterceptResiduals(with_chief, torch.ones(6).double() / 6, "chief").values(triplet)
+    centroid = RayInterceptResiduals(spots, torch.ones(6).double() / 6).values(triplet)
     assert bool((chief.mean_squares >= centroid.mean_squares).all())
     with pytest.raises(InputError, match="hold no chief rays"):
-        SpotResiduals(spots, torch.ones(6).double() / 6, "chief")
+        RayInterceptResiduals(spots, torch.ones(6).double() / 6, "chief")
 
 
 @pytest.mark.parametrize(
