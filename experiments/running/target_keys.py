@@ -134,19 +134,22 @@ def located(target: Target) -> Any:
 def arguments_of(make: Callable[..., Any]) -> list[str] | None:
     """Return the names of the arguments that something takes; None where it takes any.
 
-    What a class takes as `**options` is taken to be for the class that it derives from.
+    What a class takes as `**options` is taken to be for the classes that it derives from.
     """
-    found: list[str] = []
-    calls = [part.__init__ for part in make.__mro__[:-1]] if isinstance(make, type) else [make]
-    for call in calls:
-        try:
-            parameters = list(inspect.signature(call).parameters.values())
-        except (TypeError, ValueError):  # of some classes that are written in C
+    try:
+        call = make.__init__ if isinstance(make, type) else make
+        parameters = list(inspect.signature(call).parameters.values())
+    except (TypeError, ValueError):  # of some classes that are written in C
+        return None
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    found = [p.name for p in parameters if p.kind in named and p.name != "self"]
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+        bases = [base for base in getattr(make, "__bases__", ()) if base is not object]
+        inherited = [arguments_of(base) for base in bases]
+        if not inherited or None in inherited:
             return None
-        found += [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
-            return [name for name in dict.fromkeys(found) if name != "self"]
-    return None
+        found += [name for names in inherited for name in names]
+    return list(dict.fromkeys(found))
 
 
 def _at(plain: Any, path: str) -> Any:
