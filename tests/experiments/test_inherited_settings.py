@@ -90,6 +90,14 @@ def test_dropping_what_no_parent_has_is_one_line(inherited, entry):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("module", "missing"), [("camera", "learning_rates.optics"), ("tolerances", "fields")]
+)
+def test_a_setting_that_an_experiment_must_make_is_named(inherited, module, missing):
+    with pytest.raises(InputError, match=f"^{missing}: must be given; neither experiment=mine"):
+        checked(inherited(f"  - override /module: {module}\n  - override /lens: nikon\n"))
+
+
 def test_the_run_folder_has_what_is_left(inherited, tmp_path):
     run(
         inherited(
