@@ -56,6 +56,7 @@ RENAMED = Renamed(
         Key("module.simulation_arms", "module.simulation_pupil.arms"),
     ),
     values={"semi_diameters": {"follow": "automatic"}},
+    options={"experiment": {"pose_knowledge": "pose_bounds"}},
     targets={
         "dolens.imaging.choice.auto_renderer.AutoRenderer": (
             "dolens.rendering.auto.auto_renderer.AutoRenderer"
@@ -89,7 +90,7 @@ RENAMED = Renamed(
             "experiments.poses.coverage.PoseCoverageModule"
         ),
         "experiments.pose_knowledge.PoseKnowledgeModule": (
-            "experiments.poses.knowledge.PoseKnowledgeModule"
+            "experiments.poses.bounds.PoseBoundsModule"
         ),
         "experiments.speed_vs_error.SpeedVsErrorModule": (
             "experiments.speed.speed_vs_error.SpeedVsErrorModule"
