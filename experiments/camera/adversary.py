@@ -1,11 +1,8 @@
 """Discriminators that train beside the network."""
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
 from dolens.reconstruction import RelativisticDiscriminators
 
 
@@ -17,18 +14,15 @@ class Adversary(nn.Module):
 
     Args:
         discriminators: tell restored images from true ones.
-        learning_rates: with `discriminator`; by default that of the `network`.
+        learning_rate: of the discriminators.
     """
 
-    def __init__(
-        self, discriminators: RelativisticDiscriminators, learning_rates: Mapping[str, float]
-    ) -> None:
+    def __init__(self, discriminators: RelativisticDiscriminators, learning_rate: float) -> None:
         super().__init__()
-        rate = learning_rates.get("discriminator", learning_rates.get("network"))
-        if rate is None or not rate > 0.0:
-            raise InputError(f"learning_rates.discriminator: {rate}; allowed: above 0")
         self.discriminators = discriminators
-        self.optimizer = torch.optim.Adam(discriminators.parameters(), lr=rate, betas=(0.5, 0.99))
+        self.optimizer = torch.optim.Adam(
+            discriminators.parameters(), lr=learning_rate, betas=(0.5, 0.99)
+        )
 
     def forward(self, real: Tensor, fake: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Make one step of the discriminators, and return their term of the network's loss.

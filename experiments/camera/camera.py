@@ -1,14 +1,13 @@
 """Training and evaluation of a camera."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.reconstruction import RelativisticDiscriminators, psnr_db
+from dolens.reconstruction import psnr_db
 from experiments.camera.adversary import Adversary
 from experiments.camera.base import Camera
 from experiments.camera.calibration import Calibration
@@ -19,7 +18,7 @@ from experiments.camera.figures import camera_figures
 from experiments.camera.lens_steps import LensSteps, variable_numbers
 from experiments.camera.operands import CameraOperands
 from experiments.camera.photograph_scores import PhotographScores
-from experiments.camera.reconstruction import Loss
+from experiments.camera.settings import Reconstruction, Training
 from experiments.camera.views.base import Imaging
 from experiments.experiment import Figures
 
@@ -38,19 +37,12 @@ class CameraModule(Camera):
         lens: the lens; its other parameters stay as they are.
         experiment: name of the experiment; a checkpoint of another one is refused.
         views: images the textures.
-        network: restores them: a `Restoration`, or any module that maps display-encoded images
-            (B, 3, H, W) to such images.
-        loss: compares restored and true images (B, 3, H, W), display-encoded, by a number or by a
-            mapping with the number as `total`.
-        optimizer: parameter groups → optimizer; a `CameraOptimizer` may move the lens apart.
-        learning_rates: `optics` and `network`.
-        scheduler: optimizer → scheduler, stepped once a training step; or None.
+        reconstruction: restores the images, and judges what it restored.
+        training: how the network and the lens's variables move.
         variables: settings of `DesignVariables`; empty or None trains the network alone.
-        discriminator: judges the restored images besides; None for no adversarial term.
         operands: what the lens must be besides, as of a merit function: Σ (weight·deviation)² is
             added to the loss.  Objects are at the views' `object_distance`; see `CameraOperands`.
             A step of the lens after which a chief ray does not reach the stop is taken back.
-        view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
         calibrations: point spread functions that tests give the network besides; see `Evaluation`.
 
     Raises:
@@ -62,22 +54,25 @@ class CameraModule(Camera):
         lens: Lens,
         experiment: str,
         views: Imaging,
-        network: nn.Module,
-        loss: Loss,
-        optimizer: Callable[..., torch.optim.Optimizer],
-        learning_rates: Mapping[str, float],
-        scheduler: Callable[..., Any] | None = None,
-        variables: Mapping[str, Mapping[str, Any] | None] | None = None,
-        discriminator: RelativisticDiscriminators | None = None,
-        operands: Sequence[Mapping[str, Any]] = (),
-        view_norm: float = 1.0,
-        calibrations: Mapping[str, Calibration] | None = None,
+        reconstruction: Reconstruction,
+        training: Training,
+        variables: Mapping[str, Mapping[str, Any] | None] | None,
+        operands: Sequence[Mapping[str, Any]],
+        calibrations: Mapping[str, Calibration] | None,
     ) -> None:
-        super().__init__(lens, experiment, views, network, loss, variables or {}, view_norm)
-        self.adversary = Adversary(discriminator, learning_rates) if discriminator else None
-        self.optimizer = optimizer
-        self.scheduler = scheduler
-        self.learning_rates = dict(learning_rates)
+        super().__init__(
+            lens,
+            experiment,
+            views,
+            reconstruction.network,
+            reconstruction.loss,
+            variables or {},
+            reconstruction.view_norm,
+        )
+        self.optimizer, self.scheduler = training.optimizer, training.scheduler
+        self.learning_rates = rates = training.learning_rates
+        discriminator, rate = reconstruction.discriminator, rates.discriminator or rates.network
+        self.adversary = Adversary(discriminator, rate) if discriminator else None
         self.costs = StepCosts()
         self.evaluation = Evaluation(calibrations)
         self.test_scores: dict[str, PhotographScores] = {}
@@ -89,13 +84,10 @@ class CameraModule(Camera):
             self.variables,
             CameraOperands(operands, lens, views.object_distance),
             views,
-            getattr(optimizer, "lens_steps", None),
+            getattr(self.optimizer, "lens_steps", None),
         )
         views.expose(self.lens)
         check_calibrations(self.evaluation.calibrations, lens)
-        missing = {"optics", "network"} - set(self.learning_rates)
-        if missing:
-            raise InputError(f"learning_rates: '{missing.pop()}' is missing (optics and network)")
 
     # ---------------------------------------------------------------- training
 
@@ -104,7 +96,7 @@ class CameraModule(Camera):
         groups = [
             {
                 "params": list(self.network.parameters()),
-                "lr": self.learning_rates["network"],
+                "lr": self.learning_rates.network,
                 "name": "network",
             }
         ]
@@ -112,7 +104,7 @@ class CameraModule(Camera):
             groups.append(
                 {
                     "params": [self.variables.scaled],
-                    "lr": self.learning_rates["optics"],
+                    "lr": self.learning_rates.optics,
                     "name": "optics",
                 }
             )
@@ -180,7 +172,7 @@ class CameraModule(Camera):
         before = self.variables.scaled.detach().clone()
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         if len(self.variables):
-            share = optimizer.param_groups[0]["lr"] / self.learning_rates["network"]
+            share = optimizer.param_groups[0]["lr"] / self.learning_rates.network
             # `global_step` counts this step only when this method is done.
             found = self.lens_steps.finish(optimizer, before, self.global_step + 1, share)
             self.log_dict({f"lens_step/{name}": value for name, value in found.items()})

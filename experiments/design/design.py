@@ -73,13 +73,13 @@ class DesignModule(Experiment):
         variables: Mapping[str, Mapping[str, Any] | None] | None,
         merit: MeritSettings,
         optimizer: Callable[..., torch.optim.Optimizer],
-        start: Mapping[str, Any] | None = None,
-        published: Mapping[str, Any] | None = None,
-        evaluation: MeritSettings | None = None,
-        semi_diameters: str = "fixed",
-        round_tolerance: float = 1e-3,
-        seed: int = 0,
-        mtf_max_frequency: float | None = None,
+        start: Mapping[str, Any] | None,
+        published: Mapping[str, Any] | None,
+        evaluation: MeritSettings | None,
+        semi_diameters: str,
+        round_tolerance: float,
+        seed: int,
+        mtf_max_frequency: float | None,
     ) -> None:
         super().__init__(lens, experiment)
         self.automatic_optimization = False

@@ -50,14 +50,35 @@ RENAMED = Renamed(
         Key("optimizer.least_squares.most", "optimizer.least_squares.max_trust_radius"),
         Key("optimizer.most", "optimizer.max_variables"),
         Key("optimizer.network.lr", None, instead="learning_rates.network is the rate"),
-        Key("module.rings", "module.pupil.rings"),
-        Key("module.arms", "module.pupil.arms"),
+        Key("callbacks.pictures.most_frequency", "module.mtf_max_frequency"),
+        Key("module.rings", "module.spots.pupil.rings"),
+        Key("module.arms", "module.spots.pupil.arms"),
         Key("module.simulation_rings", "module.simulation_pupil.rings"),
         Key("module.simulation_arms", "module.simulation_pupil.arms"),
     ),
     values={"semi_diameters": {"follow": "automatic"}},
-    options={"experiment": {"pose_knowledge": "pose_bounds"}},
+    options={
+        "experiment": {"pose_knowledge": "pose_bounds"},
+        # One callback saves the figures of every experiment.
+        "callbacks": dict.fromkeys(
+            ("alignment", "pose_accuracy", "pose_knowledge", "speed", "tolerances"), "figures"
+        ),
+    },
     targets={
+        **dict.fromkeys(
+            (
+                "experiments.callbacks.alignment_pictures.AlignmentPictures",
+                "experiments.callbacks.design_pictures.DesignPictures",
+                "experiments.callbacks.misalignment_pictures.MisalignmentPictures",
+                "experiments.callbacks.pictures.CameraPictures",
+                "experiments.callbacks.pose_accuracy_pictures.PoseAccuracyPictures",
+                "experiments.callbacks.pose_coverage_pictures.PoseCoveragePictures",
+                "experiments.callbacks.pose_knowledge_pictures.PoseKnowledgePictures",
+                "experiments.callbacks.speed_pictures.SpeedPictures",
+                "experiments.callbacks.tolerance_pictures.TolerancePictures",
+            ),
+            "experiments.callbacks.figures.SaveFigures",
+        ),
         "dolens.imaging.choice.auto_renderer.AutoRenderer": (
             "dolens.rendering.auto.auto_renderer.AutoRenderer"
         ),

@@ -4,14 +4,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
-
-from dolens.errors import check_choice, check_keys
-from dolens.optics.parameter_units import to_lens_units
+from dolens.errors import check_choice
+from dolens.optics.lens import Lens
 from dolens.plotting import Point, pareto_front
-from dolens.prescriptions import lens_from_prescription
-from dolens.scene.planar import PlanarScene
-from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.speed.figures import speed_figures
@@ -22,6 +17,7 @@ from experiments.speed.renders import (
     render_contenders,
     render_rows,
 )
+from experiments.speed.settings import Contenders, Effort, subject_of
 from experiments.speed.traces import trace_rows
 from experiments.tables import Row
 
@@ -29,7 +25,6 @@ logger = logging.getLogger(__name__)
 
 PARTS = ("trace", "psf", "render")
 _SUPPLEMENT = 7  # strata along each side of the pupil of the supplement's renders
-_SUBJECT_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
 
 
 class SpeedVsErrorModule(Analysis):
@@ -38,43 +33,32 @@ class SpeedVsErrorModule(Analysis):
     Args:
         lens: the lens of the run; it is not used.
         experiment: name of the experiment.
-        scenes: name → `lens` (a prescription), `values` (parameters to change), `depths` (mm),
-            `wavelengths` (nm), `sensor`, and `variables`, patterns of what gradients are taken of.
         folder: where the table goes.
+        scenes: name → settings of `subject_of`.
         parts: of `trace`, `psf` and `render`.
-        pupil_samples: strata along each side of the pupil, of rays and of functions.
-        fields: functions along each side of the sensor.
-        tolerances: grey levels that `auto` plans for.
-        reference_samples: strata of the converged image.
-        rays: of a trace.
-        seconds: for the times of each group.
+        contenders: the ways of rendering.
+        effort: of references and times.
+
+    Raises:
+        InputError: an unknown part, or a bad setting of a scene.
     """
 
     def __init__(
         self,
-        lens: Any,
+        lens: Lens,
         experiment: str,
-        scenes: Mapping[str, Mapping[str, Any]],
         folder: str,
-        parts: Sequence[str] = PARTS,
-        pupil_samples: Sequence[int] = (1, 2, 4, 7, 16, 32, 64),
-        fields: Sequence[int] = (1, 2, 3, 5, 9),
-        tolerances: Sequence[float] = (4.0, 1.0, 0.25),
-        reference_samples: int = 48,
-        rays: int = 100_000,
-        seconds: float = 2.0,
+        scenes: Mapping[str, Mapping[str, Any]],
+        parts: Sequence[str],
+        contenders: Contenders,
+        effort: Effort,
     ) -> None:
         super().__init__(lens, experiment, folder)
         for part in parts:
             check_choice(part, PARTS, "parts")
         self.parts = tuple(parts)
-        self.subjects = [_subject(name, entry) for name, entry in scenes.items()]
-        self.pupil_samples = tuple(pupil_samples)
-        self.fields = tuple(fields)
-        self.tolerances = tuple(tolerances)
-        self.reference_samples = reference_samples
-        self.rays = rays
-        self.seconds = seconds
+        self.subjects = [subject_of(name, settings) for name, settings in scenes.items()]
+        self.contenders, self.effort = contenders, effort
         self.rows: list[Row] = []
         self.numbers: dict[str, float] = {}
 
@@ -96,15 +80,22 @@ class SpeedVsErrorModule(Analysis):
         return speed_figures(self.rows, [s.name for s in self.subjects], self.parts)
 
     def _trace(self, subject: Subject) -> list[dict[str, float | str]]:
-        return trace_rows(subject, ("reference", "cpu"), self.rays, self.seconds)
+        return trace_rows(subject, ("reference", "cpu"), self.effort.rays, self.effort.seconds)
 
     def _psf(self, subject: Subject) -> list[dict[str, float | str]]:
-        samples = [n for n in self.pupil_samples if n > 1]
-        return function_rows(subject, samples, self.seconds)
+        samples = [n for n in self.contenders.pupil_samples if n > 1]
+        return function_rows(subject, samples, self.effort.seconds)
 
     def _render(self, subject: Subject) -> list[dict[str, float | str]]:
-        contenders = render_contenders(subject, self.pupil_samples, self.fields, self.tolerances)
-        rows, judge = render_rows(subject, contenders, self.reference_samples, self.seconds)
+        contenders = render_contenders(
+            subject,
+            self.contenders.pupil_samples,
+            self.contenders.fields,
+            self.contenders.tolerances,
+        )
+        rows, judge = render_rows(
+            subject, contenders, self.effort.reference_samples, self.effort.seconds
+        )
         name, numbers = subject.name, self.numbers
         agreements = gradient_agreements(subject, contenders)
         for row in rows:
@@ -137,16 +128,3 @@ class SpeedVsErrorModule(Analysis):
 
 def _points(rows: Sequence[Mapping[str, Any]]) -> list[Point]:
     return [Point(str(r["setting"]), r["with_gradient_s"], r["error_grey_levels"]) for r in rows]
-
-
-def _subject(name: str, entry: Mapping[str, Any]) -> Subject:
-    check_keys(entry, _SUBJECT_KEYS, f"scenes.{name}")
-    lens = lens_from_prescription(entry["lens"], torch.float32, where=f"scenes.{name}.lens")
-    with torch.no_grad():
-        for pattern, value in (entry.get("values") or {}).items():
-            for key, parameter in lens.variables([pattern]).items():
-                parameter.fill_(to_lens_units(key, value))
-    scene = PlanarScene(entry["depths"], entry["wavelengths"])
-    sensor = Sensor(**entry["sensor"])
-    names = tuple(lens.variables(list(entry["variables"])))
-    return Subject(name, lens.requires_grad_(False), scene, sensor, names)

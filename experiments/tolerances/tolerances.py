@@ -3,13 +3,12 @@
 import copy
 import logging
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.tolerancing import (
     Outcome,
@@ -22,7 +21,7 @@ from dolens.tolerancing import (
 )
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
-from experiments.settings import numbers_of
+from experiments.settings import Spots, check_count, numbers_of
 from experiments.tables import Row
 from experiments.tolerances.figures import tolerance_figures
 from experiments.tolerances.tables import (
@@ -37,6 +36,29 @@ logger = logging.getLogger(__name__)
 QUANTILES = (0.5, 0.8, 0.9, 0.95, 0.98)
 
 
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Lenses with errors drawn at random.
+
+    Attributes:
+        lenses: how many.
+        chunk_size: how many are traced at a time; None leaves it to `trace_perturbed`.
+        seed: of the errors.
+
+    Raises:
+        InputError: a number that is no integer of 1 or more.
+    """
+
+    lenses: int
+    chunk_size: int | None
+    seed: int
+
+    def __post_init__(self) -> None:
+        check_count("lenses", self.lenses)
+        if self.chunk_size is not None:
+            check_count("chunk_size", self.chunk_size)
+
+
 class TolerancesModule(Analysis):
     """Finds a lens's sensitivities to errors of manufacture, and the yield under tolerances.
 
@@ -46,18 +68,16 @@ class TolerancesModule(Analysis):
     Args:
         lens: as designed; any elements with poses of their own are in its prescription.
         experiment: name of the experiment.
-        fields: (x, y), degrees or mm; on all sides, for a perturbed lens has no symmetry.
-        wavelengths: nm.
-        tolerances: see `tolerances_from`.
         folder: where tables go.
-        lenses: how many to draw.
+        spots: by which a lens is judged.
+        weights: of the spots' fields; None: equal.
+        tolerances: see `tolerances_from`.
         tolerance_factor: multiplies every half-range.
-        weights: of the fields; None: equal.
-        rings: radii of the pupil's quadrature.
-        arms: its azimuths.
+        monte_carlo: the lenses drawn.
         yield_at_um: limits of the RMS radius, µm.
-        chunk_size: lenses traced at a time; None leaves it to `trace_perturbed`.
-        seed: of the lenses drawn.
+
+    Raises:
+        InputError: a setting is out of range.
     """
 
     digits: ClassVar[int] = 9
@@ -66,34 +86,20 @@ class TolerancesModule(Analysis):
         self,
         lens: Lens,
         experiment: str,
-        fields: Sequence[Sequence[float]],
-        wavelengths: Sequence[float],
-        tolerances: Mapping[str, Any],
         folder: str,
-        lenses: int = 4000,
-        tolerance_factor: float = 1.0,
-        weights: Sequence[float] | None = None,
-        rings: int = 4,
-        arms: int = 12,
-        yield_at_um: Sequence[float] = (),
-        chunk_size: int | None = None,
-        seed: int = 0,
+        spots: Spots,
+        weights: Sequence[float] | None,
+        tolerances: Mapping[str, Any],
+        tolerance_factor: float,
+        monte_carlo: MonteCarlo,
+        yield_at_um: Sequence[float],
     ) -> None:
         super().__init__(lens, experiment, folder)
-        for key, number in (("lenses", lenses), ("chunk_size", chunk_size)):
-            if number is not None and not (type(number) is int and number >= 1):
-                raise InputError(f"{key}: {number!r}; allowed: an integer of 1 or more")
-        self.fields = [numbers_of("fields", field, 2) for field in fields]
-        self.wavelengths = numbers_of("wavelengths", wavelengths)
-        for key, given in (("fields", self.fields), ("wavelengths", self.wavelengths)):
-            if not given:
-                raise InputError(f"{key}: none is given")
-        self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
+        self.spots = spots
         self.weights = self._weights(weights)
-        self.lenses, self.chunk_size = lenses, chunk_size
-        self.rings, self.arms = rings, arms
+        self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
+        self.monte_carlo = monte_carlo
         self.yield_at_um = numbers_of("yield_at_um", yield_at_um)
-        self.seed = seed
         self.analysis: ToleranceAnalysis | None = None
 
     def analyse(self) -> dict[str, float]:
@@ -130,12 +136,12 @@ class TolerancesModule(Analysis):
         numbers["tolerance/linear/expected_rms_um"] = 1e3 * found.contributions.expected_rms
         numbers["tolerance/failed_lenses"] = float((found.perturbed.failed > 0.0).double().mean())
         numbers["tolerance/vignetted_share"] = float(found.perturbed.vignetted.mean())
-        numbers["cost/lenses_per_s"] = self.lenses / found.seconds
+        numbers["cost/lenses_per_s"] = self.monte_carlo.lenses / found.seconds
         for stage in ("", "_before_refocus"):
             traced = numbers[f"tolerance{stage.replace('_', '/', 1)}/rms_um/p90"]
             linear = numbers[f"tolerance/linear{stage}/rms_um/p90"]
             numbers[f"error/linear_p90{stage}"] = abs(linear / traced - 1.0)
-        numbers["cost/rays"] = float(self.lenses * len(found.spots.weight))
+        numbers["cost/rays"] = float(self.monte_carlo.lenses * len(found.spots.weight))
         return numbers
 
     def _spot_labels(self) -> list[str]:
@@ -149,18 +155,15 @@ class TolerancesModule(Analysis):
     def _analyse(self) -> ToleranceAnalysis:
         # Squares of small differences need double precision, whatever the lens is kept in.
         lens = copy.deepcopy(self.lens).double()
-        spots = gaussian_quadrature(
-            lens,
-            self.fields,
-            self.wavelengths,
-            self.rings,
-            self.arms,
-            lens.object_distance,
-            symmetry=False,
-        )
-        generator = torch.Generator().manual_seed(self.seed)
+        drawn = self.monte_carlo
         return analyse_tolerances(
-            lens, spots, self.tolerances, self.weights, self.lenses, generator, self.chunk_size
+            lens,
+            self.spots.rays(lens),
+            self.tolerances,
+            self.weights,
+            drawn.lenses,
+            torch.Generator().manual_seed(drawn.seed),
+            drawn.chunk_size,
         )
 
     def _outcome(self, name: str, outcome: Outcome, refocused: bool) -> dict[str, float]:
@@ -191,13 +194,14 @@ class TolerancesModule(Analysis):
             )
         ]
         return (
-            f"RMS radius, µm, of {self.lenses} lenses: {'; '.join(parts)} "
+            f"RMS radius, µm, of {self.monte_carlo.lenses} lenses: {'; '.join(parts)} "
             f"({n['cost/lenses_per_s']:.0f} lenses/s)"
         )
 
     def _weights(self, weights: Sequence[float] | None) -> Tensor:
         """Return weights of spots (S,) from those of fields; all wavelengths count alike."""
         if weights is not None:
-            weights = torch.tensor(numbers_of("weights", weights, len(self.fields)))
-            weights = weights.double().repeat_interleave(len(self.wavelengths))
-        return spot_weights(weights, len(self.fields) * len(self.wavelengths))
+            numbers = numbers_of("weights", weights, len(self.spots.fields))
+            weights = torch.tensor(numbers).double()
+            weights = weights.repeat_interleave(len(self.spots.wavelengths))
+        return spot_weights(weights, len(self.spots))

@@ -91,11 +91,15 @@ def test_a_key_that_a_class_takes_is_no_old_name(composed):
             "variables={surfaces.1.conic: {step: 3, upper: null}}",
             ["variables={surfaces.1.conic:{scale:3,upper:null}}"],
         ),
+        (
+            "sharpness={rays: few, list: ['30', true, 'null'], 5: 1}",
+            ["sharpness={list:['30',True,'null'],5:1}", "++merit.quality=spots"],
+        ),
         ("merit.reference=middle", ["merit.reference=centroid"]),
         ("renderer=montecarlo", ["renderer=rays"]),
         (
-            "optimizer={_target_: old.place.Adam, lr: 0.1, betas: [0.9, 0.99], name: 'it''s'}",
-            ["optimizer={_target_:torch.optim.Adam,lr:0.1,betas:[0.9,0.99],name:its}"],
+            "optimizer={_target_: old.place.Adam, betas: [0.9, 0.99], name: 'two words'}",
+            ["optimizer={_target_:torch.optim.Adam,betas:[0.9,0.99],name:'two words'}"],
         ),
     ],
 )
@@ -131,7 +135,7 @@ def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(composed, roo
         "callbacks.pictures=null",
         "+trainer.enable_progress_bar=false",
     ]
-    run(composed(*kept, "module.pupil.rings=3", "module.pupil.arms=6"))
+    run(composed(*kept, "module.spots.pupil.rings=3", "module.spots.pupil.arms=6"))
     folder = tmp_path / "run"
     old = [*kept, "module.rings=3", "+module.arms=6"]
     (folder / ".hydra/overrides.yaml").write_text("\n".join(f"- '{text}'" for text in old))
@@ -139,6 +143,6 @@ def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(composed, roo
     done = subprocess.run(script, capture_output=True, text=True, cwd=root, timeout=500)
     assert done.returncode == 0, done.stderr
     for name in ("rings", "arms"):
-        note = f"note: module.{name}: this setting is called module.pupil.{name} now"
+        note = f"note: module.{name}: this setting is called module.spots.pupil.{name} now"
         assert note in done.stdout.splitlines()
     assert done.stdout.splitlines()[-1] == "reproduced"

@@ -18,8 +18,8 @@ SMALL = [
     "fields=[[0,0],[0,20],[-14,0]]",
     "wavelengths=[587.5618]",
     "lenses=200",
-    "module.rings=3",
-    "module.arms=6",
+    "module.spots.pupil.rings=3",
+    "module.spots.pupil.arms=6",
     "+trainer.enable_progress_bar=false",
 ]
 AXIAL = [*SMALL, "fields=[[0,0]]", "lenses=20", "callbacks.pictures=null"]

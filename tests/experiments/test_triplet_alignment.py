@@ -13,10 +13,10 @@ SMALL = [
     "experiment=triplet_alignment",
     "fields=[[0,0],[0,14],[-14,0],[14,-6]]",
     "misalignments=12",
-    "module.arms=16",
-    "module.simulation_rings=5",
-    "module.simulation_arms=20",
-    "+module.iterations=12",
+    "module.spots.pupil.arms=16",
+    "module.simulation_pupil.rings=5",
+    "module.simulation_pupil.arms=20",
+    "module.iterations=12",
     "+trainer.enable_progress_bar=false",
 ]
 COLUMNS = ("tilt_x_deg", "tilt_y_deg", "decenter_x_um", "decenter_y_um")
@@ -70,7 +70,7 @@ def test_a_run_names_the_elements_and_its_table_agrees_with_its_metrics(composed
 
 def test_an_ideal_sensor_in_a_known_place_with_the_fits_own_rays(composed, tmp_path):
     ideal = ["pixel_pitch=0", "read_noise=0", "sensor_shift_range=0", "focus_range=0"]
-    same = ["module.simulation_rings=4", "module.simulation_arms=16"]
+    same = ["module.simulation_pupil.rings=4", "module.simulation_pupil.arms=16"]
     run(composed(*SMALL, *ideal, *same))
     folder = tmp_path / "run"
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -107,8 +107,11 @@ BAD_INPUT = {
     "noise": (["read_noise=-1"], "read_noise: -1; allowed: 0 or more"),
     "no pixels": (["pixel_pitch=0"], "read_noise: 2.0; allowed: 0 where pixel_pitch is 0"),
     "window": (["window=1"], "window: 1; light lands up to"),
-    "rays": (["module.simulation_arms=7"], "rings must be at least 1 and arms even, not 5 and 7"),
-    "fields": (["fields=[]"], "fields, wavelengths: give at least one"),
+    "rays": (
+        ["module.simulation_pupil.arms=7"],
+        "rings must be at least 1 and arms even, not 5 and 7",
+    ),
+    "fields": (["fields=[]"], "fields: none is given"),
 }
 
 

@@ -1,0 +1,70 @@
+"""Settings of a camera's reconstruction and of its training."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from dolens.reconstruction import RelativisticDiscriminators
+from experiments.camera.reconstruction import Loss
+from experiments.settings import check_positive
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """The network that restores images, and what restored images are judged by.
+
+    Attributes:
+        network: a `Restoration`, or any module that maps display-encoded images (B, 3, H, W) to
+            such images.
+        loss: compares restored and true images (B, 3, H, W), display-encoded, by a number or by a
+            mapping with the number as `total`.
+        view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
+        discriminator: judges the restored images besides; None for no adversarial term.
+    """
+
+    network: nn.Module
+    loss: Loss
+    view_norm: float
+    discriminator: RelativisticDiscriminators | None
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Learning rates of the parts of a camera.
+
+    Attributes:
+        optics: of the lens's variables, where its optimizer takes steps with the network's.
+        network: of the network.
+        discriminator: of the discriminators; None: the network's.
+
+    Raises:
+        InputError: a rate that is not positive.
+    """
+
+    optics: float
+    network: float
+    discriminator: float | None
+
+    def __post_init__(self) -> None:
+        for key in ("optics", "network", "discriminator"):
+            rate = getattr(self, key)
+            if key != "discriminator" or rate is not None:
+                check_positive(f"learning_rates.{key}", rate)
+
+
+@dataclass(frozen=True)
+class Training:
+    """How the parameters of a camera move.
+
+    Attributes:
+        optimizer: parameter groups → optimizer; a `CameraOptimizer` may move the lens apart.
+        learning_rates: of the groups.
+        scheduler: optimizer → scheduler, stepped once a training step; or None.
+    """
+
+    optimizer: Callable[..., torch.optim.Optimizer]
+    learning_rates: LearningRates
+    scheduler: Callable[..., Any] | None
