@@ -5,7 +5,11 @@ from omegaconf import DictConfig, OmegaConf
 from experiments.running.dropped_entries import without_dropped
 from experiments.running.renaming import refuse_renamed
 from experiments.running.run_settings import RunSettings
-from experiments.running.target_keys import refuse_targets_in_lenses, refuse_unknown_keys
+from experiments.running.target_keys import (
+    refuse_missing,
+    refuse_targets_in_lenses,
+    refuse_unknown_keys,
+)
 from experiments.running.unread_settings import refuse_unread
 
 # What Hydra makes; the lens is made by `dolens.prescriptions`, from data alone.
@@ -23,12 +27,13 @@ def checked(cfg: DictConfig) -> DictConfig:
 
     Raises:
         InputError: an old name, an entry dropped that no parent has, a `_target_` in a lens, a key
-            that a class does not take, or a setting that nothing reads.
+            that a class does not take, a setting that is missing, or one that nothing reads.
     """
     own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     refuse_renamed(own)
     own = without_dropped(own)
     refuse_targets_in_lenses(own)
     refuse_unknown_keys(own, _MADE)
+    refuse_missing(own, _MADE)
     refuse_unread(own, RunSettings.names())
     return own

@@ -15,6 +15,10 @@ from dolens.errors import InputError, did_you_mean
 from experiments.running.renamed_keys import RENAMED, Key, Renamed
 from experiments.running.target_keys import Target, arguments_of, located
 
+# Text that the command line takes without quotes, and that it would not take for text.
+_PLAIN = re.compile(r"[A-Za-z_][\w./-]*")
+_WORDS = ("true", "false", "null", "nan", "inf")
+
 
 class Change(NamedTuple):
     """A setting as it was written, and as it is written now.
@@ -46,7 +50,7 @@ class Change(NamedTuple):
 def refuse_renamed(cfg: DictConfig, renamed: Renamed = RENAMED) -> None:
     """Refuse old names in a composed configuration.
 
-    A key that a class beside it takes is no old name, whatever the table says.
+    A key that the class beside it takes is that class's own, and not the old name of another one.
 
     Raises:
         InputError: the first old name; the message has the new one.
@@ -54,7 +58,9 @@ def refuse_renamed(cfg: DictConfig, renamed: Renamed = RENAMED) -> None:
     plain = OmegaConf.to_container(cfg, resolve=False)
     for path, value, holder in _settings("", plain, {}):
         change = _change(path, value, renamed)
-        if change is not None and not _is_taken(path, holder):
+        if change is None:
+            continue
+        if change.new in (None, path) or not _is_taken(path, holder):
             raise InputError(change.message())
 
 
@@ -170,7 +176,7 @@ def _text(value: Any) -> str:
         return "[" + ",".join(map(_text, value)) + "]"
     if value is None:
         return "null"
-    if isinstance(value, str) and not re.fullmatch(r"[\w./-]+", value):
+    if isinstance(value, str) and (not _PLAIN.fullmatch(value) or value.lower() in _WORDS):
         return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
     return str(value)
 

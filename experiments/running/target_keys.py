@@ -1,4 +1,4 @@
-"""Keys beside a `_target_` that its class does not take are errors, before anything is made."""
+"""What Hydra is to make: keys that no class takes, and settings that are missing, are errors."""
 
 import inspect
 import pkgutil
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dolens.errors import InputError, check_keys
 
@@ -66,6 +66,24 @@ def refuse_targets_in_lenses(cfg: DictConfig) -> None:
             )
 
 
+def refuse_missing(cfg: DictConfig, parts: Sequence[str]) -> None:
+    """Refuse settings that must be given and are not: `???` in a file of the configuration.
+
+    Args:
+        cfg: the composed configuration.
+        parts: top-level keys that Hydra makes something of.
+
+    Raises:
+        InputError: the first such setting.
+    """
+    for path, node in _settings(OmegaConf.to_container(cfg, resolve=False), parts):
+        if node == MISSING:
+            raise InputError(
+                f"{path}: must be given; neither experiment="
+                f"{HydraConfig.get().runtime.choices.get('experiment')} nor the command line does"
+            )
+
+
 def targets(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[Target]:
     """Yield all targets of some parts of a configuration, each once.
 
@@ -73,20 +91,27 @@ def targets(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[Target]:
         plain: the configuration, not resolved.
         parts: top-level keys; what they refer to as a whole (`${network}`) belongs to them.
     """
-    seen: set[str] = set()
-
-    def visit(path: str, node: Any) -> Iterator[Target]:
-        reference = _REFERENCE.fullmatch(node) if isinstance(node, str) else None
-        if reference:
-            path, node = reference[1], _at(plain, reference[1])
-        if path in seen or not isinstance(node, dict | list):
-            return
-        seen.add(path)
+    for path, node in _settings(plain, parts):
         if isinstance(node, dict) and isinstance(node.get("_target_"), str):
             given = tuple(str(key) for key in node if key not in _HYDRAS)
             yield Target(path, node["_target_"], given)
-        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
-            yield from visit(f"{path}.{key}", value)
+
+
+def _settings(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """All settings of some parts, and of what these refer to: path and value, each once."""
+    seen: set[str] = set()
+
+    def visit(path: str, node: Any) -> Iterator[tuple[str, Any]]:
+        reference = _REFERENCE.fullmatch(node) if isinstance(node, str) else None
+        if reference:
+            path, node = reference[1], _at(plain, reference[1])
+        if path in seen:
+            return
+        seen.add(path)
+        yield path, node
+        if isinstance(node, dict | list):
+            for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+                yield from visit(f"{path}.{key}", value)
 
     for part in parts:
         yield from visit(part, plain.get(part))
@@ -107,14 +132,24 @@ def located(target: Target) -> Any:
 
 
 def arguments_of(make: Callable[..., Any]) -> list[str] | None:
-    """Return the names of the arguments that something takes; None where it takes any."""
+    """Return the names of the arguments that something takes; None where it takes any.
+
+    What a class takes as `**options` is taken to be for the classes that it derives from.
+    """
     try:
-        parameters = inspect.signature(make).parameters.values()
+        call = make.__init__ if isinstance(make, type) else make
+        parameters = list(inspect.signature(call).parameters.values())
     except (TypeError, ValueError):  # of some classes that are written in C
         return None
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return None
-    return [p.name for p in parameters if p.kind not in (p.POSITIONAL_ONLY, p.VAR_POSITIONAL)]
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    found = [p.name for p in parameters if p.kind in named and p.name != "self"]
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+        bases = [base for base in getattr(make, "__bases__", ()) if base is not object]
+        inherited = [arguments_of(base) for base in bases]
+        if not inherited or None in inherited:
+            return None
+        found += [name for names in inherited for name in names]
+    return list(dict.fromkeys(found))
 
 
 def _at(plain: Any, path: str) -> Any:

@@ -69,8 +69,8 @@ def test_the_command_line_drops_and_replaces_too(composed):
 @pytest.mark.parametrize(
     ("parent", "override", "left"),
     [
-        ("cooke_sensitivity", "tolerances: {thicknesses.[135]: drop}", 4),
-        ("misalignment", "fits: {'30': drop, '25': drop}", 4),
+        ("cooke_sensitivity", "tolerances: {'thicknesses.[135]': drop}", 4),
+        ("misalignment", "fits: {'30': drop, '25': drop}", 3),
         ("wavefront_coding", "calibrations: {noise: drop}", 2),
         ("wavefront_coding", "callbacks: {pictures: drop}", 3),
         ("speed_vs_error", "scenes: {nikon: drop}", 3),
@@ -88,6 +88,14 @@ def test_dropping_what_no_parent_has_is_one_line(inherited, entry):
     with pytest.raises(InputError, match="nothing to drop: no parent of experiment=mine") as caught:
         checked(inherited(f"  - wavefront_coding\n  - _self_\n{entry}\n"))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("module", "missing"), [("camera", "learning_rates.optics"), ("tolerances", "fields")]
+)
+def test_a_setting_that_an_experiment_must_make_is_named(inherited, module, missing):
+    with pytest.raises(InputError, match=f"^{missing}: must be given; neither experiment=mine"):
+        checked(inherited(f"  - override /module: {module}\n  - override /lens: nikon\n"))
 
 
 def test_the_run_folder_has_what_is_left(inherited, tmp_path):

@@ -91,11 +91,15 @@ def test_a_key_that_a_class_takes_is_no_old_name(composed):
             "variables={surfaces.1.conic: {step: 3, upper: null}}",
             ["variables={surfaces.1.conic:{scale:3,upper:null}}"],
         ),
+        (
+            "sharpness={rays: few, list: ['30', true, 'null'], 5: 1}",
+            ["sharpness={list:['30',True,'null'],5:1}", "++merit.quality=spots"],
+        ),
         ("merit.reference=middle", ["merit.reference=centroid"]),
         ("renderer=montecarlo", ["renderer=rays"]),
         (
-            "optimizer={_target_: old.place.Adam, lr: 0.1, betas: [0.9, 0.99], name: 'it''s'}",
-            ["optimizer={_target_:torch.optim.Adam,lr:0.1,betas:[0.9,0.99],name:its}"],
+            "optimizer={_target_: old.place.Adam, betas: [0.9, 0.99], name: 'two words'}",
+            ["optimizer={_target_:torch.optim.Adam,betas:[0.9,0.99],name:'two words'}"],
         ),
     ],
 )
