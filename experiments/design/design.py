@@ -14,15 +14,14 @@ from torch import Tensor
 
 from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
-from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
 from dolens.optimize.merit import MeritValue
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
 from experiments.design.figures import design_figures
 from experiments.design.iteration import Progress, gradient_iteration, least_squares_iteration
-from experiments.design.tables import iteration_row, spot_labels, spot_table
+from experiments.design.light import fit_edges, refuse_lost_light
+from experiments.design.tables import iteration_row, spot_metrics
 from experiments.experiment import Experiment, Figures
 
 logger = logging.getLogger(__name__)
@@ -30,8 +29,6 @@ logger = logging.getLogger(__name__)
 SEMI_DIAMETERS = ("fixed", "automatic")
 # So many iterations are logged one by one; history.csv holds all.
 _LOGGED_FIRST = 20
-# Rings of the quadrature that tells where the edges of the beams are.
-_EDGE_RINGS = 40
 
 
 class DesignModule(Experiment):
@@ -199,7 +196,7 @@ class DesignModule(Experiment):
         try:
             self.merit = self._build(self.lens)
             value = self.merit()
-            self._check_light()
+            self._refuse_lost_light()
             reached = value.sum_of_squares()
             self._keep_if_better(value)
         except InputError as problem:
@@ -240,7 +237,7 @@ class DesignModule(Experiment):
             self.variables.write_to(self.lens)
             self.lens.sensor_distance.copy_(self.best_focus)
         if self.automatic_semi_diameters:
-            self._fit_edges()
+            fit_edges(self.lens, self.initial, self.merit_settings)
 
     def _build(self, lens: Lens) -> MeritFunction:
         if not self.automatic_semi_diameters:
@@ -248,35 +245,9 @@ class DesignModule(Experiment):
         # The rays of the start serve every round.
         return self.merit or self.merit_settings.build(self.initial, self.variables)
 
-    def _fit_edges(self) -> None:
-        settings = replace(
-            self.merit_settings,
-            sampling="gaussian_quadrature",
-            sampling_options={"rings": _EDGE_RINGS, "arms": 2 * _EDGE_RINGS, "symmetry": True},
-        )
-        edges = fitted_semi_diameters(self.lens, settings.rays(self.initial))
-        for number, semi_diameter in edges.items():
-            self.lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
-
-    def _check_light(self) -> None:
-        """Check that no spot has lost too much light since the search began.
-
-        Each round takes its rays from the lens as it then is, so that every one could lose some.
-
-        Raises:
-            InputError: a spot has lost more of its light than it may.
-        """
-        quality = self.merit.quality
-        if quality is None or self.automatic_semi_diameters:
-            return
-        least = self.initial_light * (1.0 - quality.max_vignetting)
-        lost = quality.spots.light < least.to(quality.spots.light)
-        if bool(lost.any()):
-            label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
-            raise InputError(
-                f"spot {label} has lost more than merit.max_vignetting = "
-                f"{quality.max_vignetting:g} of the light that it had at first"
-            )
+    def _refuse_lost_light(self) -> None:
+        if self.merit.quality is not None and not self.automatic_semi_diameters:
+            refuse_lost_light(self.merit.quality, self.initial_light)
 
     def _keep_if_better(self, value: MeritValue) -> None:
         merit = value.sum_of_squares()
@@ -314,24 +285,10 @@ class DesignModule(Experiment):
 
     def test_step(self, batch: Any, batch_idx: int) -> None:
         """Log RMS spot radii before and after the design, and those of the published one."""
-        final = spot_table(self.lens, self.evaluation)
-        tables = {"initial": spot_table(self.initial, self.evaluation), "final": final}
+        others = {"initial": self.initial}
         if self.published is not None:
-            tables["published"] = spot_table(self.published, self.evaluation)
-        for name, table in tables.items():
-            self.log(f"rms_spot_um/{name}", table.mean)
-            self.log(f"light/{name}", table.light)
-        for label, radius in final.radii.items():
-            self.log(f"rms_spot_um/final/{label}", radius)
-        self.log(
-            "error/sampling_um",
-            abs(spot_table(self.lens, self.evaluation, finer=True).mean - final.mean),
-        )
-        logger.info(
-            "RMS spot radius, mean of %d: %s µm",
-            len(final.radii),
-            ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items()),
-        )
+            others["published"] = self.published
+        self.log_dict(spot_metrics(self.lens, others, self.evaluation))
 
     def summary(self) -> dict[str, float]:
         """Return the merit of the best round, and costs."""

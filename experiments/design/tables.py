@@ -1,5 +1,7 @@
 """Tables of a design: spots of a lens, numbers of an iteration, operands."""
 
+import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -7,6 +9,8 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.lens import Lens
 from dolens.optimize import MeritFunction, MeritSettings
 from experiments.design.iteration import Progress
+
+logger = logging.getLogger(__name__)
 
 SQUARE_GRID_COUNT = 31
 _DEFAULTS = {
@@ -45,6 +49,34 @@ def spot_table(lens: Lens, settings: MeritSettings, finer: bool = False) -> Spot
     mean = float((quality.weights.to(rms) * rms).sum())
     radii = dict(zip(spot_labels(quality.spots), rms.tolist(), strict=True))
     return SpotTable(radii, mean, float(quality.spots.light.mean()))
+
+
+def spot_metrics(
+    lens: Lens, others: Mapping[str, Lens], settings: MeritSettings
+) -> dict[str, float]:
+    """Return mean RMS spot radii and light of a design and others, and radii of all its spots.
+
+    Args:
+        lens: the design, `final` in the names of metrics.
+        others: lenses to compare with, by their names there.
+        settings: of a merit of spots.
+    """
+    final = spot_table(lens, settings)
+    tables = {name: spot_table(other, settings) for name, other in others.items()}
+    tables["final"] = final
+    numbers = {}
+    for name, table in tables.items():
+        numbers[f"rms_spot_um/{name}"] = table.mean
+        numbers[f"light/{name}"] = table.light
+    for label, radius in final.radii.items():
+        numbers[f"rms_spot_um/final/{label}"] = radius
+    numbers["error/sampling_um"] = abs(spot_table(lens, settings, finer=True).mean - final.mean)
+    logger.info(
+        "RMS spot radius, mean of %d: %s µm",
+        len(final.radii),
+        ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items()),
+    )
+    return numbers
 
 
 def spot_labels(spots: SpotRays) -> list[str]:

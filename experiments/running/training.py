@@ -169,9 +169,8 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
 
     # What `module` holds refers to the other groups and would only repeat them.
     left_out = ("module", "views", "lens", "callbacks", "logger", "trainer")
-    # Resolved as a whole: what is kept may refer to what is left out, as a wavelength to the lens.
-    plain = OmegaConf.to_container(cfg, resolve=True)
-    visit({key: value for key, value in plain.items() if key not in left_out}, "")
+    whole = OmegaConf.to_container(cfg, resolve=True)
+    visit({key: value for key, value in whole.items() if key not in left_out}, "")
     return {"experiment": HydraConfig.get().runtime.choices.get("experiment"), **flat}
 
 

@@ -1,0 +1,57 @@
+"""Edges of a lens and the light that they cut, before and after its design."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optimize import MeritSettings
+from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
+from dolens.optimize.image_quality import ImageQuality
+from experiments.design.tables import spot_labels
+
+# Rings of the quadrature that tells where the edges of the beams are.
+_EDGE_RINGS = 40
+
+
+def fit_edges(lens: Lens, initial: Lens, settings: MeritSettings) -> None:
+    """Put every edge of a lens where the rays that pass another one meet it.
+
+    Args:
+        lens: its clear apertures are replaced.
+        initial: decides which rays there are.
+        settings: fields and wavelengths of the rays.
+    """
+    settings = replace(
+        settings,
+        sampling="gaussian_quadrature",
+        sampling_options={"rings": _EDGE_RINGS, "arms": 2 * _EDGE_RINGS, "symmetry": True},
+    )
+    edges = fitted_semi_diameters(lens, settings.rays(initial))
+    for number, semi_diameter in edges.items():
+        lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
+
+
+def refuse_lost_light(quality: ImageQuality, initial_light: Tensor) -> None:
+    """Check that no spot has lost too much light since a search began.
+
+    Each round takes its rays from the lens as it then is, so that every one could lose some.
+
+    Args:
+        quality: that of the present round.
+        initial_light: (S,), the light of its spots when the search began; see `SpotRays.light`.
+
+    Raises:
+        InputError: a spot has lost more than `max_vignetting` of its light.
+    """
+    least = initial_light * (1.0 - quality.max_vignetting)
+    lost = quality.spots.light < least.to(quality.spots.light)
+    if bool(lost.any()):
+        label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
+        raise InputError(
+            f"spot {label} has lost more than merit.max_vignetting = "
+            f"{quality.max_vignetting:g} of the light that it had at first"
+        )
