@@ -152,12 +152,14 @@ def fisher_information(
 
     A pixel of λ expected electrons has the variance λ + σ², σ the read noise; a share of light i
     has λ = N·i with N, the exposure of its source, unknown as well.  With A the derivatives of all
-    λ/√(λ + σ²) by θ, less their parts along those by N, the information is AᵀA.
+    λ/√(λ + σ²) with respect to θ, less their parts along those to N, the information is AᵀA.
 
     Args:
         pose: the lens where it is.
         imager: makes the expected images.
         measurement: of these sources; its totals and its mask count, its pixels do not.
+
+    Rarely needed:
         slopes: makes their derivatives; None: `imager` does.  Few rays in narrow patches of light
             make derivatives rough, and a rough image would seem to tell more than it can: patches
             should be wide enough that some ten rays cross each edge of a pixel.

@@ -114,6 +114,8 @@ def simulated(
         photons: behind the lens, of each source; those beyond the sensor's edge are among them.
         read_noise: RMS, electrons.
         generator: of directions and noise.
+
+    Rarely needed:
         full_well: electrons at which a pixel saturates, and is not trusted; None: never.
         planes: where the sensor stands, mm from where the lens has it; an exposure of each source
             on each.

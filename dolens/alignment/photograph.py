@@ -59,6 +59,8 @@ def read_measurement(
         path: TIFF or PNG.
         pixel_pitch: of the photograph, mm.
         dark_level: counts that the sensor gives in the dark.
+
+    Rarely needed:
         region: top, left, height and width that are used, pixels; None: all.  The optical axis is
             taken to meet the middle of the photograph.
         downsample: pixels along each side that are averaged to one; those that are left over at the

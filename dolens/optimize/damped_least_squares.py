@@ -67,6 +67,8 @@ class DampedLeastSquares(torch.optim.Optimizer):
             (Marquardt; Moré 1978); or `identity`, one D for all (S15): the largest ‖J_j‖ of the
             first point, so that ρ has no unit either.
         initial_damping: ρ of the first step.
+
+    Rarely needed:
         bounds: `active`: the step is the minimum within the box; or `projected`: the minimum
             without it, put back (S17).
         merit_tolerance: stop when a step's actual and predicted gains are this part of the merit.

@@ -33,6 +33,8 @@ class DesignVariables(nn.Module):
         variables: name or pattern → settings: `scale` (default 1), `initial` (default: the
             lens's own value), `lower` and `upper` (default: none), all in the unit of files;
             or name → `pickup` or `solve` with their settings.
+
+    Rarely needed:
         others: numbers besides the lens's parameters that may be varied, by their exact names,
             in their own units.
 

@@ -60,6 +60,8 @@ def trace_perturbed(
         spots: of the whole pupil, `gaussian_quadrature(..., symmetry=False)`.
         names: of P parameters, each a single number.
         errors: (K, P), added to the parameters, in the lens's units (radians for tilts).
+
+    Rarely needed:
         chunk_size: lenses that a thread traces at a time, which bounds memory; None: as many as
             take `RAYS_AT_A_TIME`.
 

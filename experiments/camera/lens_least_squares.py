@@ -67,6 +67,8 @@ class LensLeastSquares:
         every: steps of the network between two of the lens.
         trust_radius: how far rays may move in the first step, RMS over spots, pixels.
         max_trust_radius: how far they may move in any later one.
+
+    Rarely needed:
         damping: of variables that undo one another.
         rings: of rays in a pupil.
         arms: of rays in a pupil, even.

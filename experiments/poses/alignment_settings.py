@@ -87,9 +87,10 @@ class Misalignments:
 
     def half_range(self) -> Tensor:
         """Return the half-ranges of tilts (radians), decentres and unknown coordinates (mm)."""
-        tilt, shift = math.radians(self.tilt_range), float(self.decenter_range)
+        tilt, shift = self.tilt_range, self.decenter_range
+        pose = torch.tensor([tilt, tilt, shift, shift], dtype=torch.float64) * unit_factors(POSE)
         places = [float(half_range) for half_range in self._places().values() if half_range > 0.0]
-        return torch.tensor([tilt, tilt, shift, shift, *places], dtype=torch.float64)
+        return torch.cat([pose, torch.tensor(places, dtype=torch.float64)])
 
     def known_case(self, elements: Sequence[str]) -> tuple[int, Tensor]:
         """Return the demo's element (its number) and pose (4,), in radians and mm.
@@ -100,8 +101,8 @@ class Misalignments:
         name = self.demo.get("element")
         check_choice(name, elements, "demo.element")
         values = [float(self.demo.get(part, 0.0)) for part in POSE]
-        pose = torch.tensor(values, dtype=torch.float64)
-        return list(elements).index(name), pose * unit_factors(POSE)
+        pose = torch.tensor(values, dtype=torch.float64) * unit_factors(POSE)
+        return list(elements).index(name), pose
 
     def _places(self) -> dict[str, float]:
         shift = self.sensor_shift_range

@@ -57,6 +57,7 @@ RENAMED = Renamed(
         Key("module.simulation_arms", "module.simulation_pupil.arms"),
     ),
     options={
+        "experiment": {"pose_knowledge": "pose_bounds"},
         # One callback saves the figures of every experiment.
         "callbacks": dict.fromkeys(
             ("alignment", "pose_accuracy", "pose_knowledge", "speed", "tolerances"), "figures"
@@ -110,7 +111,7 @@ RENAMED = Renamed(
             "experiments.poses.coverage.PoseCoverageModule"
         ),
         "experiments.pose_knowledge.PoseKnowledgeModule": (
-            "experiments.poses.knowledge.PoseKnowledgeModule"
+            "experiments.poses.bounds.PoseBoundsModule"
         ),
         "experiments.speed_vs_error.SpeedVsErrorModule": (
             "experiments.speed.speed_vs_error.SpeedVsErrorModule"

@@ -169,8 +169,8 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
 
     # What `module` holds refers to the other groups and would only repeat them.
     left_out = ("module", "views", "lens", "callbacks", "logger", "trainer")
-    chosen = [key for key in cfg if key not in left_out]
-    visit(OmegaConf.to_container(OmegaConf.masked_copy(cfg, chosen), resolve=True), "")
+    whole = OmegaConf.to_container(cfg, resolve=True)
+    visit({key: value for key, value in whole.items() if key not in left_out}, "")
     return {"experiment": HydraConfig.get().runtime.choices.get("experiment"), **flat}
 
 

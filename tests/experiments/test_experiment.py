@@ -157,7 +157,7 @@ def test_what_a_run_cannot_do_is_one_clear_line(own, case):
         "cooke_sensitivity",
         "misalignment_coverage",
         "pose_accuracy",
-        "pose_knowledge",
+        "pose_bounds",
         "speed_vs_error",
         "triplet_alignment",
     ],

@@ -252,11 +252,11 @@ def test_the_jacobian_is_that_of_forward_mode(triplet):
 
 
 def test_sums_serve_where_rows_would_not_fit(triplet, monkeypatch):
-    from dolens.optimize import spot_residuals
+    from dolens.optimize import ray_intercept_residuals
 
     merit, _ = merit_of(triplet, sampling="square_grid", sampling_options={"count": 21})
     rows = merit().linear_model()
-    monkeypatch.setattr(spot_residuals, "MOST_STORED", 0)
+    monkeypatch.setattr(ray_intercept_residuals, "MOST_STORED", 0)
     sums = merit().linear_model()
     assert torch.allclose(sums.gradient, rows.gradient, rtol=1e-8)
     assert torch.allclose(sums.root.T @ sums.root, rows.root.T @ rows.root, rtol=1e-8)

@@ -17,7 +17,7 @@ from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.poses.arrangement import UNSEEN, Arrangement
 from experiments.poses.bench import Bench, Light, draw, repetitions, simulate
-from experiments.poses.knowledge_figures import knowledge_figures
+from experiments.poses.bounds_figures import bounds_figures
 from experiments.poses.results import spread_metrics
 from experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
 from experiments.tables import Row
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 _KEYS = ("sources", "planes", "variables")
 
 
-class PoseKnowledgeModule(Analysis):
+class PoseBoundsModule(Analysis):
     """Compares arrangements of sources and planes by their bounds of the same unknowns.
 
     Args:
@@ -93,7 +93,7 @@ class PoseKnowledgeModule(Analysis):
 
     def figures(self) -> Figures:
         """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
-        return knowledge_figures(self.arrangements, self.lens.name, int(self.light.photons))
+        return bounds_figures(self.arrangements, self.lens.name, int(self.light.photons))
 
     def bound_rows(self) -> list[Row]:
         """Return rows of bounds.csv, one for each variable of each arrangement."""

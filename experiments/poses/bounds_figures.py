@@ -17,7 +17,7 @@ from experiments.poses.labels import variable_label
 _MARKERS = "osD^vP*X"
 
 
-def knowledge_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:
+def bounds_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:
     """Return `knowledge`, and `corner_<arrangement>` of those that tell all variables.
 
     Args:

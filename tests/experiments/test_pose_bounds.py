@@ -9,7 +9,7 @@ from tiny_experiment import figure_names
 from experiments.running.training import run
 
 TINY = [
-    "experiment=pose_knowledge",
+    "experiment=pose_bounds",
     "sensor.height=32",
     "sensor.width=32",
     "sensor.pixel_pitch=0.2208",
