@@ -46,8 +46,8 @@ def bound_table(found: Mapping[str, Sequence[BoundGain]]) -> list[str]:
     ]
     for name, gains in found.items():
         lines += [
-            f"| {name} | {g.light:g} | {g.shared:+.2f} | {g.own:+.2f} | F/{g.plain_f_number:.1f} "
-            f"| {g.plate:.1e} |"
+            f"| {name} | {g.light:g} | {g.common_filter:+.2f} | {g.filter_per_depth:+.2f} "
+            f"| F/{g.plain_f_number:.1f} | {g.plate:.1e} |"
             for g in gains
         ]
     return lines
@@ -88,8 +88,8 @@ def figure_of(
             GainRange(
                 name,
                 [g.light for g in gains],
-                [g.shared for g in gains],
-                [g.own for g in gains],
+                [g.common_filter for g in gains],
+                [g.filter_per_depth for g in gains],
                 points,
             )
         )

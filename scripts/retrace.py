@@ -48,7 +48,7 @@ def compared(folder: Path, every: int) -> list[str]:
     own = lens.trace(spots.rays).position[:, :2].detach()[chosen]
     started = time.perf_counter()
     values = exact.values_of(lens)
-    found = [landing(lens, values, spots, ray) for ray in chosen]
+    found = [intercept(lens, values, spots, ray) for ray in chosen]
     again = torch.tensor(found, dtype=torch.float64)
     seconds = time.perf_counter() - started
     of_ray, weight = spots.spot[chosen], spots.weight[chosen]
@@ -73,7 +73,7 @@ def evaluated_spots(folder: Path, lens: Lens) -> SpotRays:
     return MeritSettings(**settings).rays(lens)
 
 
-def landing(lens: Lens, values: dict, spots: SpotRays, ray: int) -> list[float]:
+def intercept(lens: Lens, values: dict, spots: SpotRays, ray: int) -> list[float]:
     """Where a ray lands, mm."""
     status, _, point, *_ = exact.trace(
         lens,

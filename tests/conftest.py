@@ -42,14 +42,13 @@ def reference():
 @pytest.fixture(params=["reference", "cpu"])
 def backend(request, monkeypatch):
     """What traces a lens that leaves the choice open; tests that use it state no physics twice."""
-    from dolens.optics import backend
+    of_lens = Lens.system
 
-    choose = backend.choose_backend
+    def system(lens, values=None):
+        found = of_lens(lens, values)
+        return found.traced_by(request.param) if found.backend == "auto" else found
 
-    def chosen(system, requested, rays=None):
-        return choose(system, request.param if requested == "auto" else requested, rays)
-
-    monkeypatch.setattr(backend, "choose_backend", chosen)
+    monkeypatch.setattr(Lens, "system", system)
     return request.param
 
 

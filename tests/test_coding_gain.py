@@ -67,7 +67,7 @@ def test_linear_bounds_find_the_textbook_s_tendencies():
     # The brighter, the further a plain lens is stopped down.
     assert bright.plain_f_number > dim.plain_f_number > 8.5
     # Where the depth is known a plate gains more, and the more so the brighter it is.
-    assert bright.own > dim.own > dim.shared
+    assert bright.filter_per_depth > dim.filter_per_depth > dim.common_filter
     # One plane needs no plate: the weakest is best, and gains nothing.
     (flat,) = bound_gains([5760.0], [1000.0], 3.0, (0.0,))
-    assert flat.plate == 0.5e-5 and flat.shared <= 0.0
+    assert flat.plate == 0.5e-5 and flat.common_filter <= 0.0

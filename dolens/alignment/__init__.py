@@ -1,1 +1,3 @@
-"""Where a lens is, from what a sensor saw: models, losses, and how well it can be known."""
+"""This package finds where a lens is from what a sensor saw: models, losses, and Cramér–Rao
+bounds.
+"""

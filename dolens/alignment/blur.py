@@ -1,4 +1,4 @@
-"""Images convolved with a Gaussian."""
+"""A Gaussian blur makes images comparable from farther away."""
 
 import math
 
@@ -7,8 +7,10 @@ from torch import Tensor
 
 
 def blurred(images: Tensor, deviation: float) -> Tensor:
-    """(..., height, width), of the Gaussian's standard deviation in pixels; 0 leaves them as they
-    are.  What leaves at the edges is lost.  The operation is its own transpose.
+    """Return images (..., height, width) convolved with a Gaussian.
+
+    The standard deviation is in pixels; 0 leaves the images as they are.  Light that leaves at the
+    edges is lost.  The operation is its own transpose.
     """
     if deviation == 0.0:
         return images
@@ -17,7 +19,9 @@ def blurred(images: Tensor, deviation: float) -> Tensor:
 
 
 def noise_left(deviation: float) -> float:
-    """The variance that independent noise of variance 1 keeps when it is blurred, Σ kernel²."""
+    """Return the variance that independent noise of variance 1 keeps when it is blurred, Σ
+    kernel².
+    """
     if deviation == 0.0:
         return 1.0
     length = 2 * 4 * math.ceil(deviation) + 1
@@ -26,7 +30,7 @@ def noise_left(deviation: float) -> float:
 
 
 def _gaussian(length: int, deviation: float, like: Tensor) -> Tensor:
-    """(length, length), symmetric: the convolution with a Gaussian along one side."""
+    """Return the convolution with a Gaussian along one side, (length, length), symmetric."""
     place = torch.arange(length, dtype=like.dtype, device=like.device)
     far = (place[:, None] - place) / deviation
     step = torch.arange(-4 * math.ceil(deviation), 4 * math.ceil(deviation) + 1).to(like)

@@ -1,4 +1,6 @@
-"""Photons of a point source that land as wave optics has it, anywhere between lens and focus."""
+"""Wave optics gives the places where photons of a point source are detected, anywhere between lens
+and focus.
+"""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
 
 _RAYS, _DEGREE = 48, 16
-# Light that diffraction spreads farther beyond the rays' landing points is lost: widths of the
+# Light that diffraction spreads farther beyond the ray intercepts is lost: widths of the
 # fringes at an edge, and pixels.
 _FRINGES, _PIXELS = 8.0, 2.0
 # Copies of the image meet the window at 1.
@@ -28,7 +30,7 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class DiffractedLight:
-    """The light of a point source on a fine grid of the sensor.
+    """Holds the light of a point source on a fine grid of the sensor.
 
     Attributes:
         shares: (Y, X), of the light behind the lens, in each cell of the grid.
@@ -45,7 +47,7 @@ class DiffractedLight:
     def photons(
         self, count: int, source_diameter: float, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Where photons land, x and y in mm.
+        """Return the places of detected photons, x and y in mm.
 
         Their number is that of a Poisson process, evenly spread within a cell.  A source of finite
         size is a disc of points whose images differ in their places only.
@@ -69,7 +71,7 @@ class DiffractedLight:
 
 
 def on_disc(u: Tensor, v: Tensor, radius: float) -> Tensor:
-    """Points (2, N) of even density on a disc, from even numbers (N,) between 0 and 1."""
+    """Return points (2, N) of even density on a disc, from even numbers (N,) between 0 and 1."""
     rho, angle = radius * u.sqrt(), 2.0 * torch.pi * v
     return torch.stack([rho * angle.cos(), rho * angle.sin()])
 
@@ -78,7 +80,7 @@ def on_disc(u: Tensor, v: Tensor, radius: float) -> Tensor:
 def diffracted_light(
     lens: Lens, source: Tensor, wavelength: float, sensor: Sensor, source_diameter: float = 0.0
 ) -> DiffractedLight:
-    """The irradiance of a point source by the angular spectrum of the light behind the lens.
+    """Return the irradiance of a point source by the angular spectrum of the light behind the lens.
 
     With the root A of the flux per area in direction cosines α of the rays, and their optical path
     to the sensor's axes,
@@ -108,7 +110,7 @@ def diffracted_light(
     points = source.double() + moved * torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     system = lens.system()
     beams = pupil_wavefront(system, ObjectPoints.at(points), wavelength, None, _RAYS, math.inf)
-    middles = beams.centre + _mean_landing(beams)
+    middles = beams.centre + _mean_intercept(beams)
     movement = ((middles[1:] - middles[0]) / moved).mT
     front = pupil_wavefront(
         system, ObjectPoints.at(points[:1]), wavelength, beams.centre[:1], _RAYS, math.inf
@@ -147,8 +149,8 @@ def diffracted_light(
     )
 
 
-def _mean_landing(front: Wavefront) -> Tensor:
-    """(N, 2), mm from the spheres' centres."""
+def _mean_intercept(front: Wavefront) -> Tensor:
+    """Return the mean ray intercept (N, 2), mm from the spheres' centres."""
     flux = (front.amplitude * front.weight)[..., None]
     return (flux * front.landing).sum((1, 2)) / flux.sum((1, 2)).clamp(min=1e-300)
 
@@ -156,7 +158,9 @@ def _mean_landing(front: Wavefront) -> Tensor:
 def _on_sensor(
     sensor: Sensor, low: Tensor, high: Tensor, centre: Tensor, margin: float
 ) -> tuple[Tensor, Tensor]:
-    """The part of a box (mm from a centre) that lies on the sensor, or a margin beyond it."""
+    """Return the part of a box (mm from a centre) that lies on the sensor, or a margin beyond
+    it.
+    """
     corners = torch.tensor([[-0.5, -0.5], [sensor.height - 0.5, sensor.width - 0.5]])
     ends = torch.stack(sensor.positions(*corners.double().unbind(-1)), -1) - centre
     first = torch.maximum(low, ends.amin(0) - margin)

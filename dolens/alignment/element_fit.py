@@ -1,4 +1,5 @@
-"""Which element of a lens is misaligned, and by how much: a fit of each, for many lenses at once.
+"""A fit of each element's pose identifies the misaligned element of a lens, for many lenses at
+once.
 
 Every hypothesis is that one element has a pose of its own and all others are as designed; where
 the sensor is may be unknown besides.
@@ -32,7 +33,7 @@ _ENOUGH, _WRONG, _SHARE = 1e-8, 10.0, 0.05
 
 @dataclass(frozen=True)
 class ElementFit:
-    """The best pose of one element, and place of the sensor, for each of K measurements.
+    """Holds the best pose of one element, and place of the sensor, for each of K measurements.
 
     Attributes:
         errors: (K, P), in the lens's units (radians, mm), in the order of the model's names.
@@ -48,7 +49,7 @@ class ElementFit:
 
 
 def element_names(lens: Lens, element: str) -> tuple[str, ...]:
-    """Names of an element's tilts and decentres.
+    """Return the names of an element's tilts and decentres.
 
     Raises:
         InputError: the lens has no such element.
@@ -78,7 +79,7 @@ def fit_element(model: MomentModel, measured: MeasuredMoments, iterations: int =
 
 @torch.no_grad()
 def information_root(model: MomentModel, measured: MeasuredMoments, errors: Tensor) -> Tensor:
-    """R, upper triangular, with RᵀR = JᵀJ the information that these moments hold.
+    """Return R, upper triangular, where RᵀR = JᵀJ is the Fisher information of these moments.
 
     The first rows and columns of R are the R of the first parameters alone, the others known.
 
@@ -97,7 +98,7 @@ def information_root(model: MomentModel, measured: MeasuredMoments, errors: Tens
 
 
 def least_covariance(root: Tensor) -> Tensor:
-    """Of unbiased estimates (Cramér and Rao): (RᵀR)⁻¹.
+    """Return the Cramér–Rao bound (RᵀR)⁻¹ on the covariance of unbiased estimates.
 
     A block of it is the covariance of some parameters with all others unknown.
 
@@ -112,8 +113,8 @@ def least_covariance(root: Tensor) -> Tensor:
     return inverse @ inverse.mT
 
 
-def named_element(chi_squared: Sequence[Tensor] | Tensor) -> tuple[Tensor, Tensor]:
-    """The element that explains each measurement best, and how sure that is.
+def most_likely_element(chi_squared: Sequence[Tensor] | Tensor) -> tuple[Tensor, Tensor]:
+    """Return the element that explains each measurement best, and its posterior probability.
 
     Hypotheses have equally many parameters and equal priors; a hypothesis's share is
     exp(-χ²/2) over the sum of all.
@@ -129,7 +130,7 @@ def named_element(chi_squared: Sequence[Tensor] | Tensor) -> tuple[Tensor, Tenso
 
 
 def _from_centroids(model: MomentModel, measured: MeasuredMoments) -> Tensor:
-    """Parameters (K, P) that all but explain the centroids.
+    """Return parameters (K, P) that all but explain the centroids.
 
     Damped steps with the derivatives of the design throughout, which are the same for all.
     """
@@ -151,7 +152,7 @@ def _from_centroids(model: MomentModel, measured: MeasuredMoments) -> Tensor:
 def _descend(
     model: MomentModel, measured: MeasuredMoments, start: Tensor, iterations: int
 ) -> ElementFit:
-    """Marquardt's steps with all moments."""
+    """Make Marquardt's steps with all moments."""
     errors = start.clone()
     residual, jacobian = _whitened(model, measured, errors)
     cost = residual.square().sum(-1)
@@ -181,7 +182,9 @@ def _descend(
 
 
 def _damped_step(residual: Tensor, jacobian: Tensor, damping: Tensor) -> Tensor:
-    """(K, P), solved with the parameters scaled to columns of unit length."""
+    """Return the damped step (K, P), solved with the parameters scaled to columns of unit
+    length.
+    """
     length = jacobian.norm(dim=1)
     unit = jacobian / length[:, None]
     normal = unit.mT @ unit + torch.diag_embed(damping[:, None].expand_as(length))
@@ -192,7 +195,7 @@ def _damped_step(residual: Tensor, jacobian: Tensor, damping: Tensor) -> Tensor:
 def _whitened(
     model: MomentModel, measured: MeasuredMoments, errors: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Residuals (K, S·9) of unit variance, and their derivatives (K, S·9, P)."""
+    """Return residuals (K, S·9) of unit variance, and their derivatives (K, S·9, P)."""
     moments, jacobian = model.moments_and_jacobian(errors, measured.origin)
     both = torch.cat([(moments - measured.moments)[..., None], jacobian], -1)
     white = torch.linalg.solve_triangular(measured.factor, both, upper=False)

@@ -1,4 +1,6 @@
-"""How well a pose can be known: Fisher information, bounds, correlations, what cannot be seen."""
+"""Fisher information bounds the errors of a pose: bounds, correlations, and directions that no
+image shows.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,44 +17,46 @@ from dolens.rendering.spot_image import SpotImager
 
 
 @dataclass(frozen=True)
-class Knowledge:
-    """What images can tell of P numbers θ.
+class FisherInformation:
+    """Holds the Fisher information that images carry on P numbers θ.
 
     Attributes:
         names: of θ.
         expected: (S, height, width), electrons.
         noise: (S, height, width), standard deviation of each pixel, electrons.
-        weighted: (S·height·width, P): G ∂expected/∂θ over the noise, image after image, exposures
-            projected out; zero where pixels are not trusted.
+        whitened_jacobian: (S·height·width, P): G ∂expected/∂θ over the noise, image after image,
+            exposures projected out; zero where pixels are not trusted.
         blur: standard deviation of the Gaussian G that noise and derivatives are convolved with,
             pixels; 0: none.
-        inherited: (P, P), covariance that θ has from numbers which were not fitted but held as
-            another measurement found them; None: all others are exact.
-        inheritance: (P, H), ∂θ/∂held: by how much the best θ moves with each of H held numbers.
+        propagated_covariance: (P, P), covariance that θ has from nuisance parameters, which were
+            not fitted but held as another measurement found them; None: all others are exact.
+        nuisance_sensitivity: (P, H), ∂θ/∂nuisance: by how much the best θ moves with each of H
+            nuisance parameters.
     """
 
     names: tuple[str, ...]
     expected: Tensor
     noise: Tensor
-    weighted: Tensor
+    whitened_jacobian: Tensor
     blur: float = 0.0
-    inherited: Tensor | None = None
-    inheritance: Tensor | None = None
+    propagated_covariance: Tensor | None = None
+    nuisance_sensitivity: Tensor | None = None
 
     @cached_property
     def root(self) -> Tensor:
-        """R (P, P), triangular, with RᵀR the information."""
-        return torch.linalg.qr(self.weighted, mode="r").R
+        """Return R (P, P), triangular, where RᵀR is the information."""
+        return torch.linalg.qr(self.whitened_jacobian, mode="r").R
 
     @property
-    def fisher(self) -> Tensor:
-        """(P, P), the images' information in θ's own units, exposures taken as unknown."""
+    def matrix(self) -> Tensor:
+        """Return the images' Fisher information (P, P) in θ's own units, exposures taken as
+        unknown.
+        """
         return self.root.T @ self.root
 
     @cached_property
     def own_covariance(self) -> Tensor:
-        """(P, P), its inverse: the least of any unbiased estimate (Cramér and Rao) from these
-        images, all other numbers being exact.
+        """Return the Cramér–Rao bound (P, P) from these images, all other numbers being exact.
 
         With G it is the covariance of the estimate that `correction` makes, (A⁺G)(A⁺G)ᵀ for noise
         of unit variance, which is a little more than the least.
@@ -66,40 +70,45 @@ class Knowledge:
 
     @cached_property
     def _inverse(self) -> Tensor:
-        """A⁺ (P, S·height·width)."""
-        return torch.linalg.pinv(self.weighted)
+        """Return A⁺ (P, S·height·width)."""
+        return torch.linalg.pinv(self.whitened_jacobian)
 
     def _blurred(self, rows: Tensor) -> Tensor:
-        """(..., S·height·width), convolved."""
+        """Return rows (..., S·height·width), convolved."""
         return blurred(rows.unflatten(-1, self.noise.shape), self.blur).flatten(-3)
 
     @property
     def covariance(self) -> Tensor:
-        """(P, P), the same with what is inherited."""
+        """Return the covariance (P, P) with what the nuisance parameters propagate."""
         own = self.own_covariance
-        return own if self.inherited is None else own + self.inherited
+        return own if self.propagated_covariance is None else own + self.propagated_covariance
 
-    def holding(self, count: int, covariance: Tensor) -> "Knowledge":
-        """Of the first numbers alone, the last ones being held as they were found elsewhere.
+    def with_nuisance_parameters(self, count: int, covariance: Tensor) -> "FisherInformation":
+        """Return the information on the first numbers alone; the last ones are nuisance parameters.
 
-        With A and B the columns of both, θ is off by -(AᵀA)⁻¹AᵀB times what those held are off.
+        With A and B the columns of both, θ is off by -(AᵀA)⁻¹AᵀB times the nuisance parameters'
+        errors.
 
         Args:
             count: P - H numbers that are fitted.
-            covariance: (H, H), of those held, independent of these images.
+            covariance: (H, H), of the nuisance parameters, independent of these images.
         """
-        slope = -torch.linalg.pinv(self.weighted[:, :count]) @ self.weighted[:, count:]
+        slope = (
+            -torch.linalg.pinv(self.whitened_jacobian[:, :count])
+            @ self.whitened_jacobian[:, count:]
+        )
         return replace(
             self,
             names=self.names[:count],
-            weighted=self.weighted[:, :count],
-            inherited=slope @ covariance @ slope.T,
-            inheritance=slope,
+            whitened_jacobian=self.whitened_jacobian[:, :count],
+            propagated_covariance=slope @ covariance @ slope.T,
+            nuisance_sensitivity=slope,
         )
 
     def correction(self, measurement: Measurement) -> Tensor:
-        """(P,), by which θ moves to another measurement of the same mask: one step of weighted
-        least squares, efficient where the pose is right to a few bounds.
+        """Return the step (P,) by which θ moves to another measurement of the same mask.
+
+        It is one step of weighted least squares, efficient where the pose is right to a few bounds.
 
         What the expected images lack of those measured, over the noise and convolved with G, is
         explained; pixels that are not trusted lack nothing.
@@ -110,34 +119,36 @@ class Knowledge:
 
     @property
     def bounds(self) -> Tensor:
-        """(P,), standard deviations in θ's units, with what is inherited."""
+        """Return standard deviations (P,) in θ's units, with what the nuisance parameters
+        propagate.
+        """
         return self.covariance.diagonal().sqrt()
 
     @property
     def correlations(self) -> Tensor:
-        """(P, P)."""
+        """Return the correlation matrix (P, P)."""
         return self.covariance / torch.outer(self.bounds, self.bounds)
 
-    def combinations(self, scales: Tensor) -> tuple[Tensor, Tensor]:
-        """Which combinations of θ/scale are known how well.
+    def eigenvectors(self, scales: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the eigenvectors of the information in θ/scale, and their standard deviations.
 
         Returns:
-            Standard deviations, from the worst known to the best, in units of the scales, and the
-            combinations (P, P), one a row, unit vectors in θ/scale.
+            Standard deviations (P,), from the largest to the smallest, in units of the scales; and
+            the eigenvectors (P, P), one a row, unit vectors in θ/scale.
         """
-        values, vectors = torch.linalg.eigh(scales[:, None] * self.fisher * scales)
+        values, vectors = torch.linalg.eigh(scales[:, None] * self.matrix * scales)
         return values.clamp(min=0.0).rsqrt(), vectors.T
 
 
 @torch.no_grad()
-def knowledge(
+def fisher_information(
     pose: Pose,
     imager: SpotImager,
     measurement: Measurement,
     slopes: SpotImager | None = None,
     blur: float = 0.0,
-) -> Knowledge:
-    """What a measurement can tell of a pose's variables, at the pose.
+) -> FisherInformation:
+    """Return the Fisher information that a measurement carries on a pose's variables, at the pose.
 
     A pixel of λ expected electrons has the variance λ + σ², σ the read noise; a share of light i
     has λ = N·i with N, the exposure of its source, unknown as well.  With A the derivatives of all
@@ -150,7 +161,8 @@ def knowledge(
         slopes: makes their derivatives; None: `imager` does.  Few rays in narrow patches of light
             make derivatives rough, and a rough image would seem to tell more than it can: patches
             should be wide enough that some ten rays cross each edge of a pixel.
-        blur: of noise and derivatives, pixels, where rays are too few for that; see `Knowledge`.
+        blur: of noise and derivatives, pixels, where rays are too few for that; see
+            `FisherInformation`.
     """
     point = pose.scaled.detach()
 
@@ -171,11 +183,15 @@ def knowledge(
         own = own / own.norm()
         along = (derivatives * own).sum((-2, -1), keepdim=True)
         rows.append(blurred(derivatives - along * own, blur).flatten(1))
-    return Knowledge(pose.names, exposure * shares, noise, torch.cat(rows, 1).T, blur)
+    return FisherInformation(
+        tuple(pose.names), exposure * shares, noise, torch.cat(rows, 1).T, blur
+    )
 
 
 def covariance_of(root: Tensor) -> Tensor:
-    """(RᵀR)⁻¹ of a triangular R (P, P); what R does not see has a variance beyond all measure."""
+    """Return (RᵀR)⁻¹ of a triangular R (P, P); directions that R does not see have a huge
+    variance.
+    """
     norms = torch.linalg.vector_norm(root, dim=0).clamp(min=torch.finfo(root.dtype).tiny ** 0.5)
     norms = torch.maximum(norms, 1e-12 * norms.max())
     _, values, vectors = torch.linalg.svd(root / norms)

@@ -1,4 +1,4 @@
-"""What a sensor saw of point sources, and how it is simulated photon by photon."""
+"""A measurement holds images of point sources; a simulation counts photons one by one."""
 
 import copy
 import itertools
@@ -30,7 +30,7 @@ _REACH = 1.4
 
 @dataclass(frozen=True)
 class Measurement:
-    """S images, of a source each, or of some on several planes.
+    """Holds S images, one of each source, or of some sources on several planes.
 
     Attributes:
         images: (S, height, width), electrons, the dark level taken off.
@@ -46,26 +46,28 @@ class Measurement:
 
     @cached_property
     def totals(self) -> Tensor:
-        """(S,), electrons in trusted pixels."""
+        """Return the electrons (S,) in trusted pixels."""
         return torch.where(self.mask, self.images, 0.0).sum((-2, -1))
 
     @cached_property
     def shares(self) -> Tensor:
-        """(S, height, width): images of sum 1 over the trusted pixels."""
+        """Return the images (S, height, width), scaled to a sum of 1 over the trusted pixels."""
         return torch.where(self.mask, self.images, 0.0) / self.totals[:, None, None]
 
     @cached_property
     def lit_pixels(self) -> Tensor:
-        """(S,), how many pixels each image covers: 1/Σ share², their number if all were alike."""
+        """Return how many pixels each image covers (S,): 1/Σ share², their number if all were
+        alike.
+        """
         return 1.0 / self.shares.square().sum((-2, -1))
 
     def centroids(self) -> Tensor:
-        """(S, 2), x and y, mm, of trusted pixels."""
+        """Return the centroids (S, 2), x and y, mm, of trusted pixels."""
         return torch.stack([self.centroid_of(share) for share in self.shares])
 
     def as_seen(self, found: SpotImage, source: int) -> tuple[Tensor, Tensor]:
-        """A model's image as the measured one is: shares (height, width) of the light on trusted
-        pixels, and their centroid (2,), mm.
+        """Return a model's image as the measured one is: shares (height, width) of the light on
+        trusted pixels, and their centroid (2,), mm.
 
         Where less than a hundredth of the light falls on them, both are of all light behind the
         lens, so that they lead back from anywhere.
@@ -78,7 +80,7 @@ class Measurement:
         return image, centroid
 
     def centroid_of(self, share: Tensor) -> Tensor:
-        """(2,), x and y, mm, of an image (height, width) of sum 1."""
+        """Return the centroid (2,), x and y, mm, of an image (height, width) of sum 1."""
         options = {"dtype": share.dtype, "device": share.device}
         rows = torch.arange(self.sensor.height, **options)
         columns = torch.arange(self.sensor.width, **options)
@@ -99,7 +101,8 @@ def simulated(
     planes: Sequence[float] = (0.0,),
     unmodelled: Unmodelled | None = None,
 ) -> Measurement:
-    """Photons that leave each source in random directions and are counted where they land.
+    """Simulate images: photons leave each source in random directions and are counted where they
+    arrive.
 
     Rims are sharp, pixels are squares that count, and nothing is smoothed.
 
@@ -154,7 +157,7 @@ def _by_rays(
     source_diameter: float,
     generator: torch.Generator,
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Where photons land, x and y in mm, some at a time."""
+    """Yield the places where photons arrive, x and y in mm, some at a time."""
     passed = 0
     while passed < photons:
         count = min(_AT_A_TIME, _DRAWN * (photons - passed) + 1024)
@@ -177,7 +180,7 @@ def _by_waves(
     source_diameter: float,
     generator: torch.Generator,
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """The same with diffraction, all at once."""
+    """Yield the same with diffraction, all at once."""
     light = diffracted_light(lens, source, wavelength, sensor, source_diameter)
     yield light.photons(photons, source_diameter, generator)
 
@@ -190,7 +193,9 @@ def _directions(
     source_diameter: float,
     generator: torch.Generator,
 ) -> Rays:
-    """At most so many rays of even density in solid angle, towards the first surface as it is."""
+    """Return at most so many rays of even density in solid angle, towards the first surface as it
+    is.
+    """
     system = lens.system()
     axes = system.axes[0]
     radius = _REACH * system.surfaces[0].semi_diameter
@@ -209,8 +214,10 @@ def _directions(
 
 
 def _aimed(axes: Axes, radius: float, u: Tensor, v: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors (N, 3) from points (N, 3) to those of even density on a disc in a surface's
-    vertex plane, and how much solid angle a part of its area takes (N,).
+    """Return rays' directions to points of even density on a disc in a surface's vertex plane.
+
+    The directions are unit vectors (N, 3) from points (N, 3); beside them stands how much solid
+    angle a part of the disc's area takes (N,).
     """
     x, y = on_disc(u, v, radius)
     local = Components(x, y, *4 * (torch.zeros_like(x),))

@@ -1,4 +1,6 @@
-"""Moments of spots as a sensor gives them: their covariance, and simulated measurements."""
+"""Measured moments of spots have a covariance that is known in closed form, and can be
+simulated.
+"""
 
 from dataclasses import dataclass
 
@@ -28,7 +30,7 @@ def moment_covariance(
     photons: float,
     pitch: float = 0.0,
 ) -> Tensor:
-    """Covariance of the moments of spots of so many photons each, exactly.
+    """Return the exact covariance of the moments of spots of so many photons each.
 
     A moment about a fixed origin is the mean over photons of f = xⁱ·yʲ, and the photons land
     independently: cov = (E[f·fᵀ] - E[f]·E[f]ᵀ)/photons, from moments up to the sixth.  With
@@ -57,7 +59,7 @@ def moment_covariance(
 
 @dataclass(frozen=True)
 class MeasuredMoments:
-    """Moments of S spots of K lenses as a sensor gave them.
+    """Holds moments of S spots of K lenses as a sensor gave them.
 
     With (x, y) about another origin every moment is a linear combination of those up to its own
     order, so χ² is the same about any origin; near the spot, rounding is least.
@@ -76,7 +78,9 @@ class MeasuredMoments:
         return MeasuredMoments(self.origin[rows], self.moments[rows], self.factor[rows])
 
     def over_noise(self, difference: Tensor) -> Tensor:
-        """L⁻¹·difference, for differences of moments (..., K, S, 9): of unit variance if noise."""
+        """Return L⁻¹·difference for differences of moments (..., K, S, 9): of unit variance if
+        noise.
+        """
         return torch.linalg.solve_triangular(self.factor, difference[..., None], upper=False)[
             ..., 0
         ]
@@ -86,7 +90,7 @@ class MeasuredMoments:
 def simulated_moments(
     model: MomentModel, errors: Tensor, photons: float, generator: torch.Generator | None
 ) -> MeasuredMoments:
-    """What a sensor would measure of lenses with these errors.
+    """Simulate what a sensor would measure of lenses with these errors.
 
     The sums over so many photons are normally distributed about the true moments, by the central
     limit theorem, with all their correlations.  Noise is that of the photons and, where the model
@@ -124,7 +128,7 @@ def simulated_moments(
 def _covariance(
     model: MomentModel, points: Tensor, origin: Tensor, mean: Tensor, photons: float
 ) -> Tensor:
-    """(K, S, 9, 9), of photons and of reading."""
+    """Return the covariance (K, S, 9, 9) of photons and of reading."""
     pixels = model.pixels
     pitch = 0.0 if pixels is None else pixels.pitch
     parts = zip(points.split(_LENSES_AT_A_TIME), origin.split(_LENSES_AT_A_TIME), strict=True)

@@ -1,4 +1,4 @@
-"""Moments of spots: which, their sums over rays, and how they change when the sensor moves."""
+"""Moments describe spots by sums over rays, which change in a known way when the sensor moves."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ def weighted_sums(
     size: Tensor,
     powers: Sequence[tuple[int, int]],
 ) -> Tensor:
-    """Σ w·xⁱ·yʲ of each spot, about an origin and in units of a size.
+    """Return Σ w·xⁱ·yʲ of each spot, about an origin and in units of a size.
 
     Args:
         points: (..., 2, N), mm.
@@ -43,7 +43,7 @@ def weighted_sums(
 
 
 def shift_derivatives(sums: Tensor, size: Tensor) -> Tensor:
-    """Derivatives of the moments by the sensor's place in x and in y.
+    """Return the derivatives of the moments with respect to the sensor's place in x and in y.
 
     Light that lands at x lands at x - Δ of a sensor moved by Δ, so that
     ∂⟨xⁱyʲ⟩/∂Δ_x = -i·⟨xⁱ⁻¹yʲ⟩/a about a fixed origin, with a the unit of length.

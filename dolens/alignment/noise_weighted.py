@@ -1,4 +1,4 @@
-"""Images weighted by their noise: the fit that reaches Cramér and Rao's bound."""
+"""A fit of images weighted by their noise reaches the Cramér–Rao bound."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from dolens.rendering.spot_image import SpotImager
 
 @dataclass(frozen=True)
 class NoiseWeightedLoss:
-    """ε = mean (G (N·I - M)/σ)²/g, over the trusted pixels of all sources and planes.
+    """Computes ε = mean (G (N·I - M)/σ)²/g over the trusted pixels of all sources and planes.
 
     I are shares of light, M electrons; each image's exposure N is the one that fits best, so that
     nothing is assumed of it.  σ² = N·I + σ_r² is that of the model, not of the measurement, whose
@@ -50,7 +50,7 @@ class NoiseWeightedLoss:
 
     @torch.no_grad()
     def weighted_at(self, pose: Pose) -> "NoiseWeightedLoss":
-        """The same with σ and I of an iteration that begins at the pose."""
+        """Return the loss with σ and I of an iteration that begins at the pose."""
         shares = torch.stack([found.image for found in pose.images(self.imager)])
         defect = torch.zeros_like(shares)
         if self.slopes is not None:
@@ -59,7 +59,9 @@ class NoiseWeightedLoss:
         return replace(self, deviation=sigma, defect=defect)
 
     def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
-        """r with ε = |r|²: all pixels, image after image; zero where they are not trusted."""
+        """Return r with ε = |r|²: all pixels, image after image; zero where they are not
+        trusted.
+        """
         if self.deviation is None or self.defect is None:
             return self.weighted_at(pose).residuals(pose, scaled)
         mask, parts = self.measurement.mask, []
@@ -74,18 +76,18 @@ class NoiseWeightedLoss:
         return torch.cat(parts) / (float(mask.sum()) * noise_left(self.blur)) ** 0.5
 
     def terms(self, residuals: Tensor) -> dict[str, Tensor]:
-        """`chi_squared`, of a pixel."""
+        """Return `chi_squared`, the loss per pixel."""
         return {"chi_squared": residuals.square().sum()}
 
     def jacobian(self, pose: Pose, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool."""
+        """Return r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool."""
         if self.deviation is None:
             return self.weighted_at(pose).jacobian(pose, chosen)
         return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
 
 
 def deviation(shares: Tensor, measurement: Measurement) -> tuple[Tensor, Tensor]:
-    """How much light images were given, and by how much their pixels scatter.
+    """Return the exposure of images and the standard deviation of their pixels.
 
     Args:
         shares: (S, height, width), of the light behind the lens.
@@ -102,6 +104,6 @@ def deviation(shares: Tensor, measurement: Measurement) -> tuple[Tensor, Tensor]
 
 
 def exposure_of(images: Tensor, measurement: Measurement) -> Tensor:
-    """(S, 1, 1), what images (S, height, width) are multiplied by to have the measured totals."""
+    """Return the factors (S, 1, 1) that give images (S, height, width) the measured totals."""
     seen = torch.where(measurement.mask, images, 0.0).sum((-2, -1), keepdim=True)
     return measurement.totals[:, None, None] / seen.clamp(min=torch.finfo(seen.dtype).tiny)

@@ -1,4 +1,4 @@
-"""Photographs of point sources, read from files."""
+"""Photographs of point sources are read from image files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ from dolens.sensor.pixels import Sensor
 def read_measurements(
     settings: Mapping[str, Any] | Sequence[Mapping[str, Any]], count: int
 ) -> Measurement:
-    """One photograph, or some of them, of each source on each plane, by one sensor.
+    """Read one photograph, or several, of each source on each plane, by one sensor.
 
     Args:
         settings: of `read_measurement`, or a list of such.
@@ -53,7 +53,7 @@ def read_measurement(
     electrons_per_count: float = 1.0,
     read_noise: float = 1.0,
 ) -> Measurement:
-    """A photograph of a source, 16 bits or 8, of one channel.
+    """Read a photograph of a source, 16 bits or 8, of one channel.
 
     Args:
         path: TIFF or PNG.

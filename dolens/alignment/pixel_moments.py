@@ -1,4 +1,4 @@
-"""What pixels do to moments of spots: they round places to their centres, and add read noise.
+"""Pixels change moments of spots: they round places to their centres, and add read noise.
 
 Counts are divided by their own sum over a window about the spot.  A photon counts at the centre of
 its pixel, x + u for one that lands at x.  Averaged over the places of the grid under the spot, u
@@ -25,7 +25,8 @@ _HIGHEST = 2 * max(max(pair) for pair in POWERS)
 
 @dataclass(frozen=True)
 class Pixels:
-    """Square pixels, with centres at whole multiples of the pitch, and a square window of them.
+    """Describes square pixels, with centres at whole multiples of the pitch, and a square window of
+    them.
 
     Attributes:
         pitch: mm; the whole pixel is sensitive.
@@ -48,12 +49,14 @@ class Pixels:
             raise InputError(f"read_noise: {self.read_noise!r}; allowed: 0 or more")
 
     def half_width(self, radius: Tensor) -> Tensor:
-        """Pixels of the window on each side of its middle, for spots of an RMS radius (mm)."""
+        """Return the pixels of the window on each side of its middle, for spots of an RMS radius
+        (mm).
+        """
         return torch.ceil(self.window * radius / self.pitch).clamp(min=_LEAST)
 
 
 def pixel_convolution(powers: Sequence[tuple[int, int]], width: Tensor) -> Tensor:
-    """How moments of a spot convolved with a square follow from the spot's own.
+    """Return the matrix that turns a spot's moments into those of the spot convolved with a square.
 
     With u and v uniform over ±b/2 and independent,
     ⟨(x+u)ⁱ(y+v)ʲ⟩ = Σ C(i,k)·C(j,l)·⟨uᵏ⟩·⟨vˡ⟩·⟨xⁱ⁻ᵏyʲ⁻ˡ⟩ over even k and l, ⟨uᵏ⟩ = (b/2)ᵏ/(k+1):
@@ -77,7 +80,7 @@ def pixel_convolution(powers: Sequence[tuple[int, int]], width: Tensor) -> Tenso
 
 
 def convolved(sums: Tensor, powers: Sequence[tuple[int, int]], width: Tensor) -> Tensor:
-    """Moments (..., S, Q) after the convolution; see `pixel_convolution`."""
+    """Return moments (..., S, Q) after the convolution; see `pixel_convolution`."""
     matrix = pixel_convolution(powers, width)
     return (matrix[..., :-1] @ sums[..., None])[..., 0] + matrix[..., -1]
 
@@ -85,7 +88,7 @@ def convolved(sums: Tensor, powers: Sequence[tuple[int, int]], width: Tensor) ->
 def read_covariance(
     pixels: Pixels, origin: Tensor, mean: Tensor, size: Tensor, photons: float
 ) -> Tensor:
-    """What read noise adds to the covariance of moments.
+    """Return what read noise adds to the covariance of moments.
 
     Counts c_p = N·q_p + e_p give the moment Σ f·c/Σ c.  To first order in e the noise in it is
     Σ (f - ⟨f⟩)·e/N, the sum's own noise included, and its covariance
@@ -127,14 +130,15 @@ def read_covariance(
 
 
 def observed_radius(mean: Tensor, size: Tensor) -> Tensor:
-    """RMS radius (..., S), mm, from moments (..., S, 9) about the centroid."""
+    """Return the RMS radius (..., S), mm, from moments (..., S, 9) about the centroid."""
     return size * (mean[..., POWERS.index((2, 0))] + mean[..., POWERS.index((0, 2))]).sqrt()
 
 
 def check_window(
     pixels: Pixels, points: Tensor, shares: Tensor, origin: Tensor, radius: Tensor
 ) -> None:
-    """Moments over a window are those of the spot only where all its light is in the window.
+    """Check that all light of a spot is in its window: only then are moments over it those of the
+    spot.
 
     Args:
         pixels: what counts.
@@ -160,7 +164,8 @@ def check_window(
 def grid_error(
     points: Tensor, shares: Tensor, origin: Tensor, size: Tensor, pitch: float, places: Tensor
 ) -> Tensor:
-    """By how much moments in one exposure differ from the mean over the grid's places.
+    """Return the difference of moments in one exposure from their mean over places of the pixels'
+    grid.
 
     Args:
         points: (2, N), mm, so dense that every pixel in a spot has many.

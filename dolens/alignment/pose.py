@@ -1,45 +1,44 @@
-"""A lens, its sources, and what of them is to be found."""
+"""A pose holds a lens, point sources and the sensor's planes, and varies some of their numbers."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.elements import TILTS
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_lens_units
+from dolens.optimize.variables import DesignVariables
 from dolens.rendering.spot_image import SpotImage, SpotImager
 
 _COORDINATES = ("x", "y", "z")
-_KEYS = ("scale", "initial")
 
 
-class Pose(nn.Module):
-    """Chosen numbers of a lens and its sources, θ, held as u = θ/scale.
+class Pose(DesignVariables):
+    """Varies numbers of a lens and its sources, and gives the images that follow.
 
     Names are those of the lens's parameters (`elements.lens.tilt_x`, `elements.lens.decenter_x`,
     `sensor_distance`), `sources.<n>.x`, `.y`, `.z`, and `sources.*.x`, `.y`, `.z`, by which all
-    sources are shifted from where they are given, as one target.  Settings, and what is found, are
-    in degrees for tilts and in mm; θ is in the lens's own units, radians and mm.
+    sources are shifted from where they are given, as one target.  Settings and `file_values` are
+    in degrees and mm; θ is in the lens's own units, radians and mm.
 
     Args:
         lens: `put` and `store` change it, nothing else does.
         sources: (S, 3), mm, in the lens's axes.
-        variables: name → settings: `scale` (default 1) and `initial` (default: as it is).
+        variables: name → settings of `DesignVariables`.
         planes: where the sensor stands for each of a source's images, mm from `sensor_distance`,
             as on a stage whose travel is known.
         shift: (3,), mm, of all sources from there.
 
     Attributes:
-        names: of θ, P of them.
-        scaled: u (P,).
-        scale: (P,), in θ's units.
-        units: (P,), θ's units in those of the settings: radians of a degree, or 1.
+        sources: (S, 3), mm, as given.
+        shift: (3,), mm.
+        planes: mm.
 
     Raises:
-        InputError: an unknown name or setting, or a scale that is not positive.
+        InputError: an unknown name or setting, a variable that is an array, a solve for the best
+            focus, or no plane.
     """
 
     def __init__(
@@ -50,96 +49,73 @@ class Pose(nn.Module):
         planes: Sequence[float] = (0.0,),
         shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        super().__init__()
-        self._of = (lens,)
         options = {"dtype": torch.float64, "device": lens.device}
-        self.register_buffer("sources", torch.tensor(sources, **options).reshape(-1, 3))
-        self.register_buffer("shift", torch.tensor(shift, **options), persistent=False)
-        self.names, self.planes = tuple(variables), tuple(float(z) for z in planes)
+        places = torch.tensor(sources, **options).reshape(-1, 3)
+        offset = torch.tensor(shift, **options)
+        others = {f"sources.*.{c}": offset[axis] for axis, c in enumerate(_COORDINATES)}
+        for number, place in enumerate(places, 1):
+            others |= {f"sources.{number}.{c}": place[axis] for axis, c in enumerate(_COORDINATES)}
+        for name in variables:
+            _source(name, len(places))
+        super().__init__(lens, variables, others)
+        self.register_buffer("sources", places)
+        self.register_buffer("shift", offset, persistent=False)
+        self.planes = tuple(float(z) for z in planes)
         if not self.planes:
             raise InputError("planes: none is given; allowed: one or more places of the sensor, mm")
-        scales, starts, units = [], [], []
-        for name, settings in variables.items():
-            settings = dict(settings or {})
-            for key in settings:
-                if key not in _KEYS:
-                    raise InputError(
-                        f"variable '{name}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-                    )
-            scale = float(settings.get("scale", 1.0))
-            if not scale > 0.0:
-                raise InputError(f"variable '{name}': scale must be positive, not {scale:g}")
-            units.append(_unit(name))
-            scales.append(scale)
-            starts.append(float(settings.get("initial", self.value(name) / units[-1])) / scale)
-        self.register_buffer("units", torch.tensor(units, **options))
-        self.register_buffer("scale", self.units * torch.tensor(scales, **options))
-        self.scaled = nn.Parameter(torch.tensor(starts, **options))
+        if self.best_focus:
+            raise InputError("variable 'sensor_distance': solve 'best_focus' is of merit functions")
+        for name, shape in zip(self.names, self._shapes, strict=True):
+            if shape:
+                raise InputError(f"variable '{name}' is not one number of the lens")
+        self._dependent_settings = {p.name: dict(variables[p.name] or {}) for p in self.dependents}
 
     @property
     def lens(self) -> Lens:
-        """The lens as it was given."""
+        """Return the lens as it was given."""
         return self._of[0]
 
     @property
-    def unit_names(self) -> list[str]:
-        """Of the settings, `deg` or `mm`."""
-        return ["mm" if unit == 1.0 else "deg" for unit in self.units.tolist()]
-
-    @property
-    def settings(self) -> dict[str, dict[str, float]]:
-        """Of its variables, starting where they are."""
-        scales = dict(zip(self.names, self.scale_in_units.tolist(), strict=True))
-        return {n: {"scale": scales[n], "initial": at} for n, at in self.found().items()}
+    def settings(self) -> dict[str, dict[str, Any]]:
+        """Return settings of the variables, with their present values as initial ones."""
+        columns = (self.file_scale, self.file_scale * self.lower, self.file_scale * self.upper)
+        found: dict[str, dict[str, Any]] = {}
+        for (name, value), scale, lower, upper in zip(
+            self.file_values().items(), *(c.tolist() for c in columns), strict=True
+        ):
+            found[name] = {"scale": scale, "initial": value, "lower": lower, "upper": upper}
+        return found | self._dependent_settings
 
     @property
     def places(self) -> Tensor:
-        """(S, 3), mm, the sources where they stand, but for θ."""
+        """Return the sources (S, 3), mm, where they stand, but for θ."""
         return self.sources + self.shift
 
     def varying(self, variables: Mapping[str, Mapping[str, Any] | None]) -> "Pose":
-        """The same lens, sources and planes, with other variables."""
+        """Return the same lens, sources and planes with other variables."""
         sources, shift = self.sources.tolist(), self.shift.tolist()
         return Pose(self.lens, sources, variables, self.planes, shift)
 
-    @property
-    def scale_in_units(self) -> Tensor:
-        """(P,), the scales as the settings have them."""
-        return self.scale / self.units
-
-    def found(self) -> dict[str, float]:
-        """θ by name, in degrees and mm."""
-        values = (self.scale_in_units * self.scaled.detach()).tolist()
-        return dict(zip(self.names, values, strict=True))
-
-    def value(self, name: str) -> float:
-        """A number as the lens, or the sources, have it, in θ's units.
+    def check_name(self, name: str) -> None:
+        """Refuse a name that is not one number of the lens or of the sources.
 
         Raises:
             InputError: there is none of this name.
         """
-        place = self._source(name)
-        if place is not None:
-            return float(self._at(place))
-        found = self.lens.variables([name])
-        if list(found) != [name] or found[name].numel() != 1:
-            raise InputError(f"variable '{name}' is not one number of the lens")
-        return float(found[name])
-
-    def values(self, scaled: Tensor | None = None) -> dict[str, Tensor]:
-        """θ by name."""
-        theta = self.scale * (self.scaled if scaled is None else scaled)
-        return dict(zip(self.names, theta.unbind(), strict=True))
+        if _source(name, len(self.sources)) is None:
+            found = self.lens.variables([name])
+            if list(found) != [name] or found[name].numel() != 1:
+                raise InputError(f"variable '{name}' is not one number of the lens")
 
     def images(self, imager: SpotImager, scaled: Tensor | None = None) -> list[SpotImage]:
-        """Of every source on every plane of the sensor, a source's images together.
+        """Return the image of every source on every plane of the sensor, a source's together.
 
         Args:
-            imager: how.
-            scaled: u, in place of the stored one.
+            imager: makes the images.
+            scaled: u (P,), in place of the stored one.
         """
-        values = self.values(scaled)
-        own = {n: v for n, v in values.items() if self._source(n) is None}
+        values = self(scaled)
+        own = {name: values[name] for name in self._of_lens(values)}
         distance = own.get("sensor_distance", self.lens.sensor_distance)
         systems = [
             self.lens.system({**own, "sensor_distance": distance + plane}) for plane in self.planes
@@ -147,7 +123,7 @@ class Pose(nn.Module):
         return [imager.image(s, source) for source in self._placed(values) for s in systems]
 
     def _placed(self, values: Mapping[str, Tensor]) -> list[Tensor]:
-        """The sources, (3,) each."""
+        """Return the sources, (3,) each, mm."""
 
         def along(place: tuple[int | None, int]) -> Tensor:
             number, axis = place
@@ -160,42 +136,45 @@ class Pose(nn.Module):
         ]
 
     def _at(self, place: tuple[int | None, int]) -> Tensor:
-        """A stored number of a source, or of their shift."""
+        """Return a stored number of a source, or of their shift, as a view."""
         number, axis = place
         return self.shift[axis] if number is None else self.sources[number, axis]
-
-    def _source(self, name: str) -> tuple[int | None, int] | None:
-        """Number of the source, from 0, or None for all, and of the coordinate; None for the lens's
-        parameters.
-        """
-        parts = name.split(".")
-        if parts[0] != "sources":
-            return None
-        known = len(parts) == 3 and parts[2] in _COORDINATES
-        if known and parts[1] == "*":
-            return None, _COORDINATES.index(parts[2])
-        if not (known and parts[1].isdigit() and 1 <= int(parts[1]) <= len(self.sources)):
-            raise InputError(
-                f"variable '{name}': allowed are sources.<1 to {len(self.sources)}>.x, .y and .z, "
-                "and sources.*.x, .y and .z"
-            )
-        return int(parts[1]) - 1, _COORDINATES.index(parts[2])
 
     @torch.no_grad()
     def put(self, values: Mapping[str, float]) -> None:
         """Put numbers, in degrees and mm, into the lens and the sources; θ stays as it is."""
         for name, value in values.items():
-            place = self._source(name)
+            place = _source(name, len(self.sources))
             if place is not None:
-                self._at(place).fill_(value * _unit(name))
+                self._at(place).fill_(to_lens_units(name, value))
             else:
-                self.lens.variables([name])[name].fill_(value * _unit(name))
+                self.lens.variables([name])[name].fill_(to_lens_units(name, value))
 
+    @torch.no_grad()
     def store(self) -> None:
-        """Put θ into the lens and the sources."""
-        self.put(self.found())
+        """Put θ, and what follows from it, into the lens and the sources."""
+        self.write_to(self.lens)
+        self.put({name: v for name, v in self.file_values().items() if name in self._others})
 
 
-def _unit(name: str) -> float:
-    """Of the settings, in the lens's: radians of a degree for tilts."""
-    return math.pi / 180.0 if name.rpartition(".")[2] in TILTS else 1.0
+def _source(name: str, count: int) -> tuple[int | None, int] | None:
+    """Return which coordinate of which source a name means; None for the lens's parameters.
+
+    Returns:
+        Number of the source, from 0, or None for all; and of the coordinate.
+
+    Raises:
+        InputError: a name of a source that is none of `count` sources.
+    """
+    parts = name.split(".")
+    if parts[0] != "sources":
+        return None
+    known = len(parts) == 3 and parts[2] in _COORDINATES
+    if known and parts[1] == "*":
+        return None, _COORDINATES.index(parts[2])
+    if not (known and parts[1].isdigit() and 1 <= int(parts[1]) <= count):
+        raise InputError(
+            f"variable '{name}': allowed are sources.<1 to {count}>.x, .y and .z, and "
+            "sources.*.x, .y and .z"
+        )
+    return int(parts[1]) - 1, _COORDINATES.index(parts[2])

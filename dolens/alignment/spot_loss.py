@@ -1,4 +1,4 @@
-"""S21: how far images are from those measured, and how far apart their centroids lie."""
+"""The loss S21 compares images, and their centroids, with those measured."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,28 +16,28 @@ from dolens.rendering.spot_image import SpotImager
 
 
 class ImageLoss(Protocol):
-    """A sum of squares that is small where a pose explains what a sensor saw."""
+    """Computes a sum of squares that is small where a pose explains what a sensor saw."""
 
     def weighted_at(self, pose: Pose) -> "ImageLoss":
-        """The same with the weights of an iteration that begins at the pose."""
+        """Return the loss with the weights of an iteration that begins at the pose."""
         ...
 
     def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
-        """r (rows,), at the pose or at another point u (P,)."""
+        """Return r (rows,), at the pose or at another point u (P,)."""
         ...
 
     def terms(self, residuals: Tensor) -> dict[str, Tensor]:
-        """Parts of |r|² by name."""
+        """Return parts of |r|² by name."""
         ...
 
     def jacobian(self, pose: Pose, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool."""
+        """Return r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool."""
         ...
 
 
 @dataclass(frozen=True)
 class SpotLoss:
-    """ε = mean (I - M)² + μ·|c - c_M|², over the trusted pixels of all sources (S21).
+    """Computes ε = mean (I - M)² + μ·|c - c_M|², over the trusted pixels of all sources (S21).
 
     I and M are shares of the light that trusted pixels get, over the largest that was measured, so
     that the first term is at most near 1; c are their centroids, mm.  Where less than a hundredth
@@ -68,11 +68,11 @@ class SpotLoss:
             raise InputError(f"loss.centroid_weight: {self.centroid_weight}; allowed: 0 or more")
 
     def weighted_at(self, pose: Pose) -> "SpotLoss":
-        """Itself: all pixels weigh the same, wherever the pose is."""
+        """Return the loss itself: all pixels weigh the same, wherever the pose is."""
         return self
 
     def residuals(self, pose: Pose, scaled: Tensor | None = None) -> Tensor:
-        """r with ε = |r|²: trusted pixels, source after source, and 2·S of the centroids."""
+        """Return r with ε = |r|²: trusted pixels, source after source, and 2·S of the centroids."""
         found = pose.images(self.imager, scaled)
         measurement = self.measurement
         shares, mask = blurred(measurement.shares, self.blur), measurement.mask
@@ -87,21 +87,21 @@ class SpotLoss:
         return torch.cat([*parts, *centroids])
 
     def terms(self, residuals: Tensor) -> dict[str, Tensor]:
-        """`image`, mean (I - M)², and `centroid`, μ·|c - c_M|²."""
+        """Return `image`, mean (I - M)², and `centroid`, μ·|c - c_M|²."""
         count = 2 * len(self.measurement.images)
         square = residuals.square()
         return {"image": square[:-count].sum(), "centroid": square[-count:].sum()}
 
     def jacobian(self, pose: Pose, chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool.
+        """Return r, and ∂r/∂u (rows, P), zero for variables that are not chosen (P,), bool.
 
         By forward mode: memory for one column at a time.
         """
         return forward_columns(lambda u: self.residuals(pose, u), pose.scaled.detach(), chosen)
 
 
-class SpotResiduals:
-    """The residuals where the variables are, as `DampedLeastSquares` takes them."""
+class ImageResiduals:
+    """Holds the residuals at the variables' values, as `DampedLeastSquares` takes them."""
 
     def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
         self._loss, self._pose, self._chosen = loss, pose, chosen
@@ -110,17 +110,17 @@ class SpotResiduals:
             self.residuals = loss.residuals(pose)
 
     def sum_of_squares(self) -> float:
-        """ε."""
+        """Return ε."""
         return float(self.residuals.square().sum())
 
     def linear_model(self) -> LinearModel:
-        """R and b of the chosen variables."""
+        """Return R and b of the chosen variables."""
         with torch.no_grad():
             return LinearModel.of_rows(*self._loss.jacobian(self._pose, self._chosen))
 
 
-class SpotMerit:
-    """The residuals wherever the variables are, as a closure; the last point's are kept.
+class ImageMerit:
+    """Evaluates the residuals wherever the variables are, as a closure; the last point's are kept.
 
     Args:
         loss: what is to be small.
@@ -130,11 +130,11 @@ class SpotMerit:
 
     def __init__(self, loss: ImageLoss, pose: Pose, chosen: Tensor) -> None:
         self._of = (loss, pose, chosen)
-        self._last: SpotResiduals | None = None
+        self._last: ImageResiduals | None = None
 
-    def __call__(self) -> SpotResiduals:
-        """Where the variables are."""
+    def __call__(self) -> ImageResiduals:
+        """Return the residuals where the variables are."""
         point = self._of[1].scaled.detach()
         if self._last is None or not torch.equal(self._last.point, point):
-            self._last = SpotResiduals(*self._of)
+            self._last = ImageResiduals(*self._of)
         return self._last

@@ -1,4 +1,4 @@
-"""Spots of a lens in a few numbers each: moments of where light lands, and their derivatives."""
+"""Moments describe the spots of a lens in a few numbers each, with their derivatives."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from torch.func import jacfwd, jvp, vmap
 from dolens.alignment.moments import POWERS, shift_derivatives, weighted_sums
 from dolens.alignment.pixel_moments import Pixels, convolved, pixel_convolution
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
 from dolens.optics.trace import trace_surfaces, trace_to_plane
@@ -25,7 +25,7 @@ _RAYS_AT_A_TIME = 1 << 18
 
 @dataclass(frozen=True)
 class MomentModel:
-    """Moments of S spots as functions of P numbers: T of a lens, and then some of its sensor's.
+    """Computes moments of S spots from P numbers: T of a lens, and then some of its sensor's.
 
     Spots are lit by fixed rays of the lens as designed: they do not move in object space, as if
     the entrance pupil stayed where it is, and no aperture clips them.  Points are on the sensor,
@@ -56,7 +56,7 @@ class MomentModel:
 
     @torch.no_grad()
     def points(self, errors: Tensor) -> Tensor:
-        """Where rays land, (K, 2, N), mm, with the parameters off by errors (K, P).
+        """Return the ray intercepts (K, 2, N), mm, with the parameters off by errors (K, P).
 
         Raises:
             InputError: a ray of such a lens misses a surface or is reflected totally.
@@ -69,7 +69,8 @@ class MomentModel:
 
     @torch.no_grad()
     def moments(self, errors: Tensor, origin: Tensor) -> Tensor:
-        """m = Σ w·((x - x₀)/a)ⁱ·((y - y₀)/a)ʲ of each spot, a its size; (i, j) from `POWERS`.
+        """Return m = Σ w·((x - x₀)/a)ⁱ·((y - y₀)/a)ʲ of each spot, a its size; (i, j) from
+        `POWERS`.
 
         With pixels, x and y are their centres, averaged over the places of the grid.
 
@@ -85,7 +86,9 @@ class MomentModel:
 
     @torch.no_grad()
     def moments_and_jacobian(self, errors: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-        """The moments (K, S, 9) and their derivatives by the parameters (K, S, 9, P)."""
+        """Return the moments (K, S, 9) and their derivatives (K, S, 9, P) with respect to the
+        parameters.
+        """
         copies = 1 + len(self.start)
         sums, jacobian = self._in_chunks(
             vmap(self._derivatives), copies, *self._split(errors), origin
@@ -96,31 +99,35 @@ class MomentModel:
         return self.convolved(sums), jacobian
 
     def convolved(self, sums: Tensor) -> Tensor:
-        """Moments (..., S, 9) of what pixels count, from those of where light lands."""
+        """Return moments (..., S, 9) of what pixels count, from those of the ray intercepts."""
         if self.pixels is None:
             return sums
         return convolved(sums, POWERS, self.pixels.pitch / self.size)
 
     def _split(self, errors: Tensor) -> tuple[Tensor, Tensor]:
-        """Values that are traced (K, T), and the sensor's place (K, 3)."""
+        """Return values that are traced (K, T), and the sensor's place (K, 3)."""
         traced, other = errors.to(self.start).split([len(self.start), len(self.sensor)], 1)
         return self.start + traced, other @ self.sensor
 
     def _arrive(self, values: Tensor, sensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `land`, on the sensor at its place (3,)."""
+        """Return what `land` does, on the sensor at its place (3,)."""
         points, slopes, margin = self.land(values)
         return points + sensor[2] * slopes - sensor[:2, None], slopes, margin
 
     def _sums(
         self, values: Tensor, sensor: Tensor, origin: Tensor
     ) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """Moments (S, 9), to be differentiated; and the same, points, and slopes, to be kept."""
+        """Return moments (S, 9), to be differentiated; and the same, points, and slopes, to be
+        kept.
+        """
         points, slopes, _ = self._arrive(values, sensor)
         found = weighted_sums(points, self.shares, origin, self.size, POWERS)
         return found, (found, points.detach(), slopes.detach())
 
     def _derivatives(self, values: Tensor, sensor: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-        """Moments (S, 9), and derivatives (S, 9, P): only those of the lens need its rays."""
+        """Return moments (S, 9), and derivatives (S, 9, P): only those of the lens need its
+        rays.
+        """
         traced, (found, points, slopes) = jacfwd(self._sums, has_aux=True)(values, sensor, origin)
         if not len(self.sensor):
             return found, traced
@@ -135,7 +142,7 @@ class MomentModel:
     def _in_chunks(
         self, batch: Callable[..., tuple[Tensor, ...]], copies: int, *rows: Tensor
     ) -> list[Tensor]:
-        """A function of a batch, some rows at a time, on one thread.
+        """Return a function of a batch, computed some rows at a time, on one thread.
 
         Chunks cannot have threads of their own: PyTorch counts the levels of forward derivatives
         for the whole process.
@@ -149,8 +156,9 @@ class MomentModel:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """For many short operations: split among PyTorch's threads they wait for one another, which
-    takes up to thirty times as long.
+    """Run many short operations on one thread.
+
+    Split among PyTorch's threads they wait for one another, which takes up to thirty times as long.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -168,7 +176,7 @@ def moment_model(
     pixels: Pixels | None = None,
     size: Tensor | None = None,
 ) -> MomentModel:
-    """A lens's spots as functions of some of its parameters, by the reference tracer.
+    """Return a lens's spots as functions of some of its parameters, by the reference tracer.
 
     Args:
         lens: as designed.
@@ -186,9 +194,8 @@ def moment_model(
         raise InputError(f"lens_dtype: moments of spots need float64, not {lens.dtype}")
     if bool(spots.centred.any()):
         raise InputError("spots: rays of the whole pupil are needed (symmetry=False)")
-    unknown = set(sensor) - set(SENSOR)
-    if unknown:
-        raise InputError(f"sensor: '{unknown.pop()}' is unknown; allowed: {', '.join(SENSOR)}")
+    for name in sensor:
+        check_choice(name, SENSOR, "sensor")
     nominal = {name: value.detach() for name, value in lens.variables(names).items()}
     names = tuple(names)
     start = torch.stack([nominal[name] for name in names])

@@ -1,4 +1,4 @@
-"""Effects that a measurement has and the model of a pose fit has not."""
+"""A real measurement has effects that the model of a pose fit has not."""
 
 import copy
 import math
@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium
 
@@ -19,7 +19,8 @@ _NO_GLASS = ("air", "occluder")
 
 @dataclass(frozen=True)
 class Unmodelled:
-    """Effects of a real measurement that a pose fit does not model; all are absent by default.
+    """Describes effects of a real measurement that a pose fit does not model; all are absent by
+    default.
 
     Attributes:
         radius: tolerance of every surface's radius of curvature, relative; the error is uniform
@@ -58,11 +59,11 @@ class Unmodelled:
 
     @property
     def of_the_lens(self) -> bool:
-        """Whether the lens differs from its design."""
+        """Return whether the lens differs from its design."""
         return self.radius > 0.0 or self.index > 0.0
 
     def made(self, lens: Lens, generator: torch.Generator) -> Lens:
-        """A copy of a lens with radii and indices as they might be made.
+        """Return a copy of a lens with radii and indices as they might be made.
 
         A radius R becomes R·(1 + ε), a plane stays plane; the index n of a glass becomes n + δ.
         Surfaces that have the same glass have the same error of its index.  The generator gives
@@ -92,23 +93,23 @@ class Unmodelled:
 
 @dataclass(frozen=True)
 class ShiftedMedium:
-    """A medium whose index is off by the same number at every wavelength."""
+    """Shifts the index of a medium by the same number at every wavelength."""
 
     medium: Medium
     shift: float
 
     @property
     def name(self) -> str:
-        """Of the medium, and by how much it is off."""
+        """Return the medium's name, and by how much it is off."""
         return f"{self.medium.name}{self.shift:+g}"
 
     def index(self, wavelength: float | Tensor) -> float | Tensor:
-        """Refractive index at a wavelength in nm."""
+        """Return the refractive index at a wavelength in nm."""
         return self.medium.index(wavelength) + self.shift
 
 
 def unmodelled_of(settings: Mapping[str, Any] | None, key: str = "unmodelled") -> Unmodelled:
-    """Effects as a configuration gives them; none of them where there are no settings.
+    """Return the effects that a configuration describes; none of them where there are no settings.
 
     Args:
         settings: of `Unmodelled`.
@@ -117,8 +118,4 @@ def unmodelled_of(settings: Mapping[str, Any] | None, key: str = "unmodelled") -
     Raises:
         InputError: an unknown key, or a number out of range.
     """
-    known = tuple(Unmodelled.__dataclass_fields__)
-    for name in settings or {}:
-        if name not in known:
-            raise InputError(f"{key}: unknown key '{name}' (allowed: {', '.join(known)})")
-    return Unmodelled(**(settings or {}))
+    return call_with_settings(Unmodelled, settings or {}, key)

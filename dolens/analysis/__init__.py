@@ -1,1 +1,1 @@
-"""What a lens designer looks at: spot diagrams, ray fans, modulation transfer, RMS curves."""
+"""Image quality of a lens is analysed: spot diagrams, ray fans, MTF, RMS curves and vignetting."""

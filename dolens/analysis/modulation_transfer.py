@@ -1,4 +1,5 @@
-"""Modulation transfer: how much contrast of a sine pattern is left in the image.
+"""The modulation transfer function (MTF) gives the contrast that a lens leaves of a sinusoidal
+pattern.
 
 The geometric transfer function is the Fourier transform of the spot, and so of its rays
 (Goodman, Introduction to Fourier Optics, section 6.4; Smith, Modern Optical Engineering, ch. 15).
@@ -13,7 +14,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.ray_intercepts import even_points, in_double_precision, land
+from dolens.analysis.ray_intercepts import (
+    in_double_precision,
+    trace_ray_intercepts,
+    uniform_pupil_points,
+)
 from dolens.analysis.spot_diagram import spectral_shares, working_f_numbers
 from dolens.errors import InputError
 from dolens.optics.aiming import field_tangents
@@ -27,7 +32,8 @@ _TINY = 1e-30
 
 @dataclass(frozen=True)
 class Modulation:
-    """Polychromatic geometric MTF of F fields at Q frequencies; double precision, on the CPU.
+    """A `Modulation` holds the polychromatic geometric MTF of F fields at Q frequencies, in double
+    precision on the CPU.
 
     Attributes:
         fields: (F, 2), degrees or mm.
@@ -52,7 +58,7 @@ class Modulation:
 def modulation_transfer(
     points: Tensor, weights: Tensor, frequencies: Tensor, direction: str | Tensor
 ) -> Tensor:
-    """|Σ w·exp(-2πi·ν·(p - p̄))| / Σ w: the geometric MTF of spots.
+    """Return the geometric MTF of spots, |Σ w·exp(-2πi·ν·(p - p̄))| / Σ w.
 
     Differentiable any number of times in points and weights, but for the kink of the modulus where
     the transfer function is zero.  At ν = 0 its second derivative is -(2π)² times the variance of
@@ -94,7 +100,8 @@ def modulation_transfer(
 def diffraction_limited_transfer(
     frequencies: Tensor, wavelength: float | Tensor, f_number: float | Tensor
 ) -> Tensor:
-    """MTF of a circular pupil without aberrations: (2/π)·(arccos s - s·√(1 - s²)), s = ν·λ·N.
+    """Return the MTF of a circular pupil without aberrations, (2/π)·(arccos s - s·√(1 - s²)), s =
+    ν·λ·N.
 
     Goodman, Introduction to Fourier Optics, equation 6-31; zero from s = 1 on.
 
@@ -117,7 +124,7 @@ def modulation(
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> Modulation:
-    """The polychromatic geometric MTF of a lens, by rays spread evenly over the stop.
+    """Compute the polychromatic geometric MTF of a lens from rays spread uniformly over the stop.
 
     All wavelengths of a field make one spot, so that lateral colour counts.
 
@@ -135,14 +142,14 @@ def modulation(
         InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
     """
     lens = in_double_precision(lens)
-    pupil, weight = even_points(rays)
+    pupil, weight = uniform_pupil_points(rays)
     # The rim weighs nothing.
     pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
-    landings = land(lens, fields, wavelengths, pupil, object_distance)
-    field, waves = landings.fields, landings.wavelengths
+    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
+    field, waves = intercepts.fields, intercepts.wavelengths
     spectrum = spectral_shares(wavelength_weights, len(waves))
-    light = (weight * landings.valid * spectrum[:, None]).flatten(1, 2)
-    points = landings.points.flatten(1, 2)
+    light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
+    points = intercepts.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
     along = _radial(field, object_distance)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
@@ -160,7 +167,7 @@ def modulation(
     limits = diffraction_limited_transfer(frequency, waves[:, None], numbers[:, None])
     return Modulation(
         field,
-        landings.field_unit,
+        intercepts.field_unit,
         waves,
         frequency,
         tangential,
@@ -170,7 +177,7 @@ def modulation(
 
 
 def _radial(field: Tensor, object_distance: float | None) -> Tensor:
-    """(F, 2), unit vectors along the fields; +y on the axis."""
+    """Return unit vectors along the fields, (F, 2); +y on the axis."""
     angles = torch.deg2rad(field) if vergence(object_distance) == 0.0 else field
     slopes, _ = field_tangents(angles, object_distance)
     length = slopes.norm(dim=-1, keepdim=True)

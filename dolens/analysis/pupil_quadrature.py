@@ -1,4 +1,4 @@
-"""Rays of the spots that a lens is judged by: which, and how much each counts.
+"""Spots are sampled by rays through a grid or a Gaussian quadrature of the pupil.
 
 A spot is the light of one field and one wavelength.  Only rays that pass the lens are kept, so that
 whoever traces them again and again spends nothing on the others.
@@ -14,16 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dolens.analysis.vignetting import Beams
+from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-from dolens.optics.system import is_rotationally_symmetric
 
 
 @dataclass(frozen=True)
 class SpotRays:
-    """Rays of S spots, all of them passing the lens.
+    """The rays of S spots are stored together; all of them pass the lens.
 
     Attributes:
         rays: N rays, (N, 3), with wavelengths (N,), spot after spot.
@@ -52,7 +51,7 @@ class SpotRays:
 
     @property
     def count(self) -> int:
-        """Spots."""
+        """Return the number of spots."""
         return len(self.wavelengths)
 
 
@@ -63,7 +62,8 @@ def square_grid(
     count: int = 31,
     half_width: float | None = None,
 ) -> SpotRays:
-    """Parallel rays through a square grid in the plane of the first vertex, equally weighted.
+    """Launch parallel rays through a square grid in the plane of the first vertex, equally
+    weighted.
 
     Every wavelength has the rays that pass at its own index.
 
@@ -72,6 +72,8 @@ def square_grid(
         fields: (x, y), degrees.
         wavelengths: nm.
         count: points along each side.
+
+    Rarely needed:
         half_width: mm; None: the first surface's semi-diameter r₁, plus what its rim's sag moves
             the beam of a field aside, tan(field)·sag(r₁).
 
@@ -86,7 +88,7 @@ def square_grid(
         tangent = torch.tensor(tangents, dtype=torch.float64)
         width = half_width
         if width is None:
-            width = first_semi_diameter(lens, float(tangent.norm()))
+            width = beam_half_width(lens, float(tangent.norm()))
         position = torch.cat([unit * width, torch.zeros_like(unit[:, :1])], 1)
         direction = torch.cat([tangent, torch.ones(1, dtype=torch.float64)])
         direction = (direction / direction.norm()).expand(position.shape)
@@ -95,8 +97,10 @@ def square_grid(
     return _passing(lens, fields, wavelengths, launch)
 
 
-def first_semi_diameter(lens: Lens, tangent: float) -> float:
-    """Half-width (mm) of a beam that fills the first surface, in the plane of its vertex."""
+def beam_half_width(lens: Lens, tangent: float) -> float:
+    """Return the half-width (mm), in the plane of the first vertex, of a beam that fills the first
+    surface.
+    """
     surface = lens.system().surfaces[0]
     return surface.semi_diameter + tangent * float(surface.rim_sag(lens.sensor_distance.detach()))
 
@@ -110,7 +114,7 @@ def gaussian_quadrature(
     object_distance: float | None = None,
     symmetry: bool = True,
 ) -> SpotRays:
-    """Rays on rings and arms across the part of the stop that a field fills, by Gauss's weights.
+    """Sample the vignetted pupil of each field on rings and arms by Gaussian quadrature.
 
     The means over these rays are those over the light that passes, up to high order: aberrations of
     degree 4·rings - 1 along a radius are integrated exactly where nothing but the stop clips
@@ -127,6 +131,8 @@ def gaussian_quadrature(
         rings: radii.
         arms: azimuths of the whole pupil, an even number.
         object_distance: mm in front of the first vertex; None for an object at infinity.
+
+    Rarely needed:
         symmetry: whether a part of the pupil may stand for its mirror images, where the lens has
             the symmetry.
 
@@ -139,24 +145,24 @@ def gaussian_quadrature(
     # Gauss and Legendre's nodes in ρ², on which an area's element is even.
     radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))
     shares = torch.from_numpy(0.5 * shares)
-    symmetric = symmetry and is_rotationally_symmetric(lens.system())
+    symmetric = symmetry and lens.system().rotationally_symmetric
 
     distinct = list(dict.fromkeys(map(tuple, fields)))
     points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)
     azimuths = [_azimuths(field, arms, symmetric) for field in distinct]
-    most = max(map(len, azimuths), default=0)
+    count = max(map(len, azimuths), default=0)
     # Fields with fewer arms repeat theirs, to be traced with the others.
-    angles = torch.stack([angle.repeat(-(-most // len(angle)))[:most] for angle in azimuths])
+    angles = torch.stack([angle.repeat(-(-count // len(angle)))[:count] for angle in azimuths])
     arm = torch.stack((angles.cos(), angles.sin()), -1)
-    beams = Beams(lens, points, object_distance)
-    centres = beams.centres((points[:, 0] == 0.0) & symmetric)
-    reach = beams.reach(centres, arm)
-    along = (radii[:, None] * reach[:, None])[..., None] * arm[:, None]
-    aimed = beams.aim((centres[:, None, None] + along).flatten(1, 2))
+    pupils = VignettedPupils(lens, points, object_distance)
+    centres = pupils.centres((points[:, 0] == 0.0) & symmetric)
+    boundary = pupils.boundary_radius(centres, arm)
+    along = (radii[:, None] * boundary[:, None])[..., None] * arm[:, None]
+    aimed = pupils.aim((centres[:, None, None] + along).flatten(1, 2))
     launched = {}
     for at, (field, angle) in enumerate(zip(distinct, azimuths, strict=True)):
-        own = torch.arange(rings * most).reshape(rings, most)[:, : len(angle)].flatten()
-        weight = shares[:, None] * reach[at, : len(angle)].square()
+        own = torch.arange(rings * count).reshape(rings, count)[:, : len(angle)].flatten()
+        weight = shares[:, None] * boundary[at, : len(angle)].square()
         launched[field] = Launched(
             aimed.position[at, own], aimed.direction[at, own], weight.reshape(-1), len(angle)
         )
@@ -164,7 +170,7 @@ def gaussian_quadrature(
 
 
 def _azimuths(field: tuple[float, float], arms: int, symmetric: bool) -> Tensor:
-    """Of the arms that stand for the whole pupil, radians."""
+    """Return the azimuths (radians) of the arms that stand for the whole pupil."""
     x, y = field
     if symmetric and x == 0.0 and y == 0.0:
         return torch.tensor([0.25 * math.pi], dtype=torch.float64)
@@ -175,8 +181,8 @@ def _azimuths(field: tuple[float, float], arms: int, symmetric: bool) -> Tensor:
 
 
 class Launched(NamedTuple):
-    """Rays of a field before the lens: positions, directions, weights, and what these would sum up
-    to if all of the beam passed.
+    """The rays of one field in front of the lens have positions, directions and weights; `whole` is
+    the sum of the weights if all of the beam passed.
     """
 
     position: Tensor
@@ -196,7 +202,7 @@ def _passing(
     launch: Launch,
     symmetric: bool = False,
 ) -> SpotRays:
-    """The rays that pass, of every field and wavelength, in the lens's precision."""
+    """Keep the rays that pass, of every field and wavelength, in the lens's precision."""
     options = {"dtype": lens.dtype, "device": lens.device}
     pieces, launched, launches, light = [], 0, {}, []
     for spot, (field, wavelength) in enumerate(product(map(tuple, fields), wavelengths)):
@@ -242,7 +248,7 @@ def _passing(
 
 @torch.no_grad()
 def with_chief_rays(lens: Lens, spots: SpotRays, object_distance: float | None = None) -> SpotRays:
-    """The same spots with their chief rays, which weigh nothing, after all others.
+    """Return the spots with their chief rays appended; a chief ray has no weight.
 
     Raises:
         InputError: a chief ray does not reach the stop.

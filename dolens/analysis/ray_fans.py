@@ -1,4 +1,4 @@
-"""Ray fans: transverse ray aberrations along two diameters of the stop."""
+"""Ray fans show transverse ray aberrations along two diameters of the stop."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.ray_intercepts import land
+from dolens.analysis.ray_intercepts import trace_ray_intercepts
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
@@ -16,7 +16,8 @@ _RIM = 1.0 - 1e-9
 
 @dataclass(frozen=True)
 class RayFans:
-    """Transverse ray aberrations of F fields and W wavelengths at P points of the stop.
+    """A `RayFans` holds transverse ray aberrations of F fields and W wavelengths at P points of the
+    stop.
 
     Attributes:
         fields: (F, 2), degrees or mm.
@@ -46,7 +47,7 @@ def ray_fans(
     count: int = 41,
     object_distance: float | None = None,
 ) -> RayFans:
-    """Fans along y and x of the stop: tangential and sagittal for fields in the y-z plane.
+    """Trace fans along y and x of the stop: tangential and sagittal for fields in the y-z plane.
 
     Every ray is aimed at its own wavelength.
 
@@ -65,12 +66,12 @@ def ray_fans(
     coordinate = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
     along, across = _RIM * coordinate, torch.zeros_like(coordinate)
     pupil = torch.cat([torch.stack((across, along), -1), torch.stack((along, across), -1)])
-    landings = land(lens, fields, wavelengths, pupil, object_distance, exact=True)
-    deviation = 1e3 * (landings.points - landings.chief[:, None, None])
+    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance, exact=True)
+    deviation = 1e3 * (intercepts.points - intercepts.chief[:, None, None])
     return RayFans(
-        fields=landings.fields,
-        field_unit=landings.field_unit,
-        wavelengths=landings.wavelengths,
+        fields=intercepts.fields,
+        field_unit=intercepts.field_unit,
+        wavelengths=intercepts.wavelengths,
         reference_wavelength=lens.primary_wavelength,
         coordinate=coordinate,
         tangential_um=deviation[..., :count, 1],

@@ -1,9 +1,9 @@
-"""Where the light of many fields and wavelengths lands, by points of the stop.
+"""Ray intercepts on the sensor are computed for many fields and wavelengths, by points of the stop.
 
 Aiming a ray at a point of the stop costs far more than tracing it.  A few dozen rays are therefore
-aimed, the points where they start are fitted by a polynomial in the stop coordinates, and thousands
-start where the polynomial says.  Each is exactly a ray of its field: what the fit leaves is where
-it crosses the stop, by some 1e-4 of the stop's semi-diameter or less.
+aimed, their starting points are fitted by a polynomial in the stop coordinates, and thousands of
+rays start at values of the polynomial.  Each is exactly a ray of its field.  The error of the fit
+moves its crossing of the stop by some 1e-4 of the stop's semi-diameter or less.
 """
 
 import copy
@@ -30,8 +30,9 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True)
-class Landings:
-    """Rays of F fields and W wavelengths through N points of the stop, on the sensor.
+class RayIntercepts:
+    """A `RayIntercepts` holds the sensor intercepts of rays of F fields and W wavelengths through N
+    points of the stop.
 
     Attributes:
         fields: (F, 2), degrees or mm, double precision, on the CPU like all of these.
@@ -39,8 +40,8 @@ class Landings:
         wavelengths: (W,), nm.
         points: (F, W, N, 2), mm, double precision; NaN where a ray does not pass.
         valid: (F, W, N), bool.
-        chief: (F, 2), mm, where the chief rays of the reference wavelength land, whether apertures
-            clip them or not; NaN where one does not reach the sensor.
+        chief: (F, 2), mm, intercepts of the chief rays of the reference wavelength, whether
+            apertures clip them or not; NaN where one does not reach the sensor.
     """
 
     fields: Tensor
@@ -51,8 +52,8 @@ class Landings:
     chief: Tensor
 
 
-def even_points(count: int) -> tuple[Tensor, Tensor]:
-    """Points that share the unit disc evenly, and its rim.
+def uniform_pupil_points(count: int) -> tuple[Tensor, Tensor]:
+    """Return points that cover the unit disc uniformly, and points on its edge.
 
     A spiral fills the quadrant x, y > 0, and its mirror images the others, so that odd moments are
     exactly zero: ρ² grows evenly and the azimuth by the golden section of the quarter turn (after
@@ -84,15 +85,15 @@ def even_points(count: int) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def land(
+def trace_ray_intercepts(
     lens: Lens,
     fields: Sequence[Sequence[float]] | Tensor,
     wavelengths: Sequence[float] | Tensor,
     pupil: Tensor,
     object_distance: float | None = None,
     exact: bool = False,
-) -> Landings:
-    """Aim rays at points of the stop, every wavelength by itself, and trace them in one go.
+) -> RayIntercepts:
+    """Aim rays at points of the stop, separately for every wavelength, and trace them together.
 
     Args:
         lens: of any precision; the rays are traced in double precision.
@@ -100,6 +101,8 @@ def land(
         wavelengths: (W,), nm.
         pupil: (N, 2), x and y on the stop over its semi-diameter, in the unit disc.
         object_distance: mm in front of the first vertex; None for an object at infinity.
+
+    Rarely needed:
         exact: aim every ray, rather than to fit a few.
 
     Raises:
@@ -138,7 +141,7 @@ def land(
     valid = hit.valid & started
     reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
     reached = reached & aimed.converged[:, at, 0]
-    return Landings(
+    return RayIntercepts(
         field.cpu(),
         field_unit(object_distance),
         waves[:count].cpu(),
@@ -149,12 +152,12 @@ def land(
 
 
 def field_unit(object_distance: float | None) -> str:
-    """What fields are measured in: `°` for an object at infinity, else `mm`."""
+    """Return the unit of field coordinates: `°` for an object at infinity, else `mm`."""
     return "°" if vergence(object_distance) == 0.0 else "mm"
 
 
 def in_double_precision(lens: Lens) -> Lens:
-    """The lens, or a copy of it in double precision where it is not."""
+    """Return the lens, or a copy of it in double precision where it is not."""
     return lens if lens.dtype == torch.float64 else copy.deepcopy(lens).to(torch.float64)
 
 
@@ -166,7 +169,9 @@ def _fitted(
     pupil: Tensor,
     object_distance: float | None,
 ) -> tuple[Rays, Tensor]:
-    """Rays (F, W, N) by a fit of aimed ones (F, W, nodes), and (F, W): whether there is a fit."""
+    """Return rays (F, W, N) from a fit of aimed ones (F, W, nodes), and whether there is a fit, (F,
+    W).
+    """
     near = vergence(object_distance)
     tangents, _ = field_tangents(torch.deg2rad(field) if near == 0.0 else field, object_distance)
     tangents = tangents[:, None, None]
@@ -190,7 +195,7 @@ def _fitted(
 
 
 def _nodes() -> Tensor:
-    """(1 + rings·azimuths, 2): the centre, and rings that crowd towards the rim as Chebyshev's."""
+    """Return the centre and rings of Chebyshev radii, (1 + rings·azimuths, 2)."""
     rings = [torch.zeros(1, 2, dtype=torch.float64)]
     for ring in range(_RINGS):
         radius = math.cos(0.5 * math.pi * ring / (_RINGS + 0.5))
@@ -200,7 +205,7 @@ def _nodes() -> Tensor:
 
 
 def _basis(points: Tensor) -> Tensor:
-    """(N, terms): products of Chebyshev's polynomials in x and y up to the degree, in all."""
+    """Return products of Chebyshev polynomials in x and y up to the total degree, (N, terms)."""
     angle = torch.arccos(points.clamp(-1.0, 1.0))[..., None]
     along_x, along_y = torch.cos(angle * torch.arange(_DEGREE + 1).to(points)).unbind(1)
     terms = [
@@ -210,6 +215,6 @@ def _basis(points: Tensor) -> Tensor:
 
 
 def _circle(count: int, offset: float) -> Tensor:
-    """(count, 2), points of the unit circle; the first is `offset` steps from +x."""
+    """Return points of the unit circle, (count, 2); the first is `offset` steps from +x."""
     angle = (torch.arange(count, dtype=torch.float64) + offset) * (2.0 * math.pi / count)
     return torch.stack((angle.cos(), angle.sin()), -1)

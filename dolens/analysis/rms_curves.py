@@ -1,4 +1,4 @@
-"""How sharp a lens is across its field and its spectrum: RMS spot radii as curves."""
+"""RMS spot radii are computed against field and against wavelength."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from dolens.optics.lens import Lens
 
 @dataclass(frozen=True)
 class RMSCurves:
-    """RMS spot radii of F fields and W wavelengths; NaN where no light passes.
+    """An `RMSCurves` holds RMS spot radii of F fields and W wavelengths; NaN where no light passes.
 
     Attributes:
         fields: (F, 2), degrees or mm.
@@ -41,7 +41,7 @@ def rms_against_field(
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> RMSCurves:
-    """RMS spot radii at evenly spaced fields from the axis to an edge.
+    """Compute RMS spot radii at evenly spaced fields from the axis to an edge.
 
     Args:
         lens: the lens.
@@ -71,7 +71,7 @@ def rms_against_wavelength(
     rays: int = 4000,
     object_distance: float | None = None,
 ) -> RMSCurves:
-    """RMS spot radii at evenly spaced wavelengths.
+    """Compute RMS spot radii at evenly spaced wavelengths.
 
     Args:
         lens: the lens.

@@ -1,4 +1,4 @@
-"""Spot diagrams: where a point's light lands, and how far it spreads."""
+"""Spot diagrams show the ray intercepts of an object point and measure their spread."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.analysis.ray_intercepts import even_points, in_double_precision, land
+from dolens.analysis.ray_intercepts import (
+    in_double_precision,
+    trace_ray_intercepts,
+    uniform_pupil_points,
+)
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
@@ -18,20 +22,21 @@ AIRY = 1.2196698912665045
 
 @dataclass(frozen=True)
 class SpotDiagram:
-    """Spots of F fields and W wavelengths by N points of the stop; double precision, on the CPU.
+    """A `SpotDiagram` holds spots of F fields and W wavelengths by N points of the stop, in double
+    precision on the CPU.
 
-    What no light reaches is NaN.
+    Values of fields or wavelengths that no light reaches are NaN.
 
     Attributes:
         fields: (F, 2), degrees or mm.
         field_unit: `°` for an object at infinity, else `mm`.
         wavelengths: (W,), nm.
         reference_wavelength: nm, of the chief rays.
-        landing: (F, W, N, 2), mm on the sensor; NaN for rays that do not pass.
+        intercepts: (F, W, N, 2), mm on the sensor; NaN for rays that do not pass.
         valid: (F, W, N), bool.
         weight: (N,), share of a ray in the light through the stop; zero for rays on its rim.
         wavelength_weight: (W,), shares of the wavelengths in polychromatic values.
-        chief: (F, 2), mm, where the chief ray of the reference wavelength lands.
+        chief: (F, 2), mm, intercept of the chief ray of the reference wavelength.
         centroid: (F, W, 2), mm.
         rms: (F, W), mm, √(Σ w·|p - p̄|²) about the spot's own centroid.
         geo: (F, W), mm, the largest |p - p̄|; over the rim of the stop too, but no nearer to an edge
@@ -45,7 +50,7 @@ class SpotDiagram:
     field_unit: str
     wavelengths: Tensor
     reference_wavelength: float
-    landing: Tensor
+    intercepts: Tensor
     valid: Tensor
     weight: Tensor
     wavelength_weight: Tensor
@@ -57,16 +62,6 @@ class SpotDiagram:
     polychromatic_rms: Tensor
     airy_radius: Tensor
 
-    @property
-    def from_chief(self) -> Tensor:
-        """(F, W, N, 2), mm, landing points from where the field's chief ray lands."""
-        return self.landing - self.chief[:, None, None]
-
-    @property
-    def from_centroid(self) -> Tensor:
-        """(F, W, N, 2), mm, landing points from their spot's centroid."""
-        return self.landing - self.centroid[:, :, None]
-
 
 @torch.no_grad()
 def spot_diagram(
@@ -77,7 +72,7 @@ def spot_diagram(
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
 ) -> SpotDiagram:
-    """Rays spread evenly over the stop, at every field and wavelength.
+    """Trace rays spread uniformly over the stop, at every field and wavelength.
 
     Args:
         lens: the lens.
@@ -93,9 +88,9 @@ def spot_diagram(
         InputError: no fields or wavelengths, weights that do not fit, or a wrong number of rays.
     """
     lens = in_double_precision(lens)
-    pupil, weight = even_points(rays)
-    landings = land(lens, fields, wavelengths, pupil, object_distance)
-    points, valid = landings.points, landings.valid
+    pupil, weight = uniform_pupil_points(rays)
+    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
+    points, valid = intercepts.points, intercepts.valid
     spectrum = spectral_shares(wavelength_weights, points.shape[1])
 
     light = weight * valid
@@ -103,17 +98,17 @@ def spot_diagram(
     extent = (points - centroid[:, :, None]).norm(dim=-1).nan_to_num(-math.inf).amax(-1)
     every = (light * spectrum[:, None]).flatten(1, 2)
     common, common_square = moments(points.flatten(1, 2), every)
-    waves = landings.wavelengths
+    waves = intercepts.wavelengths
     return SpotDiagram(
-        fields=landings.fields,
-        field_unit=landings.field_unit,
+        fields=intercepts.fields,
+        field_unit=intercepts.field_unit,
         wavelengths=waves,
         reference_wavelength=lens.primary_wavelength,
-        landing=points,
+        intercepts=points,
         valid=valid,
         weight=weight,
         wavelength_weight=spectrum,
-        chief=landings.chief,
+        chief=intercepts.chief,
         centroid=centroid,
         rms=mean_square.sqrt(),
         geo=extent.where(extent >= 0.0, math.nan),
@@ -124,7 +119,8 @@ def spot_diagram(
 
 
 def moments(points: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (..., 2) and mean square distance from it (...), of points (..., N, 2).
+    """Return the centroid (..., 2) of points (..., N, 2) and their mean square distance from it
+    (...).
 
     Args:
         points: NaN where there is no light.
@@ -140,7 +136,7 @@ def moments(points: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def spectral_shares(weights: Sequence[float] | None, count: int) -> Tensor:
-    """(count,), float64, shares of wavelengths, of sum one; equal where none are given.
+    """Return normalised wavelength weights, (count,), float64; equal ones where none are given.
 
     Raises:
         InputError: another number of weights, a negative one, or none that is positive.
@@ -156,7 +152,7 @@ def spectral_shares(weights: Sequence[float] | None, count: int) -> Tensor:
 
 
 def working_f_numbers(lens: Lens, wavelengths: Tensor, object_distance: float | None) -> Tensor:
-    """(W,), paraxial working F-number of the stop, positive, at each wavelength in nm."""
+    """Return the paraxial working F-number at each wavelength in nm, (W,), positive."""
     system = lens.system()
     numbers = [
         first_order(system, float(wavelength), object_distance).working_f_number.abs()

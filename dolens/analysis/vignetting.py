@@ -1,4 +1,4 @@
-"""Where on the stop the light of a field passes, when other apertures clip some of it."""
+"""The vignetted pupil of a field is found on the stop."""
 
 import torch
 from torch import Tensor
@@ -13,8 +13,8 @@ _RADII = 48
 _SIDE = 32
 
 
-class Beams:
-    """The light of F fields on the stop, all of them at once: aiming costs by the call.
+class VignettedPupils:
+    """The vignetted pupils of F fields are searched together, because aiming costs by the call.
 
     Stop coordinates are x and y over its semi-diameter.
 
@@ -28,16 +28,17 @@ class Beams:
         self.lens, self.fields, self.object_distance = lens, fields, object_distance
 
     def aim(self, pupil: Tensor) -> AimedRays:
-        """Rays of every field through points (F, N, 2) of the stop."""
+        """Aim rays of every field at points (F, N, 2) of the stop."""
         wavelength = self.lens.primary_wavelength
         return self.lens.aim(self.fields[:, None], pupil, wavelength, self.object_distance)
 
     def passes(self, pupil: Tensor) -> Tensor:
-        """(F, N), bool."""
+        """Return whether rays through points of the stop pass the lens, (F, N), bool."""
         return self.lens.trace(self.aim(pupil)).valid.cpu()
 
     def centres(self, meridional: Tensor) -> Tensor:
-        """(F, 2): the middle of the light, from where every arm can be followed to its edge.
+        """Return the centroid of each vignetted pupil, (F, 2); every arm from it meets the
+        boundary.
 
         Args:
             meridional: (F,), bool: the lens and the field make it lie on the y axis.
@@ -59,8 +60,8 @@ class Beams:
         middle[meridional, 0] = 0.0
         return middle
 
-    def reach(self, centres: Tensor, arms: Tensor) -> Tensor:
-        """(F, A): how far along each arm (F, A, 2) from its centre light passes."""
+    def boundary_radius(self, centres: Tensor, arms: Tensor) -> Tensor:
+        """Return the distance of the boundary from the centre along each arm (F, A, 2), (F, A)."""
         centres = centres[:, None]
         # |c + ρa| = 1: the stop's own edge.
         along = (arms * centres).sum(-1)

@@ -52,22 +52,19 @@ class EntranceBeam:
 
 
 @torch.no_grad()
-def find_beam(
-    system: OpticalSystem, points: ObjectPoints, wavelength: Tensor, backend: str = "auto"
-) -> EntranceBeam:
+def find_beam(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -> EntranceBeam:
     """Search the plane before the lens for the light that passes it.
 
     Args:
         system: the lens, in double precision.
         points: N object points.
         wavelength: (N,), nm, of each.
-        backend: what traces; see `choose_backend`.
 
     Returns:
         Beams; those of points whose light does not pass are not `lit`, and cover the first surface.
     """
     centre, half_width = _first_surface(system, points)
-    search = _Search(system, points, wavelength, backend)
+    search = _Search(system, points, wavelength)
     side = _first_side(system, float(wavelength[0]), float(half_width.max()))
     q = box_grid(centre, half_width, side)
     valid = search.passing(q)
@@ -122,7 +119,6 @@ class _Search:
     system: OpticalSystem
     points: ObjectPoints
     wavelength: Tensor
-    backend: str
 
     def passing(self, q: Tensor) -> Tensor:
         """(N, S, S), bool: which rays through points (N, S, S, 2) pass the lens."""
@@ -172,7 +168,7 @@ class _Search:
 
     def _trace(self, ray: Components, wavelength: Tensor) -> TracedRays:
         rays = Rays.from_components(ray, wavelength)
-        return trace_rays(self.system, rays, self.backend, 1.0, False, 1, None)
+        return trace_rays(self.system, rays)
 
 
 def _box(q: Tensor, valid: Tensor, centre: Tensor, half_width: Tensor) -> tuple[Tensor, Tensor]:

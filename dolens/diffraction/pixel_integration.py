@@ -1,7 +1,38 @@
 """From irradiance on the sensor to what pixels collect of it."""
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+
+from dolens.errors import InputError
+
+
+@dataclass(frozen=True)
+class PixelWindow:
+    """A square window of pixels about a point of the sensor.
+
+    Attributes:
+        pitch: of the pixels, mm.
+        size: pixels along each side.
+
+    Raises:
+        InputError: a pitch that is not positive, or no pixel.
+    """
+
+    pitch: float
+    size: int
+
+    def __post_init__(self) -> None:
+        if not self.pitch > 0.0 or self.size < 1:
+            raise InputError(
+                f"pitch must be positive and size at least 1, not {self.pitch} and {self.size}"
+            )
+
+    @property
+    def half_width(self) -> float:
+        """mm, of what `fine_grid` covers."""
+        return self.pitch * (0.5 * self.size + 1.0)
 
 
 def quadratic_b_spline(u: Tensor) -> Tensor:

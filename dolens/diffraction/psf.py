@@ -9,7 +9,7 @@ from torch import Tensor
 from dolens.diffraction.field import direct_field, fourier_field
 from dolens.diffraction.moving_bounds import with_moving_bounds
 from dolens.diffraction.object_points import ObjectPoints
-from dolens.diffraction.pixel_integration import fine_grid, pixel_matrix
+from dolens.diffraction.pixel_integration import PixelWindow, fine_grid, pixel_matrix
 from dolens.diffraction.propagation import (
     DiffractionSettings,
     Propagation,
@@ -20,7 +20,6 @@ from dolens.diffraction.propagation import (
 )
 from dolens.diffraction.pupil_fit import PupilFit, RegularPupil, fit_pupil, regular_pupil
 from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
-from dolens.errors import InputError
 from dolens.optics.backend import say_once
 from dolens.optics.replay import replay
 from dolens.optics.system import OpticalSystem
@@ -42,12 +41,10 @@ def wave_kernels(
     points: Points,
     wavelength: Wavelengths,
     centres: Centres,
-    pitch: float,
-    size: int,
+    window: PixelWindow,
     settings: DiffractionSettings | None = None,
-    backend: str = "auto",
 ) -> Tensor:
-    """What pixels collect of object points' light, with diffraction.
+    """Compute what pixels collect of object points' light, with diffraction.
 
     Each kernel is the irradiance convolved with a quadratic B-spline, a pixel's box by a texel's
     tent, as in `axial_point_spread_functions`: the discrete convolution of a texture with it is the
@@ -61,10 +58,8 @@ def wave_kernels(
         points: N object points, or their positions (N, 3) in mm in the lens's axes (z < 0).
         wavelength: nm, one or N.
         centres: (N, 2), mm on the sensor, of the windows; None: where the chief rays land.
-        pitch: of the pixels, mm.
-        size: pixels along each side of a window.
+        window: its pitch and size are those of all windows.
         settings: how finely; None: the default.
-        backend: what traces; see `choose_backend`.
 
     Returns:
         (N, size, size), in the lens's precision, upright as in `Sensor`: the point (x, y) from the
@@ -77,13 +72,14 @@ def wave_kernels(
         InputError: numbers that do not fit, or a wavefront too steep for diffraction.
     """
     settings = settings or DiffractionSettings()
-    found = _prepare(system, points, wavelength, centres, pitch, size, settings, backend)
-    window = _Window(pitch, size, settings.subsamples or subsamples(found.fit, pitch), system.dtype)
+    found = _prepare(system, points, wavelength, centres, window, settings)
+    cells = settings.subsamples or subsamples(found.fit, window.pitch)
+    pixels = _Subpixels(window, cells, system.dtype)
     fourier = found.chosen.fourier
     if settings.method != "auto":
         fourier = torch.full_like(fourier, settings.method == "fourier")
     if bool(fourier.all()):
-        return _by_fourier(found, window)
+        return _by_fourier(found, pixels)
     which = torch.nonzero(~fourier).flatten()
     if settings.method == "auto":
         for n in which.tolist():
@@ -96,12 +92,11 @@ def wave_kernels(
         front.centre[which],
         direct_samples(front, window.half_width, settings),
         1.0 / front.curvature[which],
-        backend,
     )
-    direct = _by_integration(rays, window)
+    direct = _by_integration(rays, pixels)
     if len(which) == len(found.points):
         return direct
-    return _by_fourier(found, window).index_copy(0, which, direct)
+    return _by_fourier(found, pixels).index_copy(0, which, direct)
 
 
 @torch.no_grad()
@@ -110,14 +105,12 @@ def propagation(
     points: Points,
     wavelength: Wavelengths,
     centres: Centres,
-    pitch: float,
-    size: int,
+    window: PixelWindow,
     settings: DiffractionSettings | None = None,
-    backend: str = "auto",
 ) -> Propagation:
-    """How `wave_kernels` of the same arguments propagates light by itself, and why."""
+    """Say how `wave_kernels` of the same arguments propagates light by itself, and why."""
     settings = settings or DiffractionSettings()
-    return _prepare(system, points, wavelength, centres, pitch, size, settings, backend).chosen
+    return _prepare(system, points, wavelength, centres, window, settings).chosen
 
 
 @dataclass(frozen=True)
@@ -136,27 +129,21 @@ class _Prepared:
 
 
 @dataclass(frozen=True)
-class _Window:
-    pitch: float
-    size: int
-    subsamples: int
+class _Subpixels:
+    window: PixelWindow
+    count: int
     dtype: torch.dtype
-
-    @property
-    def half_width(self) -> float:
-        """mm, of what `fine_grid` covers."""
-        return self.pitch * (0.5 * self.size + 1.0)
 
     def grid(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """x and y (mm) of the irradiance's columns and rows, ordered as pixels are stored."""
-        fine = self.pitch * fine_grid(self.size, self.subsamples, like)
+        fine = self.window.pitch * fine_grid(self.window.size, self.count, like)
         return -fine, fine
 
     def integrated(self, field: Tensor) -> Tensor:
         """(N, size, size): the flux of |field|² in every pixel."""
         irradiance = field.real.square() + field.imag.square()
-        step = self.pitch / self.subsamples
-        matrix = step * pixel_matrix(self.size, self.subsamples, irradiance)
+        step = self.window.pitch / self.count
+        matrix = step * pixel_matrix(self.window.size, self.count, irradiance)
         return matrix @ irradiance @ matrix.mT
 
 
@@ -165,20 +152,15 @@ def _prepare(
     points: Points,
     wavelength: Wavelengths,
     centres: Centres,
-    pitch: float,
-    size: int,
+    window: PixelWindow,
     settings: DiffractionSettings,
-    backend: str,
 ) -> _Prepared:
-    if not pitch > 0.0 or size < 1:
-        raise InputError(f"pitch must be positive and size at least 1, not {pitch} and {size}")
     if not isinstance(points, ObjectPoints):
         points = ObjectPoints.at(points)
-    rays = pupil_wavefront(system, points, wavelength, centres, settings.rays, backend=backend)
+    rays = pupil_wavefront(system, points, wavelength, centres, settings.rays)
     fit = with_moving_bounds(_fitted(rays, settings))
-    half_width = pitch * (0.5 * size + 1.0)
     points = points.to(rays.opd.dtype, rays.opd.device)
-    found = _Prepared(points, fit, fourier_samples(fit, half_width, settings))
+    found = _Prepared(points, fit, fourier_samples(fit, window.half_width, settings))
     parts = found.pieces()
     if len(parts) == 1:
         found = replace(found, pupil=regular_pupil(fit, found.samples))
@@ -186,7 +168,7 @@ def _prepare(
     else:
         with torch.no_grad():
             flux = torch.cat([regular_pupil(fit, found.samples, part).flux for part in parts])
-    chosen = choose_propagation(fit, flux, half_width, settings)
+    chosen = choose_propagation(fit, flux, window.half_width, settings)
     return replace(found, chosen=replace(chosen, samples=found.samples))
 
 
@@ -199,12 +181,12 @@ def _fitted(wavefront: Wavefront, settings: DiffractionSettings) -> PupilFit:
     return fit_pupil(wavefront, _DEGREES[1])
 
 
-def _by_fourier(found: _Prepared, window: _Window) -> Tensor:
-    x, y = window.grid(found.fit.low)
+def _by_fourier(found: _Prepared, pixels: _Subpixels) -> Tensor:
+    x, y = pixels.grid(found.fit.low)
     parts = found.pieces(len(x))
 
     def kernels(pupil: RegularPupil) -> Tensor:
-        return window.integrated(fourier_field(pupil, x, y, window.dtype))
+        return pixels.integrated(fourier_field(pupil, x, y, pixels.dtype))
 
     if found.pupil is not None and len(parts) == 1:
         return kernels(found.pupil)
@@ -223,8 +205,8 @@ def _by_fourier(found: _Prepared, window: _Window) -> Tensor:
     return replay(piece, [len(part) for part in parts], tensors).movedim(-1, 0)
 
 
-def _by_integration(wavefront: Wavefront, window: _Window) -> Tensor:
-    x, y = window.grid(wavefront.opd)
+def _by_integration(wavefront: Wavefront, pixels: _Subpixels) -> Tensor:
+    x, y = pixels.grid(wavefront.opd)
     rows, columns = torch.meshgrid(y, x, indexing="ij")
-    field = direct_field(wavefront, columns.flatten(), rows.flatten(), window.dtype)
-    return window.integrated(field.unflatten(-1, (len(y), len(x))))
+    field = direct_field(wavefront, columns.flatten(), rows.flatten(), pixels.dtype)
+    return pixels.integrated(field.unflatten(-1, (len(y), len(x))))

@@ -91,16 +91,13 @@ def sphere_curvature(
 
 
 @torch.no_grad()
-def chief_ray_landings(
-    system: OpticalSystem, points: ObjectPoints, wavelength: Tensor, backend: str = "auto"
-) -> Tensor:
+def chief_ray_landings(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -> Tensor:
     """Where rays through the centre of the stop land, whether apertures clip them or not.
 
     Args:
         system: the lens.
         points: N of them, in the lens's precision.
         wavelength: (N,), nm.
-        backend: what traces.
 
     Returns:
         (N, 2), mm on the sensor; no gradient.
@@ -114,7 +111,7 @@ def chief_ray_landings(
     finite = torch.where(infinite, torch.ones_like(distance), distance)
     field = torch.where(infinite[:, None], points.slopes.atan(), -points.slopes * finite[:, None])
     chief = aim(system, field, torch.zeros_like(field), wavelength, distance)
-    hit = trace_rays(system, chief, backend, 1.0, False, 1, None)
+    hit = trace_rays(system, chief)
     reached = chief.converged & hit.valid
     if not bool(reached.all()):
         at = int(torch.nonzero(~reached)[0])

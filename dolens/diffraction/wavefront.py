@@ -14,7 +14,7 @@ from dolens.diffraction.reference_sphere import chief_ray_landings, sphere_curva
 from dolens.errors import InputError
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
-from dolens.optics.rays import Components, Rays
+from dolens.optics.rays import Rays
 from dolens.optics.surfaces.base import SurfaceState
 from dolens.optics.system import OpticalSystem
 
@@ -111,7 +111,6 @@ def pupil_wavefront(
     centres: Sequence[Sequence[float]] | Tensor | None = None,
     samples: int = 32,
     radius: float | Tensor | None = None,
-    backend: str = "auto",
     beam: EntranceBeam | None = None,
 ) -> Wavefront:
     """Trace the wavefronts of object points to reference spheres about points of the sensor.
@@ -125,9 +124,10 @@ def pupil_wavefront(
         wavelength: nm, one or N.
         centres: (N, 2), mm on the sensor; None: where the chief rays land.
         samples: S, rays along each side of a box about the beam; the outermost lie outside of it.
+
+    Rarely needed:
         radius: mm, of the reference spheres, one or N; infinite ones are planes far away.  None: to
             the paraxial exit pupil at the first wavelength (see `sphere_curvature`).
-        backend: what traces; see `choose_backend`.
         beam: of the same points through this lens; None: it is searched.
 
     Returns:
@@ -145,9 +145,9 @@ def pupil_wavefront(
     points = points.to(**options)
     waves = _one_each("wavelengths", wavelength, len(points), options)
     if beam is None:
-        beam = find_beam(system, points, waves, backend)
+        beam = find_beam(system, points, waves)
     if centres is None:
-        centre = chief_ray_landings(system, points, waves, backend)
+        centre = chief_ray_landings(system, points, waves)
     else:
         centre = torch.as_tensor(centres, **options).detach()
         if centre.shape != (len(points), 2):
@@ -161,7 +161,7 @@ def pupil_wavefront(
     q = box_grid(beam.centre, half_width, samples, _RIM)
     ray, every, opened = launched(points, q), waves[:, None, None], system.opened()
     rays = Rays.from_components(ray, every)
-    hit = trace_rays(opened, rays, backend, 1.0, False, 1, None)
+    hit = trace_rays(opened, rays)
     away = hit.position[..., :2] - centre[:, None, None]
     excess, direction, meets = to_sphere(away, hit.direction, curvature[:, None, None])
     valid = _with_neighbours(hit.valid & meets)
@@ -177,7 +177,7 @@ def pupil_wavefront(
     inside = Rays(_inner(rays.position), _inner(rays.direction), every)
     crossings, share = {}, (valid & beam.lit[:, None, None]).to(opd.dtype)
     for number in beam.apertures:
-        x, y = _crossing(opened, inside, number, backend)
+        x, y = _crossing(opened, inside, number)
         crossings[number] = torch.stack((x, y), -1)
         surface = system.surfaces[number - 1]
         share = torch.minimum(share, coverage(surface.aperture, x, y, surface.edge))
@@ -200,13 +200,10 @@ def pupil_wavefront(
     )
 
 
-def _crossing(
-    system: OpticalSystem, rays: Rays, number: int, backend: str
-) -> tuple[Tensor, Tensor]:
+def _crossing(system: OpticalSystem, rays: Rays, number: int) -> tuple[Tensor, Tensor]:
     """Where rays cross a surface, x and y in its axes, mm."""
-    hit = trace_rays(system, rays, backend, 1.0, False, 1, number)
-    there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
-    there = from_lens_axes(there, system.axes[number - 1])
+    hit = trace_rays(system, rays, last=number)
+    there = from_lens_axes(hit.components(), system.axes[number - 1])
     return there.x, there.y
 
 

@@ -75,6 +75,20 @@ class Outline(IntEnum):
     RECTANGLE = 2
 
 
+class Failure:
+    """Statuses that are added to a surface's tag; see `dolens.optics.rays.Status`."""
+
+    VIGNETTED = 1
+    TOTALLY_REFLECTED = 2
+    MISSED = 3
+    BITS = 2  # that a tag leaves free for a status
+    MASK = 3
+
+
+# Steps of Newton's iteration at most, as in `dolens.optics.surfaces.newton`.
+NEWTON_STEPS = 40
+
+
 @dataclass(frozen=True)
 class SurfaceTable:
     """A lens, or some of its surfaces, packed for rays of one sense.

@@ -33,26 +33,23 @@ def check_backend(name: str) -> str:
 
 
 def choose_backend(
-    system: OpticalSystem,
-    requested: str,
-    rays: Rays | None = None,
-    others: Iterable[Tensor] = (),
+    system: OpticalSystem, rays: Rays | None = None, others: Iterable[Tensor] = ()
 ) -> str:
-    """Which of `reference`, `cpu` and `cuda` traces a lens.
+    """Choose which of `reference`, `cpu` and `cuda` traces a lens.
 
-    `auto` takes the kernels of the lens's device where they serve: for its surfaces and precision,
-    outside torch.func's transforms and forward mode, which only the reference can follow.  It logs
-    what it took, once for each reason.
+    A lens whose `backend` is `auto` takes the kernels of its device where they serve: for its
+    surfaces and precision, outside torch.func's transforms and forward mode, which only the
+    reference can follow.  The log says what was taken, once for each reason.
 
     Args:
-        system: the lens.
-        requested: one of `BACKENDS`.
-        rays: what is traced.
+        system: the lens; its `backend` is one of `BACKENDS`.
+        rays: the rays that are traced.
         others: tensors besides that enter the computation.
 
     Raises:
         InputError: kernels are asked for by name and cannot serve; the message says why.
     """
+    requested = system.backend
     if requested == "reference":
         return "reference"
     device = system.device.type
@@ -82,29 +79,51 @@ def choose_backend(
     return "reference"
 
 
+def with_chosen_backend(system: OpticalSystem, others: Iterable[Tensor] = ()) -> OpticalSystem:
+    """Choose the implementation once, for every trace of a computation.
+
+    Args:
+        system: the lens.
+        others: tensors that enter the computation besides the lens's own.
+
+    Returns:
+        The same lens with `reference`, `cpu` or `cuda` as its `backend`.
+    """
+    return system.traced_by(choose_backend(system, others=others))
+
+
+def cpu_kernels_serve(system: OpticalSystem, others: Iterable[Tensor] = ()) -> bool:
+    """Whether what is done with a lens's rays is done by the CPU's fused kernels too.
+
+    These render, splat and look up images; on other devices PyTorch's operations do.
+    """
+    return choose_backend(system, others=others) == "cpu"
+
+
 def trace_rays(
     system: OpticalSystem,
     rays: Rays,
-    requested: str,
-    sense: float,
-    record: bool,
-    first: int,
-    last: int | None,
+    sense: float = 1.0,
+    record: bool = False,
+    first: int = 1,
+    last: int | None = None,
 ) -> TracedRays:
     """Trace rays through surfaces `first` to `last`, and to the sensor where no last is given.
 
     Args:
-        system: the lens.
+        system: the lens; its `backend` says what traces, see `choose_backend`.
         rays: as users give them.
-        requested: one of `BACKENDS`.
         sense: +1 towards the sensor, -1 towards the object.
         record: keep the intersections; the reference does this.
         first: number of the first surface.
         last: number of the last, or None.
+
+    Raises:
+        InputError: the lens asks for kernels by name that cannot serve.
     """
     end = len(system.surfaces) if last is None else last
     to_sensor = last is None and sense > 0.0
-    reference = record or choose_backend(system, requested, rays) == "reference"
+    reference = record or choose_backend(system, rays) == "reference"
     finer = torch.promote_types(rays.position.dtype, rays.direction.dtype)
     ray = before = None
     if reference or torch.promote_types(finer, system.dtype) != system.dtype:
@@ -139,6 +158,29 @@ def trace_rays(
         surface=surface.reshape(shape),
         path_length=path,
     )
+
+
+def trace_components(
+    system: OpticalSystem, ray: Components, wavelength: float | Tensor, sense: float
+) -> tuple[Components, Tensor]:
+    """Trace rays through the whole lens without statuses and path lengths.
+
+    Args:
+        system: the lens; its `backend` says what traces.
+        ray: one broadcast shape, in the lens's precision, mm, z from the first vertex.
+        wavelength: nm; a tensor broadcasts with the rays.
+        sense: +1 towards the sensor, -1 towards the object.
+
+    Returns:
+        The rays: on the sensor plane, or on surface 1 for a sense of -1; and bool, which of them
+        are valid, as in `TracedRays`.
+    """
+    rays = Rays.from_components(ray, wavelength)
+    if sense < 0.0 and choose_backend(system, rays) == "reference":
+        traced = trace_surfaces(system, ray, wavelength, sense)
+        return traced.ray, traced.valid
+    hit = trace_rays(system, rays, sense)
+    return hit.components(), hit.valid
 
 
 def _joined(

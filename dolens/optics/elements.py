@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.rays import Components
 
 # Smallest cosine to the axis that is divided by when a ray is carried to a tilted element.
@@ -48,9 +48,7 @@ class Element(nn.Module):
         if not 1 <= first <= last:
             raise InputError(f"an element's surfaces run from its first to its last: {first, last}")
         pose = dict(pose or {})
-        unknown = set(pose) - set(POSE)
-        if unknown:
-            raise InputError(f"unknown pose '{unknown.pop()}' (allowed: {', '.join(POSE)})")
+        check_keys(pose, POSE, "pose")
         self.first, self.last = first, last
         x, y, z = (float(value) for value in pivot)
         self.pivot = (x, y, z)

@@ -133,7 +133,7 @@ def ray_jacobian(
     parameters = lens.variables(variables)
     columns = _columns(parameters)
     system, leaves = _with_leaves(lens, parameters)
-    if not _has_kernel(lens, system, rays):
+    if not _has_kernel(system, rays):
         values, derivatives, valid = reference_jacobian(lens, rays, parameters, outputs)
         return RayJacobian(outputs, columns, values, derivatives, valid)
     from dolens.kernels.cpu import derivatives as kernels  # compiles when first needed
@@ -194,7 +194,7 @@ def normal_equations(
     if group is not None:
         group, groups = _checked_groups(group.to(lens.device), shape)
     system, leaves = _with_leaves(lens, parameters)
-    if _has_kernel(lens, system, rays):
+    if _has_kernel(system, rays):
         from dolens.kernels.cpu import derivatives as kernels  # compiles when first needed
 
         flat = flat_rays(system, rays)
@@ -267,11 +267,11 @@ def _with_leaves(
     return lens.system(leaves), list(leaves.values())
 
 
-def _has_kernel(lens: Lens, system: OpticalSystem, rays: Rays) -> bool:
+def _has_kernel(system: OpticalSystem, rays: Rays) -> bool:
     """Whether the CPU's kernels differentiate; on a GPU the reference does, and says so."""
-    chosen = choose_backend(system, lens.backend, rays)
+    chosen = choose_backend(system, rays)
     if chosen == "cuda":
-        if lens.backend == "cuda":
+        if system.backend == "cuda":
             raise InputError("backend 'cuda' has no Jacobians; use 'auto' or 'reference'")
         _say_reference()
     return chosen == "cpu"

@@ -177,7 +177,13 @@ class Lens(nn.Module):
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
         return OpticalSystem(
-            surfaces, thicknesses, sensor_distance, self.materials, self.stop, elements
+            surfaces,
+            thicknesses,
+            sensor_distance,
+            self.materials,
+            self.stop,
+            elements,
+            self.backend,
         )
 
     def forward(self, rays: Rays) -> TracedRays:
@@ -198,7 +204,7 @@ class Lens(nn.Module):
             last: number of the last; given, the trace ends there, in the medium behind it.
         """
         self._check_range(first, last)
-        return trace_rays(self.system(), rays, self.backend, 1.0, record, first, last)
+        return trace_rays(self.system(), rays, 1.0, record, first, last)
 
     def sensor_to_scene(
         self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
@@ -215,7 +221,7 @@ class Lens(nn.Module):
             The rays on surface `first`, travelling towards -z in the medium before it.
         """
         self._check_range(first, last)
-        return trace_rays(self.system(), rays, self.backend, -1.0, record, first, last)
+        return trace_rays(self.system(), rays, -1.0, record, first, last)
 
     def first_order(
         self, wavelength: float | Tensor = 587.5618, object_distance: float | Tensor | None = None

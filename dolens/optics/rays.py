@@ -93,3 +93,7 @@ class TracedRays:
     surface: Tensor
     path_length: Tensor
     points: Tensor | None = None
+
+    def components(self) -> Components:
+        """Position and direction as six tensors of the leading shape."""
+        return Components(*self.position.unbind(-1), *self.direction.unbind(-1))

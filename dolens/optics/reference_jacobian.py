@@ -36,7 +36,7 @@ def reference_jacobian(
     def outputs_of(vector: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         parts = zip(parameters.items(), vector.split(sizes), strict=True)
         system = lens.system({name: part.reshape(p.shape) for (name, p), part in parts})
-        hit = trace_rays(system, rays, "reference", 1.0, False, 1, None)
+        hit = trace_rays(system.traced_by("reference"), rays)
         values = _select(hit, outputs)
         values = torch.where(hit.valid[..., None], values, torch.zeros_like(values))
         return values, (values.detach(), hit.valid)

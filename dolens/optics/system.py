@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ class OpticalSystem:
         materials: before surface 1 and after each surface.
         stop: number of the stop surface, from 1.
         elements: groups of surfaces with a pose of their own.
+        backend: the implementation that traces rays through it: `reference`, `cpu`, `cuda`, or
+            `auto`; see `dolens.optics.backend.choose_backend`.
     """
 
     surfaces: Sequence[SurfaceState]
@@ -30,6 +33,7 @@ class OpticalSystem:
     materials: Sequence[Medium]
     stop: int
     elements: Sequence[ElementState] = ()
+    backend: str = "auto"
 
     def indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
         """Indices before surface 1 and after each surface, at a wavelength in nm.
@@ -68,6 +72,16 @@ class OpticalSystem:
         """Where the lens lives."""
         return self.sensor_distance.device
 
+    @cached_property
+    def rotationally_symmetric(self) -> bool:
+        """Whether nothing in the lens singles out a direction across the axis."""
+        surfaces = all(s.shape.rotational and s.aperture.rotational for s in self.surfaces)
+        return surfaces and not self.elements
+
+    def traced_by(self, backend: str) -> "OpticalSystem":
+        """The same lens, traced by another implementation."""
+        return replace(self, backend=backend)
+
     def double(self) -> "OpticalSystem":
         """The same lens in double precision; gradients flow back to its own tensors."""
         return replace(
@@ -89,11 +103,3 @@ class OpticalSystem:
         return replace(
             self, surfaces=[replace(s, aperture=s.aperture.opened()) for s in self.surfaces]
         )
-
-
-def is_rotationally_symmetric(system: OpticalSystem) -> bool:
-    """Whether nothing in a lens singles out a direction across the axis."""
-    surfaces = all(
-        surface.shape.rotational and surface.aperture.rotational for surface in system.surfaces
-    )
-    return surfaces and not system.elements

@@ -1,4 +1,4 @@
-"""Design variables, merit functions, and the optimizers that fit optics."""
+"""This package holds design variables, merit functions, and the optimizers that fit optics."""
 
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.optimize.merit import MeritFunction

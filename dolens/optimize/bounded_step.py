@@ -1,4 +1,4 @@
-"""The damped step within bounds: a small convex problem, solved exactly.
+"""A damped least-squares step within bounds is a small convex problem, solved exactly here.
 
     minimise ‖b + Rδ‖² + Σ d_j δ_j²   with   lower ≤ δ ≤ upper
 
@@ -20,14 +20,16 @@ _PATIENCE = 3
 
 
 class BoundedStep(NamedTuple):
-    """A step δ (P,) and, for each variable, whether its bound stops it: -1 lower, +1 upper."""
+    """Holds a step δ (P,) and, for each variable, the bound that stops it: -1 lower, +1 upper, 0
+    none.
+    """
 
     step: Tensor
     active: Tensor
 
 
 def damped_step(model: LinearModel, damping: Tensor) -> Tensor:
-    """The minimum without bounds, (P,): (RᵀR + diag d)·δ = -Rᵀb (S15).
+    """Return the step without bounds, (P,): the solution of (RᵀR + diag d)·δ = -Rᵀb (S15).
 
     It is the least-squares solution of the rows R and diag √d together, by an orthogonal
     factorisation, so that its error goes with R's condition number and not with the square.
@@ -40,7 +42,7 @@ def damped_step(model: LinearModel, damping: Tensor) -> Tensor:
 
 
 def bounded_step(model: LinearModel, damping: Tensor, lower: Tensor, upper: Tensor) -> BoundedStep:
-    """The minimum within bounds.
+    """Return the step that minimises the damped sum of squares within bounds.
 
     Args:
         model: R and b.
@@ -84,14 +86,14 @@ def bounded_step(model: LinearModel, damping: Tensor, lower: Tensor, upper: Tens
 def projected_step(
     model: LinearModel, damping: Tensor, lower: Tensor, upper: Tensor
 ) -> BoundedStep:
-    """The minimum without bounds, put back onto them variable by variable (S17)."""
+    """Return the step without bounds, projected onto them variable by variable (S17)."""
     step = damped_step(model, damping)
     active = (step > upper).to(torch.int8) - (step < lower).to(torch.int8)
     return BoundedStep(step.clamp(lower, upper), active)
 
 
 def _solve(model: LinearModel, damping: Tensor, held: Tensor, free: Tensor) -> Tensor:
-    """The minimum over the free variables, the others held."""
+    """Return the minimum over the free variables while the others are held."""
     step = torch.where(free, 0.0, held)
     places = torch.nonzero(free).squeeze(1)
     if len(places) == 0:

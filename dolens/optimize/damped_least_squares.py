@@ -1,4 +1,4 @@
-"""Damped least squares (Levenberg, Marquardt) as an optimizer of PyTorch (S12 to S17)."""
+"""Damped least squares (Levenberg, Marquardt) is an optimizer of PyTorch here (S12 to S17)."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optimize.bounded_step import bounded_step, projected_step
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.residuals import Residuals, TensorResiduals
@@ -27,7 +27,7 @@ _ROUNDING = 8.0 * _EPS
 
 @dataclass(frozen=True)
 class Iteration:
-    """What one call of `step` did.
+    """Reports one call of `step`.
 
     Attributes:
         merit: ‖r‖² at the point reached.
@@ -93,10 +93,8 @@ class DampedLeastSquares(torch.optim.Optimizer):
         gradient_tolerance: float = 1e-12,
         max_trials: int = 40,
     ) -> None:
-        if damping not in DAMPINGS:
-            raise InputError(f"damping must be one of {', '.join(DAMPINGS)}, not '{damping}'")
-        if bounds not in BOUNDS:
-            raise InputError(f"bounds must be one of {', '.join(BOUNDS)}, not '{bounds}'")
+        check_choice(damping, DAMPINGS, "damping")
+        check_choice(bounds, BOUNDS, "bounds")
         for name, value in (
             ("merit_tolerance", merit_tolerance),
             ("step_tolerance", step_tolerance),
@@ -127,12 +125,14 @@ class DampedLeastSquares(torch.optim.Optimizer):
 
     @property
     def _memory(self) -> dict[str, Any]:
-        """What a checkpoint keeps: ρ, the factor of its next growth, D, and why we stopped."""
+        """Return the state for a checkpoint: ρ, the factor of its next growth, D, and the reason to
+        stop.
+        """
         return self.state[self._variables[0]]
 
     @property
     def stopped(self) -> str | None:
-        """Why there is nothing more to gain, in words; None while there may be."""
+        """Return why nothing more can be gained, in words; None while something may be."""
         return self._memory.get("stopped")
 
     def restart(self) -> None:
@@ -162,7 +162,7 @@ class DampedLeastSquares(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Tensor | Residuals]) -> Tensor:
-        """One iteration: a Jacobian, and trials until one of them is better.
+        """Make one iteration: compute a Jacobian, and try steps until one of them is better.
 
         Args:
             closure: evaluates at the variables' values and returns the residuals: a tensor, or an
@@ -239,7 +239,7 @@ class DampedLeastSquares(torch.optim.Optimizer):
         return found
 
     def _weights(self, model: LinearModel) -> Tensor:
-        """D², (P,)."""
+        """Return D², (P,)."""
         columns = model.column_norms
         kept = self._memory.get("columns")
         if self.damping == "identity":
@@ -252,7 +252,7 @@ class DampedLeastSquares(torch.optim.Optimizer):
     # ---------------------------------------------------------------- when to stop
 
     def _solved(self, model: LinearModel, merit: float, lower: Tensor, upper: Tensor) -> str | None:
-        """Why the point where a step would begin is a minimum, or None."""
+        """Return the reason why the point where a step would begin is a minimum, or None."""
         if merit == 0.0:
             return "the merit is zero"
         gradient = model.gradient
@@ -277,7 +277,7 @@ class DampedLeastSquares(torch.optim.Optimizer):
         point: Tensor,
         weight: Tensor,
     ) -> str | None:
-        """Why a step that was taken is the last that matters, or None."""
+        """Return the reason why the step that was taken is the last that matters, or None."""
         if trial <= _EPS**2 * self._memory["first"]:
             return "the residuals have fallen to the rounding of what they were at first"
         gained = merit - trial

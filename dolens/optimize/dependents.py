@@ -1,4 +1,4 @@
-"""Parameters that follow from others: pickups and solves.
+"""Pickups and solves make parameters of a lens follow from others.
 
 A pickup copies another parameter; a solve holds a first-order property at its value.  Both are
 functions of the values that are varied, differentiable, so that a search knows of them.
@@ -10,32 +10,35 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_lens_units
 from dolens.optics.paraxial import first_order, surface_matrix
 
 SOLVES = ("efl", "paraxial_focus", "best_focus")
 
 
 class Dependent(Protocol):
-    """A parameter as a function of the others."""
+    """Computes a parameter from the others."""
 
     name: str
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """From the lens and the values that are known so far, by name."""
+        """Return the parameter's value, from the lens and the values that are known so far, by
+        name.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Pickup:
-    """factor · another parameter + offset, as two radii that must be equal.
+    """Copies another parameter: factor · parameter + offset, as two radii that must be equal.
 
     Attributes:
         name: the parameter that follows.
         source: the one that it follows, of the same shape.
         factor: without a unit.
-        offset: in the parameter's unit.
+        offset: in the lens's own unit of the parameter.
     """
 
     name: str
@@ -44,7 +47,7 @@ class Pickup:
     offset: float = 0.0
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """From the source's own value."""
+        """Return the value that follows from the source's."""
         source = values.get(self.source)
         if source is None:
             source = lens.variables([self.source])[self.source].detach()
@@ -53,7 +56,7 @@ class Pickup:
 
 @dataclass(frozen=True)
 class FocalLength:
-    """The curvature of a surface that gives the lens its focal length.
+    """Solves for the curvature of a surface that gives the lens its focal length.
 
     Power is linear in the curvature of any one surface, P(c) = P(0) + c·(P(1) - P(0)), because it
     enters one matrix of the product; so two evaluations solve for it.
@@ -69,7 +72,7 @@ class FocalLength:
     wavelength: float
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """c where P(c) = 1/EFL, 1/mm."""
+        """Return the curvature c for which P(c) = 1/EFL, 1/mm."""
         stored = lens.variables([self.name])[self.name].detach()
 
         def power(curvature: float) -> Tensor:
@@ -83,7 +86,7 @@ class FocalLength:
 
 @dataclass(frozen=True)
 class ParaxialFocus:
-    """The sensor at the paraxial image of the axis.
+    """Puts the sensor at the paraxial image of the axis.
 
     Attributes:
         wavelength: nm.
@@ -97,19 +100,19 @@ class ParaxialFocus:
     name: str = "sensor_distance"
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """From the last vertex, mm."""
+        """Return the distance of the sensor from the last vertex, mm."""
         system = lens.system({n: v for n, v in values.items() if n != self.name})
         image = first_order(system, self.wavelength, self.object_distance).image
         return image - system.vertices[len(system.surfaces) - 1] + self.defocus
 
 
 def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent | None:
-    """A pickup or a solve as a configuration gives it.
+    """Return the pickup or the solve that a configuration describes.
 
     Args:
         name: the parameter that follows.
-        settings: `pickup` with `factor` and `offset`; or `solve` with `target` (of `efl`) or
-            `defocus` (of `paraxial_focus`).
+        settings: `pickup` with `factor` and `offset` (in the unit of files); or `solve` with
+            `target` (of `efl`) or `defocus` (of `paraxial_focus`), mm.
         lens: whose wavelength and object distance count.
 
     Returns:
@@ -118,9 +121,9 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
     Raises:
         InputError: unknown or missing settings, or a solve for a parameter that it cannot move.
     """
-    wavelength = lens.primary_wavelength
+    wavelength, where = lens.primary_wavelength, f"variable '{name}'"
     if "pickup" in settings:
-        _check(name, settings, ("pickup", "factor", "offset"))
+        check_keys(settings, ("pickup", "factor", "offset"), where)
         source = str(settings["pickup"])
         pair = {**lens.variables([name]), **lens.variables([source])}
         if source == name or set(pair) != {name, source}:
@@ -131,33 +134,22 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
             name,
             source,
             _number(name, settings, "factor", 1.0),
-            _number(name, settings, "offset", 0.0),
+            to_lens_units(name, _number(name, settings, "offset", 0.0)),
         )
     solve = settings["solve"]
     if solve == "efl":
-        _check(name, settings, ("solve", "target"))
+        check_keys(settings, ("solve", "target"), where)
         if not name.endswith(".curvature") or settings.get("target") is None:
             raise InputError(f"variable '{name}': solve 'efl' moves a curvature, to a target in mm")
         return FocalLength(name, _number(name, settings, "target", 0.0), wavelength)
-    if solve not in SOLVES:
-        raise InputError(
-            f"variable '{name}': solve '{solve}' is unknown (allowed: {', '.join(SOLVES)})"
-        )
+    check_choice(solve, SOLVES, f"{where}: solve")
     if name != "sensor_distance":
         raise InputError(f"variable '{name}': solve '{solve}' moves sensor_distance only")
     if solve == "best_focus":
-        _check(name, settings, ("solve",))
+        check_keys(settings, ("solve",), where)
         return None
-    _check(name, settings, ("solve", "defocus"))
+    check_keys(settings, ("solve", "defocus"), where)
     return ParaxialFocus(wavelength, lens.object_distance, _number(name, settings, "defocus", 0.0))
-
-
-def _check(name: str, settings: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
-    for key in settings:
-        if key not in allowed:
-            raise InputError(
-                f"variable '{name}': unknown key '{key}' (allowed: {', '.join(allowed)})"
-            )
 
 
 def _number(name: str, settings: Mapping[str, Any], key: str, default: float) -> float:

@@ -1,4 +1,5 @@
-"""What the terms of a merit function share that are made of rays: how sharp a lens is.
+"""The rays' term of a merit function measures image quality; this module holds what its kinds
+share.
 
 Every ray carries K numbers that a perfect lens would make zero: how far it lands from the reference
 point of its spot, or how far its light runs ahead of the reference sphere.
@@ -15,18 +16,18 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Status, TracedRays
 from dolens.optimize.linear_model import LinearModel
 
 REFERENCES = ("centroid", "chief")
-COLOURS = ("apart", "together")
+SPECTRA = ("monochromatic", "polychromatic")
 
 
 def without_edges(lens: Lens) -> Lens:
-    """A lens whose apertures clip nothing, with the very parameters of this one.
+    """Return a lens whose apertures clip nothing, with the very parameters of this one.
 
     A search for a better lens follows the same rays all the way: one that slips out of an aperture
     would otherwise leave its spot, and make it smaller.
@@ -40,7 +41,7 @@ def without_edges(lens: Lens) -> Lens:
 
 @dataclass(frozen=True)
 class QualityValues:
-    """Rays of a lens, and how good their spots are.
+    """Holds the rays of a lens, and the sizes of their spots or wavefront errors.
 
     Attributes:
         deviations: (N, K), of every ray, double precision; mm, or wavelengths.
@@ -61,21 +62,24 @@ class QualityValues:
 
     @property
     def rms(self) -> Tensor:
-        """(S,), RMS value of each spot: its radius in mm, or its wavefront's error in waves."""
+        """Return the RMS value (S,) of each spot: its radius in mm, or its wavefront error in
+        waves.
+        """
         return self.mean_squares.sqrt()
 
 
 @dataclass(frozen=True)
 class ImageQuality(ABC):
-    """A term of a merit function: Σ W_s·(RMS value of spot s)², or another loss of its rays.
+    """Measures the image quality of a lens as a term of a merit function: Σ W_s·(RMS value of spot
+    s)², or another loss of its rays.
 
     Args:
         spots: the rays, with chief rays where those are the reference.
         weights: (S,), W of each spot.
         reference: deviations count from the spot's `centroid` or from its `chief` ray.
-        colours: `apart`: every wavelength has a reference of its own; `together`: one for all of a
-            field, so that lateral colour counts.
-        most_vignetted: share of a spot that apertures may clip before the lens counts as failed: a
+        reference_spectrum: `monochromatic`: every wavelength has a reference of its own;
+            `polychromatic`: one for all of a field, so that lateral colour counts.
+        max_vignetting: share of a spot that apertures may clip before the lens counts as failed: a
             search would else buy sharpness with light.
 
     Raises:
@@ -85,8 +89,8 @@ class ImageQuality(ABC):
     spots: SpotRays
     weights: Tensor
     reference: str = "centroid"
-    colours: str = "apart"
-    most_vignetted: float = 0.2
+    reference_spectrum: str = "monochromatic"
+    max_vignetting: float = 0.2
 
     # Factor of deviations in the merit, and the unit that they then have.
     scale: ClassVar[float] = 1.0
@@ -97,10 +101,9 @@ class ImageQuality(ABC):
     def __post_init__(self) -> None:
         for what, value, allowed in (
             ("reference", self.reference, REFERENCES),
-            ("colours", self.colours, COLOURS),
+            ("reference_spectrum", self.reference_spectrum, SPECTRA),
         ):
-            if value not in allowed:
-                raise InputError(f"{what} must be one of {', '.join(allowed)}, not '{value}'")
+            check_choice(value, allowed, what)
         if self.reference == "chief" and self.spots.chief is None:
             raise InputError("reference 'chief': these rays hold no chief rays")
 
@@ -108,21 +111,25 @@ class ImageQuality(ABC):
 
     @abstractmethod
     def _traced(self, lens: Lens, hit: TracedRays) -> tuple[Tensor, Tensor]:
-        """(K, N) deviations, referenced, and (K, N) growth, not referenced; with hit's graph."""
+        """Return (K, N) deviations from their references, and (K, N) growth, not referenced; with
+        hit's graph.
+        """
 
     @abstractmethod
     def _rows(self, lens: Lens, names: Sequence[str]) -> Tensor:
-        """(1 + P, K, N): deviations and their derivatives by parameters of a lens, referenced."""
+        """Return (1 + P, K, N): deviations and their derivatives with respect to parameters of a
+        lens, referenced.
+        """
 
     @abstractmethod
     def _slopes(self, growth: Tensor) -> Tensor:
-        """(K, N), how fast referenced deviations grow."""
+        """Return the growth (K, N) of referenced deviations with the sensor's distance."""
 
     # ---------------------------------------------------------------- values
 
     @torch.no_grad()
     def values(self, lens: Lens) -> QualityValues:
-        """Of a lens as it is; rays that its apertures clip count as if they did not."""
+        """Evaluate a lens as it is; rays that its apertures clip count as if they did not."""
         spots = self.spots
         hit = lens.trace(spots.rays)
         deviations, growth = (part.T for part in self._traced(lens, hit))
@@ -134,15 +141,15 @@ class ImageQuality(ABC):
         return QualityValues(deviations, growth, squares, self._merit(deviations), *found)
 
     def is_usable(self, values: QualityValues) -> bool:
-        """Whether every ray arrives, and apertures clip no more than they may."""
-        return not values.failed and values.vignetted <= self.most_vignetted
+        """Return whether every ray arrives, and apertures clip no more than they may."""
+        return not values.failed and values.vignetted <= self.max_vignetting
 
     def slopes(self, values: QualityValues) -> Tensor:
-        """(N, K), how fast the deviations grow with the distance of the sensor."""
+        """Return the derivatives (N, K) of the deviations with respect to the sensor's distance."""
         return self._slopes(values.growth.T).T
 
     def best_focus(self, values: QualityValues, slopes: Tensor) -> float:
-        """How far to move the sensor (mm) to where the sum of squares is least.
+        """Return the shift of the sensor (mm) to where the sum of squares is least.
 
         Rays are straight behind the lens, so that deviations d + k·δz are linear: δz = -d·k/k·k.
         """
@@ -153,7 +160,7 @@ class ImageQuality(ABC):
         return -float((weight * values.deviations * slopes).sum()) / square
 
     def refocused(self, values: QualityValues, slopes: Tensor, shift: float) -> QualityValues:
-        """The same on a sensor that stands farther from the lens by `shift` (mm)."""
+        """Return the values on a sensor that stands farther from the lens by `shift` (mm)."""
         deviations = values.deviations + shift * slopes
         return replace(
             values,
@@ -163,22 +170,20 @@ class ImageQuality(ABC):
         )
 
     def loss(self, lens: Lens, parameters: Mapping[str, Tensor]) -> Tensor:
-        """The term with a graph, where parameters replace a lens's own: for a gradient.
+        """Return the term with a graph to parameters that replace a lens's own.
 
         Args:
             lens: one `without_edges`.
             parameters: name → value.
         """
-        hit = trace_rays(
-            lens.system(parameters), self.spots.rays, lens.backend, 1.0, False, 1, None
-        )
+        hit = trace_rays(lens.system(parameters), self.spots.rays)
         deviations, _ = self._traced(lens, hit)
         return self._loss(deviations)
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
     ) -> tuple[LinearModel, Tensor | None]:
-        """R and b in parameters of a lens, columns in the lens's own order.
+        """Return the linear model in parameters of a lens, columns in the lens's own order.
 
         Args:
             lens: one `without_edges`.
@@ -209,41 +214,41 @@ class ImageQuality(ABC):
 
     @cached_property
     def ray_weights(self) -> Tensor:
-        """(N,): W·w of every ray, the spot's weight times the ray's share."""
+        """Return W·w (N,) of every ray, the spot's weight times the ray's share."""
         return self.weights.to(self.spots.weight)[self.spots.spot] * self.spots.weight
 
     @property
     def _numbers(self) -> int:
-        """K."""
+        """Return K, how many numbers a ray has."""
         return 2
 
     @cached_property
     def group(self) -> Tensor:
-        """(N,), int64: which rays have one reference: those of a spot, or of a field."""
+        """Return the number of each ray's reference group (N,), int64: its spot, or its field."""
         spots = self.spots
-        if self.colours == "apart":
+        if self.reference_spectrum == "monochromatic":
             return spots.spot
         _, field = spots.fields.unique(dim=0, return_inverse=True)
         return field.to(spots.spot.device)[spots.spot]
 
     @cached_property
     def group_weights(self) -> Tensor:
-        """(S,): W of every group, of which there are S at most; they sum to one."""
+        """Return the weight W (S,) of every group, at most S of them; they sum to one."""
         weight = self.ray_weights
         return weight.new_zeros(self.spots.count).index_add(0, self.group, weight)
 
     @cached_property
     def group_shares(self) -> Tensor:
-        """(N,): w of every ray in its group; they sum to one over each."""
+        """Return the share w (N,) of every ray in its group; they sum to one over each."""
         weight, total = self.ray_weights, self.group_weights
         return weight / total.clamp(min=torch.finfo(weight.dtype).tiny)[self.group]
 
     def _referenced(self, points: Tensor) -> Tensor:
-        """Points (..., 2, N) on the sensor, or derivatives of points, from their references."""
+        """Return points (..., 2, N) on the sensor, or their derivatives, less their references."""
         return points - self._reference_points(points)
 
     def _reference_points(self, points: Tensor) -> Tensor:
-        """(..., 2, N): centroid or chief ray of every ray's group."""
+        """Return the reference (..., 2, N) of every ray: centroid or chief ray of its group."""
         spots, group = self.spots, self.group
         if self.reference == "chief":
             return points[..., self._chief_of_rays]
@@ -254,9 +259,11 @@ class ImageQuality(ABC):
 
     @cached_property
     def _chief_of_rays(self) -> Tensor:
-        """(N,), int64: each ray's chief ray; that of the middle wavelength where colours join."""
+        """Return the number of each ray's chief ray (N,), int64; for a polychromatic reference that
+        of the middle wavelength.
+        """
         spots = self.spots
-        if self.colours == "apart":
+        if self.reference_spectrum == "monochromatic":
             return spots.chief[spots.spot]
         group_of_spot = torch.zeros_like(spots.chief)
         group_of_spot[spots.spot] = self.group
@@ -271,7 +278,7 @@ class ImageQuality(ABC):
         return squares.new_zeros(self.spots.count).index_add(0, self.spots.spot, squares)
 
     def _loss(self, deviations: Tensor) -> Tensor:
-        """The term, of deviations (K, N)."""
+        """Return the term for deviations (K, N)."""
         squares = self.ray_weights * deviations.square().sum(0)
         return self.scale**2 * squares.sum()
 

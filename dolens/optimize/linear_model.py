@@ -1,4 +1,4 @@
-"""The linear model of a least-squares problem, small whatever the number of its residuals.
+"""The linear model of a least-squares problem is small, whatever the number of its residuals.
 
 Near a point r(u + δ) ≈ r + J·δ, and all that a step needs of J (N × P) is a matrix R of few rows
 with RᵀR = JᵀJ and a vector b with Rᵀb = Jᵀr: then ‖r + Jδ‖² = ‖b + Rδ‖² + what no δ changes.
@@ -14,7 +14,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class LinearModel:
-    """Residuals that change by J·δ.  P variables; K rows, P or more; double precision, CPU.
+    """Describes residuals that change by J·δ.  P variables; K rows, P or more; double precision,
+    CPU.
 
     Attributes:
         sum_of_squares: ‖r‖².
@@ -28,7 +29,7 @@ class LinearModel:
 
     @staticmethod
     def of_rows(residuals: Tensor, jacobian: Tensor) -> "LinearModel":
-        """From r (N,) and J (N, P), by an orthogonal factorisation.
+        """Return the model of r (N,) and J (N, P), by an orthogonal factorisation.
 
         J = QR and b = Qᵀr: unlike the normal equations this does not square J's condition number.
         """
@@ -43,7 +44,7 @@ class LinearModel:
 
     @staticmethod
     def of_sums(sum_of_squares: float, jtr: Tensor, jtj: Tensor) -> "LinearModel":
-        """From ‖r‖², Jᵀr (P,) and JᵀJ (P, P), where J itself was never stored.
+        """Return the model of ‖r‖², Jᵀr (P,) and JᵀJ (P, P), where J itself was never stored.
 
         JᵀJ = VΛVᵀ gives R = Λ½Vᵀ.  Directions whose eigenvalue is below rounding are left out: the
         sums do not know them.
@@ -60,7 +61,7 @@ class LinearModel:
 
     @staticmethod
     def join(models: Sequence["LinearModel"]) -> "LinearModel":
-        """The model of all residuals together, of several parts over the same variables."""
+        """Return the model of all residuals together, of several parts over the same variables."""
         if len(models) == 1:
             return models[0]
         root = torch.cat([model.root for model in models])
@@ -69,25 +70,25 @@ class LinearModel:
         return LinearModel(sum(model.sum_of_squares for model in models), joined.root, joined.right)
 
     def scaled(self, factor: float) -> "LinearModel":
-        """Of residuals that are this many times as large."""
+        """Return the model of residuals that are this many times as large."""
         return LinearModel(factor**2 * self.sum_of_squares, factor * self.root, factor * self.right)
 
     def of_variables(self, derivatives: Tensor) -> "LinearModel":
-        """In other variables u, from the derivatives ∂θ/∂u (P, Q) of these ones by them."""
+        """Return the model in other variables u, from the derivatives ∂θ/∂u (P, Q)."""
         return LinearModel(self.sum_of_squares, self.root @ _on_cpu(derivatives), self.right)
 
     @cached_property
     def column_norms(self) -> Tensor:
-        """(P,), ‖J_j‖: how much the residuals change with each variable."""
+        """Return ‖J_j‖ (P,): how much the residuals change with each variable."""
         return torch.linalg.vector_norm(self.root, dim=0)
 
     @cached_property
     def gradient(self) -> Tensor:
-        """(P,), Jᵀr: half the gradient of ‖r‖²."""
+        """Return Jᵀr (P,): half the gradient of ‖r‖²."""
         return self.root.T @ self.right
 
     def reduction(self, step: Tensor) -> float:
-        """‖r‖² - ‖r + Jδ‖², which the model predicts of a step δ (P,)."""
+        """Return ‖r‖² - ‖r + Jδ‖², which the model predicts of a step δ (P,)."""
         change = self.root @ step
         return float(-(change @ (change + 2.0 * self.right)))
 

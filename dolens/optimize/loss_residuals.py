@@ -1,6 +1,6 @@
-"""Least squares for any loss of the points where rays land.
+"""Any loss of the ray intercepts can be minimised by least squares.
 
-A loss L(p) of landing points p has the gradient g = ∂L/∂p for each ray.  With rows √(κ·w)·J and
+A loss L(p) of ray intercepts p has the gradient g = ∂L/∂p for each ray.  With rows √(κ·w)·J and
 residuals g/(2·√(κ·w)) the step of damped least squares minimises
 
     L + g·Jδ + κ·Σ w·|(J - J̄)δ|²,
@@ -11,7 +11,7 @@ spots' size does.  There are two choices for it:
 
 - `step`: one κ, the ratio of both second derivatives along the step that it leads to;
 - `directions`: a κ for each of P directions of the variables, in which the loss's second
-  derivative over the landing points, seen through J, and the spots' size are both diagonal.
+  derivative over the ray intercepts, seen through J, and the spots' size are both diagonal.
 
 For the squared spot radius every κ is 1, and the step is the classical one.
 """
@@ -23,10 +23,10 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import check_choice
 from dolens.optics.lens import Lens
-from dolens.optimize.landing_points import LandingPoints
 from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.ray_intercepts import RayInterceptQuality
 
 CURVATURES = ("directions", "step")
 # Directions that move rays less than this part of what the strongest does are left out.
@@ -34,8 +34,8 @@ _LEAST_MOVE = 1e-10
 
 
 @dataclass(frozen=True)
-class Spots:
-    """Rays by spots, as a loss of landing points sees them.
+class RayGroups:
+    """Assigns rays to the groups that share a reference, for losses of ray intercepts.
 
     Attributes:
         weight: (N,), share of every ray in its group; they sum to one over each.
@@ -48,27 +48,27 @@ class Spots:
     group_weights: Tensor
 
 
-class LandingPointLoss(Protocol):
-    """A smooth scalar of where rays land, twice differentiable."""
+class RayInterceptLoss(Protocol):
+    """Computes a smooth scalar of the ray intercepts, twice differentiable."""
 
-    def __call__(self, points: Tensor, spots: Spots) -> Tensor:
-        """Of deviations (2, N), mm, from their groups' references."""
+    def __call__(self, points: Tensor, groups: RayGroups) -> Tensor:
+        """Return the loss of deviations (2, N), mm, from their groups' references."""
         ...
 
 
 @dataclass(frozen=True)
-class LossResiduals(LandingPoints):
-    """A loss of the landing points as the rays' residuals.
+class LossResiduals(RayInterceptQuality):
+    """Gives a loss of the ray intercepts a linear model, so that least squares minimises it.
 
     Args:
-        landing_loss: of deviations from the reference.
+        intercept_loss: of deviations from the reference.
         curvature: `directions` or `step`, see above.
 
     Raises:
         InputError: an unknown curvature.
     """
 
-    landing_loss: LandingPointLoss | Callable[[Tensor, Spots], Tensor] | None = None
+    intercept_loss: RayInterceptLoss | Callable[[Tensor, RayGroups], Tensor] | None = None
     curvature: str = "directions"
 
     unit: ClassVar[str] = "loss"
@@ -76,15 +76,12 @@ class LossResiduals(LandingPoints):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.curvature not in CURVATURES:
-            raise InputError(
-                f"curvature must be one of {', '.join(CURVATURES)}, not '{self.curvature}'"
-            )
+        check_choice(self.curvature, CURVATURES, "curvature")
 
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
     ) -> tuple[LinearModel, Tensor | None]:
-        """R and b; ‖b‖² is not the loss, whose value a merit function asks for apart."""
+        """Return R and b; ‖b‖² is not the loss, whose value a merit function asks for apart."""
         rows = self._rows(lens, names)
         points, jacobian = rows[0], rows[1:].flatten(1).T
         root = self.ray_weights.sqrt().repeat(2)
@@ -120,7 +117,7 @@ class LossResiduals(LandingPoints):
         return LinearModel(float(right @ right), rows, right), None
 
     def _derivatives(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """∂L/∂p (2, N), and the product of ∂²L/∂p² with displacements (D, 2, N) of the rays."""
+        """Return ∂L/∂p (2, N), and the product of ∂²L/∂p² with rays' displacements (D, 2, N)."""
         points = points.detach().requires_grad_()
         with torch.enable_grad():
             (gradient,) = torch.autograd.grad(self._loss(points), points, create_graph=True)
@@ -134,5 +131,5 @@ class LossResiduals(LandingPoints):
         return gradient.detach(), product
 
     def _loss(self, deviations: Tensor) -> Tensor:
-        spots = Spots(self.group_shares, self.group, self.group_weights)
-        return self.landing_loss(deviations, spots)
+        groups = RayGroups(self.group_shares, self.group, self.group_weights)
+        return self.intercept_loss(deviations, groups)

@@ -1,9 +1,8 @@
-"""The merit function of a design: its spots and its operands, as residuals of least squares."""
+"""The merit function of a design gives its spots and its operands as residuals of least squares."""
 
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -11,33 +10,16 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.image_quality import ImageQuality, QualityValues, without_edges
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operands import Operand, UnreachableField, View
+from dolens.optimize.operand_values import OperandValue, OperandValues, evaluate_operands
+from dolens.optimize.operands import Operand, UnreachableField
 from dolens.optimize.variables import DesignVariables
 
 
-@dataclass(frozen=True)
-class OperandValue:
-    """An operand at a point of the search.
-
-    Attributes:
-        label: its kind, and which gap or field.
-        value: in its own unit.
-        deviation: from its target, or beyond its limits.
-        weight: of the deviation.
-    """
-
-    label: str
-    value: float
-    deviation: float
-    weight: float
-
-
 class MeritFunction:
-    """How sharp a lens is + Σ (weight·deviation of an operand)².
+    """Sums image quality and Σ (weight·deviation of an operand)².
 
     The first is Σ W_s·(RMS radius of spot s, µm)², or what else an `ImageQuality` sums up.
 
@@ -70,7 +52,7 @@ class MeritFunction:
         self._last: tuple[Tensor, MeritValue] | None = None
 
     def __call__(self) -> "MeritValue":
-        """The merit at the variables' values; what a `DampedLeastSquares` takes as closure."""
+        """Return the merit at the variables' values; `DampedLeastSquares` takes it as closure."""
         point = self.variables.scaled.detach()
         # A step begins where the last trial of the one before it ended.
         if self._last is None or not torch.equal(self._last[0], point):
@@ -79,7 +61,7 @@ class MeritFunction:
 
 
 class MeritValue:
-    """A merit function where its variables are; it is not to outlive their next move.
+    """Evaluates a merit function at its variables; it is not to outlive their next move.
 
     Attributes:
         quality: values of the rays, or None without them.
@@ -108,10 +90,7 @@ class MeritValue:
             self._found = _operands(merit, self._sensor if merit.variables.best_focus else None)
         self.operands: list[OperandValue] | None = None
         if self._found is not None:
-            self.operands = [
-                OperandValue(label, value.item(), operand.deviation(value).item(), operand.weight)
-                for operand, label, value in self._found
-            ]
+            self.operands = self._found.numbers()
 
     @torch.no_grad()
     def write_to(self, lens: Lens) -> None:
@@ -120,7 +99,7 @@ class MeritValue:
         lens.sensor_distance.fill_(self.sensor_distance)
 
     def sum_of_squares(self) -> float:
-        """The merit; `inf` where rays fail or a chief ray cannot be found."""
+        """Return the merit; `inf` where rays fail or a chief ray cannot be found."""
         if self.operands is None:
             return math.inf
         total = sum((item.weight * item.deviation) ** 2 for item in self.operands)
@@ -131,7 +110,7 @@ class MeritValue:
         return total
 
     def loss(self) -> Tensor:
-        """The merit with a graph to the variables, for an optimizer that takes gradients.
+        """Return the merit with a graph to the variables, for an optimizer that takes gradients.
 
         A best focus has no graph: there the sharpness does not change with the focus.  Operands
         that do are seen as if the sensor stood still.
@@ -144,12 +123,12 @@ class MeritValue:
             if merit.variables.best_focus:
                 values["sensor_distance"] = merit.lens.sensor_distance.detach()
             parts.append(merit.quality.loss(merit.opened, values))
-        for operand, _, value in _operands(merit) or []:
-            parts.append((operand.weight * operand.deviation(value)).square().reshape(()))
+        found = _operands(merit)
+        parts += found.penalties() if found is not None else []
         return torch.stack([part.double() for part in parts]).sum()
 
     def linear_model(self) -> LinearModel:
-        """R and b in the variables u."""
+        """Return R and b in the variables u."""
         merit, models = self._merit, []
         if merit.quality is not None:
             names, matrix = merit.variables.derivatives()
@@ -157,14 +136,13 @@ class MeritValue:
             models.append(model.of_variables(matrix))
             self._focus = None if of_lens is None else of_lens @ matrix
         if self.operands:
-            owners, _, values = zip(*self._found, strict=True)
-            found = torch.stack([value.detach().reshape(()).double().cpu() for value in values])
-            model = OperandModel(owners, found, self.operand_derivatives())
-            models.append(model.near(found.new_zeros(model.derivatives.shape[1])))
+            model = OperandModel.of(self._found, self.operand_derivatives())
+            models.append(model.near(model.values.new_zeros(model.derivatives.shape[1])))
         return LinearModel.join(models)
 
     def operand_derivatives(self) -> Tensor:
-        """(n, P): of every operand's value by the variables u, in the order of `operands`.
+        """Return the derivatives (n, P) of every operand's value with respect to the variables u,
+        in the order of `operands`.
 
         Once the linear model is known the sensor moves with a best focus; before, it stands still.
         """
@@ -175,32 +153,22 @@ class MeritValue:
 
     @cached_property
     def _operand_rows(self) -> Tensor:
-        """(n, P + 1): of every operand by the variables and, last, by the sensor's distance."""
-        scaled = self._merit.variables.scaled
-        if not self._found:
-            return scaled.new_zeros(0, scaled.numel() + 1).double().cpu()
-        with torch.enable_grad():
-            values = torch.stack([value.reshape(()) for _, _, value in self._found])
-            return jacobian_of(values, [scaled, self._sensor]).double().cpu()
+        """Return the derivatives (n, P + 1) of every operand with respect to the variables and,
+        last, to the sensor's distance.
+        """
+        leaves = [self._merit.variables.scaled, self._sensor]
+        return (self._found or OperandValues((), (), ())).derivatives(leaves)
 
 
-def _operands(
-    merit: MeritFunction, sensor_distance: Tensor | None = None
-) -> list[tuple[Operand, str, Tensor]] | None:
-    """Every operand with its labels and values; None where one cannot be evaluated."""
-    if not merit.operands:
-        return []
-    lens, parameters = merit.lens, merit.variables()
+def _operands(merit: MeritFunction, sensor_distance: Tensor | None = None) -> OperandValues | None:
+    """Return the operands' values; None where one cannot be evaluated."""
+    parameters = merit.variables()
     if sensor_distance is not None:
         parameters["sensor_distance"] = sensor_distance
-    view = View(
-        lens.system(parameters), lens.primary_wavelength, lens.object_distance, merit.crossings
-    )
+    lens = merit.lens
     try:
-        return [
-            (operand, label, value)
-            for operand in merit.operands
-            for label, value in operand.values(view).items()
-        ]
+        return evaluate_operands(
+            merit.operands, lens, parameters, lens.object_distance, merit.crossings
+        )
     except UnreachableField:
         return None

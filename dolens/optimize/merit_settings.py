@@ -1,4 +1,4 @@
-"""A merit function as a configuration describes it."""
+"""A configuration describes a merit function by these settings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,14 +13,14 @@ from dolens.analysis.pupil_quadrature import (
     square_grid,
     with_chief_rays,
 )
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.optics.lens import Lens
 from dolens.optimize.image_quality import ImageQuality
-from dolens.optimize.landing_losses import EncircledEnergy, Modulation, SpotSize
-from dolens.optimize.loss_residuals import LossResiduals
+from dolens.optimize.loss_residuals import LossResiduals, RayInterceptLoss
 from dolens.optimize.merit import MeritFunction
-from dolens.optimize.operands import operand
-from dolens.optimize.spot_residuals import SpotResiduals
+from dolens.optimize.operands import Operand, operand
+from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation, SpotSize
+from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
@@ -30,7 +30,7 @@ SAMPLINGS: dict[str, Callable[..., SpotRays]] = {
 }
 # Residuals of rays, and losses of the points where they land.
 RESIDUALS: dict[str, type[ImageQuality]] = {
-    "spots": SpotResiduals,
+    "spots": RayInterceptResiduals,
     "wavefront": WavefrontResiduals,
 }
 LOSSES = {"spot_size": SpotSize, "modulation": Modulation, "encircled_energy": EncircledEnergy}
@@ -38,7 +38,7 @@ LOSSES = {"spot_size": SpotSize, "modulation": Modulation, "encircled_energy": E
 
 @dataclass(frozen=True)
 class MeritSettings:
-    """Which spots of a lens count, and what else it should be.
+    """Describes the spots of a lens that count, and the operands that constrain it.
 
     Attributes:
         fields: (x, y), degrees or mm; None: the lens's own.
@@ -49,13 +49,16 @@ class MeritSettings:
         sampling_options: what that function takes: `rings` and `arms`, or `count` and `half_width`;
             None leaves one at its default, in all options.
         quality: `spots`: RMS radii, µm; `wavefront`: RMS wavefront errors, wavelengths; a loss of
-            landing points: `modulation`, `encircled_energy` or `spot_size`; None: operands alone.
-        quality_options: of a loss, see `dolens.optimize.landing_losses`, and its `curvature`, see
-            `dolens.optimize.loss_residuals`.
+            ray intercepts: `modulation`, `encircled_energy`, `spot_size`, or an object that is
+            called as `RayInterceptLoss` is; None: operands alone.
+        quality_options: of a loss by name, see `dolens.optimize.ray_intercept_losses`; and the
+            `curvature` of any loss, see `dolens.optimize.loss_residuals`.
         reference: deviations count from the spot's `centroid` or its `chief` ray.
-        colours: wavelengths have references `apart`, or one for each field `together`.
-        most_vignetted: share of a spot that apertures may clip; see `ImageQuality`.
-        operands: settings of each, as `dolens.optimize.operands.operand` takes them.
+        reference_spectrum: `monochromatic`: each wavelength has a reference of its own; or
+            `polychromatic`: one for all wavelengths of a field.
+        max_vignetting: share of a spot that apertures may clip; see `ImageQuality`.
+        operands: each by its settings, as `dolens.optimize.operands.operand` takes them, or as an
+            object.
     """
 
     fields: Sequence[Sequence[float]] | None = None
@@ -64,15 +67,15 @@ class MeritSettings:
     wavelength_weights: Sequence[float] | None = None
     sampling: str = "gaussian_quadrature"
     sampling_options: Mapping[str, Any] = field(default_factory=dict)
-    quality: str | None = "spots"
+    quality: str | RayInterceptLoss | None = "spots"
     quality_options: Mapping[str, Any] = field(default_factory=dict)
     reference: str = "centroid"
-    colours: str = "apart"
-    most_vignetted: float = 0.2
-    operands: Sequence[Mapping[str, Any]] = ()
+    reference_spectrum: str = "monochromatic"
+    max_vignetting: float = 0.2
+    operands: Sequence[Mapping[str, Any] | Operand] = ()
 
     def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
-        """(x, y) of every field that counts, degrees or mm.
+        """Return (x, y) of every field that counts, degrees or mm.
 
         Raises:
             InputError: neither the settings nor the lens name any.
@@ -84,7 +87,7 @@ class MeritSettings:
         return lens.fields.points
 
     def wavelengths_of(self, lens: Lens) -> Sequence[float]:
-        """Of every colour that counts, nm.
+        """Return every wavelength that counts, nm.
 
         Raises:
             InputError: neither the settings nor the lens name any.
@@ -95,36 +98,35 @@ class MeritSettings:
         return wavelengths
 
     def rays(self, lens: Lens) -> SpotRays:
-        """The rays of all spots that pass the lens as it is now.
+        """Return the rays of all spots that pass the lens as it is now.
 
         Raises:
             InputError: no fields or wavelengths, or an unknown sampling or option.
         """
-        if self.sampling not in SAMPLINGS:
-            raise InputError(
-                f"merit.sampling: '{self.sampling}' is unknown (allowed: {', '.join(SAMPLINGS)})"
-            )
+        check_choice(self.sampling, SAMPLINGS, "merit.sampling")
         fields, wavelengths = self.fields_of(lens), self.wavelengths_of(lens)
         options = _given(self.sampling_options)
         if self.sampling == "gaussian_quadrature":
             options.setdefault("object_distance", lens.object_distance)
             # A loss sees all of a spot, not one half that stands for both.
-            options.setdefault("symmetry", self.quality not in LOSSES)
+            options.setdefault(
+                "symmetry", not callable(self.quality) and self.quality not in LOSSES
+            )
         elif lens.object_distance is not None:
             raise InputError(
                 f"merit.sampling: '{self.sampling}' is for objects at infinity; lens "
                 f"'{lens.name}' has object_distance {lens.object_distance:g} mm"
             )
-        try:
-            rays = SAMPLINGS[self.sampling](lens, fields, wavelengths, **options)
-        except TypeError as error:
-            raise InputError(f"merit.sampling_options: {error}") from None
+        sampling = SAMPLINGS[self.sampling]
+        rays = call_with_settings(
+            sampling, options, "merit.sampling_options", lens, fields, wavelengths
+        )
         if self.reference == "chief":
             return with_chief_rays(lens, rays, lens.object_distance)
         return rays
 
     def weights(self, rays: SpotRays) -> Tensor:
-        """(S,), of every spot; they sum to one."""
+        """Return the weight (S,) of every spot; they sum to one."""
         number = len(rays.wavelengths.unique())
         of_fields = _weights("field_weights", self.field_weights, rays.count // number)
         of_waves = _weights("wavelength_weights", self.wavelength_weights, number)
@@ -132,7 +134,7 @@ class MeritSettings:
         return weights / weights.sum()
 
     def build(self, lens: Lens, variables: DesignVariables) -> MeritFunction:
-        """The merit function, over rays that pass the lens as it is now.
+        """Return the merit function, over rays that pass the lens as it is now.
 
         Raises:
             InputError: an unknown quality or option, or nothing that counts.
@@ -143,28 +145,33 @@ class MeritSettings:
         return MeritFunction(lens, variables, self.image_quality(lens), operands)
 
     def image_quality(self, lens: Lens) -> ImageQuality | None:
-        """The term of the rays."""
+        """Return the rays' term over rays that pass the lens as it is now; None without one."""
         if self.quality is None:
             return None
-        allowed = (*RESIDUALS, *LOSSES)
-        if self.quality not in allowed:
-            raise InputError(
-                f"merit.quality: '{self.quality}' is unknown (allowed: {', '.join(allowed)})"
-            )
+        own_loss = self.quality if callable(self.quality) else None
+        if own_loss is None:
+            check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
         rays = self.rays(lens)
-        common = (rays, self.weights(rays), self.reference, self.colours, self.most_vignetted)
-        options = _given(self.quality_options)
-        try:
-            if self.quality in RESIDUALS:
-                return RESIDUALS[self.quality](*common, **options)
-            curvature = options.pop("curvature", "directions")
-            return LossResiduals(*common, LOSSES[self.quality](**options), curvature)
-        except TypeError as error:
-            raise InputError(f"merit.quality_options: {error}") from None
+        common = (
+            rays,
+            self.weights(rays),
+            self.reference,
+            self.reference_spectrum,
+            self.max_vignetting,
+        )
+        options, where = _given(self.quality_options), "merit.quality_options"
+        if own_loss is None and self.quality in RESIDUALS:
+            return call_with_settings(RESIDUALS[self.quality], options, where, *common)
+        curvature = options.pop("curvature", "directions")
+        if own_loss is None:
+            loss = call_with_settings(LOSSES[self.quality], options, where)
+            return LossResiduals(*common, loss, curvature)
+        check_keys(options, ("curvature",), where)
+        return LossResiduals(*common, own_loss, curvature)
 
 
 def _given(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Without those that are None, which stand for a default."""
+    """Return the options without those that are None, which stand for a default."""
     return {key: value for key, value in options.items() if value is not None}
 
 

@@ -1,4 +1,4 @@
-"""Operands near a point, as residuals that are linear in the variables between their limits."""
+"""Near a point, operands give residuals that are linear in the variables between their limits."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,20 +7,20 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
-from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.linear_model import LinearModel
-from dolens.optimize.operands import Operand, View
+from dolens.optimize.operand_values import OperandValues, evaluate_operands
+from dolens.optimize.operands import Operand
 from dolens.optimize.variables import DesignVariables
 
 
 @dataclass(frozen=True)
 class OperandModel:
-    """Values v + V·δ of operands at a step δ (P,).  Double precision, CPU.
+    """Predicts values v + V·δ of operands after a step δ (P,).  Double precision, CPU.
 
     Attributes:
         operands: of each value its own; one that has several values is there several times.
         values: v (n,), each in its own unit.
-        derivatives: V (n, P), by the variables.
+        derivatives: V (n, P), with respect to the variables.
     """
 
     operands: tuple[Operand, ...]
@@ -28,16 +28,16 @@ class OperandModel:
     derivatives: Tensor
 
     @staticmethod
-    def of(
+    def at(
         lens: Lens,
         variables: DesignVariables,
         operands: Sequence[Operand],
         object_distance: float | None,
     ) -> "OperandModel":
-        """At the variables' values.
+        """Return the model at the variables' values.
 
         Args:
-            lens: that they belong to.
+            lens: the lens that they belong to.
             variables: u.
             operands: none is allowed.
             object_distance: mm in front of the first vertex; None for infinity.
@@ -45,24 +45,24 @@ class OperandModel:
         Raises:
             UnreachableField: a chief ray does not reach the stop.
         """
-        if not operands:
-            empty = torch.zeros(0, dtype=torch.float64)
-            return OperandModel((), empty, empty.new_zeros(0, variables.scaled.numel()))
         with torch.enable_grad():
-            view = View(lens.system(variables()), lens.primary_wavelength, object_distance)
-            found = [(entry, v) for entry in operands for v in entry.values(view).values()]
-            values = torch.stack([value.reshape(()) for _, value in found])
-            derivatives = jacobian_of(values, [variables.scaled])
-        owners = tuple(entry for entry, _ in found)
-        return OperandModel(owners, values.detach().double().cpu(), derivatives.double().cpu())
+            found = evaluate_operands(operands, lens, variables(), object_distance)
+        return OperandModel.of(found, found.derivatives([variables.scaled]))
+
+    @staticmethod
+    def of(found: OperandValues, derivatives: Tensor) -> "OperandModel":
+        """Return the model of n values with these derivatives (n, P)."""
+        return OperandModel(found.operands, found.vector(), derivatives)
 
     def gradient(self, step: Tensor) -> Tensor:
-        """Of Σ (weight·deviation)² after a step, by the variables, (P,)."""
+        """Return the gradient (P,) of Σ (weight·deviation)² with respect to the variables, after a
+        step.
+        """
         weight, deviations = self._at(step)
         return 2.0 * self.derivatives.T @ (weight.square() * deviations)
 
     def near(self, step: Tensor) -> LinearModel:
-        """Residuals of the targets, and of the limits that are broken after a step.
+        """Return residuals of the targets, and of the limits that are broken after a step.
 
         A limit that is kept there has no slope.  The model is of steps from v, not from there.
         """

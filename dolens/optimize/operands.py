@@ -1,4 +1,5 @@
-"""What a lens should be besides sharp: focal lengths, thicknesses, angles, distortion.
+"""Operands constrain properties of a lens besides sharpness: focal lengths, thicknesses, angles,
+distortion.
 
 An operand is a property of the lens, one number or several of a kind, with a target or with limits.
 A target t contributes (weight·(v - t))² to the merit function, a limit only the part of v that is
@@ -14,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.aiming import aim
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import FirstOrder, first_order
@@ -26,7 +27,8 @@ _KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
 
 
 class UnreachableField(ArithmeticError):
-    """The chief ray of a field does not reach the stop: the lens cannot be judged.
+    """Says that the chief ray of a field does not reach the stop, so that the lens cannot be
+    judged.
 
     Args:
         field: (x, y), degrees or mm.
@@ -42,14 +44,14 @@ class UnreachableField(ArithmeticError):
 
 
 @dataclass(frozen=True)
-class View:
-    """A lens at the values of a search, as operands see it.
+class LensProperties:
+    """Computes properties of a lens at a point of a search, each once for all operands.
 
     Attributes:
         system: with a graph to the variables.
         wavelength: nm, the reference wavelength.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        crossings: where the chief rays of the last view crossed the front; this one leaves its own
+        crossings: where chief rays crossed the front at an earlier point; this point's are stored
             there for the next.
     """
 
@@ -61,17 +63,17 @@ class View:
 
     @cached_property
     def first_order(self) -> FirstOrder:
-        """Computed once for all operands."""
+        """Return first-order properties, computed once for all operands."""
         return first_order(self.system, self.wavelength, self.object_distance)
 
     @cached_property
     def rim_sags(self) -> list[Tensor]:
-        """Sag (mm) of every surface at the edge of its own aperture."""
+        """Return the sag (mm) of every surface at the edge of its own aperture."""
         like = self.system.vertices[-1]
         return [surface.rim_sag(like) for surface in self.system.surfaces]
 
     def chief_ray(self, field: tuple[float, float]) -> Components:
-        """The real chief ray of a field on the sensor plane, aimed once for all operands.
+        """Return the real chief ray of a field on the sensor plane, aimed once for all operands.
 
         Raises:
             UnreachableField: it does not reach the stop.
@@ -99,79 +101,87 @@ class View:
 
 @dataclass(frozen=True)
 class Operand:
-    """A property of a lens with a target or limits.
+    """Wants a property of a lens at a target or within limits.
+
+    A subclass with another `values` is a new operand; `_target_` names it in a configuration.
 
     Attributes:
-        kind: a name in `KINDS`.
-        target: what it should be; None where only limits are given.
-        low: the least that costs nothing; None for no limit.
-        high: the most that costs nothing.
+        kind: a name in `KINDS`; of a subclass, its label.
+        target: what the property should be; None where only limits are given.
+        min: the least that costs nothing; None for no limit.
+        max: the most that costs nothing.
         weight: factor of the residual: merit counts (weight·deviation)².
         field: (x, y) of the chief ray, degrees or mm, of operands that have one.
         gaps: numbers of the gaps, of operands that have them; None for all of their kind.
+
+    Raises:
+        InputError: no target and no limit, or both; limits that exclude each other; a weight that
+            is not positive; or a field that is not x and y.
     """
 
     kind: str
     target: float | None = None
-    low: float | None = None
-    high: float | None = None
+    min: float | None = None
+    max: float | None = None
     weight: float = 1.0
     field: tuple[float, float] = (0.0, 0.0)
     gaps: tuple[int, ...] | None = None
 
-    def values(self, view: View) -> dict[str, Tensor]:
-        """Label → value, a scalar with a graph, in the property's own unit."""
-        return KINDS[self.kind](self, view)
+    def __post_init__(self) -> None:
+        where = f"operand '{self.kind}'"
+        limits = self.min is not None or self.max is not None
+        if limits == (self.target is not None):
+            raise InputError(f"{where}: give a target, or limits (min, max), one of the two")
+        if None not in (self.min, self.max) and self.min > self.max:
+            raise InputError(f"{where}: min exceeds max")
+        if not self.weight > 0.0:
+            raise InputError(f"{where}: weight must be positive, not {self.weight:g}")
+        if len(self.field) != 2:
+            raise InputError(f"{where}: field is x and y, not {self.field}")
+
+    def values(self, lens: LensProperties) -> dict[str, Tensor]:
+        """Return label → value, a scalar with a graph, in the property's own unit."""
+        return KINDS[self.kind](self, lens)
 
     def deviation(self, value: Tensor) -> Tensor:
-        """What is amiss: value - target, or the part of it beyond the limits, with its sign."""
+        """Return value - target, or the part of the value beyond the limits, with its sign."""
         if self.target is not None:
             return value - self.target
-        below = 0.0 if self.low is None else (value - self.low).clamp(max=0.0)
-        above = 0.0 if self.high is None else (value - self.high).clamp(min=0.0)
+        below = 0.0 if self.min is None else (value - self.min).clamp(max=0.0)
+        above = 0.0 if self.max is None else (value - self.max).clamp(min=0.0)
         return below + above
 
 
-def operand(settings: Mapping[str, Any], lens: Lens) -> Operand:
-    """An operand as a configuration gives it.
+def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
+    """Return the operand that a configuration describes.
 
     Args:
-        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`.
+        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`; or an operand,
+            which is returned as it is.
         lens: that it is meant for.
 
     Raises:
-        InputError: an unknown key or kind, no target and no limit, or both, a weight that is not
-            positive, or a gap that the lens does not have.
+        InputError: an unknown key or kind, a value that `Operand` refuses, or a gap that the lens
+            does not have.
     """
+    if isinstance(settings, Operand):
+        return settings
     kind = settings.get("kind")
-    if kind not in KINDS:
-        raise InputError(f"operand: kind '{kind}' is unknown (allowed: {', '.join(KINDS)})")
-    for key in settings:
-        if key not in _KEYS:
-            raise InputError(f"operand '{kind}': unknown key '{key}' (allowed: {', '.join(_KEYS)})")
-    numbers = {
-        key: None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
+    check_choice(kind, KINDS, "operand: kind")
+    check_keys(settings, _KEYS, f"operand '{kind}'")
+    target, low, high = (
+        None if settings.get(key) is None else _number(settings[key], f"{kind}: {key}")
         for key in ("target", "min", "max")
-    }
-    limits = numbers["min"] is not None or numbers["max"] is not None
-    if limits == (numbers["target"] is not None):
-        raise InputError(f"operand '{kind}': give a target, or limits (min, max), one of the two")
-    if None not in (numbers["min"], numbers["max"]) and numbers["min"] > numbers["max"]:
-        raise InputError(f"operand '{kind}': min exceeds max")
+    )
     weight = _number(settings.get("weight", 1.0), f"{kind}: weight")
-    if not weight > 0.0:
-        raise InputError(f"operand '{kind}': weight must be positive, not {weight:g}")
     field = tuple(_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0))
-    if len(field) != 2:
-        raise InputError(f"operand '{kind}': field is x and y, not {field}")
-    gaps = settings.get("gaps")
-    count = len(lens.thicknesses)
+    gaps, count = settings.get("gaps"), len(lens.thicknesses)
     if gaps is not None:
         gaps = tuple(int(gap) for gap in gaps)
         for gap in gaps:
             if not 1 <= gap <= count:
                 raise InputError(f"operand '{kind}': the lens has gaps 1 to {count}, not {gap}")
-    return Operand(kind, numbers["target"], numbers["min"], numbers["max"], weight, field, gaps)
+    return Operand(kind, target, low, high, weight, field, gaps)
 
 
 def _number(value: object, what: str) -> float:
@@ -184,9 +194,9 @@ def _number(value: object, what: str) -> float:
 # -------------------------------------------------------------------- first order
 
 
-def _first_order(name: str) -> Callable[[Operand, View], dict[str, Tensor]]:
-    def value(operand: Operand, view: View) -> dict[str, Tensor]:
-        return {operand.kind: getattr(view.first_order, name)}
+def _first_order(name: str) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
+    def value(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
+        return {operand.kind: getattr(lens.first_order, name)}
 
     return value
 
@@ -194,17 +204,19 @@ def _first_order(name: str) -> Callable[[Operand, View], dict[str, Tensor]]:
 # -------------------------------------------------------------------- lengths
 
 
-def _total_track(operand: Operand, view: View) -> dict[str, Tensor]:
-    """From the first vertex to the sensor, mm."""
-    return {"total_track": view.system.vertices[-1]}
+def _total_track(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
+    """Return the distance from the first vertex to the sensor, mm."""
+    return {"total_track": lens.system.vertices[-1]}
 
 
-def _gaps(operand: Operand, view: View, glass: bool) -> Sequence[int]:
-    """Numbers of the gaps that an operand means: its own, or all those of glass, or of air."""
+def _gaps(operand: Operand, lens: LensProperties, glass: bool) -> Sequence[int]:
+    """Return the numbers of the gaps that an operand means: its own, or all those of glass, or of
+    air.
+    """
     if operand.gaps is not None:
         return operand.gaps
-    indices = view.system.indices(view.wavelength)
-    gaps = range(1, len(view.system.thicknesses) + 1)
+    indices = lens.system.indices(lens.wavelength)
+    gaps = range(1, len(lens.system.thicknesses) + 1)
     return [gap for gap in gaps if (float(indices[gap]) > _GLASS) == glass]
 
 
@@ -212,23 +224,25 @@ def _gaps(operand: Operand, view: View, glass: bool) -> Sequence[int]:
 _GLASS = 1.1
 
 
-def _at_centre(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
-    def values(operand: Operand, view: View) -> dict[str, Tensor]:
+def _at_centre(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
+    def values(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
         return {
-            f"{operand.kind}/{gap}": view.system.thicknesses[gap - 1]
-            for gap in _gaps(operand, view, glass)
+            f"{operand.kind}/{gap}": lens.system.thicknesses[gap - 1]
+            for gap in _gaps(operand, lens, glass)
         }
 
     return values
 
 
-def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
-    def values(operand: Operand, view: View) -> dict[str, Tensor]:
-        """Along the axis from rim to rim, each surface at the edge of its own aperture."""
+def _at_edge(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
+    def values(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
+        """Return distances along the axis from rim to rim, each surface at the edge of its own
+        aperture.
+        """
         found = {}
-        for gap in _gaps(operand, view, glass):
-            at_centre = view.system.thicknesses[gap - 1]
-            front, back = view.rim_sags[gap - 1], view.rim_sags[gap]
+        for gap in _gaps(operand, lens, glass):
+            at_centre = lens.system.thicknesses[gap - 1]
+            front, back = lens.rim_sags[gap - 1], lens.rim_sags[gap]
             found[f"{operand.kind}/{gap}"] = at_centre + back - front
         return found
 
@@ -238,21 +252,21 @@ def _at_edge(glass: bool) -> Callable[[Operand, View], dict[str, Tensor]]:
 # -------------------------------------------------------------------- real chief rays
 
 
-def _chief_ray_angle(operand: Operand, view: View) -> dict[str, Tensor]:
-    """Between the chief ray and the sensor's normal, degrees."""
-    ray = view.chief_ray(operand.field)
+def _chief_ray_angle(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
+    """Return the angle between the chief ray and the sensor's normal, degrees."""
+    ray = lens.chief_ray(operand.field)
     across = torch.hypot(ray.l, ray.m)
     return {_labelled(operand): torch.rad2deg(torch.atan2(across, ray.n))}
 
 
-def _distortion(operand: Operand, view: View) -> dict[str, Tensor]:
-    """How far the chief ray lands from its paraxial image height, per cent of this height."""
-    ray = view.chief_ray(operand.field)
-    field = torch.tensor(operand.field, dtype=view.system.dtype, device=view.system.device)
-    if view.object_distance is None:
-        ideal = view.first_order.efl * torch.tan(torch.deg2rad(field))
+def _distortion(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
+    """Return the chief ray's distance from its paraxial image height, per cent of this height."""
+    ray = lens.chief_ray(operand.field)
+    field = torch.tensor(operand.field, dtype=lens.system.dtype, device=lens.system.device)
+    if lens.object_distance is None:
+        ideal = lens.first_order.efl * torch.tan(torch.deg2rad(field))
     else:
-        ideal = view.first_order.magnification * field
+        ideal = lens.first_order.magnification * field
     along = ideal.detach() / ideal.detach().norm()
     height, real = (ideal * along).sum(), ray.x * along[0] + ray.y * along[1]
     return {_labelled(operand): 100.0 * (real - height) / height}
@@ -264,7 +278,7 @@ def _labelled(operand: Operand) -> str:
 
 
 # Each gives label → value of an operand: mm, degrees or per cent.
-KINDS: dict[str, Callable[[Operand, View], dict[str, Tensor]]] = {
+KINDS: dict[str, Callable[[Operand, LensProperties], dict[str, Tensor]]] = {
     "efl": _first_order("efl"),
     "bfd": _first_order("bfd"),
     "f_number": _first_order("f_number"),

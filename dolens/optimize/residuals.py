@@ -1,4 +1,4 @@
-"""What a least-squares optimizer asks of the thing that it makes small."""
+"""A least-squares optimizer takes residuals as a tensor, or as an object with a linear model."""
 
 import logging
 from collections.abc import Sequence
@@ -19,23 +19,24 @@ _MANY = 4
 
 @runtime_checkable
 class Residuals(Protocol):
-    """Residuals r at a point.
+    """Evaluates residuals r at a point.
 
     A merit function of rays knows its Jacobian better than autograd does, and may never store it;
     a closure may return such an object instead of a tensor of residuals.
     """
 
     def sum_of_squares(self) -> float:
-        """‖r‖²; `inf` or NaN where the point cannot be evaluated, as when rays fail."""
+        """Return ‖r‖²; `inf` or NaN where the point cannot be evaluated, as when rays fail."""
         ...
 
     def linear_model(self) -> LinearModel:
-        """R and b in the optimizer's variables, in the order of its parameters."""
+        """Return R and b in the optimizer's variables, in the order of its parameters."""
         ...
 
 
 class TensorResiduals:
-    """Residuals as a tensor with a graph; autograd sweeps it once for each of the fewer numbers.
+    """Holds residuals as a tensor with a graph; autograd sweeps it once for each of the fewer
+    numbers.
 
     Few residuals of many variables take a reverse sweep each, many of few variables a forward one
     for each variable.  Forward sweeps need operations that can be differentiated twice: where one
@@ -50,11 +51,11 @@ class TensorResiduals:
         self._residuals, self._variables = residuals.reshape(-1), list(variables)
 
     def sum_of_squares(self) -> float:
-        """‖r‖²."""
+        """Return ‖r‖²."""
         return float(self._residuals.detach().double().square().sum())
 
     def linear_model(self) -> LinearModel:
-        """R and b.
+        """Return R and b.
 
         Raises:
             InputError: the residuals have no graph.

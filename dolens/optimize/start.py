@@ -1,4 +1,4 @@
-"""Where a search begins, when that is not where the prescription is."""
+"""A search may begin elsewhere than at the prescription."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,21 +6,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_lens_units
 
 _KEYS = ("multiply", "add", "relative", "absolute")
+_WITHOUT_UNIT = ("multiply", "relative")
 
 
 def start_values(
     lens: Lens, settings: Mapping[str, float | Mapping[str, Any]], generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Parameters of a lens to begin with; the lens is not changed.
+    """Return parameters of a lens to begin with; the lens is not changed.
 
     Args:
         lens: whose parameters are named.
         settings: pattern → a number; or `multiply` and `add`, applied in this order; or `relative`
-            and `absolute`, standard deviations of normal errors, of the parameter and in its unit.
+            and `absolute`, standard deviations of normal errors, as a share of the parameter and in
+            its unit.  Numbers are in the units of files, degrees for tilts.
             Later patterns go on from what earlier ones made.
         generator: of the errors.
 
@@ -32,8 +35,12 @@ def start_values(
     """
     found: dict[str, Tensor] = {}
     for pattern, change in settings.items():
-        numbers = _numbers(pattern, change)
+        written = _numbers(pattern, change)
         for name, parameter in lens.variables([pattern]).items():
+            numbers = {
+                key: value if key in _WITHOUT_UNIT else to_lens_units(name, value)
+                for key, value in written.items()
+            }
             value = found.get(name, parameter.detach().clone())
             if "value" in numbers:
                 found[name] = torch.full_like(value, numbers["value"])
@@ -47,11 +54,9 @@ def start_values(
 
 def _numbers(pattern: str, change: object) -> dict[str, float]:
     given = dict(change) if isinstance(change, Mapping) else {"value": change}
+    if isinstance(change, Mapping):
+        check_keys(change, _KEYS, f"start '{pattern}'")
     for key, value in given.items():
-        if key not in (*_KEYS, "value"):
-            raise InputError(
-                f"start '{pattern}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-            )
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(f"start '{pattern}': {key} must be a number, not {value!r}")
     return {key: float(value) for key, value in given.items()}

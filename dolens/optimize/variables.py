@@ -1,14 +1,15 @@
-"""Lens parameters as an optimizer likes them: scaled, bounded, and named."""
+"""Design variables are parameters of a lens, scaled, bounded and named for an optimizer."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_file_units, unit_factors, unit_of
 from dolens.optics.row_jacobian import jacobian_of
 from dolens.optimize.dependents import Dependent, dependent
 
@@ -16,7 +17,7 @@ _KEYS = ("scale", "initial", "lower", "upper")
 
 
 class DesignVariables(nn.Module):
-    """Chosen lens parameters θ, held as u = θ/scale so that optimizers see numbers near one.
+    """Holds chosen lens parameters θ as u = θ/scale, so that optimizers see numbers near one.
 
     A parameter that is an array (the coefficients of a B-spline) counts as many variables, with
     one scale and the same bounds for all its elements.
@@ -24,15 +25,22 @@ class DesignVariables(nn.Module):
     A parameter may also follow from others: a pickup or a solve (see `dependents`).  Patterns leave
     such parameters out.
 
+    Settings are in the units of files, degrees for tilts (see `dolens.optics.parameter_units`); θ
+    is in the lens's own units, radians and mm.
+
     Args:
         lens: where the parameters live; it is not changed.
         variables: name or pattern → settings: `scale` (default 1), `initial` (default: the
-            lens's own value), `lower` and `upper` (default: none), all in the parameter's unit;
+            lens's own value), `lower` and `upper` (default: none), all in the unit of files;
             or name → `pickup` or `solve` with their settings.
+        others: numbers besides the lens's parameters that may be varied, by their exact names,
+            in their own units.
 
     Attributes:
         names: of the parameters that are varied.
         scaled: u, P numbers.
+        scale: (P,), θ/u, in the lens's own units.
+        units: (P,), the lens's own unit in one of files: radians in a degree, or 1.
         dependents: the parameters that follow from others, in the order of their settings.
         best_focus: whether a merit function is to keep the sensor at the best focus.
 
@@ -41,11 +49,17 @@ class DesignVariables(nn.Module):
             value outside its bounds.
     """
 
-    def __init__(self, lens: Lens, variables: Mapping[str, Mapping[str, Any] | None]) -> None:
+    def __init__(
+        self,
+        lens: Lens,
+        variables: Mapping[str, Mapping[str, Any] | None],
+        others: Mapping[str, Tensor] | None = None,
+    ) -> None:
         super().__init__()
         self.names: list[str] = []
         # In a tuple, so that the lens's parameters are not this module's too.
         self._of = (lens,)
+        self._others = frozenset(others or ())
         self._shapes: list[torch.Size] = []
         self.dependents, self.best_focus = _dependents(lens, variables)
         following = {parameter.name for parameter in self.dependents}
@@ -56,19 +70,19 @@ class DesignVariables(nn.Module):
             settings = dict(settings or {})
             if pattern in following:
                 continue
-            for key in settings:
-                if key not in _KEYS:
-                    raise InputError(
-                        f"variable '{pattern}': unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-                    )
-            for name, parameter in lens.variables([pattern]).items():
+            check_keys(settings, _KEYS, f"variable '{pattern}'")
+            found = {pattern: others[pattern]} if pattern in self._others else None
+            for name, parameter in (found or lens.variables([pattern])).items():
                 if name in following:
                     continue
                 if name in self.names:
                     raise InputError(f"variable '{name}' is named twice (by '{pattern}' too)")
                 s = _setting(settings, "scale", 1.0, pattern)
                 own = parameter.detach().double().flatten().tolist()
-                starts = [_setting(settings, "initial", value, pattern) for value in own]
+                starts = [
+                    _setting(settings, "initial", to_file_units(name, value), pattern)
+                    for value in own
+                ]
                 low = _setting(settings, "lower", -math.inf, pattern)
                 high = _setting(settings, "upper", math.inf, pattern)
                 if not s > 0.0:
@@ -82,7 +96,7 @@ class DesignVariables(nn.Module):
                 self.names.append(name)
                 self._shapes.append(parameter.shape)
                 scaled += [start / s for start in starts]
-                scale += [s] * len(starts)
+                scale += [unit_of(name).factor * s] * len(starts)
                 lower += [low / s] * len(starts)
                 upper += [high / s] * len(starts)
         options = {"dtype": lens.dtype, "device": lens.device}
@@ -90,25 +104,55 @@ class DesignVariables(nn.Module):
         self.register_buffer("scale", torch.tensor(scale, **options))
         self.register_buffer("lower", torch.tensor(lower, **options))
         self.register_buffer("upper", torch.tensor(upper, **options))
+        units = unit_factors(
+            name
+            for name, shape in zip(self.names, self._shapes, strict=True)
+            for _ in range(shape.numel())
+        )
+        # It follows from the names, so that checkpoints need not hold it.
+        self.register_buffer("units", units.to(**options), persistent=False)
 
     def __len__(self) -> int:
-        """How many parameters; an array is one."""
+        """Return the number of parameters; an array is one."""
         return len(self.names)
 
     def labels(self) -> list[str]:
-        """P names: those of the parameters, with a number for every element of an array."""
+        """Return P names: those of the parameters, with a number for every element of an array."""
         labels = []
         for name, shape in zip(self.names, self._shapes, strict=True):
             count = shape.numel()
             labels += [name] if not shape else [f"{name}[{place}]" for place in range(count)]
         return labels
 
-    def forward(self) -> dict[str, Tensor]:
-        """The parameters θ = scale·u by name, and those that follow from them.
+    @property
+    def unit_names(self) -> list[str]:
+        """Return P units of files, `deg` or `mm`; nothing where one depends on the surface."""
+        return [
+            unit_of(name).name
+            for name, shape in zip(self.names, self._shapes, strict=True)
+            for _ in range(shape.numel())
+        ]
+
+    @property
+    def file_scale(self) -> Tensor:
+        """Return the scales (P,) as the settings have them, in the units of files."""
+        return self.scale / self.units
+
+    def file_values(self) -> dict[str, float]:
+        """Return the values by label, in the units of files (degrees, mm)."""
+        values = (self.file_scale * self.scaled.detach()).tolist()
+        return dict(zip(self.labels(), values, strict=True))
+
+    def forward(self, scaled: Tensor | None = None) -> dict[str, Tensor]:
+        """Return the parameters θ = scale·u by name, and those that follow from them.
 
         They are to be traced with instead of the stored ones.
+
+        Args:
+            scaled: u (P,), in place of the stored one.
         """
-        parts = (self.scale * self.scaled).split([shape.numel() for shape in self._shapes])
+        theta = self.scale * (self.scaled if scaled is None else scaled)
+        parts = theta.split([shape.numel() for shape in self._shapes])
         values = {
             name: part.reshape(shape)
             for name, part, shape in zip(self.names, parts, self._shapes, strict=True)
@@ -118,7 +162,7 @@ class DesignVariables(nn.Module):
         return values
 
     def derivatives(self) -> tuple[list[str], Tensor]:
-        """How the lens's parameters change with u.
+        """Return the derivatives of the lens's parameters with respect to u.
 
         Returns:
             Names of all parameters that change, in the lens's own order, and ∂θ/∂u, (Q, P), in
@@ -126,7 +170,7 @@ class DesignVariables(nn.Module):
         """
         with torch.enable_grad():
             values = self()
-            names = list(self._of[0].variables(list(values)))
+            names = list(self._of[0].variables(self._of_lens(values)))
             if self.dependents:
                 flat = torch.cat([values[name].reshape(-1) for name in names])
                 return names, jacobian_of(flat, [self.scaled]).double()
@@ -138,9 +182,13 @@ class DesignVariables(nn.Module):
             [first[name] + torch.arange(values[name].numel()) for name in names]
             or [torch.zeros(0, dtype=torch.int64)]
         )
-        matrix = torch.zeros(place, place, dtype=torch.float64)
-        matrix[torch.arange(place), columns] = self.scale.double().cpu()[columns]
+        matrix = torch.zeros(len(columns), place, dtype=torch.float64)
+        matrix[torch.arange(len(columns)), columns] = self.scale.double().cpu()[columns]
         return names, matrix
+
+    def parameter_group(self) -> dict[str, Any]:
+        """Return u and its bounds as a group of parameters for an optimizer."""
+        return {"params": [self.scaled], "lower": self.lower.clone(), "upper": self.upper.clone()}
 
     @torch.no_grad()
     def project(self) -> None:
@@ -151,8 +199,12 @@ class DesignVariables(nn.Module):
     def write_to(self, lens: Lens) -> None:
         """Store the current values in a lens."""
         values = self()
-        for name, parameter in lens.variables(list(values)).items():
+        for name, parameter in lens.variables(self._of_lens(values)).items():
             parameter.copy_(values[name])
+
+    def _of_lens(self, names: Iterable[str]) -> list[str]:
+        """Return those of some names that are the lens's parameters."""
+        return [name for name in names if name not in self._others]
 
 
 def _dependents(

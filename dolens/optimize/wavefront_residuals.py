@@ -1,4 +1,4 @@
-"""How far a lens's wavefronts lie from spheres, and how that follows from the lens."""
+"""Optical path differences from reference spheres are the residuals of RMS wavefront errors."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -18,7 +18,7 @@ _MM_PER_NM = 1e-6
 
 
 class WavefrontResiduals(ImageQuality):
-    """Residuals √(W_s·w_i)·(OPD_i - mean OPD of spot s), in wavelengths.
+    """Gives residuals √(W_s·w_i)·(OPD_i - mean OPD of spot s), in wavelengths.
 
     Their sum of squares is Σ W_s·(RMS wavefront error)².  The optical path difference is the path
     from the object's wavefront to a sphere about the reference point (X, Y) on the sensor, centroid
@@ -71,23 +71,23 @@ class WavefrontResiduals(ImageQuality):
     # ---------------------------------------------------------------- the path difference
 
     def _differences(self, lens: Lens, position: Tensor, direction: Tensor, path: Tensor) -> Tensor:
-        """(1, N), wavelengths."""
+        """Return the optical path differences (1, N), wavelengths."""
         tilt = (self._referenced(position) * direction).sum(0)
         return self._without_piston((path - self._index(lens) * tilt) / self._waves)[None]
 
     def _without_piston(self, values: Tensor) -> Tensor:
-        """(..., N) less the mean over each spot."""
+        """Return values (..., N) less their mean over each spot."""
         spots = self.spots
         means = values.new_zeros((*values.shape[:-1], spots.count))
         means.index_add_(-1, spots.spot, values * spots.weight)
         return values - means[..., spots.spot]
 
     def _index(self, lens: Lens) -> Tensor:
-        """(N,), n' before the sensor."""
+        """Return the index n' (N,) before the sensor."""
         return lens.materials[-1].index(self._wavelengths)
 
     def _path_before(self, lens: Lens) -> Tensor:
-        """(N,), mm: from the object's wavefront to where the rays begin."""
+        """Return the path (N,), mm, from the object's wavefront to where the rays begin."""
         spots = self.spots
         position, direction = spots.rays.position, spots.rays.direction
         index = lens.materials[0].index(self._wavelengths)
@@ -102,7 +102,7 @@ class WavefrontResiduals(ImageQuality):
 
     @cached_property
     def _waves(self) -> Tensor:
-        """(N,), mm."""
+        """Return each ray's wavelength (N,), mm."""
         return _MM_PER_NM * self._wavelengths
 
     def _check(self, lens: Lens) -> None:

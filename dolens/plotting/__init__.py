@@ -1,29 +1,24 @@
-"""Figures: functions from data to a `matplotlib.figure.Figure`, without any global state."""
+"""Functions turn data into a `matplotlib.figure.Figure`, without global state."""
 
 from dolens.plotting.before_after import before_after_figure
 from dolens.plotting.comparison import comparison_figure
-from dolens.plotting.curves import curves_figure
 from dolens.plotting.export import figure_to_image, save_figure
 from dolens.plotting.history import history_figure
 from dolens.plotting.layout import layout_figure
-from dolens.plotting.matrix import matrix_figure
 from dolens.plotting.modulation import modulation_figure
 from dolens.plotting.pareto import Point, pareto_figure, pareto_front
 from dolens.plotting.psf import psf_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
 from dolens.plotting.spots import spots_figure
-from dolens.plotting.yields import yield_figure
 
 __all__ = [
     "Point",
     "before_after_figure",
     "comparison_figure",
-    "curves_figure",
     "figure_to_image",
     "history_figure",
     "layout_figure",
-    "matrix_figure",
     "modulation_figure",
     "pareto_figure",
     "pareto_front",
@@ -32,5 +27,4 @@ __all__ = [
     "rms_curves_figure",
     "save_figure",
     "spots_figure",
-    "yield_figure",
 ]

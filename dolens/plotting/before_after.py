@@ -1,4 +1,4 @@
-"""A lens before and after it was changed."""
+"""Two layouts compare a lens before and after a change."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ def before_after_figure(
     object_distance: float | None = None,
     titles: tuple[str, str] | None = None,
 ) -> Figure:
-    """Two layouts one above the other, of one scale and with their first vertices in one line.
+    """Draw two layouts one above the other, at one scale and with their first vertices aligned.
 
     Args:
         before: drawn above.

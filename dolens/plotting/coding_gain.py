@@ -1,4 +1,4 @@
-"""Where a coded aperture's image beats a plain lens's: gain against light, for each depth range."""
+"""The gain of a coded aperture over a plain lens is plotted against light, for each depth range."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,27 +10,27 @@ from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
 
 @dataclass(frozen=True)
 class GainRange:
-    """Gains (dB) of one depth range.
+    """A `GainRange` holds the gains (dB) of one depth range.
 
     Attributes:
         label: of the range, as `4.5 to 8 m`.
         lights: of the bound, electrons of a white pixel at full aperture.
-        shared: the bound's gain with one linear filter for all depths.
-        own: the bound's gain with a linear filter for each depth.
+        common_filter: the bound's gain with one linear filter for all depths.
+        filter_per_depth: the bound's gain with a linear filter for each depth.
         trained: light, gain, and the lower and upper end of its interval, of trained cameras.
     """
 
     label: str
     lights: Sequence[float] = ()
-    shared: Sequence[float] = ()
-    own: Sequence[float] = ()
+    common_filter: Sequence[float] = ()
+    filter_per_depth: Sequence[float] = ()
     trained: Sequence[tuple[float, float, float, float]] = ()
 
 
 def coding_gain_figure(
     ranges: Sequence[GainRange], title: str | None = "Gain over the best plain lens"
 ) -> Figure:
-    """Gain against light: axes for each depth range.
+    """Plot gain against light, with axes for each depth range.
 
     Lines are bounds of linear restoration; points with bars are trained cameras with their
     intervals.
@@ -45,8 +45,14 @@ def coding_gain_figure(
     for axes, found in zip(grid[0], ranges, strict=True):
         axes.axhline(0.0, color="0.3", linewidth=0.8)
         if len(found.lights):
-            axes.plot(found.lights, found.shared, color=blue, label="one linear filter")
-            axes.plot(found.lights, found.own, color=green, ls="--", label="a filter each depth")
+            axes.plot(found.lights, found.common_filter, color=blue, label="one linear filter")
+            axes.plot(
+                found.lights,
+                found.filter_per_depth,
+                color=green,
+                ls="--",
+                label="a filter each depth",
+            )
         if found.trained:
             light, gain, low, high = zip(*found.trained, strict=True)
             below = [g - bottom for g, bottom in zip(gain, low, strict=True)]

@@ -1,4 +1,4 @@
-"""What the sensor saw and what was restored, beside the truth."""
+"""Raw and restored images are shown beside the ground truth."""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,8 +23,8 @@ def comparison_figure(
     labels: Sequence[str],
     psnr: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
-    """Raw images above restored ones, one column a view, and the truth: at the left where it is the
-    same for all, else above them.
+    """Show raw images above restored ones, one column a view. The truth stands at the left where it
+    is the same for all views, else above them.
 
     Args:
         truth: (3, H, W), or (views, 3, H, W), display-encoded in [0, 1].

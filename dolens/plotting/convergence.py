@@ -1,4 +1,4 @@
-"""How a fit came to its end: parameters and loss by iteration."""
+"""The convergence of a fit is plotted: parameters and loss by iteration."""
 
 from collections.abc import Mapping, Sequence
 
@@ -22,7 +22,8 @@ def convergence_figure(
     title: str | None = None,
     loss_label: str = "loss",
 ) -> Figure:
-    """Loss on top, parameters below; lines part the stages, and above each is its optimizer.
+    """Plot the loss above the parameters; vertical lines separate the stages, labelled by their
+    optimizers.
 
     Parameters whose truth is known are shown by the size of their errors on logarithmic axes, the
     others by their values, those of one unit in the same axes.
@@ -78,7 +79,9 @@ def convergence_figure(
 
 
 def _part(grid: Sequence[Axes], stages: Sequence[tuple[str, int]]) -> None:
-    """Lines between the stages, halfway from iteration to iteration, and the optimizers' names."""
+    """Draw lines between the stages, halfway from iteration to iteration, and the optimizers'
+    names.
+    """
     start = 0
     for number, (optimizer, length) in enumerate(stages):
         if number:

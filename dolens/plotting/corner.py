@@ -1,4 +1,4 @@
-"""A covariance as ellipses, for every pair of parameters."""
+"""A corner plot shows a covariance as ellipses, for every pair of parameters."""
 
 from collections.abc import Sequence
 
@@ -32,7 +32,7 @@ def corner_figure(
     truth: Tensor | None = None,
     title: str | None = None,
 ) -> Figure:
-    """Ellipses of 1σ and 2σ below the diagonal, correlations above it, each σ in it.
+    """Draw ellipses of 1σ and 2σ below the diagonal, correlations above it, and each σ on it.
 
     Axes count from the centre.  Mm and degrees become thousandths where σ is below 0.1 of them.
 
@@ -118,14 +118,14 @@ def corner_figure(
 
 
 def _unit(sigma: float, unit: str) -> tuple[float, str]:
-    """What numbers are multiplied by to be shown, and their unit then."""
+    """Return the factor by which numbers are multiplied to be shown, and their unit then."""
     if sigma < 0.1 and unit in _THOUSANDTHS:
         return 1e3, _THOUSANDTHS[unit]
     return 1.0, unit
 
 
 def _limits(dots: np.ndarray, cross: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """(P,), half the length of each axis."""
+    """Return half the length of each axis, (P,)."""
     reach = _REACH * spread
     others = np.abs(np.concatenate([dots, cross[None]]))
     found = 1.1 * np.nan_to_num(others, nan=0.0, posinf=0.0).max(0)
@@ -135,7 +135,7 @@ def _limits(dots: np.ndarray, cross: np.ndarray, spread: np.ndarray) -> np.ndarr
 def _pair(
     axes: Axes, covariance: np.ndarray, dots: np.ndarray, cross: np.ndarray, reach: np.ndarray
 ) -> None:
-    """Two parameters, the first along x."""
+    """Draw two parameters, the first along x."""
     values, vectors = np.linalg.eigh(covariance)
     lengths = np.sqrt(np.maximum(values, 0.0))
     angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
@@ -165,7 +165,7 @@ def _pair(
 
 
 def _correlation(axes: Axes, correlation: float) -> None:
-    """A number on a field whose colour says it too."""
+    """Write a correlation on a background coloured by its value."""
     axes.set_facecolor(colormaps["RdBu_r"](0.5 + 0.35 * correlation))
     # As many digits as tell it from ±1.
     digits = 2 if abs(correlation) < 0.995 else 4
@@ -189,7 +189,7 @@ def _deviation(
 
 
 def _ticks(axes: Axes, row: int, column: int, count: int) -> None:
-    """Numbers only at the left and at the bottom, none around what is not a plot."""
+    """Label ticks only at the left and at the bottom."""
     axes.tick_params(labelsize=SMALL - 1, length=2)
     axes.spines[:].set_color("0.6")
     if column >= row:

@@ -1,4 +1,4 @@
-"""What a layout shows, and how it is drawn into axes."""
+"""A layout is computed from a lens, and drawn into axes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ _EDGE = "#2B3A42"
 
 
 class Fan(NamedTuple):
-    """Rays of one field (degrees) and wavelength (nm): (rays, points, 3) in mm."""
+    """A `Fan` holds rays of one field (degrees) and wavelength (nm): (rays, points, 3) in mm."""
 
     field: float
     wavelength: float
@@ -38,7 +38,7 @@ class Fan(NamedTuple):
 
 
 class LayoutDrawing(NamedTuple):
-    """A lens in section with its rays, mm.
+    """A `LayoutDrawing` holds a section of a lens with its rays, mm.
 
     Attributes:
         system: the lens.
@@ -60,7 +60,7 @@ class LayoutDrawing(NamedTuple):
 
     @property
     def needs_legend(self) -> bool:
-        """Whether colours are to be told apart, or a field has no rays."""
+        """Return whether colours must be told apart, or a field has no rays."""
         return len(self.fans) > 1 or not len(self.fans[0].paths)
 
 
@@ -72,7 +72,7 @@ def layout_drawing(
     object_distance: float | None = None,
     values: Mapping[str, Tensor] | None = None,
 ) -> LayoutDrawing:
-    """Cut a lens and trace its rays; arguments and errors are those of `layout_figure`."""
+    """Section a lens and trace its rays; arguments and errors are those of `layout_figure`."""
     lines = [wavelength] if isinstance(wavelength, int | float) else list(wavelength)
     _check(fields_deg, rays, lines)
     system = lens.system(values)
@@ -211,7 +211,7 @@ def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:
 
 
 def _stop_bar(stop: int, profiles: Sequence[Profile], height: float) -> float:
-    """How far from the axis the stop's bars end, mm."""
+    """Return the distance from the axis at which the stop's bars end, mm."""
     y = profiles[stop - 1][1]
     return (float(np.abs(y).max()) if len(y) else 0.0) + 0.2 * height
 
@@ -219,7 +219,7 @@ def _stop_bar(stop: int, profiles: Sequence[Profile], height: float) -> float:
 def _draw_stop(
     axes: Axes, system: OpticalSystem, profiles: Sequence[Profile], height: float
 ) -> None:
-    """Bars outside the stop's rim, in its own plane, with a tick along its axis at the rim."""
+    """Draw bars outside the stop's edge, in its plane, with a tick along its axis at the edge."""
     z, y = profiles[system.stop - 1]
     if not len(z):
         return

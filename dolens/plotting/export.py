@@ -1,4 +1,4 @@
-"""From a figure to a file or to an image tensor."""
+"""Figures are written to files or converted to image tensors."""
 
 from pathlib import Path
 
@@ -10,11 +10,13 @@ from torch import Tensor
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: float = 120) -> None:
-    """Write a figure; folders on the way are made.
+    """Write a figure to a file; missing folders are created.
 
     Args:
         figure: any figure.
         path: its suffix (.png, .pdf, .svg) chooses the format.
+
+    Rarely needed:
         dpi: pixels per inch of the figure's size.
     """
     path = Path(path)
@@ -23,10 +25,12 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 120) -> None:
 
 
 def figure_to_image(figure: Figure, dpi: float = 80) -> Tensor:
-    """Draw a figure into a tensor, as TensorBoard's `add_image` takes it.
+    """Render a figure into a tensor, as TensorBoard's `add_image` takes it.
 
     Args:
         figure: any figure; its own resolution is left as it was.
+
+    Rarely needed:
         dpi: pixels per inch of the figure's size.
 
     Returns:

@@ -1,4 +1,4 @@
-"""How a design came about."""
+"""The history of a design is plotted: merit and damping by iteration."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ def history_figure(
     merit_label: str = "merit",
     damping_label: str = "damping",
 ) -> Figure:
-    """Merit against iteration, on a logarithmic axis, with the damping below.
+    """Plot merit against iteration, on a logarithmic axis, with the damping below.
 
     Values that are not positive leave gaps.
 

@@ -1,4 +1,4 @@
-"""A lens in section, as its designer draws it."""
+"""A layout shows a lens in section with its rays."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ def layout_figure(
     title: str | None = None,
     values: Mapping[str, Tensor] | None = None,
 ) -> Figure:
-    """The section of a lens in the y-z plane, with fans of rays, coloured by field or wavelength.
+    """Draw the section of a lens in the y-z plane, with ray fans coloured by field or wavelength.
 
     Rays are aimed at the paraxial entrance pupil, spread evenly over the part of its plane whose
     rays reach the sensor, so that the outermost graze the apertures that limit the beam.  Rays
@@ -88,7 +88,7 @@ def layout_figure(
 
 
 def drawn_height(z_limits: tuple[float, float], half_height: float, legend: bool) -> float:
-    """Inches that a layout of the usual width takes, so that equal scales leave no gaps."""
+    """Return the height (inches) of a layout of the usual width at equal scales of both axes."""
     # What axes and legend take beside the drawing.
     beside = 0.75 + (0.8 if legend else 0.0)
     drawn = (WIDTH - beside) * 2.0 * half_height / (z_limits[1] - z_limits[0])
@@ -96,14 +96,14 @@ def drawn_height(z_limits: tuple[float, float], half_height: float, legend: bool
 
 
 def layout_title(lens: Lens, system: OpticalSystem, wavelength: float) -> str:
-    """The lens's name, and its focal length at a wavelength in nm."""
+    """Return the lens's name, and its focal length at a wavelength in nm."""
     efl = float(first_order(system, wavelength).efl)
     optics = f"f = {efl:.4g} mm at {wavelength:.4g} nm" if math.isfinite(efl) else "afocal"
     return f"{lens.name}: {optics}" if lens.name else optics
 
 
 def _depth(system: OpticalSystem, number: int) -> float:
-    """Largest difference of sag along y, mm, in the surface's own axes."""
+    """Return the largest difference of sag along y, mm, in the surface's own axes."""
     reach = system.surfaces[number - 1].semi_diameter
     y = torch.linspace(-reach, reach, SAMPLES, dtype=torch.float64)
     sag, _, _, exists = sag_of(system, number, torch.zeros_like(y), y)
@@ -111,7 +111,7 @@ def _depth(system: OpticalSystem, number: int) -> float:
 
 
 def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
-    """h(x, 0) and h(0, y) of a surface, in µm."""
+    """Draw h(x, 0) and h(0, y) of a surface, in µm."""
     semi_diameter = system.surfaces[number - 1].semi_diameter
     t = torch.linspace(-semi_diameter, semi_diameter, SAMPLES, dtype=torch.float64)
     zero = torch.zeros_like(t)

@@ -1,4 +1,4 @@
-"""Modulation transfer against frequency."""
+"""The modulation transfer function is plotted against frequency."""
 
 import math
 
@@ -9,7 +9,8 @@ from dolens.plotting.style import SMALL, TITLE, colours, field_label, ruled_axes
 
 
 def modulation_figure(mtf: Modulation, title: str | None = "Geometric MTF") -> Figure:
-    """Contrast against frequency: tangential solid, sagittal dotted, the diffraction limit dashed.
+    """Plot contrast against frequency: tangential solid, sagittal dotted, the diffraction limit
+    dashed.
 
     Args:
         mtf: the data.

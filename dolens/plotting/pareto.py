@@ -1,4 +1,4 @@
-"""Error against cost, and what no other choice beats in both."""
+"""Error is plotted against cost, with the Pareto front."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -11,7 +11,7 @@ _MARKERS = "osD^vP*X"
 
 
 class Point(NamedTuple):
-    """A way of doing something.
+    """A `Point` is one alternative with its cost and error.
 
     Attributes:
         label: written beside it where it is on the front or marked.
@@ -33,7 +33,7 @@ def pareto_figure(
     title: str | None = None,
     floor: float | None = None,
 ) -> Figure:
-    """Points on logarithmic axes, and a staircase under those that none beats.
+    """Plot points on logarithmic axes, and the Pareto front as a staircase.
 
     Args:
         families: name → points; a colour and marker each.
@@ -85,7 +85,7 @@ def pareto_figure(
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
-    """The points that no other one beats in cost and error, by rising cost."""
+    """Return the points that no other point beats in cost and error, by rising cost."""
     front: list[Point] = []
     for point in sorted(points, key=lambda p: (p.cost, p.error)):
         if not front or point.error < front[-1].error:

@@ -1,4 +1,4 @@
-"""Point spread functions as colour pictures."""
+"""Point spread functions are shown as colour images."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _SMALLEST_WINDOW = 7
 def psf_figure(
     psfs: Tensor, labels: Sequence[str], pixel_pitch_mm: float, title: str | None = None
 ) -> Figure:
-    """One panel a depth, in colour, normalised to its own peak.
+    """Show point spread functions, one panel a depth, in colour and normalised to their own peak.
 
     All panels show the same central window: the smallest that holds 99.5 % of each depth's energy.
 
@@ -69,7 +69,7 @@ def psf_figure(
 
 
 def _crop_margin(psfs: Tensor) -> int:
-    """Pixels to leave out on every side."""
+    """Return the pixels to leave out on every side."""
     size = psfs.shape[-1]
     light = psfs.sum(1)
     total = light.sum((-2, -1))
@@ -81,7 +81,7 @@ def _crop_margin(psfs: Tensor) -> int:
 
 
 def _scale_bar(axes: Axes, size: int, pixel_pitch_mm: float) -> None:
-    """A bar of a round number of pixels, at most 0.4 of the window, at the lower left."""
+    """Draw a bar of a round number of pixels, at most 0.4 of the window, at the lower left."""
     steps = [factor * 10**power for power in range(5) for factor in (1, 2, 5)]
     pixels = max(step for step in steps if step == 1 or step <= 0.4 * size)
     left, bottom = -0.5 + 0.05 * size, -0.5 + 0.94 * size

@@ -1,4 +1,4 @@
-"""Ray fans: transverse aberrations across the stop."""
+"""Ray fans are plotted as transverse aberrations across the stop."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,7 +17,7 @@ _HEIGHT = 1.45
 
 
 def ray_fans_figure(fans: RayFans, title: str | None = "Ray fans") -> Figure:
-    """A row for every field: the tangential fan at the left, the sagittal one at the right.
+    """Plot one row for every field: the tangential fan at the left, the sagittal one at the right.
 
     All panels have one scale, in µm; lines end where rays no longer pass.
 

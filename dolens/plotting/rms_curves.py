@@ -1,4 +1,4 @@
-"""RMS spot radii against field and against wavelength."""
+"""RMS spot radii are plotted against field and against wavelength."""
 
 import torch
 from matplotlib.axes import Axes
@@ -21,7 +21,7 @@ def rms_curves_figure(
     against_wavelength: RMSCurves | None = None,
     title: str | None = "RMS spot radius",
 ) -> Figure:
-    """RMS spot radii, µm: at the left over the field, at the right over the wavelength.
+    """Plot RMS spot radii, µm: at the left over the field, at the right over the wavelength.
 
     Over the field every wavelength has a line, and all together a black one; over the wavelength
     every field has a line.  Airy's radius is dashed: over the field, that of the middle wavelength.

@@ -1,4 +1,4 @@
-"""What a layout draws: surfaces cut by the meridional plane, edges of elements, fans of rays."""
+"""The meridional section of a lens is computed: surface profiles, edges of elements, ray fans."""
 
 import math
 
@@ -24,7 +24,7 @@ _NEWTON_STEPS = 20
 
 
 def surface_profile(system: OpticalSystem, number: int) -> Profile:
-    """The curve in which the plane x = 0 cuts a surface, over its clear aperture.
+    """Return the curve in which the plane x = 0 cuts a surface, over its clear aperture.
 
     Args:
         system: the lens; elements with any pose.
@@ -38,7 +38,7 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
 
 
 def obscuration_profile(system: OpticalSystem, number: int) -> Profile | None:
-    """The same over the surface's obscuration; None where it has none."""
+    """Return the profile over the surface's obscuration; None where it has none."""
     obscuration = system.surfaces[number - 1].aperture.obscuration
     return None if obscuration is None else _cut(system, number, obscuration)
 
@@ -91,7 +91,7 @@ def _cut(system: OpticalSystem, number: int, outline: Outline) -> Profile:
 def sag_of(
     system: OpticalSystem, number: int, x: Tensor, y: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sag (mm) and slopes in double precision, and where they exist."""
+    """Return sag (mm) and slopes in double precision, and where they exist."""
     surface = system.surfaces[number - 1]
     parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
     sag, sx, sy, exists = surface.shape.sag_and_gradient(parameters, x, y)
@@ -100,7 +100,7 @@ def sag_of(
 
 
 def axis_angle(system: OpticalSystem, number: int) -> float:
-    """Angle (radians) from z towards y of a surface's axis, seen along x."""
+    """Return the angle (radians) from z towards y of a surface's axis, seen along x."""
     rotation, _ = _place(system, number)
     return math.atan2(float(rotation[1, 2]), float(rotation[2, 2]))
 
@@ -108,7 +108,8 @@ def axis_angle(system: OpticalSystem, number: int) -> float:
 def element_edges(
     system: OpticalSystem, number: int, front: Profile, back: Profile
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ground edges, upper and lower, of the glass behind a surface, (corners, 2) as z, y.
+    """Return the ground edges, upper and lower, of the glass behind a surface, (corners, 2) as z,
+    y.
 
     They run along the axis of the element that carries both faces.
     """
@@ -134,7 +135,7 @@ def _place(system: OpticalSystem, number: int) -> tuple[Tensor, Tensor]:
 
 
 def _edge(front: Profile, back: Profile, end: int) -> np.ndarray:
-    """The ground edge of an element on one side (end -1: +y, 0: -y), (corners, 2) as z, y.
+    """Return the ground edge of an element on one side (end -1: +y, 0: -y), (corners, 2) as z, y.
 
     A flat from the smaller surface outwards, then a cylinder; a straight line where the flat
     would cut through the other surface.
@@ -156,7 +157,7 @@ def trace_fan(
     object_distance: float | None,
     start: float,
 ) -> np.ndarray:
-    """A meridional fan from an object point, over the entrance pupil, to the sensor.
+    """Trace a meridional fan from an object point, over the entrance pupil, to the sensor.
 
     Args:
         system: the lens.

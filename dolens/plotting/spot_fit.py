@@ -1,4 +1,4 @@
-"""Images of point sources: as measured, and as a model has them before and after a fit."""
+"""Measured images of point sources are shown beside a model before and after its fit."""
 
 from collections.abc import Sequence
 
@@ -30,7 +30,7 @@ def spot_fit_figure(
     pixel_pitch: float,
     title: str | None = None,
 ) -> Figure:
-    """A row for each image: measured, at the start of the fit, at its end, and what is left over.
+    """Show one row for each image: measured, at the start of the fit, at its end, and the residual.
 
     Each row shows one square window where the light of its three images is, and is relative to the
     largest pixel that was measured; an initial image may be brighter, its peak is written in it.
@@ -106,7 +106,7 @@ def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: floa
 
 
 def _window(images: list[Tensor]) -> tuple[int, int, int]:
-    """Top, left and side, pixels, of a square that holds nearly all light of all the images."""
+    """Return top, left and side (pixels) of a square that holds nearly all light of all images."""
     height, width = images[0].shape
     ends = []
     for direction in (1, 0):
@@ -134,7 +134,7 @@ def _window(images: list[Tensor]) -> tuple[int, int, int]:
 
 
 def _scale_bar(axes: Axes, size: int, pitch: float) -> None:
-    """A bar of a round length, at most 0.4 of the window, at the lower left."""
+    """Draw a bar of a round length, at most 0.4 of the window, at the lower left."""
     lengths = [factor * 10.0**power for power in range(-5, 4) for factor in (1, 2, 5)]
     length = max((step for step in lengths if step <= 0.4 * size * pitch), default=size * pitch)
     left, bottom = -0.5 + 0.05 * size, -0.5 + 0.94 * size

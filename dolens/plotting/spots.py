@@ -1,4 +1,4 @@
-"""Spot diagrams."""
+"""Spot diagrams are plotted."""
 
 import math
 
@@ -27,7 +27,7 @@ _COLUMNS = 4
 def spots_figure(
     spots: SpotDiagram, overlaid: bool = False, title: str | None = "Spot diagram"
 ) -> Figure:
-    """Where light lands, in µm from the centroid of all light of its field.
+    """Plot ray intercepts, in µm from the centroid of all light of the field.
 
     A row for every field and a column for every wavelength, all of one scale, so that colours that
     land apart are seen apart; or a panel for every field with all wavelengths in it.  The circle is
@@ -46,7 +46,7 @@ def spots_figure(
     """
     fields, waves = len(spots.fields), len(spots.wavelengths)
     centre = spots.polychromatic_centroid
-    points = (1e3 * (spots.landing - centre[:, None, None])).numpy()
+    points = (1e3 * (spots.intercepts - centre[:, None, None])).numpy()
     middles = (1e3 * (spots.centroid - centre[:, None])).numpy()
     airy = 1e3 * spots.airy_radius.numpy()
     chief = (1e3 * (spots.chief - centre)).numpy()
@@ -93,7 +93,9 @@ def spots_figure(
 
 
 def _half_width(points: np.ndarray, airy: np.ndarray) -> float:
-    """µm from the centre to the edge of every panel: everything, with room for the numbers."""
+    """Return the distance (µm) from the centre to the edge of every panel, with room for the
+    numbers.
+    """
     reach = max(float(np.nanmax(np.abs(points), initial=0.0)), float(airy.max()))
     return 1.2 * reach
 
@@ -125,7 +127,7 @@ def _marks(axes: Axes, chief: np.ndarray, middle: np.ndarray, radius: float) -> 
 
 
 def _radii(axes: Axes, rms: float, geo: float) -> None:
-    """Numbers in a panel's upper corner; both radii come in mm."""
+    """Write both radii, given in mm, in a panel's upper corner."""
     text = "no light passes" if math.isnan(rms) else f"RMS {1e3 * rms:.3g}, GEO {1e3 * geo:.3g} µm"
     axes.text(0.03, 0.985, text, va="top", fontsize=SMALL - 1, transform=axes.transAxes)
 

@@ -1,4 +1,4 @@
-"""Colours and text sizes that all figures share."""
+"""All figures share colours and text sizes."""
 
 from collections.abc import Sequence
 from itertools import cycle, islice
@@ -16,25 +16,25 @@ TITLE = 10
 
 
 def colours(count: int) -> list[str]:
-    """That many line colours; they repeat after seven."""
+    """Return that many line colours; they repeat after seven."""
     return list(islice(cycle(PALETTE), count))
 
 
 def spectral_colour(wavelength: float) -> str:
-    """A line colour that says which wavelength (nm), from violet at 400 to red at 700."""
+    """Return a line colour for a wavelength (nm), from violet at 400 to red at 700."""
     share = (wavelength - 400.0) / 300.0
     return to_hex(colormaps["turbo"](min(max(share, 0.05), 0.95)))
 
 
 def field_label(field: Sequence[float] | Tensor, unit: str) -> str:
-    """`14°`, or `(3, 14)°` for a field beside the y-z plane; in mm likewise."""
+    """Return `14°`, or `(3, 14)°` for a field beside the y-z plane; in mm likewise."""
     x, y = (float(f"{float(value):.6g}") for value in field)
     space = "" if unit == "°" else " "
     return f"{y:g}{space}{unit}" if x == 0.0 else f"({x:g}, {y:g}){space}{unit}"
 
 
 def wavelength_handles(wavelengths: Sequence[float] | Tensor) -> list[Line2D]:
-    """Entries of a legend: lines in the wavelengths' colours, with their nm."""
+    """Return entries of a legend: lines in the wavelengths' colours, with their nm."""
     return [
         Line2D([], [], color=spectral_colour(float(w)), linewidth=1.4, label=f"{float(w):g} nm")
         for w in wavelengths
@@ -42,7 +42,7 @@ def wavelength_handles(wavelengths: Sequence[float] | Tensor) -> list[Line2D]:
 
 
 def ruled_axes(axes: Axes) -> None:
-    """Open axes over a pale grid."""
+    """Draw open axes over a pale grid."""
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
     open_axes(axes)

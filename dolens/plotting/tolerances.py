@@ -1,4 +1,6 @@
-"""What tolerances do to a lens: Jacobians as matrices, yields as curves, offenders as bars."""
+"""A tolerance analysis is plotted: Jacobians as matrices, yields as curves, worst offenders as
+bars.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,10 +25,11 @@ def matrix_figure(
     groups: Sequence[tuple[str, int]] = (),
     title: str | None = None,
 ) -> Figure:
-    """Matrices side by side, red where positive and blue where negative, each on its own scale.
+    """Draw matrices side by side, red where positive and blue where negative, each on its own
+    scale.
 
     Args:
-        panels: what the numbers are, with their unit → matrix (R, C) and names of its columns.
+        panels: title with unit → matrix (R, C) and names of its columns.
         rows: R labels, shared by all panels.
         groups: name and number of rows of each block of rows, from the top; lines part them.
         title: above all.
@@ -77,12 +80,12 @@ def yield_figure(
     nominal: Mapping[str, float],
     title: str | None = None,
 ) -> Figure:
-    """The share of lenses within an RMS radius, against the radius.
+    """Plot the share of lenses within an RMS radius, against the radius.
 
     Args:
         panels: what the radius is → label → RMS of every lens, mm, ascending, infinite where a
             lens fails.  Labels in pairs share a colour: the second of each is dashed.
-        nominal: what the radius is → that of the lens as designed, mm.
+        nominal: kind of radius → that of the designed lens, mm.
         title: above all.
     """
     figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")
@@ -138,7 +141,7 @@ def offenders_figure(
     increases: Mapping[str, Sequence[float]],
     title: str | None = None,
 ) -> Figure:
-    """Bars, the worst offender on top.
+    """Draw bars, with the worst offender on top.
 
     Args:
         names: with their tolerances, the worst first.
@@ -178,7 +181,7 @@ def offenders_figure(
 
 
 def parameter_label(name: str) -> str:
-    """A parameter as a figure names it: `front tilt x`, `curvature 3`, `thickness 1`."""
+    """Return the label of a parameter in figures: `front tilt x`, `curvature 3`, `thickness 1`."""
     first, *rest = name.split(".")
     if first == "elements":
         return f"{rest[0]} {rest[1].replace('_', ' ')}"
@@ -190,7 +193,7 @@ def parameter_label(name: str) -> str:
 
 
 def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:
-    """Lines between blocks of rows, and their names at the left."""
+    """Draw lines between blocks of rows, and their names at the left."""
     row = 0
     for name, count in groups:
         if row:

@@ -1,4 +1,4 @@
-"""How a lens is written down."""
+"""Prescriptions describe lenses as plain data, and are read from and written to files."""
 
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.files import load_lens, load_prescription, save_lens

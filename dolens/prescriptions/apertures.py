@@ -1,4 +1,4 @@
-"""How the clear aperture of a surface is written down.
+"""Clear apertures of surfaces are read from a prescription and written to it.
 
 A surface gives `semi_diameter`, or `aperture` with a rectangle; `obscuration` is what is blocked::
 
@@ -9,16 +9,16 @@ A surface gives `semi_diameter`, or `aperture` with a rectangle; `obscuration` i
 from collections.abc import Mapping
 from typing import Any
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Outline, Rectangle
-from dolens.prescriptions.checks import as_number, check_keys, require_mapping
+from dolens.prescriptions.checks import as_number, require_mapping
 
 APERTURE_KEYS = ("semi_diameter", "aperture", "obscuration")
 _RECTANGLE = ("half_width_x", "half_width_y")
 
 
 def clear_aperture(row: Mapping[str, Any], place: str) -> ClearAperture:
-    """The clear aperture of a surface's row.
+    """Read the clear aperture of a surface from its row.
 
     Raises:
         InputError: none is given, or two are, or a length is not positive.
@@ -42,7 +42,7 @@ def clear_aperture(row: Mapping[str, Any], place: str) -> ClearAperture:
 
 
 def aperture_rows(aperture: ClearAperture) -> dict[str, Any]:
-    """The keys of a surface's row that `clear_aperture` reads back."""
+    """Return the keys of a surface's row that `clear_aperture` reads back."""
     rows: dict[str, Any] = {}
     if isinstance(aperture.edge, Circle):
         rows["semi_diameter"] = aperture.edge.semi_diameter

@@ -1,4 +1,4 @@
-"""From a prescription (plain data) to a lens, and back.
+"""A lens is built from a prescription (plain data), and written as one.
 
 A prescription is a mapping::
 
@@ -16,7 +16,7 @@ Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind th
 `occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
-that the stop is closed to (see `dolens.prescriptions.conditions`).
+that the stop is closed to (see `dolens.prescriptions.system_data`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -26,7 +26,7 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
@@ -36,18 +36,16 @@ from dolens.prescriptions.checks import (
     as_integer,
     as_number,
     as_numbers,
-    check_keys,
-    did_you_mean,
     require_mapping,
 )
-from dolens.prescriptions.conditions import (
-    CONDITION_KEYS,
-    close_stop,
-    conditions,
-    conditions_of,
-    stop_row,
-)
 from dolens.prescriptions.poses import element_rows, elements_from
+from dolens.prescriptions.system_data import (
+    SYSTEM_DATA_KEYS,
+    set_stop_semi_diameter,
+    stop_row,
+    system_data,
+    system_data_of,
+)
 
 _LENS_KEYS = (
     "name",
@@ -58,7 +56,7 @@ _LENS_KEYS = (
     "surfaces",
     "elements",
     "sensor",
-    *CONDITION_KEYS,
+    *SYSTEM_DATA_KEYS,
 )
 _SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
@@ -77,8 +75,10 @@ def lens_from_prescription(
         prescription: as the module's docstring shows.
         dtype: precision of the lens.
         index_model: used instead of the prescription's own.
-        where: what messages call this prescription, usually its file.
-        backend: what traces: auto, reference, cpu or cuda.
+
+    Rarely needed:
+        where: name of the prescription in messages, usually its file.
+        backend: auto, reference, cpu or cuda.
 
     Raises:
         InputError: one line that names `where`, the surface and the key.
@@ -95,7 +95,7 @@ def lens_from_prescription(
     if not isinstance(sensor, Mapping) or "distance" not in sensor:
         raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
     check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
-    used_with = conditions(prescription, where)
+    data = system_data(prescription, where)
     surfaces, thicknesses = [], []
     materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
     for number, row in enumerate(rows, 1):
@@ -124,16 +124,17 @@ def lens_from_prescription(
             dtype,
             elements_from(prescription.get("elements"), dtype, where),
             backend=backend,
-            **used_with,
+            **data,
         )
-        return close_stop(lens, prescription)
+        return set_stop_semi_diameter(lens, prescription)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(where) else f"{where}: {message}") from None
 
 
 def prescription_of(lens: Lens) -> dict[str, Any]:
-    """The prescription of a lens as it stands now: plain numbers and strings, ready for YAML.
+    """Return the prescription of a lens in its present state: plain numbers and strings, ready for
+    YAML.
 
     Reading it back gives a lens with the same parameters to the last bit.
     """
@@ -163,7 +164,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         "index_model": lens.index_model,
         "stop": lens.stop,
         "object_material": lens.materials[0].name,
-        **conditions_of(lens),
+        **system_data_of(lens),
         "surfaces": rows,
         **({"elements": element_rows(lens.elements)} if len(lens.elements) else {}),
         "sensor": sensor,

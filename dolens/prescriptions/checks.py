@@ -1,15 +1,14 @@
-"""Reading plain values: each mistake is one line that says where and what is allowed."""
+"""Plain values are checked: each mistake is one line that says where and what is allowed."""
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
 
 
 def as_number(value: object, what: str, finite: bool = True) -> float:
-    """A number; `what` says which, and raises `InputError` where it is none."""
+    """Return a number; raise `InputError`, which names `what`, where the value is none."""
     try:
         if isinstance(value, bool):
             raise TypeError
@@ -22,7 +21,7 @@ def as_number(value: object, what: str, finite: bool = True) -> float:
 
 
 def as_positive(value: object, what: str) -> float:
-    """A finite number above zero."""
+    """Return a finite number above zero."""
     found = as_number(value, what)
     if found <= 0.0:
         raise InputError(f"{what} must be positive, not {value!r}")
@@ -30,14 +29,14 @@ def as_positive(value: object, what: str) -> float:
 
 
 def as_numbers(value: object, what: str) -> Any:
-    """A number, or rows of numbers nested as they are written."""
+    """Return a number, or rows of numbers nested as they are written."""
     if isinstance(value, list | tuple):
         return [as_numbers(entry, what) for entry in value]
     return as_number(value, what)
 
 
 def as_integer(value: object, what: str) -> int:
-    """A whole number."""
+    """Return a whole number."""
     number = as_number(value, what)
     if number != int(number):
         raise InputError(f"{what} must be a whole number, not {value!r}")
@@ -48,20 +47,3 @@ def require_mapping(value: object, where: str) -> None:
     """Raise `InputError` where a value is no mapping."""
     if not isinstance(value, Mapping):
         raise InputError(f"{where}: expected a mapping of keys to values, not {value!r}")
-
-
-def check_keys(mapping: Mapping[str, Any], allowed: Iterable[str], where: str) -> None:
-    """Raise `InputError` at the first key that is not allowed."""
-    allowed = list(allowed)
-    for key in mapping:
-        if str(key) not in allowed:
-            raise InputError(
-                f"{where}: unknown key '{key}'{did_you_mean(str(key), allowed)} "
-                f"(allowed: {', '.join(allowed)})"
-            )
-
-
-def did_you_mean(word: str, allowed: Iterable[str]) -> str:
-    """The end of a message about an unknown word: the allowed one that is like it."""
-    near = difflib.get_close_matches(word, list(allowed), n=1)
-    return f"; did you mean '{near[0]}'?" if near else ""

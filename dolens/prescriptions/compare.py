@@ -1,4 +1,4 @@
-"""Whether a lens file holds a prescription: what was written is read again and compared."""
+"""A written lens file is read again and compared with its prescription."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -17,7 +17,7 @@ def require_same(
     medium: Callable[[str], str] = str,
     assumed: tuple[str, ...] = (),
 ) -> None:
-    """Refuse to write a prescription that its file would not give back.
+    """Raise `InputError` where a file would not give back the prescription.
 
     Numbers must agree to the last bit, a radius through its curvature.  A key that the format's
     writer does not know is missing from what comes back, so it is refused here and never lost.
@@ -25,8 +25,8 @@ def require_same(
     Args:
         wanted: the prescription to be written.
         found: the same, read again from what would be written.
-        kind: what messages call the format, for example `.zmx`.
-        where: what messages call the prescription.
+        kind: name of the format in messages, for example `.zmx`.
+        where: name of the prescription in messages.
         medium: names that mean the same medium in this format become one.
         assumed: keys that the format never leaves out; allowed to appear where none was wanted.
 
@@ -74,7 +74,7 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers as floats, so that 25 and 25.0 are the same; rows as lists."""
+    """Return numbers as floats, so that 25 and 25.0 are the same; rows as lists."""
     if isinstance(value, bool) or value is None:
         return value
     if isinstance(value, int | float):

@@ -1,4 +1,4 @@
-"""Numbers between their decimal text and double precision, without losing a bit."""
+"""Decimal text and double precision are converted to each other without losing a bit."""
 
 import math
 from decimal import Context, Decimal
@@ -12,7 +12,7 @@ _RECIPROCAL = Context(prec=40)
 
 
 def number_in_text(text: str, place: str) -> float:
-    """A finite number as files write it (`1.5`, `-2E-3`); `InputError` names the place."""
+    """Read a finite number as files write it (`1.5`, `-2E-3`); `InputError` names the place."""
     try:
         value = float(text)
     except ValueError:
@@ -23,24 +23,26 @@ def number_in_text(text: str, place: str) -> float:
 
 
 def scaled(text: str, factor: Fraction, place: str) -> float:
-    """The double nearest to the decimal number times an exact factor (a change of units)."""
+    """Return the double nearest to the decimal number times an exact factor (a change of units)."""
     value = number_in_text(text, place)
     # Zero and exponents out of range ended above: the exact fraction below stays small.
     return value if value == 0.0 or factor == 1 else _nearest(Fraction(text) * factor, place)
 
 
 def shifted(value: float, places: int) -> str:
-    """Decimal text of value·10^places, exact for the shortest text that means the value."""
+    """Return decimal text of value·10^places, exact for the shortest text that means the value."""
     return str(Decimal(repr(value)).scaleb(places))
 
 
 def reciprocal(value: float) -> str:
-    """Text of 1/value with 40 digits, from which `curvature_in_text` recovers every bit."""
+    """Return text of 1/value with 40 digits, from which `curvature_in_text` recovers every bit."""
     return str(_RECIPROCAL.divide(Decimal(1), Decimal(value)))
 
 
 def curvature_in_text(text: str, place: str) -> float | None:
-    """The curvature whose radius has more digits than a double; None for an ordinary radius."""
+    """Return the curvature whose radius has more digits than a double; None for an ordinary
+    radius.
+    """
     radius = number_in_text(text, place)
     digits = Decimal(text).normalize().as_tuple().digits
     if radius == 0.0 or len(digits) <= _DIGITS_OF_A_DOUBLE:
@@ -56,7 +58,8 @@ def _nearest(exact: Fraction, place: str) -> float:
 
 
 def radius_of(curvature: float) -> float | None:
-    """The radius with the fewest digits whose reciprocal is the curvature; None if there is none.
+    """Return the radius with the fewest digits whose reciprocal is the curvature; None if there is
+    none.
 
     Infinite for curvature 0.  1/R in double precision skips some curvatures.
     """

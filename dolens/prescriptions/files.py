@@ -1,4 +1,4 @@
-"""Reading and writing lens files."""
+"""Lens files are read and written."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ import yaml
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.source_text import prescription_from_source_text, source_text_of
+from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
@@ -18,7 +18,7 @@ _SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML's safe loader, which also refuses a key written twice: the first would be lost."""
+    """This safe YAML loader also refuses a key written twice: the first would be lost."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
@@ -36,7 +36,7 @@ def load_prescription(path: str | Path) -> Any:
     """Read a lens file as plain data.
 
     Args:
-        path: a file in YAML (.yaml, .yml), the source's format (.txt) or Zemax's (.zmx).
+        path: a file in YAML (.yaml, .yml), the diffoptics format (.txt) or Zemax's (.zmx).
 
     Raises:
         InputError: the file is missing, of another kind, or not valid; the message is one line
@@ -54,7 +54,7 @@ def load_prescription(path: str | Path) -> Any:
     try:
         text = data.decode("utf-8")
         if suffix == ".txt":
-            return prescription_from_source_text(text, str(path))
+            return prescription_from_diffoptics(text, str(path))
         # A subclass of the safe loader: it builds plain values only.
         return yaml.load(text, Loader=_UniqueKeyLoader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -68,13 +68,15 @@ def load_lens(
     index_model: str | None = None,
     backend: str = "auto",
 ) -> Lens:
-    """Read a lens from a prescription in YAML, the source's `.txt` or Zemax's `.zmx`.
+    """Read a lens from a prescription in YAML, diffoptics's `.txt` or Zemax's `.zmx`.
 
     Args:
         path: the file; its suffix says which format it is in.
         dtype: precision of the lens.
         index_model: dfc, do or paper, instead of the file's own.
-        backend: what traces: auto, reference, cpu or cuda.
+
+    Rarely needed:
+        backend: auto, reference, cpu or cuda.
 
     Raises:
         InputError: the file is missing, not valid, or no prescription; the message is one line
@@ -97,7 +99,7 @@ def save_lens(lens: Lens, path: str | Path) -> None:
     if suffix == ".zmx":
         data = encode_zemax(zemax_of(prescription, str(path)))
     elif suffix == ".txt":
-        data = source_text_of(prescription, str(path)).encode()
+        data = diffoptics_text_of(prescription, str(path)).encode()
     else:
         text = yaml.safe_dump(prescription, sort_keys=False, default_flow_style=None, width=200)
         data = text.encode()

@@ -1,4 +1,4 @@
-"""How elements and their poses are written down.
+"""Elements and their poses are read from a prescription and written to it.
 
 ``elements`` maps names to groups of neighbouring surfaces; angles are in degrees, lengths in mm::
 
@@ -8,15 +8,15 @@
 The pivot counts from the vertex of the element's first surface, and what is not written is zero.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.elements import DISPLACEMENTS, TILTS, Element
-from dolens.prescriptions.checks import as_integer, as_number, check_keys, require_mapping
+from dolens.optics.parameter_units import file_value, to_lens_units
+from dolens.prescriptions.checks import as_integer, as_number, require_mapping
 
 # A tilt that no number of degrees gives to the last bit is written in radians, under this name.
 _RADIANS = tuple(f"{name}_radians" for name in TILTS)
@@ -37,7 +37,7 @@ def elements_from(value: object, dtype: torch.dtype, where: str) -> dict[str, El
 
 
 def element_rows(elements: Mapping[str, Element]) -> dict[str, dict[str, Any]]:
-    """What `elements_from` reads back to the same parameters, to the last bit."""
+    """Return rows that `elements_from` reads back to the same parameters, to the last bit."""
     rows = {}
     for name, element in elements.items():
         row: dict[str, Any] = {"surfaces": [element.first, element.last]}
@@ -45,8 +45,8 @@ def element_rows(elements: Mapping[str, Element]) -> dict[str, dict[str, Any]]:
             number = float(value.detach())
             if number == 0.0:
                 continue
-            degrees = _degrees(number) if key in TILTS else number
-            row |= {f"{key}_radians": number} if degrees is None else {key: degrees}
+            written = file_value(key, number)
+            row |= {f"{key}_radians": number} if written is None else {key: written}
         if any(element.pivot):
             row["pivot"] = list(element.pivot)
         rows[name] = row
@@ -65,7 +65,7 @@ def _element(row: object, dtype: torch.dtype, place: str) -> Element:
     for name in TILTS:
         if f"{name}_radians" in row and name in row:
             raise InputError(f"{place}: give '{name}' or '{name}_radians', not both")
-        pose[name] = math.radians(as_number(row.get(name, 0.0), f"{place}: '{name}'"))
+        pose[name] = to_lens_units(name, as_number(row.get(name, 0.0), f"{place}: '{name}'"))
         if f"{name}_radians" in row:
             pose[name] = as_number(row[f"{name}_radians"], f"{place}: '{name}_radians'")
     for name in DISPLACEMENTS:
@@ -79,12 +79,3 @@ def _element(row: object, dtype: torch.dtype, place: str) -> Element:
         )
     except InputError as error:
         raise InputError(f"{place}: {error}") from None
-
-
-def _degrees(radians: float) -> float | None:
-    """Degrees that are these radians to the last bit, if there are any."""
-    guess = math.degrees(radians)
-    for candidate in (guess, math.nextafter(guess, -math.inf), math.nextafter(guess, math.inf)):
-        if math.radians(candidate) == radians:
-            return candidate
-    return None

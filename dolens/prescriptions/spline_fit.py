@@ -1,4 +1,4 @@
-"""From sag data to the prescription of a B-spline surface."""
+"""A B-spline surface is fitted to sag data."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +21,7 @@ def fit_b_spline(
     knots_y: Sequence[float],
     smoothing: float = 0.0,
 ) -> dict[str, Any]:
-    """Least-squares cubic B-spline through scattered or gridded sag data.
+    """Fit a cubic B-spline through scattered or gridded sag data by least squares.
 
     Minimises the mean of (s(x, y) - sag)² + smoothing · the mean of s_xx² + 2·s_xy² + s_yy² over
     the knot rectangle, the bending energy of a thin plate.  Data from a circular aperture leave
@@ -34,6 +34,8 @@ def fit_b_spline(
         sag: mm; of any shape, or (rows, columns) on the grid of y and x.
         knots_x: mm, 4 more than there are to be coefficients along x (see `clamped_knots`).
         knots_y: mm, along y.
+
+    Rarely needed:
         smoothing: mm², at least 0.
 
     Returns:
@@ -84,7 +86,7 @@ def fit_b_spline(
 def _points(
     x: ArrayLike, y: ArrayLike, sag: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scattered or gridded data as three lists of one length."""
+    """Return scattered or gridded data as three lists of one length."""
     x, y, sag = (np.asarray(values, dtype=np.float64) for values in (x, y, sag))
     if sag.ndim == 2 and x.shape == sag.shape[1:] and y.shape == sag.shape[:1]:
         x, y = np.meshgrid(x, y)
@@ -101,7 +103,7 @@ def _points(
 
 
 def _products_of_rows(a: Any, b: Any) -> Any:
-    """Row r of the result is the outer product of the rows r of a and b (four entries each)."""
+    """Return rows that are the outer products of the rows of a and b (four entries each)."""
     from scipy import sparse
 
     a_value, b_value = (m.data.reshape(-1, 4, 1) for m in (a, b))
@@ -114,7 +116,9 @@ def _products_of_rows(a: Any, b: Any) -> Any:
 
 
 def _bending(ty: np.ndarray, tx: np.ndarray) -> Any:
-    """Rows whose squares sum to the mean of s_xx² + 2·s_xy² + s_yy², by Gauss's rule, exactly."""
+    """Return rows whose squares sum to the mean of s_xx² + 2·s_xy² + s_yy², by Gauss's rule,
+    exactly.
+    """
     from scipy import sparse
 
     y, x = ([_at_gauss_points(t, order) for order in range(3)] for t in (ty, tx))
@@ -128,7 +132,9 @@ def _bending(ty: np.ndarray, tx: np.ndarray) -> Any:
 
 
 def _at_gauss_points(t: np.ndarray, order: int) -> Any:
-    """Derivatives of the basis at four points a span, times the root of the point's weight."""
+    """Return derivatives of the basis at four points a span, times the root of the point's
+    weight.
+    """
     from scipy import sparse
     from scipy.interpolate import BSpline
 

@@ -1,4 +1,4 @@
-"""Zemax `.zmx` files as text: their encoding, and their operands line by line.
+"""Zemax `.zmx` files are decoded, and their operands sorted line by line.
 
 A file is a list of lines, each an operand of capital letters and its arguments.  The first ones
 describe the system; from `SURF n` on they describe surface n, usually indented.  Surface 0 is the
@@ -28,7 +28,9 @@ _LINE_END = re.compile(r"\r\n|\r|\n")
 
 
 class Line(NamedTuple):
-    """One line: its number in the file from 1, its operand, arguments, and the text behind it."""
+    """A `Line` has its number in the file from 1, its operand, arguments, and the text behind
+    it.
+    """
 
     at: int
     operand: str
@@ -38,7 +40,7 @@ class Line(NamedTuple):
 
 @dataclass
 class ZemaxFile:
-    """The lines of a file.
+    """A `ZemaxFile` holds the lines of a file.
 
     Attributes:
         system: operand → its lines, before and after the surfaces.
@@ -50,7 +52,7 @@ class ZemaxFile:
 
 
 def decode_zemax(data: bytes, where: str = "lens") -> str:
-    """The text of a `.zmx` file: UTF-16 or UTF-8, with a byte order mark or without, or Latin-1.
+    """Decode a `.zmx` file: UTF-16 or UTF-8, with a byte order mark or without, or Latin-1.
 
     Raises:
         InputError: the file is no text.
@@ -76,7 +78,7 @@ def decode_zemax(data: bytes, where: str = "lens") -> str:
 
 
 def encode_zemax(text: str) -> bytes:
-    """Bytes of a `.zmx` file with Zemax's line ends: ASCII where that is enough, else UTF-16."""
+    """Encode a `.zmx` file with Zemax's line ends: ASCII where that is enough, else UTF-16."""
     text = _LINE_END.sub("\r\n", text)
     if text.isascii():
         return text.encode("ascii")

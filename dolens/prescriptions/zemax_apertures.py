@@ -1,4 +1,4 @@
-"""Apertures of a Zemax surface: circles, rings, rectangles, and obscurations.
+"""Apertures of a Zemax surface are circles, rings, rectangles, and obscurations.
 
 `CLAP` and `FLAP` are circles (the first may have an inner radius, an obscuration), `SQAP` is a
 rectangle of half widths, `OBSC` and `SQOB` block a circle and a rectangle.  A surface has one of
@@ -20,12 +20,12 @@ _HALF_WIDTHS = ("half_width_x", "half_width_y")
 
 
 def read_apertures(block: Block, factor: Fraction, place: str) -> tuple[dict[str, Any], bool]:
-    """The clear aperture of a surface's block.
+    """Read the clear aperture of a surface's block.
 
     Args:
         block: its lines by operand.
         factor: mm in a unit of the file.
-        place: what messages call it.
+        place: name in messages.
 
     Returns:
         `semi_diameter` or `aperture`, and `obscuration`, as a prescription's row has them (nothing
@@ -63,7 +63,7 @@ def read_apertures(block: Block, factor: Fraction, place: str) -> tuple[dict[str
 
 
 def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
-    """The lines of a surface's block that `read_apertures` reads back.
+    """Return the lines of a surface's block that `read_apertures` reads back.
 
     What one Zemax aperture cannot say (a rectangle with a hole) does not come back, and is refused
     by the writer's comparison.
@@ -84,7 +84,7 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
 
 
 def is_fixed(block: Block) -> bool:
-    """Whether a surface's DIAM is the user's own and not computed."""
+    """Return whether a surface's DIAM is the user's own and not computed."""
     return _words(block, "DIAM")[1:2] == ["1"]
 
 

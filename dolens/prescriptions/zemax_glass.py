@@ -1,4 +1,4 @@
-"""The glass of a Zemax surface: a model (nd and Vd), or a name in the catalogues of the file.
+"""The glass of a Zemax surface is a model (nd and Vd), or a name in the catalogues of the file.
 
 `GCAT` lists the catalogues that a file uses, and Zemax takes a name from the first that has it.
 Here a name is read from that catalogue too, or refused: the same name at another maker is another
@@ -46,12 +46,12 @@ Pair = tuple[str, str]
 
 
 def read_glass(words: Sequence[str], catalogues: Sequence[str] | None, place: str) -> str:
-    """The medium that the arguments of GLAS name, as a prescription writes it.
+    """Return the medium that the arguments of GLAS name, as a prescription writes it.
 
     Args:
         words: name, kind of solve (1 is a model), pick-up, nd, Vd, ...; none is air.
         catalogues: the arguments of GCAT; None where the file has none.
-        place: what messages call the surface.
+        place: name of the surface in messages.
 
     Returns:
         `air`, nd/Vd, a constant index (a model whose Vd is 0), or maker and name.
@@ -81,7 +81,7 @@ def read_glass(words: Sequence[str], catalogues: Sequence[str] | None, place: st
 
 
 def glass_line(material: object, place: str) -> list[str]:
-    """The GLAS line of a medium, none for air; `read_glass` reads it back.
+    """Return the GLAS line of a medium, none for air; `read_glass` reads it back.
 
     Raises:
         InputError: the medium is none that a prescription names.
@@ -101,7 +101,9 @@ def glass_line(material: object, place: str) -> list[str]:
 
 
 def canonical(material: str) -> str:
-    """One name for a medium in a `.zmx` file, in which `occluder` is air; as it stands if none."""
+    """Return one name for a medium in a `.zmx` file, in which `occluder` is air; unchanged if
+    none.
+    """
     try:
         name = parse_material(material, index_model("dfc")).name
     except InputError:
@@ -110,7 +112,8 @@ def canonical(material: str) -> str:
 
 
 def catalogue_line(materials: Sequence[object], where: str) -> list[str]:
-    """The GCAT line of a file with these media: an order in which every name means its glass.
+    """Return the GCAT line of a file with these media: an order in which every name means its
+    glass.
 
     Raises:
         InputError: there is no such order, because two makers' glasses share their names.
@@ -142,7 +145,7 @@ def _model(words: Sequence[str], place: str) -> str:
 
 
 def _printed(words: Sequence[str], place: str) -> Pair | None:
-    """The nd and Vd beside a name, where the program that wrote the file filled them in."""
+    """Return the nd and Vd beside a name, where the program that wrote the file filled them in."""
     if len(words) < 5:
         return None
     nd, vd = (number_in_text(word, place) for word in words[3:5])
@@ -150,7 +153,7 @@ def _printed(words: Sequence[str], place: str) -> Pair | None:
 
 
 def _named(name: str, catalogues: Sequence[str] | None, pair: Pair | None, place: str) -> str:
-    """Maker and name of the glass that a file means."""
+    """Return maker and name of the glass that a file means."""
     makers = makers_of(name)
     if catalogues is None:
         agreeing = [m for m in makers if pair and _agrees(_of(m, name), pair)]
@@ -186,7 +189,7 @@ def _named(name: str, catalogues: Sequence[str] | None, pair: Pair | None, place
 
 
 def _maker(catalogue: str) -> str | None:
-    """The maker whose glasses a catalogue of Zemax holds; editions have a suffix."""
+    """Return the maker whose glasses a catalogue of Zemax holds; editions have a suffix."""
     word = catalogue.upper()
     if word == _MISC:
         return "PLASTIC"
@@ -195,7 +198,7 @@ def _maker(catalogue: str) -> str | None:
 
 
 def _may_have(catalogue: str, maker: str | None, name: str) -> bool:
-    """Whether a catalogue may have a glass of that name, which is not known here.
+    """Return whether a catalogue may have a glass of that name, which is not known here.
 
     Makers' modern names have a hyphen and are theirs alone.  MISC has no such names, and some that
     are glasses elsewhere (LAF3 is lanthanum fluoride there).
@@ -208,7 +211,9 @@ def _may_have(catalogue: str, maker: str | None, name: str) -> bool:
 
 
 def _agrees(found: str, pair: Pair) -> bool | None:
-    """Whether a glass has that nd and Vd; None where it has none, in the infrared for example."""
+    """Return whether a glass has that nd and Vd; None where it has none, for example in the
+    infrared.
+    """
     own = _index_and_abbe_number(find_glass(found))
     if own is None:
         return None
@@ -217,7 +222,7 @@ def _agrees(found: str, pair: Pair) -> bool | None:
 
 
 def _half_unit(text: str) -> float:
-    """Half a unit of the last decimal that is written."""
+    """Return half a unit of the last decimal that is written."""
     return 0.5 * 10.0 ** int(Decimal(text).as_tuple().exponent)
 
 
@@ -247,6 +252,6 @@ def _medium(material: object, place: str) -> Medium:
 
 
 def _plain(word: str, place: str) -> str:
-    """Decimal text without an exponent; as it stands where it is so already."""
+    """Return decimal text without an exponent; unchanged where it has none."""
     value = number_in_text(word, place)
     return word if word.replace(".", "", 1).isdecimal() and word[-1] != "." else f"{value!r}"

@@ -1,4 +1,4 @@
-"""From the text of a Zemax `.zmx` file to a prescription.
+"""The text of a Zemax `.zmx` file is converted to a prescription.
 
 Held: sequential systems of STANDARD and EVENASPH surfaces, glass by model (nd, Vd) or by its name
 in the catalogues of GCAT (`zemax_glass`), circular and rectangular apertures and obscurations
@@ -12,7 +12,7 @@ neither refract nor clip are left out, and their gaps added to the sensor's dist
 A CLAP clips, so it gives the semi-diameter; else DIAM does.  In Zemax a DIAM without CLAP or FLAP
 draws and does not clip: here it clips.  A missing or zero DIAM is an error, because ENPD and FNUM
 size the beam of the axis alone, and its semi-diameters would vignette the fields.
-ENPD and FNUM close the stop (see `dolens.prescriptions.conditions`), which then needs no DIAM.
+ENPD and FNUM close the stop (see `dolens.prescriptions.system_data`), which then needs no DIAM.
 Vignetting factors, weights, ray aiming, temperature and coatings are not read.
 """
 
@@ -21,8 +21,8 @@ from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.conditions import PUPIL_KEYS
 from dolens.prescriptions.decimals import number_in_text, radius_of, scaled
+from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_glass import read_glass
@@ -41,7 +41,7 @@ def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:
 
     Args:
         text: the file's content, decoded (see `decode_zemax`).
-        where: what messages call it, usually its path.
+        where: name in messages, usually its path.
 
     Returns:
         A prescription with index model `dfc`: nd, Vd and indices relative to air are Zemax's own.
@@ -137,7 +137,7 @@ def _object(
 
 
 def _row(block: Block, before: str, material: str, factor: Fraction, place: str) -> dict[str, Any]:
-    """Type, radius, coefficients and medium of a surface between two media."""
+    """Return type, radius, coefficients and medium of a surface between two media."""
     kind = _type(block, place)
     row: dict[str, Any] = {"type": "sphere"}
     curvature = scaled(_arguments(block, "CURV", "0")[0], 1 / factor, f"{place}: CURV")
@@ -161,7 +161,7 @@ def _row(block: Block, before: str, material: str, factor: Fraction, place: str)
 
 
 def _coefficients(block: Block, factor: Fraction, place: str) -> dict[str, float]:
-    """The coefficients of r², r⁴, ... by name (a2, a4, ...), in mm.
+    """Return the coefficients of r², r⁴, ... by name (a2, a4, ...), in mm.
 
     Zemax lists all eight, used or not: then the zeros behind the last that is used are left out.
     """
@@ -183,7 +183,7 @@ def _coefficients(block: Block, factor: Fraction, place: str) -> dict[str, float
 def _without_square(
     curvature: float, conic: float, square: float, place: str
 ) -> tuple[float, float]:
-    """Curvature and conic constant of the surface whose r² term is part of the conic.
+    """Return curvature and conic constant of the surface whose r² term is part of the conic.
 
     A paraboloid (conic -1) of curvature c is c·r²/2, as a plane is for c = 0, so a term α·r² adds
     2α to c exactly.  Any other conic plus a paraboloid is no conic.
@@ -224,5 +224,5 @@ def _value(block: Block, operand: str, place: str) -> float:
 
 
 def _arguments(block: Block, operand: str, *default: str) -> list[str]:
-    """The arguments of an operand's last line."""
+    """Return the arguments of an operand's last line."""
     return (block[operand][-1].arguments if operand in block else []) or list(default)

@@ -1,4 +1,4 @@
-"""What a Zemax `.zmx` file says of the whole system: units, aperture, fields, wavelengths."""
+"""The system data of a Zemax `.zmx` file are its units, aperture, fields and wavelengths."""
 
 from fractions import Fraction
 from typing import Any
@@ -14,7 +14,7 @@ _MICROMETRE = Fraction(1000)
 
 
 def factor_to_mm(file: ZemaxFile, where: str) -> Fraction:
-    """Millimetres in the file's unit of length; millimetres where it names none."""
+    """Return millimetres in the file's unit of length; millimetres where it names none."""
     line = _last(file, "UNIT")
     unit = line.arguments[0].upper() if line and line.arguments else "MM"
     if unit not in _UNITS:
@@ -23,7 +23,7 @@ def factor_to_mm(file: ZemaxFile, where: str) -> Fraction:
 
 
 def read_system(file: ZemaxFile, factor: Fraction, where: str) -> dict[str, Any]:
-    """Name, source, wavelengths, fields and pupil as a prescription writes them.
+    """Read name, source, wavelengths, fields and pupil as a prescription writes them.
 
     Raises:
         InputError: the mode is not sequential, there are several configurations, or a field or
@@ -52,7 +52,8 @@ def read_system(file: ZemaxFile, factor: Fraction, where: str) -> dict[str, Any]
 
 
 def _wavelengths(file: ZemaxFile, kind: Line | None, where: str) -> dict[str, Any]:
-    """WAVM gives one wavelength a line, WAVL (older) all in one, in µm; PWAV numbers the primary.
+    """Read wavelengths: WAVM gives one a line, WAVL (older) all in one, in µm; PWAV numbers the
+    primary.
 
     Zemax pads WAVM to 24 lines; the fourth number of FTYP says how many are used.
     """
@@ -77,7 +78,7 @@ def _wavelengths(file: ZemaxFile, kind: Line | None, where: str) -> dict[str, An
 
 
 def _fields(file: ZemaxFile, kind: Line | None, factor: Fraction, where: str) -> dict[str, Any]:
-    """XFLN and YFLN list x and y; the third number of FTYP says how many are used."""
+    """Read fields: XFLN and YFLN list x and y; the third number of FTYP says how many are used."""
     number = _count(kind, 0, where) if kind and kind.arguments else 0
     if number not in _FIELD_KINDS:
         meant = _OTHER_FIELDS.get(number, "unknown")
@@ -103,7 +104,7 @@ def _fields(file: ZemaxFile, kind: Line | None, factor: Fraction, where: str) ->
 
 
 def _pupil(file: ZemaxFile, factor: Fraction, where: str) -> dict[str, Any]:
-    """The aperture of the system; nothing for FLOA, where the stop's semi-diameter says it."""
+    """Read the aperture of the system; nothing for FLOA, where the stop's semi-diameter says it."""
     if "FLOA" in file.system:
         return {}
     for operand in ("OBNA", "ENPD", "FNUM"):

@@ -1,4 +1,4 @@
-"""From a prescription to the text of a Zemax `.zmx` file."""
+"""A prescription is written as the text of a Zemax `.zmx` file."""
 
 import math
 import re
@@ -111,7 +111,7 @@ def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
 
 
 def _surface(row: Mapping[str, Any], place: str) -> list[str]:
-    """A surface's block but for its number, stop and distance.
+    """Write a surface's block, without its number, stop and distance.
 
     Zemax writes a curvature of zero as 0.0, so CURV 0 can mean a plane, and a sphere whose
     curvature happens to be 0 stays one.  CONI is written for conics and aspheres alone.

@@ -1,4 +1,6 @@
-"""From the sensor image to the picture: networks, deconvolution, losses, image quality."""
+"""Images are reconstructed from sensor data by networks and deconvolution, with losses and quality
+metrics.
+"""
 
 from dolens.reconstruction.adversarial import (
     RelativisticDiscriminators,

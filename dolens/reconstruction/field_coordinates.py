@@ -1,4 +1,6 @@
-"""Where on the sensor a pixel lies, as channels for a network: blur varies over the field."""
+"""Field coordinates give a network the position of each pixel, because blur varies over the
+field.
+"""
 
 import torch
 from torch import Tensor

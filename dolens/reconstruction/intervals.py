@@ -1,4 +1,4 @@
-"""Confidence intervals of image quality, by resampling photographs and seeds."""
+"""Confidence intervals of image quality are found by resampling photographs and seeds."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and its confidence interval, in the units of the scores.
+    """An `Interval` holds an estimate and its confidence interval, in the units of the scores.
 
     Attributes:
         estimate: the statistic of the means over all seeds and photographs.
@@ -57,6 +57,8 @@ def bootstrap_interval(
         scores: (S, P, K): seed, photograph, and whatever the statistic takes, such as views.
         statistic: maps mean scores (R, K) to (R,).
         generator: draws the resamples; on the CPU.
+
+    Rarely needed:
         level: confidence level, between 0 and 1.
         resamples: how many.
 
@@ -103,6 +105,8 @@ def gain_interval(
             same order.
         statistic: maps mean scores (R, K) to (R,).
         generator: draws the resamples.
+
+    Rarely needed:
         level: confidence level, between 0 and 1.
         resamples: how many.
 
@@ -124,7 +128,9 @@ def gain_interval(
 
 
 def _weights(count: int, resamples: int, generator: torch.Generator) -> Tensor:
-    """(resamples, count) weights of means over `count - 1` draws with replacement; 1 for one."""
+    """Return weights (resamples, count) of means over `count - 1` draws with replacement; 1 for
+    one.
+    """
     if count == 1:
         return torch.ones(resamples, 1, dtype=torch.float64)
     drawn = torch.randint(count, (resamples, count - 1), generator=generator)
@@ -133,7 +139,9 @@ def _weights(count: int, resamples: int, generator: torch.Generator) -> Tensor:
 
 
 def _degrees_of_freedom(scores: Tensor, statistic: Callable[[Tensor], Tensor]) -> float:
-    """Welch and Satterthwaite's ν = (Σ V)² / Σ (V² / (n - 1)), V by jackknife over each axis."""
+    """Return Welch and Satterthwaite's ν = (Σ V)² / Σ (V² / (n - 1)), V by jackknife over each
+    axis.
+    """
     variances, weighted = 0.0, 0.0
     for axis in (0, 1):
         count = scores.shape[axis]

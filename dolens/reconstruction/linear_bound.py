@@ -1,4 +1,4 @@
-"""How well any linear filter can restore: the least mean squared error, from transfer functions.
+"""The least mean squared error of any linear filter is computed from transfer functions.
 
 A cross-check of trained cameras that takes milliseconds and no photographs.  Where the depth of a
 pixel is unknown one filter serves all depths; where it is known each depth has its own.  A network
@@ -12,21 +12,22 @@ from torch import Tensor
 
 
 class LinearError(NamedTuple):
-    """Mean squared errors of D depths, in the image's units squared, each (..., D).
+    """A `LinearError` holds mean squared errors of D depths, in the image's units squared, each
+    (..., D).
 
     Attributes:
-        shared: one filter for all depths, of least mean error over them.
-        own: each depth has the filter that is best for it.
+        common_filter: one filter for all depths, of least mean error over them.
+        filter_per_depth: each depth has the filter that is best for it.
     """
 
-    shared: Tensor
-    own: Tensor
+    common_filter: Tensor
+    filter_per_depth: Tensor
 
 
 def natural_spectrum(
     rows: int, columns: int, variance: float, outer_scale: float, like: Tensor
 ) -> Tensor:
-    """The power spectrum of natural images, S ∝ 1/(f² + f₀²) without its mean.
+    """Return the power spectrum of natural images, S ∝ 1/(f² + f₀²) without its mean.
 
     Field (J. Opt. Soc. Am. A 4, 2379, 1987) has 1/f²; f₀ keeps low frequencies finite.
 
@@ -49,7 +50,8 @@ def natural_spectrum(
 
 
 def linear_error(functions: Tensor, spectrum: Tensor, noise: float) -> LinearError:
-    """The least errors of restoring an image of spectrum S that was blurred and got white noise.
+    """Return the least errors of restoring an image of spectrum S that was blurred and got white
+    noise.
 
     With transfer functions H_d and noise of variance N a pixel, a filter W leaves at depth d the
     error e_d = ⟨|1 - W·H_d|²·S + |W|²·N⟩, ⟨⟩ the mean over frequencies.  The mean of e_d over d is
@@ -67,17 +69,17 @@ def linear_error(functions: Tensor, spectrum: Tensor, noise: float) -> LinearErr
     # The place of the origin changes the phase of all depths alike, and no error.
     transfer = torch.fft.rfft2(functions, s=(rows, rows))
     power = transfer.real.square() + transfer.imag.square()
-    shared = spectrum * transfer.mean(-3, keepdim=True).conj()
-    shared = shared / (spectrum * power.mean(-3, keepdim=True) + noise)
-    residual = 1.0 - shared * transfer
+    common_filter = spectrum * transfer.mean(-3, keepdim=True).conj()
+    common_filter = common_filter / (spectrum * power.mean(-3, keepdim=True) + noise)
+    residual = 1.0 - common_filter * transfer
     left = spectrum * (residual.real.square() + residual.imag.square())
-    left = left + noise * (shared.real.square() + shared.imag.square())
+    left = left + noise * (common_filter.real.square() + common_filter.imag.square())
     own = spectrum * noise / (spectrum * power + noise)
     return LinearError(_mean(left, rows), _mean(own, rows))
 
 
 def _mean(values: Tensor, columns: int) -> Tensor:
-    """Over all frequencies of a real image, of which the transform has one half."""
+    """Average over all frequencies of a real image, of which the transform holds one half."""
     weight = values.new_full(values.shape[-1:], 2.0)
     weight[0] = 1.0
     if columns % 2 == 0:

@@ -1,4 +1,6 @@
-"""The training loss of equation S20: squared error, total variation, perceptual error, and L1."""
+"""The training loss of equation S20 adds squared error, total variation, perceptual error, and
+L1.
+"""
 
 import difflib
 import logging
@@ -54,7 +56,8 @@ def total_variation(image: Tensor) -> Tensor:
 
 
 class RestorationLoss(nn.Module):
-    """Equation S20, with means in place of the norms so that weights do not depend on size.
+    """A `RestorationLoss` is equation S20, with means instead of norms so that weights do not
+    depend on size.
 
         total = mse_weight · mse + tv_weight · tv + perceptual_weight · perceptual + l1_weight · l1
 
@@ -66,8 +69,8 @@ class RestorationLoss(nn.Module):
         tv_weight: α₂.
         perceptual_weight: α₃; at 0 no VGG-16 weights are looked for.
         perceptual: "vgg16" requires the perceptual term; "auto" leaves it out, with a warning,
-            where VGG-16's weights cannot be had; "vgg16_edges" requires it with weights that were
-            trained on to find edges, whose features are larger; "none" leaves it out.
+            where VGG-16's weights are not available; "vgg16_edges" requires it with weights
+            that were trained further to find edges, whose features are larger; "none" omits it.
         vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`, `load_edge_weights`.
         l1_weight: of the mean absolute error; at 0 it is not computed.
 
@@ -106,7 +109,7 @@ class RestorationLoss(nn.Module):
 
     @property
     def perceptual_available(self) -> bool:
-        """Whether the perceptual term is part of the loss."""
+        """Return whether the perceptual term is part of the loss."""
         return len(self._features) > 0
 
     def forward(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Sides that a network which halves its image several times can take."""
+"""Images are padded to sides that a network can halve several times."""
 
 from torch import Tensor
 from torch.nn import functional

@@ -1,4 +1,4 @@
-"""The perceptual loss: distance between images as the first layers of VGG-16 see them."""
+"""The perceptual loss is the distance between images in the features of VGG-16's first layers."""
 
 from collections.abc import Mapping, Sequence
 
@@ -25,13 +25,13 @@ VGG16 = PublishedWeights(
 
 
 class VGG16Features(nn.Module):
-    """The first 15 layers of VGG-16, frozen: the V of equation S20.
+    """The first 15 layers of VGG-16, frozen, are the feature extractor V of equation S20.
 
     They end with the third convolution of the third block (conv3_3, before its ReLU), at a
     quarter of the resolution.
 
     Args:
-        weights: what `load_vgg16_weights` or `load_edge_weights` returns; copied as float32.
+        weights: from `load_vgg16_weights` or `load_edge_weights`; copied as float32.
         mean: of R, G, B in [0, 1], which the weights were trained with; default: ImageNet's.
         standard_deviation: likewise.
 
@@ -79,7 +79,7 @@ def perceptual_loss(features: VGG16Features, restored: Tensor, truth: Tensor) ->
 
 
 def load_vgg16_weights(path: str | None) -> dict[str, Tensor]:
-    """Find the weights of VGG-16's first 15 layers; see `PublishedWeights.load`.
+    """Load the weights of VGG-16's first 15 layers; see `PublishedWeights.load`.
 
     Args:
         path: a file saved by `torch.save` with a state dict of the whole VGG-16

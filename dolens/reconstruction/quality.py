@@ -1,4 +1,4 @@
-"""How close a restored picture is to the truth, image by image."""
+"""Image quality is measured by PSNR and SSIM, image by image."""
 
 from torch import Tensor
 from torchmetrics.functional.image import (

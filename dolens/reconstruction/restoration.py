@@ -1,4 +1,4 @@
-"""The networks that turn a sensor image into the picture, behind one interface."""
+"""Restoring networks turn a sensor image into a picture, behind one interface."""
 
 import math
 from typing import ClassVar
@@ -18,7 +18,7 @@ COLORS = 3
 
 
 class Restoration(nn.Module):
-    """What every restoring network offers: `forward(raw, point_spread_functions, field)`.
+    """A restoring network offers `forward(raw, point_spread_functions, field)`.
 
     `needs_point_spread_function` and `needs_field` tell the caller whether to compute the point
     spread functions and the field coordinates at all; where one is False they are ignored and
@@ -41,7 +41,7 @@ class Restoration(nn.Module):
             raw: sensor image in linear light, (B, 3, H, W).
             point_spread_functions: (D, 3, K, K) for D depths, K odd, each centred on the pixel
                 (K//2, K//2) and of unit sum where the lens loses no light; or None.
-            field: where on the sensor each pixel lies, (B, 2, H, W): x and y over half the
+            field: position of each pixel on the sensor, (B, 2, H, W): x and y over half the
                 sensor's diagonal, so that its corners have radius 1; or None.
 
         Returns:
@@ -49,20 +49,20 @@ class Restoration(nn.Module):
             lens may stand before a float32 network, and gradients reach it.
 
         Raises:
-            InputError: what the network needs is None or of another shape.
+            InputError: an argument that the network needs is None or of another shape.
         """
         raise NotImplementedError
 
     @property
     def dtype(self) -> torch.dtype:
-        """The floating-point type of the network's parameters, or of its buffers if it has none."""
+        """Return the floating-point type of the parameters, or of the buffers if there are none."""
         tensors = (*self.parameters(), *self.buffers())
         found = (tensor.dtype for tensor in tensors if tensor.is_floating_point())
         return next(found, torch.get_default_dtype())
 
 
 class ResidualRestoration(Restoration):
-    """A network alone, which gives what the encoded image lacks.
+    """A residual network predicts the difference between the encoded image and the truth.
 
         restored = encoded + network(encoded),   encoded = sRGB(raw),
 
@@ -104,7 +104,7 @@ class ResidualRestoration(Restoration):
 
 
 class UNetRestoration(ResidualRestoration):
-    """A U-Net alone, as in the supplement.
+    """Restore by a U-Net alone, as in the supplement.
 
     It begins as the identity on the encoded image.
 
@@ -121,18 +121,20 @@ class UNetRestoration(ResidualRestoration):
 
 
 class FeaturePyramidRestoration(ResidualRestoration):
-    """The generator of DeblurGAN-v2, a feature pyramid over a classifier's layers.
+    """Restore by the generator of DeblurGAN-v2, a feature pyramid over a classifier's layers.
 
     It begins as the identity on the encoded image.
 
     Args:
         backbone: "mobilenet_v2" or "googlenet", the Inception network.
         stages: of the backbone, from 2 to 5; 5, as in the original, sees at 1/32.
-        width_multiplier: of a MobileNetV2's channels; trained weights are published for 1.
         pyramid_channels: of the pyramid, a multiple of 4; see `FeaturePyramid`.
         field_coordinates: whether it is told where on the sensor a pixel lies.
         weights: "imagenet" requires trained weights for the backbone; "auto" starts at random,
-            with a warning, where they cannot be had; "none" starts at random.
+            with a warning, where they are not available; "none" starts at random.
+
+    Rarely needed:
+        width_multiplier: of a MobileNetV2's channels; trained weights are published for 1.
         weights_file: a file of them; None for the torch cache, then torchvision's download.
 
     Raises:
@@ -158,7 +160,7 @@ class FeaturePyramidRestoration(ResidualRestoration):
 
 
 class WienerUNetRestoration(Restoration):
-    """Wiener deconvolution in linear light, then a U-Net that mends what it leaves.
+    """Restore by Wiener deconvolution in linear light, followed by a U-Net.
 
     The point spread functions are averaged over the depths: the deconvolution is one for all
     of them, as it must be where the depth of a pixel is unknown.  Both the deconvolved and the

@@ -1,4 +1,6 @@
-"""Weights that torchvision publishes: from a file, the torch cache or one announced download."""
+"""Weights that torchvision publishes are read from a file, the torch cache or one announced
+download.
+"""
 
 import logging
 import os
@@ -22,20 +24,22 @@ IMAGENET_STANDARD_DEVIATION = (0.229, 0.224, 0.225)
 
 
 class PretrainedWeightsUnavailable(InputError):
-    """No weights were given, cached or to be downloaded; the message says what to do."""
+    """Weights were not given, are not cached and cannot be downloaded; the message says what to
+    do.
+    """
 
 
 @dataclass(frozen=True)
 class PublishedWeights:
-    """One of torchvision's files of weights, and how messages speak of it.
+    """A `PublishedWeights` names one of torchvision's files of weights for messages.
 
     Attributes:
         network: whose weights they are.
-        purpose: what they are wanted for.
-        url: where torchvision publishes them.
-        megabytes: what a download costs.
+        purpose: of the weights, for messages.
+        url: torchvision's address of the file.
+        megabytes: size of the download.
         key: the configuration key that names a file of one's own, `group.argument`.
-        prefix: what the wanted parameters' names begin with in the whole network's state dict.
+        prefix: beginning of the wanted parameters' names in the whole network's state dict.
     """
 
     network: str
@@ -47,7 +51,7 @@ class PublishedWeights:
 
     @property
     def file_name(self) -> str:
-        """Its name in the torch cache."""
+        """Return the file's name in the torch cache."""
         return self.url.rsplit("/", 1)[-1]
 
     def load(self, path: str | None, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:

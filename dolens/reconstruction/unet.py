@@ -1,4 +1,4 @@
-"""The U-Net: a convolutional network that sees an image at several scales at once."""
+"""The U-Net is a convolutional network that processes an image at several scales."""
 
 import torch
 from torch import Tensor, nn
@@ -9,7 +9,8 @@ from dolens.reconstruction.padding import pad_to_multiple
 
 
 class UNet(nn.Module):
-    """Image to image, through `depth` halvings and as many doublings with skip connections.
+    """A `UNet` maps images to images, through `depth` halvings and as many doublings with skip
+    connections.
 
     The network of the supplement's Figure 4: every stage is two 3×3 convolutions, each with
     batch normalisation and a ReLU.  Stage k works at 1/2ᵏ of the resolution with width·2ᵏ
@@ -21,6 +22,8 @@ class UNet(nn.Module):
         out_channels: channels of the output.
         width: channels of the first stage.
         depth: number of halvings.
+
+    Rarely needed:
         zero_output: start with a last convolution of zeros, so that the output is zero and a
             residual network that adds it to its input begins as the identity.
 

@@ -1,8 +1,11 @@
-"""Wiener deconvolution with a prior for natural images, differentiable in all that enters it."""
+"""Wiener deconvolution uses a prior for natural images, and is differentiable in all of its
+arguments.
+"""
 
 import math
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional
 
@@ -13,7 +16,7 @@ def wiener_deconvolve(
     noise_to_signal: Tensor | float,
     margin: int,
 ) -> Tensor:
-    """Undo a blur by the linear filter of least expected error.
+    """Undo a blur by the linear filter of least expected squared error.
 
     The image model is a true convolution plus white noise,
 
@@ -51,8 +54,8 @@ def wiener_deconvolve(
     channels, height, width = image.shape[-3:]
     _check(channels, point_spread_function, margin)
     size = point_spread_function.shape[-1]
-    rows = fast_fft_length(max(height + 2 * margin, size))
-    columns = fast_fft_length(max(width + 2 * margin, size))
+    rows = next_fast_len(max(height + 2 * margin, size), real=True)
+    columns = next_fast_len(max(width + 2 * margin, size), real=True)
 
     point_spread_function = point_spread_function.to(image.dtype)
     ratio = torch.as_tensor(noise_to_signal, dtype=image.dtype, device=image.device)
@@ -65,19 +68,6 @@ def wiener_deconvolve(
     spectrum = torch.fft.rfft2(_close_periodically(image, rows, columns))
     restored = torch.fft.irfft2(spectrum * weight, s=(rows, columns))
     return restored[..., :height, :width]
-
-
-def fast_fft_length(length: int) -> int:
-    """Return the smallest product of twos, threes and fives that is at least `length`."""
-    candidate = max(length, 1)
-    while True:
-        rest = candidate
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return candidate
-        candidate += 1
 
 
 def _check(channels: int, point_spread_function: Tensor, margin: int) -> None:

@@ -7,10 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.optics.system import OpticalSystem
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points
-from dolens.rendering.pupil.exit_pupil import ExitPupil
-from dolens.scene.planar import Scene
 from dolens.sensor.pixels import Sensor
 
 # Points along each side that are tried, and pixels that the last two coefficients may amount to:
@@ -43,21 +41,16 @@ class Distortion(NamedTuple):
         return (sides[0] @ self.coefficients @ sides[1].mT).unbind(0)
 
 
-def distortion(
-    system: OpticalSystem, scene: Scene, sensor: Sensor, pupil: ExitPupil, backend: str
-) -> Distortion | None:
-    """Where the chief rays of a sensor's pixels meet the planes of a scene, as polynomials.
+def distortion(imaging: ImagingSystem) -> Distortion | None:
+    """Find where the chief rays of a sensor's pixels meet the planes of a scene, as polynomials.
 
     Rays are traced from Chebyshev points of the sensor: distortion is an analytic function of the
     field, so that 49 rays say as much as 65 536.  Where they do not within a thousandth of a pixel,
     more are traced.
 
     Args:
-        system: the lens.
-        scene: D depths and C wavelengths.
-        sensor: the pixels.
-        pupil: the disc whose centre the rays are aimed at.
-        backend: what traces.
+        imaging: the lens, D depths and C wavelengths, the pixels, and the pupil whose centre the
+            rays are aimed at.
 
     Returns:
         The polynomials; None where none of the orders that are tried is enough.
@@ -65,15 +58,16 @@ def distortion(
     Raises:
         InputError: such a ray misses a surface or is totally reflected.
     """
+    sensor, device = imaging.sensor, imaging.system.device
     for order in _ORDERS:
-        nodes = chebyshev_points(order).to(system.device)
+        nodes = chebyshev_points(order).to(device)
         down, across = (
             0.5 * (side - 1) + nodes * max(0.5 * (side - 1), 0.5)
             for side in (sensor.height, sensor.width)
         )
         row, column = torch.meshgrid(down, across, indexing="ij")
-        found = _seen(system, scene, sensor, pupil, backend, row, column)
-        transform = _to_coefficients(order).to(system.device)
+        found = _seen(imaging, row, column)
+        transform = _to_coefficients(order).to(device)
         coefficients = transform @ found @ transform.mT
         last = torch.maximum(
             coefficients[..., -2:, :].abs().amax(), coefficients[..., -2:].abs().amax()
@@ -84,64 +78,47 @@ def distortion(
 
 
 def chief_ray_maps(
-    system: OpticalSystem,
-    scene: Scene,
-    sensor: Sensor,
-    windows: Sequence[Sensor],
-    pupil: ExitPupil,
-    backend: str,
+    imaging: ImagingSystem, windows: Sequence[Sensor]
 ) -> list[tuple[Tensor, Tensor]]:
-    """Where the chief rays of windows' pixels meet the planes of a scene.
+    """Find where the chief rays of windows' pixels meet the planes of a scene.
 
     One set of polynomials serves all windows; where it is not enough, each window has its own, or
-    a ray for each of its pixels.  Arguments as of `distortion`, and:
+    a ray for each of its pixels.
 
     Args:
+        imaging: as of `distortion`; its sensor is the whole one.
         windows: of the sensor; the sensor itself is one.
 
     Returns:
         Of each window rows and columns from the axis in the image of a pinhole, each
         (D, C, height, width), double precision; differentiable in the lens.
+
+    Raises:
+        InputError: as `distortion`.
     """
-    found = distortion(system, scene, sensor, pupil, backend)
+    found = distortion(imaging)
     if found is not None:
         return [found.seen_by(window) for window in windows]
-    return [_by_itself(system, scene, sensor, window, pupil, backend) for window in windows]
+    return [_by_itself(imaging, window) for window in windows]
 
 
-def _by_itself(
-    system: OpticalSystem,
-    scene: Scene,
-    sensor: Sensor,
-    window: Sensor,
-    pupil: ExitPupil,
-    backend: str,
-) -> tuple[Tensor, Tensor]:
-    """Of a window for whose sensor there are no polynomials."""
-    if window != sensor:
-        return chief_ray_maps(system, scene, window, [window], pupil, backend)[0]
-    options = {"dtype": torch.float64, "device": system.device}
+def _by_itself(imaging: ImagingSystem, window: Sensor) -> tuple[Tensor, Tensor]:
+    """The map of a window for whose sensor there are no polynomials."""
+    if window != imaging.sensor:
+        return chief_ray_maps(imaging.on(window), [window])[0]
+    options = {"dtype": torch.float64, "device": imaging.system.device}
     row, column = torch.meshgrid(
         torch.arange(window.height, **options),
         torch.arange(window.width, **options),
         indexing="ij",
     )
-    return _seen(system, scene, window, pupil, backend, row, column).unbind(0)
+    return _seen(imaging, row, column).unbind(0)
 
 
-def _seen(
-    system: OpticalSystem,
-    scene: Scene,
-    sensor: Sensor,
-    pupil: ExitPupil,
-    backend: str,
-    row: Tensor,
-    column: Tensor,
-) -> Tensor:
+def _seen(imaging: ImagingSystem, row: Tensor, column: Tensor) -> Tensor:
     """(2, D, C, ...) of pixels (...)."""
-    points = sensor.positions(row.reshape(-1), column.reshape(-1))
-    seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch, backend)
-    found = torch.stack([c.double().permute(1, 2, 0) for c in seen])
+    points = imaging.sensor.positions(row.reshape(-1), column.reshape(-1))
+    found = torch.stack([c.double().permute(1, 2, 0) for c in chief_ray_points(imaging, points)])
     return found.unflatten(-1, row.shape)
 
 

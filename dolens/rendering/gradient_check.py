@@ -118,40 +118,46 @@ def gradient_rows(
             }
         )
     held = other or loss
-    return [_row(held, lens, start, name, seeds, [f[name] for f in found], step) for name in names]
+    rows = [_Varied(held, start, name, natural_scale(lens, name)) for name in names]
+    return [_row(varied, seeds, [f[varied.name] for f in found], step) for varied in rows]
 
 
-@torch.no_grad()
-def _row(
-    loss: Loss,
-    lens: Lens,
-    start: Mapping[str, Tensor],
-    name: str,
-    seeds: Sequence[int],
-    autograd: Sequence[float],
-    step: float | None,
-) -> GradientRow:
-    scale = natural_scale(lens, name)
+@dataclass(frozen=True)
+class _Varied:
+    """A loss as a function of one parameter, in units of its scale from where it starts."""
 
-    def pair(step: float, seed: int) -> tuple[float, float]:
+    loss: Loss
+    start: Mapping[str, Tensor]
+    name: str
+    scale: float
+
+    def pair(self, step: float, seed: int) -> tuple[float, float]:
+        """The loss a step up and a step down."""
+        name, start = self.name, self.start
         up, down = (
-            float(loss({**start, name: start[name] + sign * step * scale}, seed))
+            float(self.loss({**start, name: start[name] + sign * step * self.scale}, seed))
             for sign in (1.0, -1.0)
         )
         return up, down
 
+
+@torch.no_grad()
+def _row(
+    varied: _Varied, seeds: Sequence[int], autograd: Sequence[float], step: float | None
+) -> GradientRow:
     if step is None:
-        up, down = pair(_FIRST, seeds[0])
+        up, down = varied.pair(_FIRST, seeds[0])
         size = 0.5 * abs(up + down)
         change = max(abs(up - down) / 2.0, 1e-12 * size)
         step = min(max(_FIRST * _CHANGE * size / change, _LEAST), _LARGEST)
     differences = []
     for seed in seeds:
-        up, down = pair(step, seed)
+        up, down = varied.pair(step, seed)
         differences.append((up - down) / (2.0 * step))
     gaps = torch.tensor(
         [a - d for a, d in zip(autograd, differences, strict=True)], dtype=torch.float64
     )
     noise = float(gaps.std() / math.sqrt(len(gaps))) if len(gaps) > 1 else 0.0
     mean = torch.tensor(differences, dtype=torch.float64).mean()
-    return GradientRow(name, scale, step, sum(autograd) / len(autograd), float(mean), noise)
+    slope = sum(autograd) / len(autograd)
+    return GradientRow(varied.name, varied.scale, step, slope, float(mean), noise)

@@ -46,10 +46,10 @@ def _stacked(values: Sequence[float | Tensor], system: OpticalSystem) -> Tensor:
     return torch.stack([torch.as_tensor(v, **options) for v in values])
 
 
-def moving_view(system: OpticalSystem, scene: Scene, view: View, backend: str) -> MovingView:
+def moving_view(system: OpticalSystem, scene: Scene, view: View) -> MovingView:
     """The pupil and the magnifications of a view, with gradients where the lens has any."""
     pupil = ExitPupil(view.pupil_z, view.pupil_radius, view.axial_radius)
-    pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
+    pupil = moving_exit_pupil(system, scene.wavelengths, pupil)
     return MovingView(pupil, scene.moving_magnifications(system))
 
 

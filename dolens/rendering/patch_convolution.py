@@ -1,12 +1,13 @@
 """Convolution with a kernel that changes over the image: overlapping patches, by FFT."""
 
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.rendering.patches import Coordinates, Patch, PatchLayout
 from dolens.rendering.psf import splat
 from dolens.rendering.spline_lookup import spline_lookup
 
@@ -16,90 +17,8 @@ _FADED = 10
 _NUDGE = 2.0**-6
 
 
-class Patch(NamedTuple):
-    """A rectangle of the image around a node.
-
-    Attributes:
-        top, bottom, left, right: rows and columns of the image, half open.
-        weight: (bottom - top, right - left), or one for each channel in front of these: how much of
-            each pixel the node's kernel makes.
-    """
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-    weight: Tensor
-
-
-class Coordinates(NamedTuple):
-    """Where in the texture each pixel of the image looks, fractional rows and columns.
-
-    Attributes:
-        rows: (D, C, height, width).
-        columns: (D, C, height, width).
-    """
-
-    rows: Tensor
-    columns: Tensor
-
-
-def node_positions(length: int, count: int) -> list[float]:
-    """Coordinates of `count` nodes along `length` pixels: the ends included, or the middle."""
-    if count == 1:
-        return [0.5 * (length - 1)]
-    return [i * (length - 1) / (count - 1) for i in range(count)]
-
-
-def patches(height: int, width: int, rows: int, columns: int, like: Tensor) -> list[Patch]:
-    """The patches of a grid of nodes, row after row; at each pixel their weights sum to one.
-
-    Weights are bilinear between the nodes.
-
-    Raises:
-        InputError: more nodes than pixels.
-    """
-    if rows < 1 or columns < 1 or rows > height or columns > width:
-        raise InputError(
-            f"renderer: fields must be from 1 to {height} rows and 1 to {width} columns, "
-            f"not {rows}, {columns}"
-        )
-    vertical, horizontal = (
-        [_hat(length, count, i, like) for i in range(count)]
-        for length, count in ((height, rows), (width, columns))
-    )
-    return [
-        Patch(top, bottom, left, right, down[:, None] * across)
-        for top, bottom, down in vertical
-        for left, right, across in horizontal
-    ]
-
-
-def _hat(length: int, count: int, node: int, like: Tensor) -> tuple[int, int, Tensor]:
-    """First pixel, end and weights of a node along one side."""
-    place = torch.arange(length, dtype=torch.float64)
-    if count == 1:
-        return 0, length, torch.ones_like(place).to(like)
-    spacing = (length - 1) / (count - 1)
-    weight = (1.0 - (place - node * spacing).abs() / spacing).clamp(min=0.0)
-    if count == 2:
-        # All patches are then the whole, and share what is done to the texture.
-        return 0, length, weight.to(like)
-    inside = torch.nonzero(weight > 0.0).flatten()
-    first, end = int(inside[0]), int(inside[-1]) + 1
-    return first, end, weight[first:end].to(like)
-
-
-def convolve_patches(
-    textures: Tensor,
-    kernels: Tensor,
-    layout: Sequence[Patch],
-    origin: tuple[int, int],
-    image_size: tuple[int, int],
-    coordinates: Coordinates | None,
-    backend: str,
-) -> Tensor:
-    """Σ over nodes of weight · (texture ∗ kernel), at the image's pixels.
+def convolve_patches(textures: Tensor, kernels: Tensor, layout: PatchLayout) -> Tensor:
+    """Compute Σ over nodes of weight · (texture ∗ kernel), at the image's pixels.
 
     A texture's edge goes on beyond it.  Memory is that of one patch at a time: the backward pass
     transforms again what several patches see.
@@ -109,22 +28,27 @@ def convolve_patches(
     Args:
         textures: (B, D or 1, C or 1, H, W).
         kernels: (N, D or 1, C or 1, K, K), K odd, sums of quadratic B-splines.
-        layout: N patches.
-        origin: row and column of the texture that pixel (0, 0) looks at, where there are no
-            `coordinates`.
-        image_size: height and width.
-        coordinates: where the pixels look, if that is not simply every pixel a texel further.
-        backend: `cpu`, `cuda` or `reference`, for lookups.
+        layout: N patches, and where their pixels look.
 
     Returns:
         (B, D, C, height, width).
     """
+    coordinates = layout.coordinates
     sizes = [textures.shape[1:3], kernels.shape[1:3]]
     if coordinates is not None:
         sizes.append(coordinates.rows.shape[:2])
-    shape = (*torch.broadcast_shapes(*sizes), *image_size)
-    settings = (tuple(layout), origin, shape, backend)
+    depths, channels = torch.broadcast_shapes(*sizes)
+    # The coordinates' gradients are the function's own: it gets them as tensors.
+    settings = _Settings(replace(layout, coordinates=None), depths, channels)
     return _Convolution.apply(textures, kernels, *(coordinates or (None, None)), settings)
+
+
+class _Settings(NamedTuple):
+    """A layout without its coordinates, and how many depths and channels the image has."""
+
+    layout: PatchLayout
+    depths: int
+    channels: int
 
 
 class _Convolution(torch.autograd.Function):
@@ -135,19 +59,20 @@ class _Convolution(torch.autograd.Function):
         kernels: Tensor,
         rows: Tensor | None,
         columns: Tensor | None,
-        settings: tuple[Any, ...],
+        settings: _Settings,
     ):
         ctx.settings = settings
-        layout, _, shape, _ = settings
+        patches = settings.layout.patches
         looks = None if rows is None else Coordinates(rows, columns)
+        shape = (settings.depths, settings.channels, *settings.layout.image_size)
         image = textures.new_zeros((textures.shape[0], *shape))
-        tile = None
-        for node, patch in enumerate(layout):
-            tile = _tile(tile, textures, kernels.shape[-1], patch, settings, looks)
+        seen_by = _Tiles(textures, kernels.shape[-1], settings, looks)
+        for node, patch in enumerate(patches):
+            tile = seen_by(patch)
             seen = tile.see(tile.texture_spectrum() * tile.kernel_spectrum(kernels[node]))
             image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
         # Where all patches see the same texels, their spectrum is kept for the way back.
-        spectrum = tile.texture_spectrum() if len({p[:4] for p in layout}) == 1 else None
+        spectrum = tile.texture_spectrum() if len({p[:4] for p in patches}) == 1 else None
         ctx.save_for_backward(textures, kernels, rows, columns, spectrum)
         return image
 
@@ -162,9 +87,9 @@ class _Convolution(torch.autograd.Function):
                 (textures, kernels, rows, columns), ctx.needs_input_grad[:4], strict=True
             )
         )
-        tile = None
-        for node, patch in enumerate(ctx.settings[0]):
-            tile = _tile(tile, textures, kernels.shape[-1], patch, ctx.settings, looks, spectrum)
+        seen_by = _Tiles(textures, kernels.shape[-1], ctx.settings, looks, spectrum)
+        for node, patch in enumerate(ctx.settings.layout.patches):
+            tile = seen_by(patch)
             area = (..., slice(patch.top, patch.bottom), slice(patch.left, patch.right))
             part = patch.weight * gradient[area]
             if of_kernels is not None or of_textures is not None:
@@ -185,36 +110,37 @@ class _Convolution(torch.autograd.Function):
         return of_textures, of_kernels, of_rows, of_columns, None
 
 
-def _tile(
-    last: "_Tile | None",
-    textures: Tensor,
-    size: int,
-    patch: Patch,
-    settings: tuple[Any, ...],
-    coordinates: Coordinates | None,
-    spectrum: Tensor | None = None,
-) -> "_Tile":
-    """The tile of a patch: the last one where that has the same area, as two nodes a side do."""
-    if last is not None and last.area == patch[:4]:
-        return last
-    return _Tile(textures, size, patch, settings, coordinates, spectrum)
-
-
-class _Tile:
-    """The part of the texture that a patch sees, and the transforms between the two."""
+class _Tiles:
+    """The tiles of patches, one after the other."""
 
     def __init__(
         self,
         textures: Tensor,
         size: int,
-        patch: Patch,
-        settings: tuple[Any, ...],
+        settings: _Settings,
         coordinates: Coordinates | None,
-        spectrum: Tensor | None,
+        spectrum: Tensor | None = None,
     ) -> None:
-        _, origin, self.shape, self.backend = settings
+        self.textures, self.size, self.settings = textures, size, settings
+        self.coordinates, self.spectrum = coordinates, spectrum
+        self._last: _Tile | None = None
+
+    def __call__(self, patch: Patch) -> "_Tile":
+        """The tile of a patch: the last one where it has the same area, as two nodes a side do."""
+        if self._last is None or self._last.area != patch[:4]:
+            self._last = _Tile(self, patch)
+        return self._last
+
+
+class _Tile:
+    """The part of the texture that a patch sees, and the transforms between the two."""
+
+    def __init__(self, of: _Tiles, patch: Patch) -> None:
+        textures, size, coordinates = of.textures, of.size, of.coordinates
+        layout, *self.shape = of.settings
+        origin, self.fused = layout.origin, layout.fused
         self.textures, self.size, self.area = textures, size, patch[:4]
-        self._spectrum = spectrum
+        self._spectrum = of.spectrum
         self.height, self.width = patch.bottom - patch.top, patch.right - patch.left
         self.coordinates = None
         if coordinates is None:
@@ -233,7 +159,7 @@ class _Tile:
         self.first = (top - reach, left - reach)
         # Texels up to a length that transforms are fast at cost less than zeros in their place;
         # what they do to the image lies outside of what is seen.
-        self.transform = (fast_length(height + size - 1), fast_length(width + size - 1))
+        self.transform = (transform_length(height + size - 1), transform_length(width + size - 1))
         self.rows = _clamped(top - reach, self.transform[0], textures.shape[-2], textures)
         self.columns = _clamped(left - reach, self.transform[1], textures.shape[-1], textures)
 
@@ -280,9 +206,9 @@ class _Tile:
         image = self._blurred(spectrum)
         if self.coordinates is None:
             return image
-        image = image.expand(-1, *self.shape[:2], -1, -1)
+        image = image.expand(-1, *self.shape, -1, -1)
         flat, rows, columns = self._lookup_arguments(image)
-        seen = spline_lookup(flat, rows, columns, self.backend)
+        seen = spline_lookup(flat, rows, columns, self.fused)
         return seen.reshape(*image.shape[:3], self.height, self.width)
 
     def of_seen(self, of_seen: Tensor) -> Tensor:
@@ -292,7 +218,7 @@ class _Tile:
             images = self._batched(self.coordinates.rows, of_seen)
             columns = self._batched(self.coordinates.columns, of_seen)
             flat = of_seen.reshape(-1, self.height * self.width)
-            grids = splat(images, columns, flat, height, self.backend)
+            grids = splat(images, columns, flat, height, self.fused)
             of_seen = grids.reshape(*of_seen.shape[:3], height, width)
         image = of_seen.new_zeros((*of_seen.shape[:3], *self.transform))
         image[..., first : first + height, first : first + width] = of_seen
@@ -303,12 +229,12 @@ class _Tile:
 
         What is looked up is a quadratic between knots, of which a difference is the derivative.
         """
-        image = self._blurred(spectrum).expand(-1, *self.shape[:2], -1, -1)
+        image = self._blurred(spectrum).expand(-1, *self.shape, -1, -1)
         flat, rows, columns = self._lookup_arguments(image)
         found = []
         for down, across in ((_NUDGE, 0.0), (0.0, _NUDGE)):
-            after = spline_lookup(flat, rows + down, columns + across, self.backend)
-            before = spline_lookup(flat, rows - down, columns - across, self.backend)
+            after = spline_lookup(flat, rows + down, columns + across, self.fused)
+            before = spline_lookup(flat, rows - down, columns - across, self.fused)
             slope = (after - before) / (2.0 * _NUDGE)
             found.append(slope.reshape(of_seen.shape) * of_seen)
         return found[0], found[1]
@@ -348,14 +274,6 @@ def _clamped(start: int, count: int, size: int, like: Tensor) -> Tensor:
     return (torch.arange(count, device=like.device) + start).clamp(0, size - 1)
 
 
-def fast_length(length: int) -> int:
-    """The least even number of 2, 3 and 5 that is not below: FFTs of such lengths are fast."""
-    candidate = length + length % 2
-    while True:
-        rest = candidate
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return candidate
-        candidate += 2
+def transform_length(length: int) -> int:
+    """The least even number of factors 2, 3 and 5 that is not below: real FFTs of it are fast."""
+    return 2 * next_fast_len(-(-length // 2), real=True)

@@ -12,12 +12,11 @@ from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.pupil.aim import aim
 from dolens.rendering.pupil.edge_rays import EdgeRays, edge_rays
-from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.pupil.light_edges import AZIMUTHS, light_edges
 from dolens.rendering.pupil.moving_pupil import depends_on_parameters
-from dolens.scene.planar import Scene
 
 # Radii of sensor points closer than this share of the largest are one radius.
 _SAME_RADIUS = 1e-7
@@ -39,14 +38,7 @@ class PlanePoints(NamedTuple):
 
 
 def plane_points(
-    system: OpticalSystem,
-    scene: Scene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    disc: tuple[Tensor, Tensor],
-    pitch: float,
-    symmetric: bool,
-    backend: str,
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor], disc: tuple[Tensor, Tensor]
 ) -> PlanePoints:
     """Trace rays from points of the sensor through the exit pupil to the planes of a scene.
 
@@ -58,24 +50,20 @@ def plane_points(
     the samples (`edge_rays`): their weights are zero and have gradients.
 
     Args:
-        system: the lens.
-        scene: depths and wavelengths.
+        imaging: the lens, D depths and C wavelengths, the pupil's disc and the pixels' pitch.
         points: x and y on the sensor, mm, each (N,), double precision.
-        pupil: the disc.
-        disc: x and y of the rays in it, in units of its radius, each (N or 1, S), in the frame in
-            which a symmetric lens's point lies on the positive x axis.
-        pitch: of the pixels, mm.
-        symmetric: whether the lens has rotational symmetry.
-        backend: what traces.
+        disc: x and y of the rays in the disc, in units of its radius, each (N or 1, S), in the
+            frame in which a symmetric lens's point lies on the positive x axis.
     """
+    system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     x, y = points
     again = None
-    if symmetric:
+    if system.rotationally_symmetric:
         # Sorted radii, and which of them each point has.
         radius, again = torch.unique(_rounded(torch.hypot(x, y)), return_inverse=True)
         x, y = radius, torch.zeros_like(radius)
-    ray, weight = pupil_rays(system, scene.wavelengths, (x, y), pupil, disc, backend)
-    rim = rim_rays(system, scene.wavelengths, (x, y), pupil, backend)
+    ray, weight = pupil_rays(imaging, (x, y), disc)
+    rim = rim_rays(imaging, (x, y))
     if rim is not None:
         ray = Components(*(torch.cat(pair, -1) for pair in zip(ray, rim.ray, strict=True)))
         weight = torch.cat((weight, rim.weight), -1)
@@ -97,81 +85,60 @@ def plane_points(
 
 
 def pupil_rays(
-    system: OpticalSystem,
-    wavelengths: Sequence[float],
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    disc: tuple[Tensor, Tensor],
-    backend: str,
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor], disc: tuple[Tensor, Tensor]
 ) -> tuple[Components, Tensor]:
     """Rays from sensor points through the exit pupil, traced into object space.
 
     Args:
-        system: the lens.
-        wavelengths: nm, C of them.
-        points: x and y, mm, each (N,).
-        pupil: the disc.
-        disc: x and y in it, in units of its radius, each (N, S).
-        backend: what traces.
+        imaging: the lens, C wavelengths and the pupil's disc.
+        points: x and y on the sensor, mm, each (N,).
+        disc: x and y in the disc, in units of its radius, each (N, S).
 
     Returns:
         The rays in front of the lens, (C, N, S), and their shares in the irradiance relative to
         that of an axial pixel: cos⁴ over its mean over the axial disc; zero where one is lost.
     """
+    system, pupil = imaging.system, imaging.pupil
     sensor_z = system.vertices[-1]
     x, y = (p.to(sensor_z.dtype)[:, None] for p in points)
     disc_x, disc_y = (d[: len(x)] * pupil.radius for d in disc)
     ray = aim(x, y, sensor_z, disc_x, disc_y, pupil.z)
-    there, valid = _before_the_lens(system, ray, wavelengths, backend)
+    there, valid = _before_the_lens(system, ray, imaging.scene.wavelengths)
     share = (pupil.radius / pupil.axial_radius) ** 2
     share = share / (pupil.axial_mean(sensor_z) * disc_x.shape[-1])
     return there, torch.where(valid & (there.n < 0.0), ray.n**4 * share, 0.0)
 
 
-def rim_rays(
-    system: OpticalSystem,
-    wavelengths: Sequence[float],
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    backend: str,
-) -> EdgeRays | None:
+def rim_rays(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> EdgeRays | None:
     """Rays (C, N, AZIMUTHS) along the edges that end the light of sensor points.
 
     None where no edge cuts the disc, or no gradient of the lens is wanted.  Arguments as of
     `pupil_rays`, whose weights those of these rays complement: they are zero and have gradients.
     """
+    system, pupil, wavelengths = imaging.system, imaging.pupil, imaging.scene.wavelengths
     if not depends_on_parameters(system):
         return None
     middle = wavelengths[len(wavelengths) // 2]
-    found = light_edges(system, middle, points, pupil.numbers(), backend)
+    found = light_edges(system, middle, points, pupil.numbers())
     if found is None:
         return None
     angle = torch.arange(AZIMUTHS, dtype=system.dtype, device=system.device)
     angle = (angle * (2.0 * math.pi / AZIMUTHS)).expand(len(points[0]), -1)
     arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
     edge = (found.middle[:, None], arms, found.radius, found.surface)
-    return edge_rays(system, wavelengths, points, pupil, edge, backend)
+    return edge_rays(system, wavelengths, points, pupil, edge)
 
 
 def chief_ray_points(
-    system: OpticalSystem,
-    scene: Scene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
-    backend: str,
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Where the rays from sensor points through the exit pupil's centre meet the planes.
+    """Find where the rays from sensor points through the exit pupil's centre meet the planes.
 
     This is the image's geometry: distortion and, between wavelengths, lateral colour.
 
     Args:
-        system: as in `plane_points`, and the others.
-        scene: depths and wavelengths.
+        imaging: as in `plane_points`.
         points: x and y, mm, each (N,).
-        pupil: the disc.
-        pitch: mm.
-        backend: what traces.
 
     Returns:
         Rows and columns from the axis in the image of a pinhole, each (N, D, C).
@@ -179,18 +146,19 @@ def chief_ray_points(
     Raises:
         InputError: such a ray misses a surface or is totally reflected, so that it says nothing.
     """
+    system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     x, y = (p.to(system.dtype) for p in points)
     zero = torch.zeros_like(x)
-    ray = aim(x, y, system.vertices[-1], zero, zero, pupil.z)
+    ray = aim(x, y, system.vertices[-1], zero, zero, imaging.pupil.z)
     wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64, device=system.device)
     rays = Rays.from_components(ray, wavelengths[:, None])
-    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
+    hit = trace_rays(system, rays, -1.0)
     if bool(((hit.status == Status.TIR) | (hit.status == Status.MISSED)).any()):
         raise InputError(
             "renderer: chief rays of the sensor's outer pixels do not pass the lens, which leaves "
             "its distortion undefined; use registration=pinhole, renderer=rays or a smaller sensor"
         )
-    there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
+    there = hit.components()
     rows, columns = [], []
     for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
         t, _ = distance_to_plane(there, -depth, -1.0)
@@ -205,13 +173,12 @@ def distinct_radii(points: tuple[Tensor, Tensor]) -> int:
     return len(torch.unique(_rounded(torch.hypot(*points))))
 
 
-def pinhole_points(
-    points: tuple[Tensor, Tensor], pitch: float, planes: int, channels: int
-) -> tuple[Tensor, Tensor]:
-    """Where a pinhole sees sensor points, as `chief_ray_points`: (N, planes, channels) each."""
+def pinhole_points(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Find where a pinhole sees sensor points, as `chief_ray_points`: (N, D, C) each."""
     x, y = points
+    pitch = imaging.sensor.pixel_pitch
     rows, columns = y / pitch, -x / pitch
-    shape = (len(x), planes, channels)
+    shape = (len(x), len(imaging.scene.depths), len(imaging.scene.wavelengths))
     return rows[:, None, None].expand(shape), columns[:, None, None].expand(shape)
 
 
@@ -224,10 +191,10 @@ def _rounded(radius: Tensor) -> Tensor:
 
 
 def _before_the_lens(
-    system: OpticalSystem, ray: Components, wavelengths: Sequence[float], backend: str
+    system: OpticalSystem, ray: Components, wavelengths: Sequence[float]
 ) -> tuple[Components, Tensor]:
     """Rays (C, N, S) in object space, and which of them got there."""
     every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
     rays = Rays.from_components(ray, every[:, None, None])
-    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
-    return Components(*hit.position.unbind(-1), *hit.direction.unbind(-1)), hit.valid
+    hit = trace_rays(system, rays, -1.0)
+    return hit.components(), hit.valid

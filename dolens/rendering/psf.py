@@ -8,11 +8,10 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels import splatting
-from dolens.optics.backend import choose_backend, trace_rays
+from dolens.optics.backend import cpu_kernels_serve, trace_components
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
-from dolens.optics.rays import Components, Rays
-from dolens.optics.system import OpticalSystem
+from dolens.optics.rays import Components
 from dolens.rendering.binning import bin_rays
 from dolens.rendering.sampling import regular_square, square_to_disc
 from dolens.scene.planar import Scene
@@ -52,7 +51,6 @@ def axial_point_spread_functions(
     if size < 3 or size % 2 == 0:
         raise InputError(f"psf size must be odd and at least 3, not {size}")
     system = lens.system(values)
-    backend = choose_backend(system, lens.backend)
     scene.check(system)
     u, v = regular_square(pupil_samples, system.dtype, system.device)
     disc_x, disc_y = square_to_disc(u, v)
@@ -69,30 +67,19 @@ def axial_point_spread_functions(
             rays.append(Components(zero, zero, zero - depth, dx / dz * n, dy / dz * n, n))
     shape = (len(scene.depths), len(scene.wavelengths), disc_x.numel())
     ray = Components(*(torch.stack(each).reshape(shape) for each in zip(*rays, strict=True)))
-    x, y, valid = _on_sensor(system, ray, wavelengths.to(system.device)[:, None], backend)
+    there, valid = trace_components(system, ray, wavelengths.to(system.device)[:, None], 1.0)
     # A Lambertian point sends cos⁴ over the pupil plane, like a pixel does backwards.
     weight = torch.where(valid, ray.n**4, 0.0)
     total = weight.sum(-1)
     if not bool((total > 0.0).all()):
         dark = scene.depths[int(torch.nonzero(total <= 0.0)[0, 0])]
         raise InputError(f"no light from the axis at {dark:g} mm reaches the sensor")
-    columns = size // 2 - x / sensor.pixel_pitch
-    rows = size // 2 + y / sensor.pixel_pitch
-    return splat(rows, columns, weight / total[..., None], size, backend)
+    columns = size // 2 - there.x / sensor.pixel_pitch
+    rows = size // 2 + there.y / sensor.pixel_pitch
+    return splat(rows, columns, weight / total[..., None], size, cpu_kernels_serve(system))
 
 
-def _on_sensor(
-    system: OpticalSystem, ray: Components, wavelength: Tensor, backend: str
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Where rays meet the sensor, x and y in mm, and which of them got there."""
-    rays = Rays.from_components(ray, wavelength)
-    hit = trace_rays(system, rays, backend, 1.0, record=False, first=1, last=None)
-    return hit.position[..., 0], hit.position[..., 1], hit.valid
-
-
-def splat(
-    rows: Tensor, columns: Tensor, weight: Tensor, size: int, backend: str = "reference"
-) -> Tensor:
+def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int, fused: bool = False) -> Tensor:
     """Sum weighted quadratic B-splines, centred on points, onto a grid of pixels.
 
     Args:
@@ -100,15 +87,14 @@ def splat(
         columns: (..., N).
         weight: (..., N); zero leaves a point out, wherever it lies.
         size: pixels along each side of the grid.
-        backend: `cpu` takes the fused kernel, whose result is always the same to the bit.  The
-            others take PyTorch's operations; on a GPU these are so on request only, by
-            `torch.use_deterministic_algorithms`.
+        fused: take the CPU's kernel, whose result is always the same to the bit.  PyTorch's
+            operations are so on a GPU on request only, by `torch.use_deterministic_algorithms`.
 
     Returns:
         (..., size, size).  Once continuously differentiable in rows and columns.  Points within a
         pixel and a half of the edge lose what falls outside.
     """
-    if backend != "cpu":
+    if not fused:
         return bin_rays(rows, columns, weight, size, size)
     shape, points = rows.shape[:-1], rows.shape[-1]
     count = math.prod(shape)

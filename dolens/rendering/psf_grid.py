@@ -5,9 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.diffraction.pixel_integration import PixelWindow
 from dolens.diffraction.propagation import DiffractionSettings
 from dolens.diffraction.psf import propagation, wave_kernels
+from dolens.optics.backend import cpu_kernels_serve
 from dolens.optics.system import OpticalSystem
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import (
     PlanePoints,
     chief_ray_points,
@@ -16,10 +19,8 @@ from dolens.rendering.plane_points import (
     plane_points,
 )
 from dolens.rendering.psf import splat
-from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.random_numbers import random_words, uniform
 from dolens.rendering.sampling import square_to_disc, stratified_square
-from dolens.scene.planar import Scene
 
 # Strata of the pupil along each side, for the light of a function that rays do not make.
 _LIGHT_SAMPLES = 32
@@ -41,17 +42,12 @@ class FieldFunctions(NamedTuple):
 
 
 def field_point_spread_functions(
-    system: OpticalSystem,
-    scene: Scene,
+    imaging: ImagingSystem,
     points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
     size: int,
     pupil_samples: int,
     seed: int | None,
     distortion: bool,
-    symmetric: bool,
-    backend: str,
 ) -> FieldFunctions:
     """Geometric point spread functions at points of the sensor.
 
@@ -60,43 +56,38 @@ def field_point_spread_functions(
     ray lands as a quadratic B-spline, the pixel's box convolved with the texel's tent.
 
     Args:
-        system: the lens.
-        scene: D depths and C wavelengths.
-        points: x and y, mm, each (N,), double precision.
-        pupil: what is sampled.
-        pitch: of the pixels, mm.
+        imaging: the lens, D depths and C wavelengths, the pupil's disc, which is sampled, and the
+            pixels' pitch.
+        points: x and y on the sensor, mm, each (N,), double precision.
         size: K, odd.
         pupil_samples: strata along each side of the pupil.
         seed: of the points in the strata; None: their centres.
         distortion: whether a function's centre is where the chief ray meets the plane, else where
             a pinhole sees it.
-        symmetric: whether the lens has rotational symmetry.
-        backend: what traces and splats.
 
     Centres move with the lens, and so do the functions about them: gradients are of both, and where
     pixels look has to carry its own (`convolve_patches`).
     """
-    count = distinct_radii(points) if symmetric else len(points[0])
+    system = imaging.system
+    count = distinct_radii(points) if system.rotationally_symmetric else len(points[0])
     disc = sampled_disc(count, pupil_samples, seed, system)
-    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
-    planes, channels = len(scene.depths), len(scene.wavelengths)
-    if distortion:
-        centre = chief_ray_points(system, scene, points, pupil, pitch, backend)
-    else:
-        centre = pinhole_points(points, pitch, planes, channels)
+    seen = plane_points(imaging, points, disc)
+    centre = (chief_ray_points if distortion else pinhole_points)(imaging, points)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
     return splatted(
-        PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight), size, backend
+        PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight),
+        size,
+        cpu_kernels_serve(system),
     )
 
 
-def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
+def splatted(seen: PlanePoints, size: int, fused: bool) -> FieldFunctions:
     """Functions (N, D, C, size, size) of rays by where they meet the planes, from their centre."""
     middle = size // 2
     # A pixel sees the point at +e: seen from there, the pixel is at -e.
     rows, columns = middle - seen.rows, middle - seen.columns
     weight = seen.weight.expand(rows.shape)
-    functions = splat(rows, columns, weight, size, backend)
+    functions = splat(rows, columns, weight, size, fused)
     total = weight.sum(-1)
     with torch.no_grad():
         kept = functions.sum((-2, -1)) / total.clamp(min=torch.finfo(total.dtype).tiny)
@@ -105,15 +96,10 @@ def splatted(seen: PlanePoints, size: int, backend: str) -> FieldFunctions:
 
 
 def wave_point_spread_functions(
-    system: OpticalSystem,
-    scene: Scene,
+    imaging: ImagingSystem,
     points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
     size: int,
     distortion: bool,
-    symmetric: bool,
-    backend: str,
     settings: DiffractionSettings | None = None,
 ) -> FieldFunctions:
     """The same with diffraction: of the wavefronts of the points that functions are centred on.
@@ -122,12 +108,13 @@ def wave_point_spread_functions(
     window is given back in proportion.  Arguments as of `field_point_spread_functions`, and how
     finely diffraction is computed.
     """
-    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
+    system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
+    places = _object_points(imaging, points, distortion)
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
-    kernels = wave_kernels(system, *places, pitch, size, settings, backend)
+    kernels = wave_kernels(system, *places, PixelWindow(pitch, size), settings)
     kernels = kernels.reshape(*shape, size, size)
     disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
-    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    seen = plane_points(imaging, points, disc)
     light = seen.weight.sum(-1)
     total = kernels.sum((-2, -1))
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
@@ -136,16 +123,9 @@ def wave_point_spread_functions(
 
 
 def wave_cost(
-    system: OpticalSystem,
-    scene: Scene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
-    size: int,
-    distortion: bool,
-    backend: str,
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor], size: int, distortion: bool
 ) -> tuple[int, str | None]:
-    """What functions of `wave_point_spread_functions` take.
+    """Estimate what functions of `wave_point_spread_functions` take.
 
     Arguments as there.
 
@@ -153,27 +133,19 @@ def wave_cost(
         Samples along each side of a pupil by Fourier transform, and why one of them needs direct
         integration, which takes a thousand times as long; None where none does.
     """
-    places = _object_points(system, scene, points, pupil, pitch, distortion, backend)
-    found = propagation(system, *places, pitch, size, None, backend)
+    places = _object_points(imaging, points, distortion)
+    found = propagation(imaging.system, *places, PixelWindow(imaging.sensor.pixel_pitch, size))
     direct = (reason for reason in found.reasons if reason.startswith("direct"))
     return found.samples, next(direct, None)
 
 
 def _object_points(
-    system: OpticalSystem,
-    scene: Scene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
-    distortion: bool,
-    backend: str,
+    imaging: ImagingSystem, points: tuple[Tensor, Tensor], distortion: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Object points (N·D·C, 3), mm, their wavelengths, nm, and the windows' centres, mm."""
+    system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     planes, channels = len(scene.depths), len(scene.wavelengths)
-    if distortion:
-        rows, columns = chief_ray_points(system, scene, points, pupil, pitch, backend)
-    else:
-        rows, columns = pinhole_points(points, pitch, planes, channels)
+    rows, columns = (chief_ray_points if distortion else pinhole_points)(imaging, points)
     options = {"dtype": torch.float64, "device": system.device}
     depth = torch.tensor(scene.depths, **options)[:, None]
     magnifications = scene.moving_magnifications(system)

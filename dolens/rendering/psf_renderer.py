@@ -3,25 +3,20 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend, say_once
+from dolens.optics.backend import cpu_kernels_serve, say_once, with_chosen_backend
 from dolens.optics.lens import Lens
-from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
 from dolens.rendering.chief_ray_map import chief_ray_maps
-from dolens.rendering.patch_convolution import (
-    Coordinates,
-    Patch,
-    node_positions,
-    patches,
-)
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.patches import Coordinates, Patch, PatchLayout, node_positions, patches
 from dolens.rendering.plane_blur import PlaneBlur
-from dolens.rendering.protocol import Unprepared
+from dolens.rendering.protocol import Renderer, SensorWindow
 from dolens.rendering.psf_grid import (
     FieldFunctions,
     field_point_spread_functions,
@@ -39,16 +34,8 @@ logger = logging.getLogger(__name__)
 _NOTABLE_LOSS = 0.01
 
 
-class _View(NamedTuple):
-    """Textures (B, channels, H, W) on a window of a sensor, and where their centre lies."""
-
-    sensor: Sensor
-    texture_centre: tuple[float, float]
-    textures: Tensor
-
-
 @dataclass(frozen=True)
-class PsfRenderer(Unprepared):
+class PsfRenderer(Renderer):
     """Point spread functions at a grid of sensor points, linear in between, convolved by FFT.
 
     It renders what `RayRenderer` does, with distortion, lateral colour and relative illumination.
@@ -87,6 +74,8 @@ class PsfRenderer(Unprepared):
     diffraction: Literal["none", "limit", "wave"] = "none"
     pupil: ExitPupil | None = None
 
+    model: ClassVar[str] = "psf"
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(int(n) for n in self.fields))
         if self.pupil is not None:
@@ -110,7 +99,12 @@ class PsfRenderer(Unprepared):
                     f"allowed: {', '.join(allowed)}"
                 )
 
-    def rays_per_image(self, scene: Scene) -> int:
+    @property
+    def psf_size(self) -> int:
+        """Pixels along each side of a function."""
+        return self.size
+
+    def rays_per_image(self, scene: Scene, sensor: Sensor | None = None) -> int:
         """Rays traced for the functions of one render, where the lens has no symmetry."""
         channels = len(scene.wavelengths) if self.colours == "each" else 1
         return self.fields[0] * self.fields[1] * self.pupil_samples**2 * channels
@@ -123,24 +117,12 @@ class PsfRenderer(Unprepared):
         seed: int,
         values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """Image textures as a scene shows them; as `RayRenderer.render`.
+        """Image textures as a scene shows them; see `Renderer.render`.
 
-        Args:
-            lens: the lens; its precision is that of rays and image.
-            scene: planes, wavelengths, and what textures mean.
-            textures: (B, channels, H, W), linear light, as the scene takes them.
-            seed: of the points in the pupil's strata.
-            values: lens parameters to use instead of the stored ones.
-
-        Returns:
-            (B, images, C, height, width), linear light; of a planar scene an image for each depth.
-            Differentiable in the lens's parameters, `values` and the textures.
-
-        Raises:
-            InputError: a depth inside the lens, or channels that are not the scene's.
+        The seed is of the points in the pupil's strata.
         """
-        views = [_View(self.sensor, scene.texture_centre, textures)]
-        (image,) = self._render(lens, scene, views, seed, values)
+        whole = SensorWindow(self.sensor, scene.texture_centre)
+        (image,) = self._render(lens, scene, [(whole, textures)], seed, values)
         return image
 
     def render_windows(
@@ -148,92 +130,74 @@ class PsfRenderer(Unprepared):
         lens: Lens,
         scene: Scene,
         textures: Tensor,
-        windows: Sequence[Sensor],
-        centres: Sequence[tuple[float, float]],
+        windows: Sequence[SensorWindow],
         seed: int,
         values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """Image each texture on a window of its own of the renderer's sensor, all at once.
+        """Image each texture on a window of its own, all at once; see `Renderer.render_windows`.
 
         Rays of all windows are traced together, through a pupil that serves the whole sensor, and
         one set of polynomials says where the windows look.
-
-        Args:
-            lens: as of `render`, and the others.
-            scene: of all windows.
-            textures: (W, channels, h, w).
-            windows: W of one size.
-            centres: where each texture's centre lies; see `Scene`.
-            seed: of the points in the pupil's strata.
-            values: lens parameters.
-
-        Returns:
-            (W, images, C, height, width).
         """
-        views = [
-            _View(window, centre, texture[None])
-            for window, centre, texture in zip(windows, centres, textures, strict=True)
-        ]
-        return torch.cat(self._render(lens, scene, views, seed, values))
+        shown = [(window, texture[None]) for window, texture in zip(windows, textures, strict=True)]
+        return torch.cat(self._render(lens, scene, shown, seed, values))
 
     def _render(
         self,
         lens: Lens,
         scene: Scene,
-        views: Sequence[_View],
+        shown: Sequence[tuple[SensorWindow, Tensor]],
         seed: int,
         values: Mapping[str, Tensor] | None,
     ) -> list[Tensor]:
-        """Images (B, images, C, height, width) of views of the sensor, all rays traced at once."""
+        """Images (B, images, C, height, width) of windows of the sensor and textures that are shown
+        to each, all rays traced at once.
+        """
         options = {"device": lens.device, "dtype": lens.dtype}
-        textures = [view.textures.to(**options) for view in views]
-        system = lens.system(values)
-        backend = choose_backend(system, lens.backend, others=textures)
+        textures = [texture.to(**options) for _, texture in shown]
+        windows = [window.sensor for window, _ in shown]
+        system = with_chosen_backend(lens.system(values), textures)
         with torch.no_grad():
             scene.check(system)
             pupil = self.pupil
             if pupil is None:
-                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
-        pupil = moving_exit_pupil(system, scene.wavelengths, pupil, backend)
-        parts = [replace(self, sensor=view.sensor) for view in views]
+                pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor)
+        pupil = moving_exit_pupil(system, scene.wavelengths, pupil)
+        imaging = ImagingSystem(system, scene, self.sensor, pupil)
+        parts = [self.on(window) for window in windows]
         x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
-        found = self.point_spread_functions(system, scene, pupil, seed, backend, (x, y))
+        found = self.point_spread_functions(imaging, seed, (x, y))
         self._warn_of_loss(found)
-        looks = [None] * len(views)
+        looks = [None] * len(windows)
         if self.registration == "chief_rays":
-            windows = [view.sensor for view in views]
-            looks = chief_ray_maps(system, scene, self.sensor, windows, pupil, backend)
+            looks = chief_ray_maps(imaging, windows)
         nodes, images = self.fields[0] * self.fields[1], []
-        for i, (part, view, look) in enumerate(zip(parts, views, looks, strict=True)):
+        for i, (part, look) in enumerate(zip(parts, looks, strict=True)):
             own = slice(i * nodes, (i + 1) * nodes)
             functions = found._replace(functions=found.functions[own], light=found.light[own])
-            placed = replace(scene, texture_centre=view.texture_centre)
-            coordinates, origin = part._coordinates(placed, textures[i], look)
-            images.append(
-                part._blurred(
-                    system, placed, textures[i], functions, coordinates, origin, pupil, backend
-                )
-            )
+            placed = replace(scene, texture_centre=shown[i][0].texture_centre)
+            seen = replace(imaging, scene=placed, sensor=part.sensor)
+            images.append(part._blurred(seen, textures[i], functions, look))
         return images
 
     def _blurred(
         self,
-        system: OpticalSystem,
-        scene: Scene,
+        imaging: ImagingSystem,
         textures: Tensor,
         found: FieldFunctions,
-        coordinates: Coordinates | None,
-        origin: tuple[int, int],
-        pupil: ExitPupil,
-        backend: str,
+        look: tuple[Tensor, Tensor] | None,
     ) -> Tensor:
-        """The image by functions that are known, of pixels that look where coordinates say."""
+        """The image by functions that are known; `look` is where chief rays meet the scene, None
+        for a pinhole's.
+        """
+        scene = imaging.scene
         area = (self.sensor.height, self.sensor.width)
-        layout, functions, lit = patches(*area, *self.fields, textures), found.functions, None
+        coordinates, origin = self._coordinates(scene, textures, look)
+        parts, functions, lit = patches(*area, *self.fields, textures), found.functions, None
         if self.illumination == "map":
-            functions, layout, lit = self._illuminated(found, layout, system, scene, pupil, backend)
-        blur = PlaneBlur(functions, layout, origin, area, coordinates, backend, lit)
-        return scene.blend(scene.on_planes(textures), blur)
+            functions, parts, lit = self._illuminated(found, parts, imaging)
+        layout = PatchLayout(parts, area, origin, coordinates, cpu_kernels_serve(imaging.system))
+        return scene.blend(scene.on_planes(textures), PlaneBlur(functions, layout, lit))
 
     def _warn_of_loss(self, found: FieldFunctions) -> None:
         if float(found.lost) > _NOTABLE_LOSS:
@@ -244,49 +208,36 @@ class PsfRenderer(Unprepared):
 
     def point_spread_functions(
         self,
-        system: OpticalSystem,
-        scene: Scene,
-        pupil: ExitPupil,
+        imaging: ImagingSystem,
         seed: int,
-        backend: str,
         points: tuple[Tensor, Tensor] | None = None,
     ) -> FieldFunctions:
-        """The functions at the grid's points, row after row, or at others.
+        """The functions at the grid's points, row after row, or at others; differentiable.
 
-        Differentiable in the system.
+        Args:
+            imaging: the lens, its pupil, and the scene with all its depths and wavelengths.
+            seed: of the points in the pupil's strata.
+            points: x and y on the sensor, mm, each (N,), double precision; None: the grid's.
         """
-        shared, pitch = self.shared(scene), self.sensor.pixel_pitch
+        imaging = imaging.showing(self.shared(imaging.scene))
         points = points or self.points()
-        centred, symmetric = self.registration == "chief_rays", is_rotationally_symmetric(system)
+        centred = self.registration == "chief_rays"
         if self.diffraction == "wave":
-            return wave_point_spread_functions(
-                system,
-                shared,
-                points,
-                pupil,
-                pitch,
-                self.size,
-                centred,
-                symmetric,
-                backend,
-            )
+            return wave_point_spread_functions(imaging, points, self.size, centred)
         found = field_point_spread_functions(
-            system,
-            shared,
+            imaging,
             points,
-            pupil,
-            pitch,
             self.size,
             self.pupil_samples,
             seed if self.jitter else None,
             centred,
-            symmetric,
-            backend,
         )
         if self.diffraction == "none":
             return found
-        f_number = working_f_number(pupil, system.vertices[-1])
-        blurred = with_diffraction_limit(found.functions, pitch, shared.wavelengths, f_number)
+        f_number = working_f_number(imaging.pupil, imaging.system.vertices[-1])
+        blurred = with_diffraction_limit(
+            found.functions, self.sensor.pixel_pitch, imaging.scene.wavelengths, f_number
+        )
         return found._replace(functions=blurred)
 
     def with_pupil(
@@ -294,9 +245,19 @@ class PsfRenderer(Unprepared):
     ) -> "PsfRenderer":
         """The renderer with the pupil of the lens as it is, for a lens that hardly changes."""
         system = lens.system(values)
-        backend = choose_backend(system, lens.backend)
-        pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor, backend)
-        return replace(self, pupil=pupil)
+        return replace(self, pupil=sampled_exit_pupil(system, scene.wavelengths, self.sensor))
+
+    def without_diffraction(self) -> "PsfRenderer":
+        """The renderer with geometric functions."""
+        return replace(self, diffraction="none")
+
+    def state(self) -> dict[str, Any]:
+        """The pupil that it keeps, where it keeps one."""
+        return {} if self.pupil is None else {"pupil": list(self.pupil)}
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> "PsfRenderer":
+        """The renderer with the pupil that was kept."""
+        return replace(self, pupil=ExitPupil(*state["pupil"])) if "pupil" in state else self
 
     def points(self) -> tuple[Tensor, Tensor]:
         """x and y of the grid on the sensor, mm, each (fields,), double precision."""
@@ -316,20 +277,13 @@ class PsfRenderer(Unprepared):
         return scene.as_planes(depths, wavelengths)
 
     def _illuminated(
-        self,
-        found: FieldFunctions,
-        layout: list[Patch],
-        system: OpticalSystem,
-        scene: Scene,
-        pupil: ExitPupil,
-        backend: str,
+        self, found: FieldFunctions, layout: list[Patch], imaging: ImagingSystem
     ) -> tuple[Tensor, list[Patch], Tensor]:
         """Functions of unit light, patches of those that have any, and each pixel's illumination.
 
         Pixels whose functions are partly dark get their light from the others.
         """
-        wavelengths, symmetric = self.shared(scene).wavelengths, is_rotationally_symmetric(system)
-        wanted = relative_illumination(system, wavelengths, self.sensor, pupil, symmetric, backend)
+        wanted = relative_illumination(imaging.showing(self.shared(imaging.scene)))
         bright = found.light.detach() > 0.0
         light = torch.where(bright, found.light, 1.0)
         covered, lit = torch.zeros_like(wanted), []

@@ -4,8 +4,9 @@ Two implementations of one computation, with the same samples: fused kernels, fo
 images of their own, and PyTorch's operations, the reference that they must equal.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -13,31 +14,27 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels import rendering
 from dolens.kernels.view import View
-from dolens.optics.backend import choose_backend, say_once, trace_rays
+from dolens.optics.backend import say_once, with_chosen_backend
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack
-from dolens.optics.rays import Components, Rays
 from dolens.optics.replay import replay
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import distance_to_plane, trace_surfaces
-from dolens.rendering.moving_view import MovingView, moving_view, sample_share
-from dolens.rendering.protocol import Unprepared
-from dolens.rendering.pupil.aim import aim
-from dolens.rendering.pupil.edge_rays import EdgeRays
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.moving_view import MovingView, moving_view
+from dolens.rendering.pixel_rays import PixelRays
+from dolens.rendering.protocol import Renderer, SensorWindow
 from dolens.rendering.pupil.exit_pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
-from dolens.rendering.pupil.light_edges import EdgeMap, edge_map
+from dolens.rendering.pupil.light_edges import edge_map
 from dolens.rendering.pupil.moving_pupil import depends_on_parameters
-from dolens.rendering.pupil.pixel_edges import edge_samples, of_channel, pixel_edge_rays
-from dolens.rendering.random_numbers import random_words, uniform
-from dolens.rendering.sampling import square_to_disc, stratified_square
-from dolens.scene.planar import Scene, texture_coordinates, texture_origin
+from dolens.rendering.pupil.pixel_edges import edge_samples
+from dolens.scene.planar import Scene, texture_origin
 from dolens.sensor.pixels import Sensor
 
 _SEED_RANGE = 2**63 - 1
 
 
 @dataclass(frozen=True)
-class RayRenderer(Unprepared):
+class RayRenderer(Renderer):
     """Monte Carlo rendering: jittered points of each pixel, a stratified sampling of the pupil.
 
     Each pixel sends `pupil_samples`² rays: one from a random point of the pixel through a random
@@ -63,6 +60,9 @@ class RayRenderer(Unprepared):
     gradient_fraction: float = 1.0
     pixel_area: bool = True
 
+    model: ClassVar[str] = "rays"
+    monte_carlo: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         if self.pupil_samples < 1 or self.chunk_rays < 1:
             raise InputError("renderer: pupil_samples and chunk_rays must be at least 1")
@@ -71,29 +71,25 @@ class RayRenderer(Unprepared):
         if self.gradient_fraction < 1.0 and not self.replay:
             raise InputError("renderer: gradient_fraction below 1 needs replay")
 
-    def rays_per_image(self, scene: Scene) -> int:
+    def rays_per_image(self, scene: Scene, sensor: Sensor | None = None) -> int:
         """Rays traced through the lens for one render, all wavelengths together."""
-        pixels = self.sensor.height * self.sensor.width
-        return pixels * self.pupil_samples**2 * len(scene.wavelengths)
+        sensor = sensor or self.sensor
+        return sensor.height * sensor.width * self.pupil_samples**2 * len(scene.wavelengths)
 
     def render_windows(
         self,
         lens: Lens,
         scene: Scene,
         textures: Tensor,
-        windows: Sequence[Sensor],
-        centres: Sequence[tuple[float, float]],
+        windows: Sequence[SensorWindow],
         seed: int,
         values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
-        """Image each texture on a window of its own; as `PsfRenderer.render_windows`.
-
-        Returns:
-            (W, images, C, height, width).
-        """
+        """Image each texture on a window of its own; see `Renderer.render_windows`."""
         axial, images = self.axial_pupil(lens, scene, values), []
-        for i, (window, centre) in enumerate(zip(windows, centres, strict=True)):
-            renderer, placed = replace(self, sensor=window), replace(scene, texture_centre=centre)
+        for i, window in enumerate(windows):
+            renderer = self.on(window.sensor)
+            placed = replace(scene, texture_centre=window.texture_centre)
             texture = textures[i : i + 1]
             images.append(renderer.render(lens, placed, texture, seed + i, values, axial))
         return torch.cat(images)
@@ -108,8 +104,7 @@ class RayRenderer(Unprepared):
         """
         still = {name: value.detach() for name, value in (values or {}).items()}
         system = lens.system(still)
-        backend = choose_backend(system, lens.backend)
-        return axial_exit_pupil(system, scene.wavelengths, backend)
+        return axial_exit_pupil(system, scene.wavelengths)
 
     def render(
         self,
@@ -142,44 +137,51 @@ class RayRenderer(Unprepared):
         parameters = {**stored, **(values or {})}
         textures = textures.to(device=lens.device, dtype=lens.dtype)
         shown = scene.on_planes(textures)
-        system = lens.system(parameters)
-        backend = choose_backend(system, lens.backend, others=[textures])
-        now = lens.system({n: p.detach() for n, p in parameters.items()})
+        system = with_chosen_backend(lens.system(parameters), [textures])
+        backend = system.backend
+        now = lens.system({n: p.detach() for n, p in parameters.items()}).traced_by(backend)
         scene.check(now)
-        pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, backend, axial)
+        pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, axial)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, pupil)
-        moving = moving_view(system, scene, view, backend)
+        moving = moving_view(system, scene, view)
         edges = None
         if depends_on_parameters(system):
-            still = moving.pupil.numbers()
-            edges = edge_map(now, scene.wavelengths, self.sensor, still, backend)
+            edges = edge_map(ImagingSystem(now, scene, self.sensor, moving.pupil.numbers()))
+        rays = PixelRays(scene, self.sensor, view, edges)
+        names, planes = list(parameters), len(shown)
+
+        def moved(tensors: Sequence[Tensor]) -> tuple[OpticalSystem, MovingView, Sequence[Tensor]]:
+            """The lens, the view and what planes show, from a piece's own tensors."""
+            values = dict(zip(names, tensors[planes:-1], strict=True))
+            return lens.system(values).traced_by(backend), moving.of(tensors[-1]), tensors[:planes]
+
+        leaves = [*parameters.values(), moving.joined(system)]
         if backend == "cpu" and scene.separate_planes:
             image = self._fused(system, scene, textures, view, moving)
             if edges is None:
                 return image
-            return image + self._edge_light(lens, parameters, scene, shown, view, moving, edges)
+            pieces = self._pieces(self.chunk_rays // edge_samples(self.pupil_samples))
+
+            def edge_light(i: int, *tensors: Tensor) -> Tensor:
+                return rays.edge_light(*moved(tensors), *pieces[i], moving.still)
+
+            tensors = [*(t.detach() for t in shown), *leaves]
+            return image + self._image(replay(edge_light, _sizes(pieces), tensors))
         if backend != "reference":
             what = "cuda" if scene.separate_planes else "layers"
             say_once(f"render: no fused renderer for {what}; the reference, with fused traces")
-        names, planes = list(parameters), len(shown)
+        pieces = self._chunks
 
-        def piece(i: int, *tensors: Tensor) -> Tensor:
-            system = lens.system(dict(zip(names, tensors[planes:-1], strict=True)))
-            start, end = self._chunk(i)
-            now = moving.of(tensors[-1])
-            ray, weight = self._samples(system, view, now.pupil, start, end)
-            rim = pixel_edge_rays(
-                system, scene, self.sensor, view, now.pupil, edges, start, end, backend
-            )
-            shown = tensors[:planes]
-            return self._shade(system, scene, view, now, shown, ray, weight, rim, backend)
+        def light(i: int, *tensors: Tensor) -> Tensor:
+            return rays.light(*moved(tensors), *pieces[i])
 
-        tensors = [*shown, *parameters.values(), moving.joined(system)]
-        sizes = [end - start for start, end in map(self._chunk, range(self._chunks))]
+        tensors = [*shown, *leaves]
         if self.replay:
-            flat = replay(piece, sizes, tensors, self._replayed(seed))
-        else:
-            flat = torch.cat([piece(i, *tensors) for i in range(len(sizes))], dim=-1)
+            return self._image(replay(light, _sizes(pieces), tensors, self._replayed(seed)))
+        return self._image(torch.cat([light(i, *tensors) for i in range(len(pieces))], dim=-1))
+
+    def _image(self, flat: Tensor) -> Tensor:
+        """(..., height, width) of (..., pixels)."""
         return flat.unflatten(-1, (self.sensor.height, self.sensor.width))
 
     def _view(
@@ -209,23 +211,22 @@ class RayRenderer(Unprepared):
             tuple(scene.magnifications(system)),
         )
 
-    @property
-    def _chunks(self) -> int:
-        """Number of chunks of pixels."""
-        per_chunk = max(1, self.chunk_rays // self.pupil_samples**2)
-        return -(-self.sensor.height * self.sensor.width // per_chunk)
+    def _pieces(self, pixels: int) -> list[tuple[int, int]]:
+        """First pixels and ends of pieces of so many pixels, one at least."""
+        count, step = self.sensor.height * self.sensor.width, max(1, pixels)
+        return [(start, min(start + step, count)) for start in range(0, count, step)]
 
-    def _chunk(self, i: int) -> tuple[int, int]:
-        """First pixel and end of chunk i."""
-        per_chunk = max(1, self.chunk_rays // self.pupil_samples**2)
-        pixels = self.sensor.height * self.sensor.width
-        return i * per_chunk, min((i + 1) * per_chunk, pixels)
+    @property
+    def _chunks(self) -> list[tuple[int, int]]:
+        """First pixels and ends of what the reference traces at a time."""
+        return self._pieces(self.chunk_rays // self.pupil_samples**2)
 
     def _replayed(self, seed: int) -> list[int]:
         """The chunks that the backward pass traces again."""
-        count = max(1, round(self.gradient_fraction * self._chunks))
+        chunks = len(self._chunks)
+        count = max(1, round(self.gradient_fraction * chunks))
         generator = torch.Generator().manual_seed(seed % _SEED_RANGE)
-        return torch.randperm(self._chunks, generator=generator)[:count].tolist()
+        return torch.randperm(chunks, generator=generator)[:count].tolist()
 
     def _fused(
         self,
@@ -240,9 +241,9 @@ class RayRenderer(Unprepared):
         table = pack(system, wavelengths, -1.0, 1, len(system.surfaces), False)
         pieces, scale = [(0, view.height * view.width)], 1.0
         if self.gradient_fraction < 1.0:
-            replayed = self._replayed(view.seed)
-            pieces = [self._chunk(i) for i in sorted(replayed)]
-            scale = self._chunks / len(replayed)
+            replayed, chunks = self._replayed(view.seed), self._chunks
+            pieces = [chunks[i] for i in sorted(replayed)]
+            scale = len(chunks) / len(replayed)
         return rendering.render(
             table.values,
             table.indices,
@@ -257,117 +258,7 @@ class RayRenderer(Unprepared):
             scale,
         )
 
-    def _samples(
-        self, system: OpticalSystem, view: View, pupil: ExitPupil, start: int, end: int
-    ) -> tuple[Components, Tensor]:
-        """Rays (pixels, samples) from the sensor, and their weights, which sum to one on axis."""
-        side = view.pupil_samples
-        pixel = torch.arange(start, end, device=system.device)[:, None]
-        sample = torch.arange(side * side, device=system.device)
-        jitters = [uniform(word, system.dtype) for word in random_words(view.seed, pixel, sample)]
-        disc_x, disc_y = square_to_disc(*stratified_square(side, *jitters[:2]))
-        rows = torch.div(pixel, view.width, rounding_mode="floor").to(system.dtype)
-        columns = (pixel % view.width).to(system.dtype)
-        if view.pixel_area:
-            rows, columns = rows + (jitters[2] - 0.5), columns + (jitters[3] - 0.5)
-        x, y = self.sensor.positions(rows, columns)
-        sensor_z = system.vertices[-1]
-        radius = pupil.radius
-        ray = aim(x, y, sensor_z, disc_x * radius, disc_y * radius, pupil.z)
-        return ray, (ray.n * ray.n) ** 2 * sample_share(system, view, pupil)
 
-    def _edge_light(
-        self,
-        lens: Lens,
-        parameters: Mapping[str, Tensor],
-        scene: Scene,
-        shown: tuple[Tensor, ...],
-        view: View,
-        moving: MovingView,
-        edges: EdgeMap,
-    ) -> Tensor:
-        """A black image, whose gradient is that of the light at the edges of apertures."""
-        names, planes = list(parameters), len(shown)
-        images = shown[0].shape[0]
-        per_piece = max(1, self.chunk_rays // edge_samples(self.pupil_samples))
-        pixels = view.height * view.width
-        starts = range(0, pixels, per_piece)
-        sizes = [min(per_piece, pixels - start) for start in starts]
-
-        def piece(i: int, *tensors: Tensor) -> Tensor:
-            shape = (images, len(scene.depths), len(scene.wavelengths), sizes[i])
-            system = lens.system(dict(zip(names, tensors[planes:-1], strict=True)))
-            now, start = moving.of(tensors[-1]), starts[i]
-            rim = pixel_edge_rays(
-                system, scene, self.sensor, view, now.pupil, edges, start, start + sizes[i], "cpu"
-            )
-            if rim is None:
-                return shown[0].new_zeros(shape)
-            channels = [
-                scene.gather(
-                    tensors[:planes],
-                    channel,
-                    _texture_places(view, moving.still, of_channel(rim.ray, channel)),
-                    rim.weight[channel],
-                )
-                for channel in range(len(scene.wavelengths))
-            ]
-            return torch.stack(channels, dim=2)
-
-        still = [t.detach() for t in shown]
-        tensors = [*still, *parameters.values(), moving.joined(lens.system(parameters))]
-        return replay(piece, sizes, tensors).unflatten(-1, (view.height, view.width))
-
-    def _shade(
-        self,
-        system: OpticalSystem,
-        scene: Scene,
-        view: View,
-        moving: MovingView,
-        shown: tuple[Tensor, ...],
-        ray: Components,
-        weight: Tensor,
-        rim: EdgeRays | None,
-        backend: str,
-    ) -> Tensor:
-        """(B, images, C, count): trace, meet the planes, gather what they show.
-
-        Rays of `rim` stand beside the samples.
-        """
-        channels = []
-        for channel, wavelength in enumerate(scene.wavelengths):
-            there, valid = _trace(system, ray, wavelength, backend)
-            arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
-            if rim is not None:
-                beside = of_channel(rim.ray, channel)
-                there = Components(
-                    *(torch.cat(pair, -1) for pair in zip(there, beside, strict=True))
-                )
-                arriving = torch.cat((arriving, rim.weight[channel]), -1)
-            places = _texture_places(view, moving.magnifications, there)
-            channels.append(scene.gather(shown, channel, places, arriving))
-        return torch.stack(channels, dim=2)
-
-
-def _texture_places(
-    view: View, magnifications: Sequence[float | Tensor], there: Components
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows and columns of the texture where rays meet one plane after the other."""
-    origin = (view.texture_row, view.texture_column)
-    for depth, magnification in zip(view.depths, magnifications, strict=True):
-        t, _ = distance_to_plane(there, -depth, -1.0)
-        x = torch.addcmul(there.x, t, there.l)
-        y = torch.addcmul(there.y, t, there.m)
-        yield texture_coordinates(x, y, magnification, view.pixel_pitch, origin)
-
-
-def _trace(
-    system: OpticalSystem, ray: Components, wavelength: float, backend: str
-) -> tuple[Components, Tensor]:
-    """Rays behind the lens, in object space, and which of them got there."""
-    if backend == "reference":
-        traced = trace_surfaces(system, ray, wavelength, sense=-1.0)
-        return traced.ray, traced.valid
-    rays = Rays.from_components(ray, wavelength)
-    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
-    return Components(*hit.position.unbind(-1), *hit.direction.unbind(-1)), hit.valid
+def _sizes(pieces: Sequence[tuple[int, int]]) -> list[int]:
+    """Pixels of each piece."""
+    return [end - start for start, end in pieces]

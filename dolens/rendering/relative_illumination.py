@@ -1,16 +1,12 @@
 """Relative illumination: how bright a white scene is over the sensor."""
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.analysis.ray_intercepts import even_points
-from dolens.optics.system import OpticalSystem
+from dolens.analysis.ray_intercepts import uniform_pupil_points
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import pupil_rays, rim_rays
-from dolens.rendering.pupil.exit_pupil import ExitPupil
-from dolens.sensor.pixels import Sensor
 
 # Points along the radius of a symmetric lens, or along each side of the sensor.
 RADII, _SIDE = 65, 13
@@ -20,15 +16,7 @@ _RIM_RADII, _RIM_SIDE = 4, 3
 RAYS = 2048
 
 
-def relative_illumination(
-    system: OpticalSystem,
-    wavelengths: Sequence[float],
-    sensor: Sensor,
-    pupil: ExitPupil,
-    symmetric: bool,
-    backend: str,
-    rays: int = RAYS,
-) -> Tensor:
+def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
     """Irradiance of every pixel under a uniform scene, over that on the axis.
 
     The mean of cos⁴ over the exit pupil as each pixel sees it, vignetting included.  It is found at
@@ -36,35 +24,31 @@ def relative_illumination(
     symmetry (where an edge begins to cut, light is lost in proportion to the radius).
 
     Args:
-        system: the lens.
-        wavelengths: nm.
-        sensor: the pixels.
-        pupil: the disc that is sampled.
-        symmetric: whether the lens has rotational symmetry.
-        backend: what traces.
+        imaging: the lens, C wavelengths, the pixels, and the pupil's disc that is sampled.
         rays: through the pupil, for each point and wavelength; a multiple of four.
 
     Returns:
-        (wavelengths, height, width); differentiable in the lens.
+        (C, height, width); differentiable in the lens.
     """
+    system, sensor = imaging.system, imaging.sensor
     options = {"dtype": torch.float64, "device": system.device}
     height, width = sensor.height, sensor.width
     grid = torch.meshgrid(
         torch.arange(height, **options), torch.arange(width, **options), indexing="ij"
     )
     # No two of them on one circle: strata lie on rings, which an aperture's edge takes as wholes.
-    spiral = even_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
+    spiral = uniform_pupil_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
     disc = tuple(d.expand(max(RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
-    if symmetric:
+    if system.rotationally_symmetric:
         x, y = sensor.positions(*grid)
         distance = torch.hypot(x, y)
         low, high = float(distance.min()), float(distance.max())
         radius = torch.linspace(low, high, RADII, **options)
         points = (radius, torch.zeros_like(radius))
-        _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
+        _, weight = pupil_rays(imaging, points, disc)
         light = weight.sum(-1)
         few = tuple(p[::_RIM_RADII] for p in points)
-        rim = rim_rays(system, wavelengths, few, pupil, backend)
+        rim = rim_rays(imaging, few)
         if rim is not None:
             light = light + functional.interpolate(
                 rim.weight.sum(-1)[None], size=RADII, mode="linear", align_corners=True
@@ -77,12 +61,12 @@ def relative_illumination(
     columns = torch.linspace(0.0, width - 1.0, _SIDE, **options)
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     points = sensor.positions(row.reshape(-1), column.reshape(-1))
-    _, weight = pupil_rays(system, wavelengths, points, pupil, disc, backend)
+    _, weight = pupil_rays(imaging, points, disc)
     light = weight.sum(-1).unflatten(-1, (_SIDE, _SIDE))
     few = tuple(
         p.unflatten(0, (_SIDE, _SIDE))[::_RIM_SIDE, ::_RIM_SIDE].reshape(-1) for p in points
     )
-    rim = rim_rays(system, wavelengths, few, pupil, backend)
+    rim = rim_rays(imaging, few)
     if rim is not None:
         coarse = rim.weight.sum(-1).unflatten(-1, (-1, 1 + (_SIDE - 1) // _RIM_SIDE))
         light = light + functional.interpolate(

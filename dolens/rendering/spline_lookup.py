@@ -13,29 +13,29 @@ from dolens.rendering.binning import spline_taps
 from dolens.rendering.psf import splat
 
 
-def spline_lookup(images: Tensor, rows: Tensor, columns: Tensor, backend: str) -> Tensor:
+def spline_lookup(images: Tensor, rows: Tensor, columns: Tensor, fused: bool) -> Tensor:
     """Σ over pixels of image · β²(row - i) · β²(column - j) at points.
 
     Args:
         images: (G, size, size).
         rows: (G, N), fractional pixels; no gradient reaches them.
         columns: (G, N).
-        backend: `cpu` takes the fused kernel, the others PyTorch's operations.
+        fused: take the CPU's kernel, else PyTorch's operations.
 
     Returns:
         (G, N); points within a pixel and a half of the edge lack what lies beyond it.
     """
-    return _Lookup.apply(images, rows, columns, backend)
+    return _Lookup.apply(images, rows, columns, fused)
 
 
 class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(  # noqa: ANN205
-        ctx: Any, images: Tensor, rows: Tensor, columns: Tensor, backend: str
+        ctx: Any, images: Tensor, rows: Tensor, columns: Tensor, fused: bool
     ):
         ctx.save_for_backward(rows, columns)
-        ctx.size, ctx.backend = images.shape[-1], backend
-        if backend == "cpu":
+        ctx.size, ctx.fused = images.shape[-1], fused
+        if fused:
             return splatting.splat_adjoint(rows, columns, torch.ones_like(rows), images)[2]
         return _gather(images, rows, columns)
 
@@ -43,7 +43,7 @@ class _Lookup(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         rows, columns = ctx.saved_tensors
-        return splat(rows, columns, gradient, ctx.size, ctx.backend), None, None, None
+        return splat(rows, columns, gradient, ctx.size, ctx.fused), None, None, None
 
 
 def _gather(images: Tensor, rows: Tensor, columns: Tensor) -> Tensor:

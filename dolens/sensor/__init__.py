@@ -1,1 +1,1 @@
-"""The image sensor: pixels, noise, readout, colour filters and colour encoding."""
+"""The image sensor is modelled by pixels, noise, readout, colour filters and colour encoding."""

@@ -1,4 +1,4 @@
-"""Colour filters over the pixels, and the two colours of each pixel that they leave out."""
+"""A Bayer colour filter array is applied to an image, and its missing colours are interpolated."""
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ def check_pattern(pattern: str) -> None:
 
 
 def mosaic(image: Tensor, pattern: str) -> Tensor:
-    """What pixels behind colour filters see of an image.
+    """Sample an image through a colour filter array.
 
     Args:
         image: (..., 3, H, W): red, green, blue.
@@ -41,7 +41,7 @@ def mosaic(image: Tensor, pattern: str) -> Tensor:
 
 
 def demosaic(raw: Tensor, pattern: str) -> Tensor:
-    """The three colours of each pixel behind colour filters, by gradient-corrected interpolation.
+    """Interpolate the three colours of each pixel by gradient-corrected linear interpolation.
 
     Malvar, He and Cutler, "High-quality linear interpolation for demosaicing of Bayer-patterned
     color images" (ICASSP 2004), their Fig. 2: the mean of the nearest pixels of the wanted colour,
@@ -75,7 +75,7 @@ def demosaic(raw: Tensor, pattern: str) -> Tensor:
     )
 
     def at(row: int, column: int) -> Tensor:
-        """The pixels that lie so many rows below and columns right of each."""
+        """Return the pixels that lie so many rows below and columns right of each."""
         return padded[..., 2 + row : 2 + row + height, 2 + column : 2 + column + width]
 
     beside, above = at(0, -1) + at(0, 1), at(-1, 0) + at(1, 0)
@@ -102,7 +102,7 @@ def demosaic(raw: Tensor, pattern: str) -> Tensor:
 
 
 def _red_rows_and_columns(image: Tensor, pattern: str) -> tuple[Tensor, Tensor]:
-    """Whether a row (H, 1) and a column (W,) is one with red filters; the others have blue ones."""
+    """Return whether rows (H, 1) and columns (W,) hold red filters; the others hold blue ones."""
     check_pattern(pattern)
     row, column = PATTERNS[pattern]
     height, width = image.shape[-2:]

@@ -1,4 +1,4 @@
-"""Conversion between linear light and the sRGB encoding (IEC 61966-2-1)."""
+"""Linear light is converted to the sRGB encoding and back (IEC 61966-2-1)."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""The noise of a pixel: shot noise of the light, read noise of the electronics."""
+"""A pixel has shot noise, from the light, and read noise, from the electronics."""
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ def add_read_noise(image: Tensor, sigma: float, generator: torch.Generator) -> T
 
 
 def add_shot_noise(image: Tensor, full_well: float, generator: torch.Generator) -> Tensor:
-    """Add the noise of counting electrons, as a Gaussian whose variance follows the light.
+    """Add shot noise, as a Gaussian whose variance follows the light.
 
     A pixel of irradiance s collects a Poisson number of electrons of mean and variance N·s, with
     N the full well.  Here n = s + σ(N·s)/N · z with z from the standard normal distribution and
@@ -43,7 +43,7 @@ def add_shot_noise(image: Tensor, full_well: float, generator: torch.Generator) 
 
 
 def shot_noise_deviation(electrons: Tensor) -> Tensor:
-    """Standard deviation of a number of electrons whose mean is given.
+    """Return the standard deviation of a number of electrons whose mean is given.
 
     It is √μ, Poisson's, from one electron on.  The slope of √μ has no bound towards the dark, and
     a Gaussian is no model of less than one electron; there it is (3μ - μ²)/2, which meets √μ in

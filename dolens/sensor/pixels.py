@@ -1,4 +1,4 @@
-"""The pixel grid."""
+"""Pixels form a rectangular grid on the sensor plane."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from dolens.errors import InputError
 
 @dataclass(frozen=True)
 class Sensor:
-    """A rectangle of square pixels, centred on the axis, or a window of a larger one.
+    """A `Sensor` is a rectangle of square pixels, centred on the axis, or a window of a larger one.
 
     Images are stored upright, as a viewer expects them: row 0 at the top, column 0 at the left
     of the scene as the camera sees it (looking towards -z with y up).  A lens inverts, so the
@@ -38,19 +38,21 @@ class Sensor:
             )
 
     def positions(self, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Points (x, y) in mm on the sensor plane of fractional pixel coordinates."""
+        """Return points (x, y) in mm on the sensor plane from fractional pixel coordinates."""
         x = (0.5 * (self.width - 1) - self.centre_column - columns) * self.pixel_pitch
         y = (rows - (0.5 * (self.height - 1) - self.centre_row)) * self.pixel_pitch
         return x, y
 
     def pixels(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Fractional rows and columns of points on the sensor plane, mm; undoes `positions`."""
+        """Return fractional rows and columns of points on the sensor plane, mm; the inverse of
+        `positions`.
+        """
         rows = 0.5 * (self.height - 1) - self.centre_row + y / self.pixel_pitch
         columns = 0.5 * (self.width - 1) - self.centre_column - x / self.pixel_pitch
         return rows, columns
 
     def window(self, top: int, left: int, height: int, width: int) -> "Sensor":
-        """The pixels from row `top` and column `left` on, as a sensor of their own.
+        """Return the pixels from row `top` and column `left` on, as a sensor of its own.
 
         Raises:
             InputError: the window is not within the sensor.

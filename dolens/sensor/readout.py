@@ -1,4 +1,4 @@
-"""From the irradiance on the pixels to the numbers that a sensor gives, and back to colours."""
+"""The readout converts irradiance on the pixels to digital numbers, and those to colours."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ _MOST_BITS = 16
 
 @dataclass(frozen=True)
 class Readout:
-    """What happens between the light on the pixels and the numbers that come out.
+    """A `Readout` applies exposure, colour filters, noise, saturation and quantisation to an image.
 
     In this order, s being the irradiance relative to that of a white plane on the axis:
 
@@ -53,7 +53,7 @@ class Readout:
         pattern: colour filters, `RGGB`, `GRBG`, `GBRG` or `BGGR`; None where a pixel sees all
             channels.
         reference_f_number: N₀, that `exposure` is stated for; None: any lens has this exposure.
-        f_number: N, of the lens in front; None: the reference.  `behind` sets it.
+        f_number: N, of the lens in front; None: the reference.  `at_f_number` sets it.
     """
 
     exposure: float = 1.0
@@ -68,7 +68,8 @@ class Readout:
 
     @classmethod
     def at_light(cls, light: float, full_well: float, **others: Any) -> Self:
-        """A sensor that counts `light` electrons where a white plane on the axis is imaged.
+        """Return a readout in which a white plane, imaged on the axis, gives `light` electrons a
+        pixel.
 
         Args:
             light: electrons of a white pixel behind the lens at the reference F-number.
@@ -103,13 +104,13 @@ class Readout:
         if self.pattern is not None:
             check_pattern(self.pattern)
 
-    def behind(self, f_number: float) -> Self:
-        """The same sensor, exposed for the same time, behind a lens of another F-number."""
+    def at_f_number(self, f_number: float) -> Self:
+        """Return the same readout, with the same exposure time, at another F-number of the lens."""
         return replace(self, f_number=f_number)
 
     @property
     def relative_exposure(self) -> float:
-        """E·(N₀/N)², what the irradiance of a white plane on the axis becomes; 1 is full scale."""
+        """Return E·(N₀/N)², the signal of a white plane on the axis; 1 is full scale."""
         if self.reference_f_number is None or self.f_number is None:
             return self.exposure
         return self.exposure * (self.reference_f_number / self.f_number) ** 2
@@ -146,7 +147,7 @@ class Readout:
         return (code - black) / gain
 
     def develop(self, raw: Tensor) -> Tensor:
-        """Linear light of a raw image: colours interpolated, the exposure divided out.
+        """Return the linear light of a raw image: interpolate colours and divide by the exposure.
 
         Args:
             raw: (..., C, H, W), with a pattern (..., 1, H, W), as `__call__` gives it.
@@ -164,7 +165,8 @@ class Readout:
 
 
 def quantise(signal: Tensor, bits: int) -> Tensor:
-    """The nearest of 2ⁿ evenly spaced values from 0 to 1, with the gradient of the signal itself.
+    """Round to the nearest of 2ⁿ evenly spaced values from 0 to 1, with the gradient of the signal
+    itself.
 
     Rounding has no useful derivative, zero almost everywhere; the straight-through estimator
     (Bengio, Léonard and Courville, arXiv:1308.3432) takes 1 for it.

@@ -1,9 +1,9 @@
-"""What becomes of a lens when it is made: sensitivities, tolerances, yield."""
+"""This package predicts what manufacturing does to a lens: sensitivities, tolerances, yield."""
 
 from dolens.tolerancing.analysis import Outcome, ToleranceAnalysis, analyse_tolerances
 from dolens.tolerancing.linear_spots import LinearSpots, linear_spots
 from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed
-from dolens.tolerancing.perturbations import Tolerances, tightened, tolerances_from
+from dolens.tolerancing.perturbations import Tolerances, scaled_tolerances, tolerances_from
 from dolens.tolerancing.prediction import Contributions, contributions
 from dolens.tolerancing.sensitivity import Sensitivities, sensitivities
 from dolens.tolerancing.through_focus import FocusCurves, spot_weights
@@ -23,10 +23,10 @@ __all__ = [
     "contributions",
     "linear_spots",
     "quantiles",
+    "scaled_tolerances",
     "sensitivities",
     "share_within",
     "spot_weights",
-    "tightened",
     "tolerances_from",
     "trace_perturbed",
 ]

@@ -1,4 +1,4 @@
-"""Sensitivities, Monte Carlo and linear prediction of one lens, together."""
+"""A tolerance analysis joins sensitivities, a Monte Carlo and a linear prediction of one lens."""
 
 import time
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from dolens.tolerancing.yields import Yield
 
 @dataclass(frozen=True)
 class Outcome:
-    """Spots of K lenses with the sensor where it stands, and at each lens's best focus.
+    """Holds the spots of K lenses with the sensor where it stands, and at each lens's best focus.
 
     Attributes:
         curves: (K, S).
@@ -37,18 +37,18 @@ class Outcome:
 
     @staticmethod
     def of(curves: FocusCurves, weights: Tensor) -> "Outcome":
-        """With the compensator worked out."""
+        """Return the outcome of spots through focus, with the compensator worked out."""
         refocus = curves.best_focus(weights)
         return Outcome(curves, refocus, curves.at(), curves.at(refocus), weights)
 
     def found(self, refocused: bool = True) -> Yield:
-        """The lenses' RMS in ascending order."""
+        """Return the lenses' RMS in ascending order."""
         return Yield.of(self.after if refocused else self.before, self.weights)
 
 
 @dataclass(frozen=True)
 class ToleranceAnalysis:
-    """What there is to know about the tolerances of a lens.
+    """Holds everything that is known about the tolerances of a lens.
 
     Attributes:
         spots: rays of the lens as designed.

@@ -1,4 +1,4 @@
-"""Spots in the linear ray model: every ray's sensor point is linear in the errors of the lens."""
+"""In the linear ray model every ray intercept is linear in the errors of the lens."""
 
 import copy
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from dolens.tolerancing.through_focus import FocusCurves
 
 @dataclass(frozen=True)
 class LinearSpots:
-    """S spots of a lens whose P parameters are off by ε: p(ε) = p + J·ε for every ray.
+    """Describes S spots of a lens whose P parameters are off by ε: p(ε) = p + J·ε for every ray.
 
     With the sensor moved by δ (mm) a ray lands at p + J·ε + δ·(t + T·ε), where t are its tangents
     (l/n, m/n) and T = ∂t/∂ε.  So RMS² of a spot is Σ w·|D·v + δ·K·v|² with v = (1, ε), and D and K
@@ -43,17 +43,19 @@ class LinearSpots:
 
     @property
     def rms_radii(self) -> Tensor:
-        """(S,), mm, of the lens as it is."""
+        """Return the RMS radii (S,), mm, of the lens as it is."""
         return self.points[:, 0, 0].sqrt()
 
     @property
     def rms_jacobian(self) -> Tensor:
-        """(S, P): ∂RMS/∂θ = Σ w·(p - p̄)·(J - J̄)/RMS; zero for a perfect spot, which has none."""
+        """Return ∂RMS/∂θ (S, P) = Σ w·(p - p̄)·(J - J̄)/RMS; zero for a perfect spot, which has
+        none.
+        """
         radii = self.rms_radii[:, None]
         return torch.where(radii > 0.0, self.points[:, 0, 1:] / radii, 0.0)
 
     def focus_curves(self, errors: Tensor) -> FocusCurves:
-        """RMS² through focus of lenses with these errors.
+        """Return RMS² through focus of lenses with these errors.
 
         Args:
             errors: (..., P), ε, in the lens's units.
@@ -99,7 +101,7 @@ def linear_spots(lens: Lens, spots: SpotRays, names: Sequence[str]) -> LinearSpo
 
 
 def _points(lens: Lens, spots: SpotRays, names: Sequence[str]) -> Tensor:
-    """(N, 2, 1 + P), double precision: p and J of every ray."""
+    """Return p and J of every ray, (N, 2, 1 + P), double precision."""
     found = ray_jacobian(lens, spots.rays, list(names))
     if not bool(found.valid.all()):
         raise InputError("rays of the spots do not pass the lens as designed")

@@ -1,4 +1,4 @@
-"""Thousands of lenses as they might be made, traced in one batch."""
+"""A Monte Carlo traces thousands of lenses as they might be made in one batch."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +23,7 @@ RAYS_AT_A_TIME = 1 << 17
 
 @dataclass(frozen=True)
 class PerturbedSpots:
-    """S spots of K lenses.
+    """Holds S spots of K lenses.
 
     Attributes:
         curves: RMS² through focus, (K, S); infinite where a ray of the lens fails.
@@ -47,7 +47,7 @@ def trace_perturbed(
     errors: Tensor,
     chunk_size: int | None = None,
 ) -> PerturbedSpots:
-    """Spots of lenses whose parameters are off, traced exactly.
+    """Trace spots of lenses whose parameters are off, exactly.
 
     Every lens is lit by the rays of the lens as designed: they are fixed in object space, as if the
     entrance pupil stayed where it is.  A ray that an aperture of the displaced lens clips still
@@ -82,12 +82,12 @@ def trace_perturbed(
         return trace_to_plane(system, at_last, system.vertices[-1], wavelength, 1.0)
 
     # Sums are formed about the design's centroids, so that squares of distances lose no digits.
-    design = _landing(traced(start).ray)
+    design = _intercepts(traced(start).ray)
     means = (torch.stack(design) @ shares)[:, spots.spot].unbind()
 
     def moments(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         trace = traced(values)
-        x, y, u, v = (c - m for c, m in zip(_landing(trace.ray), means, strict=True))
+        x, y, u, v = (c - m for c, m in zip(_intercepts(trace.ray), means, strict=True))
         sums = torch.stack([x, y, u, v, x * x + y * y, x * u + y * v, u * u + v * v]) @ shares
         goes_on, inside = _smallest_margins(trace)
         failed = ~(goes_on > 0.0)
@@ -111,7 +111,8 @@ def trace_perturbed(
 def _in_chunks(
     batch: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, size: int
 ) -> list[Tensor]:
-    """A function of a batch, some rows at a time, every chunk on a thread of its own.
+    """Return a function of a batch, computed some rows at a time, every chunk on a thread of its
+    own.
 
     PyTorch would else split each of the many short operations among its threads, which then wait
     for one another; on a machine that others use too, that takes up to ten times as long.
@@ -131,13 +132,15 @@ def _in_chunks(
     return [torch.cat(part) for part in zip(*parts, strict=True)]
 
 
-def _landing(ray: Components) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """x and y on the sensor, mm, and the tangents l/n and m/n."""
+def _intercepts(ray: Components) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the ray intercepts x and y on the sensor, mm, and the tangents l/n and m/n."""
     return ray.x, ray.y, ray.l / ray.n, ray.m / ray.n
 
 
 def _smallest_margins(trace: Trace) -> tuple[Tensor, Tensor]:
-    """Of what ends a ray, and of the apertures that clip it; positive where it passes."""
+    """Return the margins of what ends a ray, and of the apertures that clip it; positive where it
+    passes.
+    """
     goes_on = [m for row in trace.margins for m in (row.met, row.transmitted) if m is not None]
     inside = [row.inside for row in trace.margins if row.inside is not None]
     return reduce(torch.minimum, goes_on), reduce(torch.minimum, inside)

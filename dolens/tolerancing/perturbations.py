@@ -1,4 +1,6 @@
-"""Tolerances: how far the parameters of a lens that is made may lie from those of the design."""
+"""Tolerances limit how far the parameters of a lens that is made may lie from those of the
+design.
+"""
 
 import math
 from collections.abc import Mapping
@@ -8,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
-from dolens.optics.elements import TILTS
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import unit_of
 
 DISTRIBUTIONS = ("uniform", "normal")
 _KEYS = ("half_range", "distribution", "relative")
@@ -23,7 +25,7 @@ _INSIDE = math.erf(_TRUNCATION / math.sqrt(2.0))
 
 @dataclass(frozen=True)
 class Tolerances:
-    """P parameters of a lens, and how far each may be off.  All errors are independent.
+    """Holds P parameters of a lens, and how far each may be off.  All errors are independent.
 
     Attributes:
         names: of the parameters, in the order of the lens.
@@ -44,7 +46,7 @@ class Tolerances:
 
     @property
     def steps(self) -> Tensor:
-        """(P,), the half-ranges in the lens's units.
+        """Return the half-ranges (P,) in the lens's units.
 
         A relative one has the sign of the value: up is away from zero.
         """
@@ -52,7 +54,7 @@ class Tolerances:
 
     @property
     def variance(self) -> Tensor:
-        """(P,), E[ε²] in the lens's units squared.
+        """Return E[ε²] (P,) in the lens's units squared.
 
         h²/3 of a uniform one; of a normal one truncated at ±a = 2 standard deviations σ = h/2,
         σ²·(1 - 2a·φ(a)/(2Φ(a) - 1)).
@@ -62,13 +64,13 @@ class Tolerances:
 
     @property
     def fourth_moment(self) -> Tensor:
-        """(P,), E[ε⁴]: h⁴/5, or σ⁴·(3 - 2(a³ + 3a)·φ(a)/(2Φ(a) - 1))."""
+        """Return E[ε⁴] (P,): h⁴/5, or σ⁴·(3 - 2(a³ + 3a)·φ(a)/(2Φ(a) - 1))."""
         a = _TRUNCATION
         inside = (3.0 - 2.0 * (a**3 + 3.0 * a) * _DENSITY / _INSIDE) / a**4
         return self.steps**4 * torch.where(self.normal, inside, 0.2)
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """Errors of lenses, (count, P), float64, in the lens's units.
+        """Draw errors of lenses, (count, P), float64, in the lens's units.
 
         Args:
             count: lenses.
@@ -81,7 +83,7 @@ class Tolerances:
         return self.steps * torch.where(self.normal, inside, centred)
 
     def label(self, column: int) -> str:
-        """A tolerance as one reads it: `± 0.05 deg`."""
+        """Return a tolerance as one reads it: `± 0.05 deg`."""
         number = float(self.half_range[column])
         unit = self.unit_names[column]
         return f"± {100.0 * number if unit == '%' else number:g} {unit}".strip()
@@ -133,48 +135,33 @@ def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0
         nominal,
         factor * torch.tensor([rows[n][0] for n in names], dtype=torch.float64),
         torch.tensor(
-            [_unit(n, rows[n][2], float(v)) for n, v in zip(names, nominal, strict=True)],
+            [
+                float(v) if rows[n][2] else unit_of(n).factor
+                for n, v in zip(names, nominal, strict=True)
+            ],
             dtype=torch.float64,
         ),
-        tuple("%" if rows[n][2] else unit_name(n) for n in names),
+        tuple("%" if rows[n][2] else unit_of(n).name for n in names),
         torch.tensor([rows[n][1] for n in names]),
     )
 
 
-def unit_name(name: str) -> str:
-    """The unit that files give a parameter in; nothing where it depends on the surface."""
-    last = name.rsplit(".", 1)[-1]
-    if last in TILTS:
-        return "deg"
-    if last == "curvature":
-        return "1/mm"
-    if name.startswith(("elements.", "thicknesses.")) or name == "sensor_distance":
-        return "mm"
-    return ""
-
-
-def tightened(tolerances: Tolerances, factor: float) -> Tolerances:
-    """The same tolerances with every half-range multiplied by a factor."""
+def scaled_tolerances(tolerances: Tolerances, factor: float) -> Tolerances:
+    """Return the tolerances with every half-range multiplied by a factor."""
     return replace(tolerances, half_range=factor * tolerances.half_range)
 
 
 def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
-    """Half-range, whether normal, whether relative."""
+    """Return half-range, whether normal, whether relative."""
     where = f"tolerances.{pattern}"
     if not isinstance(given, Mapping):
         given = {"half_range": given}
-    for key in given:
-        if key not in _KEYS:
-            raise InputError(f"{where}: unknown key '{key}' (allowed: {', '.join(_KEYS)})")
+    check_keys(given, _KEYS, where)
     half_range = given.get("half_range")
     if not _is_number(half_range) or not 0.0 < half_range < math.inf:
         raise InputError(f"{where}: half_range must be a positive number, not {half_range!r}")
     distribution = given.get("distribution", "uniform")
-    if distribution not in DISTRIBUTIONS:
-        raise InputError(
-            f"{where}: distribution '{distribution}' is unknown "
-            f"(allowed: {', '.join(DISTRIBUTIONS)})"
-        )
+    check_choice(distribution, DISTRIBUTIONS, f"{where}: distribution")
     relative = given.get("relative", False)
     if not isinstance(relative, bool):
         raise InputError(f"{where}: relative must be true or false, not {relative!r}")
@@ -183,9 +170,3 @@ def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _unit(name: str, relative: bool, nominal: float) -> float:
-    if relative:
-        return nominal
-    return math.pi / 180.0 if name.rsplit(".", 1)[-1] in TILTS else 1.0

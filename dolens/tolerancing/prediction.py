@@ -1,4 +1,4 @@
-"""What tolerances do on average, from the linear ray model and without tracing a lens."""
+"""The linear ray model predicts the mean effect of tolerances without tracing a lens."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from dolens.tolerancing.perturbations import Tolerances
 
 @dataclass(frozen=True)
 class Contributions:
-    """What each tolerance adds to M = Σ W·RMS², the mean square radius over the spots.
+    """Holds what each tolerance adds to M = Σ W·RMS², the mean square radius over the spots.
 
     In the linear ray model M = M₀ + 2g·ε + εᵀQε.  Errors that are independent and zero on average
     raise it on average by Σ Q_pp·σ_p², exactly, and each tolerance's share adds up with the others.
@@ -31,25 +31,25 @@ class Contributions:
 
     @property
     def share(self) -> Tensor:
-        """(P,): of the average rise; they sum to one."""
+        """Return the share (P,) of the average rise; the shares sum to one."""
         total = self.increase.sum()
         return self.increase / torch.where(total > 0.0, total, 1.0)
 
     @property
     def expected_rms(self) -> float:
-        """mm: √(M₀ + Σ increase), the nominal RMS and all tolerances' in root sum square."""
+        """Return √(M₀ + Σ increase), mm: the nominal RMS and all tolerances' in root sum square."""
         return float((self.nominal + self.increase.sum()).sqrt())
 
     @property
     def order(self) -> list[int]:
-        """Columns, the worst offender first."""
+        """Return the columns, the worst offender first."""
         return torch.argsort(self.increase, descending=True, stable=True).tolist()
 
 
 def contributions(
     model: LinearSpots, tolerances: Tolerances, weights: Tensor, refocused: bool = True
 ) -> Contributions:
-    """Averages over the tolerances' distributions, in closed form.
+    """Return averages over the tolerances' distributions, in closed form.
 
     Args:
         model: of the lens as designed, with the tolerances' parameters.
@@ -68,7 +68,7 @@ def contributions(
         shift = -mixed[0, 0] / steep
         points = points + shift * (mixed + mixed.T) + shift.square() * tangents
         mixed = mixed + shift * tangents
-        # Half the derivative of RMS² by the focus, as the errors change it: zero for the design.
+        # Half of ∂RMS²/∂focus, as the errors change it: zero for the design.
         focus = torch.cat([mixed[:1, 0], mixed[1:, 0] + mixed[0, 1:]])
         points = points - torch.outer(focus, focus) / steep
     gradient, curvature = points[0, 1:], points.diagonal()[1:]

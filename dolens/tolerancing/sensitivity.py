@@ -1,4 +1,4 @@
-"""How spots answer to each tolerance alone."""
+"""Sensitivities say how spots change with each tolerance alone."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from dolens.tolerancing.linear_spots import LinearSpots
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """Spots of a lens, their derivatives, and their sizes at the ends of each tolerance.
+    """Holds the spots of a lens, their derivatives, and their sizes at the ends of each tolerance.
 
     Where a symmetry makes RMS stationary (a tilt on the axis) its derivative is zero and says
     nothing; what a whole tolerance does tells more.
@@ -39,16 +39,16 @@ class Sensitivities:
 
     @property
     def centroid_shifts(self) -> Tensor:
-        """(S, 2, P), mm: how far a whole tolerance moves each spot."""
+        """Return how far a whole tolerance moves each spot, (S, 2, P), mm."""
         return self.centroid_jacobian * self.steps
 
     @property
     def largest_centroid_shift(self) -> Tensor:
-        """(P,), mm: of the spot that the tolerance moves farthest."""
+        """Return the shift (P,), mm, of the spot that the tolerance moves farthest."""
         return self.centroid_shifts.norm(dim=1).amax(0)
 
     def increase(self, refocused: bool = True) -> Tensor:
-        """(P,), mm: how much √(Σ W·RMS²) grows at the worse end of each tolerance."""
+        """Return how much √(Σ W·RMS²) grows at the worse end of each tolerance, (P,), mm."""
         ends = self.rms_at_ends_refocused if refocused else self.rms_at_ends
         start = self.rms_refocused if refocused else self.rms
         overall = (ends.square() @ self.weights).sqrt().amax(0)
@@ -56,7 +56,7 @@ class Sensitivities:
 
 
 def sensitivities(model: LinearSpots, steps: Tensor, weights: Tensor) -> Sensitivities:
-    """One tolerance at a time.
+    """Return the sensitivities to one tolerance at a time.
 
     Args:
         model: of the lens as designed.

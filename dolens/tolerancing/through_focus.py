@@ -1,4 +1,4 @@
-"""Spots as the sensor moves: what a compensator can win back."""
+"""Spots through focus show what a compensator can win back."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,8 @@ from dolens.errors import InputError
 
 @dataclass(frozen=True)
 class FocusCurves:
-    """RMS² of spots on a sensor that stands δ (mm) farther from the lens: a + 2b·δ + c·δ².
+    """Describes RMS² of spots on a sensor that stands δ (mm) farther from the lens: a + 2b·δ +
+    c·δ².
 
     Rays are straight behind the lens.  A ray lands at d + k·δ from its spot's centroid, with k its
     tangents (l/n, m/n) less their mean, so that with the rays' weights w (which sum to one over a
@@ -27,7 +28,7 @@ class FocusCurves:
     slope_square: Tensor
 
     def at(self, shift: Tensor | float = 0.0) -> Tensor:
-        """(..., S), mm²: RMS² with the sensor moved by `shift` (..., mm)."""
+        """Return RMS² (..., S), mm², with the sensor moved by `shift` (..., mm)."""
         if isinstance(shift, Tensor):
             shift = shift[..., None]
         squares = self.mean_square + (2.0 * self.product + self.slope_square * shift) * shift
@@ -35,7 +36,8 @@ class FocusCurves:
         return squares.clamp(min=0.0)
 
     def best_focus(self, weights: Tensor) -> Tensor:
-        """(...), mm: the shift where Σ W·RMS² is least, δ = -Σ W·b / Σ W·c; zero without slopes.
+        """Return the shift (...), mm, where Σ W·RMS² is least, δ = -Σ W·b / Σ W·c; zero without
+        slopes.
 
         Args:
             weights: (S,), W of each spot.
@@ -46,7 +48,7 @@ class FocusCurves:
 
 
 def spot_weights(weights: Tensor | None, spots: int) -> Tensor:
-    """(S,), float64, that sum to one; None: equal ones.
+    """Return weights (S,), float64, that sum to one; None stands for equal ones.
 
     Raises:
         InputError: another number of them, a negative one, or none that is positive.

@@ -1,4 +1,4 @@
-"""How many of the lenses that are made are good enough."""
+"""The yield is the share of the lenses that are made well enough."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from dolens.errors import InputError
 
 @dataclass(frozen=True)
 class Yield:
-    """Spot sizes of K lenses.
+    """Holds the spot sizes of K lenses.
 
     Attributes:
         rms: (K,), mm, ascending: √(Σ W·RMS²) over the spots; infinite for a lens that fails.
@@ -24,7 +24,8 @@ class Yield:
 
     @staticmethod
     def of(mean_squares: Tensor, weights: Tensor) -> "Yield":
-        """From RMS² of every spot, (K, S), mm², and the spots' weights (S,), which sum to one.
+        """Return the yield of RMS² of every spot, (K, S), mm², with the spots' weights (S,), which
+        sum to one.
 
         Spots of weight zero count neither in the one nor in the other.
         """
@@ -35,13 +36,14 @@ class Yield:
 
 
 def share_within(ascending: Tensor, limit: float) -> float:
-    """The share of lenses whose RMS (K, sorted) is at most a limit, in the same unit."""
+    """Return the share of lenses whose RMS (K, sorted) is at most a limit, in the same unit."""
     found = torch.searchsorted(ascending, torch.tensor(limit).to(ascending), right=True)
     return int(found) / len(ascending)
 
 
 def quantiles(ascending: Tensor, shares: Sequence[float]) -> list[float]:
-    """For each share of the lenses, the least RMS (K, sorted) that so many of them stay within.
+    """Return, for each share of the lenses, the least RMS (K, sorted) that so many of them stay
+    within.
 
     Raises:
         InputError: a share outside 0 to 1.

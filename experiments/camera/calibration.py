@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.sensor.measured_psf import measured_functions
+from dolens.sensor.psf_noise import noisy_point_spread_functions
 from dolens.tolerancing import tolerances_from
 from experiments.camera.views.base import Imaging
 
@@ -125,7 +125,7 @@ class NoisyMeasurement:
     ) -> Tensor:
         """Return the exact functions with shot noise and read noise."""
         same = torch.Generator().manual_seed(self.seed)
-        return measured_functions(exact, self.electrons, self.read_noise, same)
+        return noisy_point_spread_functions(exact, self.electrons, self.read_noise, same)
 
 
 def check(calibrations: Mapping[str, Calibration], lens: Lens) -> None:

@@ -2,19 +2,18 @@
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice
 from dolens.optics.lens import Lens
-from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operands import Operand
-from dolens.optimize.trusted_step import ray_moves, trusted_step
+from dolens.optimize.trust_region_step import ray_moves, trust_region_step
 from dolens.optimize.variables import DesignVariables
+from experiments.camera.operands import CameraOperands
 
 logger = logging.getLogger(__name__)
 
@@ -22,7 +21,7 @@ logger = logging.getLogger(__name__)
 # the next time, and where it has turned round less far.
 _STEADY, _LONGER, _SHORTER = 0.5, 1.25, 0.7
 # Never less far than this part of the first step.
-_LEAST_REACH = 0.02
+_MIN_TRUST_RADIUS = 0.02
 
 
 class CameraOptimizer:
@@ -44,10 +43,12 @@ class CameraOptimizer:
         lens: str = "adam",
         least_squares: Mapping[str, Any] | None = None,
     ) -> None:
-        if lens not in ("adam", "dls"):
-            raise InputError(f"optimizer.lens: '{lens}' is unknown; allowed: adam, dls")
+        check_choice(lens, ("adam", "dls"), "optimizer.lens")
         self.network = network
-        self.lens_steps = LensLeastSquares(**(least_squares or {})) if lens == "dls" else None
+        self.lens_steps = None
+        if lens == "dls":
+            where = "optimizer.least_squares"
+            self.lens_steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
 
     def __call__(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
         """Return the optimizer of parameter groups."""
@@ -58,14 +59,14 @@ class LensLeastSquares:
     """Moves a lens once for some steps of the network, by the gradient gathered in them.
 
     The step minimises the loss's linear model and the operands while rays move no farther than
-    `reach`; see `trusted_step`.  Batches are small and differ, so that a trial on one of them would
-    tell little; the next gradient, of other batches, tells how the last step was: where the loss
-    still falls along it, rays may move farther, and where it rises less far.
+    a trust radius; see `trust_region_step`.  Batches are small and differ, so that a trial on one
+    of them would tell little; the next gradient, of other batches, tells how the last step was:
+    where the loss still falls along it, rays may move farther, and where it rises less far.
 
     Args:
         every: steps of the network between two of the lens.
-        reach: how far rays may move in the first step, RMS over spots, pixels.
-        most: and in any later one.
+        trust_radius: how far rays may move in the first step, RMS over spots, pixels.
+        max_trust_radius: how far they may move in any later one.
         damping: of variables that undo one another.
         rings: of rays in a pupil.
         arms: of rays in a pupil, even.
@@ -77,22 +78,24 @@ class LensLeastSquares:
     def __init__(
         self,
         every: int = 5,
-        reach: float = 0.1,
-        most: float = 0.5,
+        trust_radius: float = 0.1,
+        max_trust_radius: float = 0.5,
         damping: float = 1e-3,
         rings: int = 4,
         arms: int = 8,
     ) -> None:
-        for name, value in (("every", every), ("reach", reach), ("damping", damping)):
+        for name, value in (("every", every), ("trust_radius", trust_radius), ("damping", damping)):
             if not 0.0 < value < math.inf:
                 raise InputError(f"optimizer.least_squares.{name}: {value}; allowed: above 0")
-        if not most >= reach:
+        if not max_trust_radius >= trust_radius:
             raise InputError(
-                f"optimizer.least_squares.most: {most}; allowed: from reach, {reach}, on"
+                f"optimizer.least_squares.max_trust_radius: {max_trust_radius}; allowed: from "
+                f"trust_radius, {trust_radius}, on"
             )
-        self.every, self.most, self.damping = int(every), float(most), float(damping)
+        self.every, self.damping = int(every), float(damping)
         self.rings, self.arms = int(rings), int(arms)
-        self.least, self.reach = _LEAST_REACH * float(reach), float(reach)
+        self.trust_radius, self.max_trust_radius = float(trust_radius), float(max_trust_radius)
+        self.min_trust_radius = _MIN_TRUST_RADIUS * self.trust_radius
         self.taken = 0
         self._gathered: Tensor | None = None
         self._last: Tensor | None = None
@@ -116,9 +119,8 @@ class LensLeastSquares:
         variables: DesignVariables,
         spots: list[SpotRays],
         pitch: float,
-        operands: Sequence[Operand] = (),
+        operands: CameraOperands | None = None,
         share: float = 1.0,
-        object_distance: float | None = None,
     ) -> dict[str, float]:
         """Make one step by the gradient that was gathered, and forget that gradient.
 
@@ -128,11 +130,11 @@ class LensLeastSquares:
             spots: rays of the lens.
             pitch: of the pixels, mm.
             operands: what the lens must be besides; the gradient is without them.
-            share: of the reach, as a schedule has it.
-            object_distance: of the operands, mm in front of the first vertex; None for infinity.
+            share: of the trust radius, as a schedule has it.
 
         Returns:
-            Numbers to log: `reach` (pixels), `slope_kept` by the last step, `moved` (RMS, pixels).
+            Numbers to log: `reach`, the trust radius (pixels); `slope_kept` by the last step;
+            `moved` (RMS, pixels).
 
         Raises:
             UnreachableField: a chief ray that operands ask for does not reach the stop.
@@ -148,41 +150,41 @@ class LensLeastSquares:
         if self._last is not None and self._slope < 0.0:
             kept = float(gradient @ self._last) / self._slope
             if kept > _STEADY:
-                self.reach = min(_LONGER * self.reach, self.most)
+                self.trust_radius = min(_LONGER * self.trust_radius, self.max_trust_radius)
             elif kept < 0.0:
-                self.reach = max(_SHORTER * self.reach, self.least)
+                self.trust_radius = max(_SHORTER * self.trust_radius, self.min_trust_radius)
             numbers["slope_kept"] = kept
         scaled, point = variables.scaled, variables.scaled.detach().double().cpu()
         moves = ray_moves(lens, variables, spots, self.damping)
         lower, upper = (b.double().cpu() - point for b in (variables.lower, variables.upper))
-        step = trusted_step(
+        step = trust_region_step(
             gradient,
             moves,
-            self.reach * share * pitch,
+            self.trust_radius * share * pitch,
             lower.clamp(max=0.0),
             upper.clamp(min=0.0),
-            OperandModel.of(lens, variables, operands, object_distance) if operands else None,
+            None if operands is None else operands.model(lens, variables),
         )
         scaled.copy_(point + step)
         variables.project()
         variables.write_to(lens)
         self.taken += 1
         self._last, self._slope = step, float(gradient @ step)
-        return numbers | {"reach": self.reach, "moved": float((moves @ step).norm()) / pitch}
+        return numbers | {"reach": self.trust_radius, "moved": float((moves @ step).norm()) / pitch}
 
     def reject(self) -> None:
         """Move rays less far the next time: the lens cannot be judged after the last step."""
-        self.reach = max(_SHORTER * self.reach, self.least)
+        self.trust_radius = max(_SHORTER * self.trust_radius, self.min_trust_radius)
         self._last, self._slope = None, 0.0
 
     def numbers(self) -> dict[str, float]:
         """Return how many steps were taken, and how far rays may move now (pixels)."""
-        return {"lens_steps/taken": float(self.taken), "lens_steps/reach": self.reach}
+        return {"lens_steps/taken": float(self.taken), "lens_steps/reach": self.trust_radius}
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint keeps, the gradient gathered so far included."""
         return {
-            "reach": self.reach,
+            "trust_radius": self.trust_radius,
             "taken": self.taken,
             "gathered": None if self._gathered is None else self._gathered.clone(),
             "last": None if self._last is None else self._last.clone(),
@@ -191,6 +193,6 @@ class LensLeastSquares:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Go on with what a checkpoint kept."""
-        self.reach, self.taken = float(state["reach"]), int(state["taken"])
+        self.trust_radius, self.taken = float(state["trust_radius"]), int(state["taken"])
         self._gathered, self._last = state["gathered"], state["last"]
         self._slope = float(state["slope"])

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import to_file_units
 from dolens.optimize.variables import DesignVariables
 from experiments.camera.lens_least_squares import LensLeastSquares
 from experiments.camera.operands import CameraOperands
@@ -64,7 +65,7 @@ class LensSteps:
             optimizer: of the network, after its step.
             before: the lens's variables before it.
             steps: that the network has made.
-            share: of the reach of least squares, as the schedule has it.
+            share: of the trust radius of least squares, as the schedule has it.
 
         Returns:
             Numbers of a step of least squares; empty without one.
@@ -78,9 +79,8 @@ class LensSteps:
                     self.variables,
                     self._spots,
                     self._pitch,
-                    self.operands.entries,
+                    self.operands,
                     share,
-                    self.operands.object_distance,
                 )
         self.variables.project()
         self.operands.take_back_if_unreachable(
@@ -90,7 +90,7 @@ class LensSteps:
         return found
 
     def _forget_last_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Drop what led to the last step: Adam's momentum, the reach of least squares."""
+        """Drop what led to the last step: Adam's momentum, the trust radius of least squares."""
         optimizer.state.pop(self.variables.scaled, None)
         if self.least_squares is not None:
             self.least_squares.reject()
@@ -115,10 +115,10 @@ class LensSteps:
 
 
 def variable_numbers(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return variables as metrics: a number as it is, an array by its root mean square."""
+    """Return variables as metrics in the units of files: a number as it is, an array by its RMS."""
     numbers = {}
     for name, value in values.items():
-        number = value.detach().float()
+        number = to_file_units(name, value.detach()).float()
         if number.dim() == 0:
             numbers[f"variables/{name}"] = number
         else:

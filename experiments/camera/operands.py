@@ -10,7 +10,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optimize.operands import UnreachableField, View, operand
+from dolens.optimize.operand_model import OperandModel
+from dolens.optimize.operand_values import evaluate_operands
+from dolens.optimize.operands import UnreachableField, operand
 from dolens.optimize.variables import DesignVariables
 
 logger = logging.getLogger(__name__)
@@ -51,15 +53,22 @@ class CameraOperands:
         Raises:
             UnreachableField: a chief ray does not reach the stop.
         """
-        found: dict[str, Tensor] = {}
+        found = evaluate_operands(self.entries, lens, values, self.object_distance)
         total = torch.zeros((), device=lens.device)
-        if self.entries:
-            view = View(lens.system(values), lens.primary_wavelength, self.object_distance)
-            for entry in self.entries:
-                for label, value in entry.values(view).items():
-                    found[label] = value.detach()
-                    total = total + (entry.weight * entry.deviation(value)).square()
-        return total, found
+        for penalty in found.penalties():
+            total = total + penalty
+        labelled = zip(found.labels, found.tensors, strict=True)
+        return total, {label: value.detach() for label, value in labelled}
+
+    def model(self, lens: Lens, variables: DesignVariables) -> OperandModel | None:
+        """Return the operands near the variables' values, for a step; None without operands.
+
+        Raises:
+            UnreachableField: a chief ray does not reach the stop.
+        """
+        if not self.entries:
+            return None
+        return OperandModel.at(lens, variables, self.entries, self.object_distance)
 
     def check(self, lens: Lens, values: Mapping[str, Tensor]) -> None:
         """Refuse a lens that training cannot begin with.
@@ -81,7 +90,7 @@ class CameraOperands:
             lens: that they belong to.
             variables: u after the step; set to `before` where it is undone.
             before: u before it.
-            forget: called then, to drop what led there: momentum, or a reach that was too long.
+            forget: called then, to drop what led there: momentum, or too long a trust radius.
         """
         problem = self._problem(lens, variables())
         if problem is None:

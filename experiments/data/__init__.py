@@ -1,1 +1,1 @@
-"""Data modules: photographs in linear light, cut into crops that can be made again."""
+"""Data modules cut photographs in linear light into reproducible crops."""

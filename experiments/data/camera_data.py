@@ -1,4 +1,4 @@
-"""What the data modules share: from photographs to batches of crops."""
+"""The data modules share the way from photographs to batches of crops."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -28,7 +28,8 @@ _LOOKED_AT = 16
 
 
 class CropDataModule(lightning.LightningDataModule):
-    """Crops of photographs in linear light; a subclass says which photographs.
+    """A `CropDataModule` cuts crops of photographs in linear light; a subclass says which
+    photographs.
 
     A batch is a tensor (batch, 3, height, width), float32, linear light in [0, 1], where
     height and width are `item_size`: the crop with `margin` texels more on each side.
@@ -49,11 +50,13 @@ class CropDataModule(lightning.LightningDataModule):
             log-uniformly.
         evaluation_crops_per_photograph: crops of each validation and test photograph at most;
             they do not overlap, so that a small photograph gives fewer.
+        seed: of the training crops.
+
+    Rarely needed:
         evaluation_scale: photograph pixels per texel in validation and test.
         flip_horizontal: mirror half of the training crops left and right.
         flip_vertical: mirror half of the training crops top and bottom.
         num_workers: processes that cut crops; 0 cuts them in the training process.
-        seed: of the training crops.
 
     Raises:
         InputError: an argument is out of range; the line names it.
@@ -105,12 +108,12 @@ class CropDataModule(lightning.LightningDataModule):
 
     @property
     def item_size(self) -> tuple[int, int]:
-        """(height, width) of an item in texels: the crop and its margins."""
+        """Return (height, width) of an item in texels: the crop and its margins."""
         return self.crop_size[0] + 2 * self.margin, self.crop_size[1] + 2 * self.margin
 
     @property
     def steps_per_epoch(self) -> int:
-        """Batches in a whole training epoch; the last may go on into the next pass."""
+        """Return the batches of a whole training epoch; the last may go on into the next pass."""
         if self._steps_per_epoch is not None:
             return self._steps_per_epoch
         crops = self._iterations_per_photograph * len(self.photographs("train"))
@@ -118,11 +121,13 @@ class CropDataModule(lightning.LightningDataModule):
 
     @property
     def samples_per_epoch(self) -> int:
-        """Crops in a whole training epoch."""
+        """Return the crops of a whole training epoch."""
         return self.steps_per_epoch * self.batch_size
 
     def load_split(self, split: Split) -> Sequence[Photograph]:
-        """The photographs of one split; may decode on demand.  For subclasses."""
+        """Load the photographs of one split; they may be decoded on demand.  Subclasses implement
+        it.
+        """
         raise NotImplementedError(f"{type(self).__name__}.load_split")
 
     def setup(self, stage: str | None = None) -> None:
@@ -135,13 +140,13 @@ class CropDataModule(lightning.LightningDataModule):
             self.photographs(split)
 
     def photographs(self, split: Split) -> Sequence[Photograph]:
-        """The photographs of a split, loaded at the first call."""
+        """Return the photographs of a split, loaded at the first call."""
         if split not in self._photographs:
             self._photographs[split] = self.load_split(split)
         return self._photographs[split]
 
     def train_dataloader(self) -> DataLoader:
-        """Batches of the training epoch under way, from the next sample on.
+        """Return batches of the present training epoch, from the next sample on.
 
         Raises:
             InputError: the trainer runs several processes, or overfits batches: both would
@@ -170,20 +175,22 @@ class CropDataModule(lightning.LightningDataModule):
         return ResumableLoader(dataset, sampler=sampler, **self._loader_arguments())
 
     def val_dataloader(self) -> DataLoader:
-        """The validation crops, always the same."""
+        """Return the validation crops, always the same."""
         return self._evaluation_loader("validation")
 
     def test_dataloader(self) -> DataLoader:
-        """The test crops, always the same."""
+        """Return the test crops, always the same."""
         return self._evaluation_loader("test")
 
     def evaluation_photographs(self, split: Split) -> list[str]:
-        """The name of the photograph that each evaluation crop of a split is cut from, in order."""
+        """Return the name of the photograph that each evaluation crop of a split is cut from, in
+        order.
+        """
         return self._evaluation_crops(split).names()
 
     def most_detailed(self) -> Tensor:
-        """(1, 3, height, width): the colours of the validation crop, of some, whose neighbouring
-        texels differ most.
+        """Return the colours, (1, 3, height, width), of the validation crop, among several, whose
+        neighbouring texels differ most.
         """
         if self._detailed is None:
             crops = self._evaluation_crops("validation")
@@ -193,7 +200,8 @@ class CropDataModule(lightning.LightningDataModule):
         return self._detailed
 
     def first_sample(self) -> tuple[int, int]:
-        """(Global number of the next training sample, samples that remain in the epoch).
+        """Return the global number of the next training sample, and the samples that remain in the
+        epoch.
 
         Read from the trainer's count of processed batches, which a checkpoint restores before
         the loader is iterated.  `processed` is raised after the optimizer's step and before

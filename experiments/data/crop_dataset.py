@@ -1,4 +1,4 @@
-"""Datasets of crops: an endless one to train on, a fixed one to evaluate on."""
+"""Crops form an endless dataset for training and a fixed one for evaluation."""
 
 from collections.abc import Sequence
 
@@ -19,14 +19,15 @@ from experiments.data.photographs import Photograph
 
 
 class TrainingCrops(Dataset):
-    """Random crops without end, indexed by the global number of the sample in the run.
+    """`TrainingCrops` yields random crops without end, indexed by the global number of the sample
+    in the run.
 
     Sample i belongs to pass i // n over the n photographs.  Each pass visits every photograph
     once, in an order of its own; the crop is `random_crop(photo, size, seed, i, …)`.  An item
     is therefore a function of (seed, i), and has no length to speak of.
 
     Args:
-        photographs: what to cut from; may decode on demand.
+        photographs: to cut from; may decode on demand.
         size: (height, width) of an item in texels.
         seed: of the run.
         scale_range: (smallest, largest) photograph pixels per texel.
@@ -60,7 +61,7 @@ class TrainingCrops(Dataset):
         self._orders: dict[int, np.ndarray] = {}
 
     def __getitem__(self, index: int) -> Tensor:
-        """Sample number `index`: (3, height, width) float32, linear light in [0, 1]."""
+        """Return sample number `index`: (3, height, width) float32, linear light in [0, 1]."""
         return random_crop(
             self.photographs[self.photograph_number(index)],
             self.size,
@@ -72,7 +73,7 @@ class TrainingCrops(Dataset):
         )
 
     def photograph_number(self, index: int) -> int:
-        """Which photograph sample number `index` is cut from."""
+        """Return the number of the photograph that sample number `index` is cut from."""
         number, position = divmod(index, len(self.photographs))
         if number not in self._orders:
             # A batch touches two passes at most, unless there are few photographs, when orders
@@ -84,12 +85,13 @@ class TrainingCrops(Dataset):
 
 
 class EvaluationCrops(Dataset):
-    """A fixed list of crops, by `centred_crops`: no two share a pixel of a photograph.
+    """`EvaluationCrops` is a fixed list of crops, by `centred_crops`: no two share a pixel of a
+    photograph.
 
     A photograph gives `count` crops, or as many as it holds without overlap, at least one.
 
     Args:
-        photographs: what to cut from; may decode on demand, here once where `count` is above 1.
+        photographs: to cut from; may decode on demand, here once where `count` is above 1.
         size: (height, width) of an item in texels.
         count: crops of each photograph at most.
         scale: photograph pixels per texel.
@@ -124,7 +126,9 @@ class EvaluationCrops(Dataset):
         return len(self._crops)
 
     def __getitem__(self, index: int) -> Tensor:
-        """Crop `index`, photograph by photograph: (3, height, width) float32, linear light."""
+        """Return crop `index`, photograph by photograph: (3, height, width) float32, linear
+        light.
+        """
         if not 0 <= index < len(self):
             raise IndexError(f"crop {index} of {len(self)}")
         photograph, number = self._crops[index]
@@ -132,6 +136,6 @@ class EvaluationCrops(Dataset):
         return centred_crop(self.photographs[photograph], self.size, count, number, self.scale)
 
     def names(self) -> list[str]:
-        """The name of the photograph of every crop, in the order of the crops."""
+        """Return the name of the photograph of every crop, in the order of the crops."""
         names = [self.photographs[number].name for number in range(len(self.photographs))]
         return [names[photograph] for photograph, _ in self._crops]

@@ -1,4 +1,4 @@
-"""Crops of photographs, in linear light.
+"""Crops are cut from photographs and converted to linear light.
 
 A random crop is a pure function of a seed and a counter, so any sample of a run can be made
 again without the state of a generator: a resumed run equals an uninterrupted one to the bit.
@@ -48,7 +48,7 @@ def random_crop(
     the crop fits into it, with one warning that names it.
 
     Args:
-        photo: where to cut.
+        photo: the photograph to cut from.
         size: (height, width) of the crop in texels.
         seed: of the run, not negative.
         index: the global number of the sample, not negative.
@@ -80,7 +80,7 @@ def random_crop(
 
 
 def random_order(count: int, seed: int, number: int) -> np.ndarray:
-    """The permutation of 0 … count-1 numbered `number` of a run, a function of its arguments.
+    """Return permutation number `number` of 0 … count-1 for a run, a function of the arguments.
 
     Raises:
         InputError: a seed or number below 0.
@@ -91,14 +91,14 @@ def random_order(count: int, seed: int, number: int) -> np.ndarray:
 def centred_crops(
     photo: Photograph, size: tuple[int, int], count: int, scale: float = 1.0
 ) -> Tensor:
-    """Cut `count` crops evenly spaced over a photograph; nothing in this is random.
+    """Cut `count` crops evenly spaced over a photograph, without randomness.
 
     One crop is cut from the centre.  More lie on a grid and share no pixel of the photograph, so
     that no part of it counts twice.  A photograph too small for one crop is treated as in
     `random_crop`.
 
     Args:
-        photo: where to cut.
+        photo: the photograph to cut from.
         size: (height, width) of a crop in texels.
         count: how many.
         scale: photograph pixels along the side of one texel.
@@ -118,7 +118,9 @@ def centred_crops(
 def centred_crop(
     photo: Photograph, size: tuple[int, int], count: int, number: int, scale: float = 1.0
 ) -> Tensor:
-    """Crop `number` (from 0) of the `count` that `centred_crops` cuts: (3, height, width)."""
+    """Return crop `number` (from 0) of the `count` that `centred_crops` cuts: (3, height,
+    width).
+    """
     check_size(size)
     check_scale_range((scale, scale))
     if not 0 <= number < count:
@@ -141,7 +143,7 @@ def crops_that_fit(photo: Photograph, size: tuple[int, int], scale: float = 1.0)
     """Count the crops that a photograph holds side by side, without overlap; at least 1.
 
     Args:
-        photo: where to cut.
+        photo: the photograph to cut from.
         size: (height, width) of a crop in texels.
         scale: photograph pixels along the side of one texel.
 
@@ -169,7 +171,7 @@ def check_scale_range(scale_range: tuple[float, float]) -> None:
 
 
 def _uniform(seed: int, stream: int, counter: int, count: int) -> np.ndarray:
-    """`count` numbers in [0, 1), a function of the arguments."""
+    """Return `count` numbers in [0, 1), a function of the arguments."""
     if seed < 0 or counter < 0:
         raise InputError(f"seed {seed}, sample {counter}; allowed: integers of 0 or more")
     sequence = np.random.SeedSequence(seed, spawn_key=(stream, counter))
@@ -182,7 +184,7 @@ def _scale(
     scale_range: tuple[float, float],
     draw: float,
 ) -> float:
-    """The scale at `draw` in [0, 1) of the range, as far as the photograph allows it."""
+    """Return the scale at `draw` in [0, 1) of the range, as far as the photograph allows it."""
     smallest, largest = scale_range
     limit = min(photo.height / size[0], photo.width / size[1])
     if limit < smallest:
@@ -203,7 +205,7 @@ def _scale(
 
 
 def _region(photo: Photograph, size: tuple[int, int], scale: float) -> tuple[int, int]:
-    """(height, width) in photograph pixels that a crop of `size` texels covers."""
+    """Return (height, width) in photograph pixels that a crop of `size` texels covers."""
     height = min(max(round(size[0] * scale), 1), photo.height)
     width = min(max(round(size[1] * scale), 1), photo.width)
     return height, width
@@ -230,12 +232,12 @@ def _cut(
 
 
 def _most_crops(photo: Photograph, region: tuple[int, int]) -> int:
-    """How many regions (height, width) in pixels lie side by side on a photograph."""
+    """Return how many regions (height, width) in pixels lie side by side on a photograph."""
     return (photo.height // region[0]) * (photo.width // region[1])
 
 
 def _grid(photo: Photograph, region: tuple[int, int], count: int) -> tuple[int, int]:
-    """(rows, columns) with at least `count` cells that a region fits into: fewest cells."""
+    """Return (rows, columns) with at least `count` cells that a region fits into: fewest cells."""
 
     def cost(grid: tuple[int, int]) -> tuple[int, float]:
         rows, columns = grid
@@ -247,5 +249,5 @@ def _grid(photo: Photograph, region: tuple[int, int], count: int) -> tuple[int, 
 
 
 def _cell_start(cell: int, cells: int, extent: int, length: int) -> int:
-    """Where the crop of a cell begins, centred in it."""
+    """Return the start of the crop of a cell, centred in it."""
     return ((2 * cell + 1) * extent - cells * length) // (2 * cells)

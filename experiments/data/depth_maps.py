@@ -1,4 +1,4 @@
-"""Depth maps on disk, beside the photographs that they belong to."""
+"""Depth maps are read from files beside their photographs."""
 
 from pathlib import Path
 
@@ -16,7 +16,9 @@ ENDINGS = (".npy", ".png", ".tif", ".tiff")
 
 
 def depth_map_of(photograph: Path, suffix: str) -> Path | None:
-    """The depth map beside a photograph: `hall.jpg` has `hall_depth.png`, for `_depth`; or None."""
+    """Return the depth map beside a photograph: `hall.jpg` has `hall_depth.png`, for `_depth`; or
+    None.
+    """
     for ending in ENDINGS:
         path = photograph.with_name(f"{photograph.stem}{suffix}{ending}")
         if path.is_file():
@@ -25,12 +27,12 @@ def depth_map_of(photograph: Path, suffix: str) -> Path | None:
 
 
 def is_depth_map(path: Path, suffix: str) -> bool:
-    """Whether a file's name is that of a depth map."""
+    """Return whether a file's name is that of a depth map."""
     return path.stem.endswith(suffix) and path.suffix.lower() in ENDINGS
 
 
 def read_depth_map(path: Path, unit: float) -> Tensor:
-    """A depth map in mm, (height, width), float32, with no holes.
+    """Read a depth map in mm, (height, width), float32, with holes filled.
 
     Numbers that are zero, negative or not finite are holes, as depth cameras leave them in the
     shadows that near things cast on far ones: each takes the largest depth on its border.
@@ -66,7 +68,7 @@ def read_depth_map(path: Path, unit: float) -> Tensor:
 
 
 def _filled(depth: Tensor) -> Tensor:
-    """Zeros take the largest depth on the border of the hole that they are in."""
+    """Replace zeros by the largest depth on the border of their hole."""
     hole = depth == 0.0
     while True:
         around = max_pool2d(depth[None], 3, stride=1, padding=1)[0]

@@ -1,4 +1,4 @@
-"""A sequence of photographs that stay on disk until they are asked for."""
+"""Photographs stay on disk until they are asked for."""
 
 import logging
 from collections import OrderedDict
@@ -14,14 +14,15 @@ _log = logging.getLogger(__name__)
 
 
 class FolderPhotographs(Sequence[Photograph]):
-    """Photographs of a folder, decoded on demand, the latest kept in memory.
+    """`FolderPhotographs` decodes photographs of a folder on demand, and keeps the latest in
+    memory.
 
     A file that cannot be decoded is replaced by the next in the list that can, always the same
     one, and named in one warning.  The record of such files is shared with the worker
     processes of a loader, so that `unreadable` is complete in the process that made this.
 
     Args:
-        folder: what messages name when nothing can be read.
+        folder: named in the message when nothing can be read.
         paths: the files, in the order of their numbers.
         cache_bytes: decoded pixels kept in memory, in each process; the latest photograph is
             kept whatever its size.
@@ -52,7 +53,7 @@ class FolderPhotographs(Sequence[Photograph]):
         return len(self.paths)
 
     def __getitem__(self, number: int) -> Photograph:  # type: ignore[override]
-        """Photograph `number`, or the next one that can be decoded.
+        """Return photograph `number`, or the next one that can be decoded.
 
         Raises:
             IndexError: there is no such number.
@@ -72,7 +73,7 @@ class FolderPhotographs(Sequence[Photograph]):
 
     @property
     def unreadable(self) -> list[Path]:
-        """The files found to be unreadable so far, by any process."""
+        """Return the files found to be unreadable so far, by any process."""
         return [self.paths[number] for number in self._unreadable.nonzero().flatten().tolist()]
 
     def _read(self, number: int) -> Photograph | None:

@@ -1,4 +1,4 @@
-"""Photographs from any folder of images."""
+"""Photographs are read from any folder of images."""
 
 import hashlib
 import logging
@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class ImageFolderDataModule(CropDataModule):
-    """Crops of the images under a folder, decoded on demand.
+    """`ImageFolderDataModule` cuts crops of the images under a folder, decoded on demand.
 
     A root with subfolders `train` and `val` (and `test`), such as ImageNet's, is split by
     them; without `test`, the files under `val` are divided between validation and test in the
@@ -30,16 +30,18 @@ class ImageFolderDataModule(CropDataModule):
 
     Args:
         root: the folder, searched recursively.
-        extensions: endings of the files to take; case is ignored.
         validation_fraction: share of the files for validation, above 0.
         test_fraction: share of the files for test, above 0.
         evaluation_limit: the most photographs to use in validation, and in test; chosen by
             their hash.  None: all.
+        **crops: the arguments of `CropDataModule`.
+
+    Rarely needed:
+        extensions: endings of the files to take; case is ignored.
         verify: look at every file's header at set-up and leave out those that are no images.
             False leaves it to decoding, where the next readable file takes the place of an
             unreadable one: what to choose for very many files.
         cache_bytes: decoded pixels kept in memory, in each split and process.
-        **crops: the arguments of `CropDataModule`.
 
     Raises:
         InputError: an argument is out of range; at set-up, the folder is missing, empty, holds
@@ -85,7 +87,7 @@ class ImageFolderDataModule(CropDataModule):
 
     @property
     def skipped_files(self) -> list[Path]:
-        """Files left out or replaced so far because they cannot be read, sorted."""
+        """Return the files left out or replaced so far because they cannot be read, sorted."""
         found = set(self._refused)
         for photographs in self._photographs.values():
             if isinstance(photographs, FolderPhotographs):
@@ -94,7 +96,7 @@ class ImageFolderDataModule(CropDataModule):
 
     @property
     def paths(self) -> dict[Split, list[Path]]:
-        """The files of each split, listed (and verified, if asked for) at the first call.
+        """Return the files of each split, listed (and verified, if asked for) at the first call.
 
         Raises:
             InputError: as at set-up.
@@ -104,7 +106,7 @@ class ImageFolderDataModule(CropDataModule):
         return self._paths
 
     def load_split(self, split: Split) -> FolderPhotographs:
-        """The photographs of a split, none of them decoded yet."""
+        """Return the photographs of a split, none of them decoded yet."""
         return FolderPhotographs(self.root, self.paths[split], self.cache_bytes)
 
     def teardown(self, stage: str) -> None:
@@ -144,7 +146,7 @@ class ImageFolderDataModule(CropDataModule):
         }
 
     def _list(self, folder: Path) -> list[Path]:
-        """The files under a folder, without those whose header Pillow refuses."""
+        """List the files under a folder, without those whose header Pillow refuses."""
         paths = self._listed_files(folder)
         if not self.verify:
             return paths
@@ -167,11 +169,11 @@ class ImageFolderDataModule(CropDataModule):
         return readable
 
     def _listed_files(self, folder: Path) -> list[Path]:
-        """The photographs' files under a folder; none is opened."""
+        """List the photographs' files under a folder; none is opened."""
         return list_photographs(folder, self.extensions)
 
     def _divided(self, paths: list[Path], bounds: list[float]) -> list[list[Path]]:
-        """Parts of the files with hashes up to each bound, and the rest; none is empty."""
+        """Divide the files by their hashes at each bound; no part is empty."""
         if len(paths) <= len(bounds):
             raise InputError(
                 f"{self.root}: {len(paths)} readable images for {len(bounds) + 1} splits; "
@@ -195,7 +197,7 @@ class ImageFolderDataModule(CropDataModule):
         return sorted(sorted(paths, key=self._hash)[: self.evaluation_limit])
 
     def _hash(self, path: Path) -> float:
-        """A number in [0, 1) from the seed and the path below the root."""
+        """Return a number in [0, 1) from the seed and the path below the root."""
         text = f"{self.seed}:{path.relative_to(self.root).as_posix()}"
         digest = hashlib.blake2b(text.encode("utf-8", "surrogateescape"), digest_size=8).digest()
         return int.from_bytes(digest, "big") / 2**64

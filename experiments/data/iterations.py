@@ -1,4 +1,4 @@
-"""Data of an experiment that has none: a lens is all that its steps look at."""
+"""An experiment without photographs iterates over step numbers."""
 
 import lightning
 from torch.utils.data import DataLoader
@@ -7,7 +7,7 @@ from dolens.errors import InputError
 
 
 class IterationData(lightning.LightningDataModule):
-    """Numbers of the iterations of an epoch; for a test, one.
+    """`IterationData` yields the numbers of the iterations of an epoch; for a test, one.
 
     Args:
         iterations: steps in an epoch.
@@ -23,9 +23,9 @@ class IterationData(lightning.LightningDataModule):
         self.iterations = iterations
 
     def train_dataloader(self) -> DataLoader:
-        """0, 1, 2, ..."""
+        """Return 0, 1, 2, ..."""
         return DataLoader(range(self.iterations), batch_size=1)
 
     def test_dataloader(self) -> DataLoader:
-        """One step."""
+        """Return one step."""
         return DataLoader(range(1), batch_size=1)

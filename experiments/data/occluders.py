@@ -1,4 +1,4 @@
-"""Scenes with depth made of photographs: discs of other parts of the image in front of it."""
+"""Scenes with depth are composed of photographs: discs cut from an image hide parts of it."""
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ def with_occluders(
     count: int,
     generator: torch.Generator,
 ) -> Tensor:
-    """Give photographs a depth: a slanted background, and ellipses hung up in front of it.
+    """Give photographs a depth: a slanted background, and ellipses in front of it.
 
     Vergences, 1/depth, are drawn evenly, so that blurs are.  The background takes the farther half
     of the range; ellipses are painted from far to near, each with a part of the photograph that
@@ -24,7 +24,7 @@ def with_occluders(
         nearest: mm in front of the first vertex.
         farthest: mm.
         count: ellipses in each image.
-        generator: what they are drawn from, on the CPU.
+        generator: of the random numbers, on the CPU.
 
     Returns:
         (B, C + 1, H, W), as `LayeredScene` takes them: the depth is the last channel.

@@ -1,4 +1,4 @@
-"""Photographs of packages that the machine has: found where they are installed, known by hash."""
+"""Photographs of installed packages are found by path, and verified by hash."""
 
 import csv
 import hashlib
@@ -29,7 +29,7 @@ _XDG_DEFAULT = "/usr/local/share/:/usr/share/"
 
 @dataclass(frozen=True)
 class Entry:
-    """A photograph of a list.
+    """An `Entry` is a photograph of a manifest.
 
     Attributes:
         split: `train`, `validation` or `test`.
@@ -49,7 +49,8 @@ class Entry:
 
 
 class PackagePhotographsDataModule(CropDataModule):
-    """Crops of photographs that installed packages bring; nothing is downloaded.
+    """`PackagePhotographsDataModule` cuts crops of photographs that installed packages bring;
+    nothing is downloaded.
 
     A manifest names the files with their hashes and says which split each belongs to.  A file is
     taken from the first folder that has it.  Training besides sees photographs of scikit-image;
@@ -99,13 +100,15 @@ class PackagePhotographsDataModule(CropDataModule):
 
 
 def data_folders() -> list[Path]:
-    """The folders of shared data that the environment's XDG_DATA_DIRS names, in its order."""
+    """Return the folders of shared data that the environment's XDG_DATA_DIRS names, in its
+    order.
+    """
     named = os.environ.get("XDG_DATA_DIRS", "") or _XDG_DEFAULT
     return [Path(folder) for folder in named.split(os.pathsep) if folder]
 
 
 def read_manifest(path: Path) -> list[Entry]:
-    """Read a list of photographs.
+    """Read a manifest of photographs.
 
     Raises:
         InputError: the file is missing, has other columns, an unknown split, a path that leaves the
@@ -133,7 +136,7 @@ def read_manifest(path: Path) -> list[Entry]:
 
 
 def find_files(entries: Sequence[Entry], folders: Sequence[Path]) -> list[Path]:
-    """The files of entries, each from the first folder that has it, with their hashes checked.
+    """Find the files of entries, each in the first folder that has it, and verify their hashes.
 
     Raises:
         InputError: files are missing, or one is not the file that was listed.
@@ -158,7 +161,8 @@ def find_files(entries: Sequence[Entry], folders: Sequence[Path]) -> list[Path]:
 
 
 def shrunk(photograph: Photograph, least: int) -> Photograph:
-    """A photograph averaged over k×k pixels in linear light, its last rows and columns left off.
+    """Average a photograph over k×k pixels in linear light; incomplete last rows and columns are
+    dropped.
 
     Args:
         photograph: without depth.

@@ -1,4 +1,4 @@
-"""Photographs on disk and in memory."""
+"""Photographs are read from disk and kept in memory."""
 
 import os
 import struct
@@ -44,7 +44,7 @@ DECODING_ERRORS = (
 
 @dataclass(frozen=True)
 class Photograph:
-    """A named photograph, kept sRGB-encoded in one byte a channel to save memory.
+    """A `Photograph` has a name, and is kept sRGB-encoded in one byte a channel to save memory.
 
     Attributes:
         name: how messages name it, as a rule its path.
@@ -79,22 +79,22 @@ class Photograph:
 
     @property
     def nbytes(self) -> int:
-        """What it takes in memory."""
+        """Return the memory it takes, bytes."""
         return self.encoded.nbytes + (0 if self.depth is None else self.depth.nbytes)
 
     @property
     def height(self) -> int:
-        """Rows, in pixels."""
+        """Return the number of rows, pixels."""
         return self.encoded.shape[1]
 
     @property
     def width(self) -> int:
-        """Columns, in pixels."""
+        """Return the number of columns, pixels."""
         return self.encoded.shape[2]
 
 
 def normalised_extensions(extensions: Iterable[str]) -> tuple[str, ...]:
-    """Lower-case endings with their dot: `JPG` and `.jpg` both give `.jpg`.
+    """Return lower-case endings with their dot: `JPG` and `.jpg` both give `.jpg`.
 
     Raises:
         InputError: there is none, or one is empty.
@@ -108,7 +108,7 @@ def normalised_extensions(extensions: Iterable[str]) -> tuple[str, ...]:
 
 
 def list_photographs(folder: str | Path, extensions: Iterable[str] = EXTENSIONS) -> list[Path]:
-    """The image files under a folder, searched recursively, sorted by their path in it.
+    """List the image files under a folder, searched recursively, sorted by their path in it.
 
     Links to folders are followed (each real folder once); names that begin with a dot are
     left out.  No file is opened.
@@ -145,7 +145,7 @@ def list_photographs(folder: str | Path, extensions: Iterable[str] = EXTENSIONS)
 
 
 def probe_photograph(path: str | Path) -> str | None:
-    """Look at a file's header without decoding its pixels.
+    """Read a file's header without decoding its pixels.
 
     Returns:
         Why Pillow cannot read the file, in one line, or None when the header is sound.  A file
@@ -170,7 +170,7 @@ def read_photograph(path: str | Path, name: str | None = None) -> Photograph:
 
     Args:
         path: the file.
-        name: what messages call it; the path when not given.
+        name: name in messages; the path when not given.
 
     Raises:
         InputError: the file is missing, or cannot be decoded, or holds floating-point pixels.
@@ -192,7 +192,7 @@ def read_photograph(path: str | Path, name: str | None = None) -> Photograph:
 
 
 def _encoded_pixels(image: Image.Image, name: str) -> np.ndarray:
-    """(height, width, 3) uint8, sRGB-encoded."""
+    """Return the pixels (height, width, 3), uint8, sRGB-encoded."""
     if image.mode == "F":
         raise InputError(f"{name}: floating-point pixels; allowed: 8-bit or 16-bit integers")
     if image.mode.startswith("I"):
@@ -220,6 +220,6 @@ def _over_black(colour_and_alpha: np.ndarray) -> np.ndarray:
 
 
 def reason_of(error: BaseException) -> str:
-    """The kind of an error and the first line of what it says."""
+    """Return the kind of an error and the first line of its message."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

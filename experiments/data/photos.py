@@ -1,4 +1,4 @@
-"""The photographs that ship inside scikit-image."""
+"""Photographs are read from the installed scikit-image."""
 
 import difflib
 import importlib.metadata
@@ -30,7 +30,8 @@ _STEREO_PAIR = ("motorcycle_left.png", "motorcycle_right.png")
 
 
 class PhotosDataModule(CropDataModule):
-    """Crops of the photographs inside the installed scikit-image; nothing is downloaded.
+    """`PhotosDataModule` cuts crops of the photographs inside the installed scikit-image; nothing
+    is downloaded.
 
     Args:
         train: names of the photographs to train on.
@@ -64,7 +65,7 @@ class PhotosDataModule(CropDataModule):
 
 
 def photographs_folder() -> Path:
-    """Where the installed scikit-image keeps its images.
+    """Return the folder in which the installed scikit-image keeps its images.
 
     Raises:
         InputError: scikit-image is not installed.

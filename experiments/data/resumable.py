@@ -1,4 +1,4 @@
-"""A sampler and a loader that go on where a checkpoint left off."""
+"""A sampler and a loader continue from a checkpoint."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ _log = logging.getLogger(__name__)
 
 
 class ResumableSampler(Sampler[int]):
-    """Yields the global sample numbers of one epoch, in order.
+    """Yield the global sample numbers of one epoch, in order.
 
     The numbers do not depend on anything drawn: where to begin is asked for anew whenever an
     iteration begins, so that an epoch resumed in the middle goes on with the very next sample.
@@ -41,7 +41,7 @@ class ResumableSampler(Sampler[int]):
 
 
 class ResumableLoader(DataLoader):
-    """A loader of `TrainingCrops` through a `ResumableSampler`.
+    """`ResumableLoader` loads `TrainingCrops` through a `ResumableSampler`.
 
     The samples follow from the progress of the trainer, so the state kept in a checkpoint
     serves only to notice that a run is resumed with settings that change the samples.  That it
@@ -49,7 +49,9 @@ class ResumableLoader(DataLoader):
     """
 
     def state_dict(self) -> dict[str, Any]:
-        """What the numbering of samples and their crops depend on, as plain numbers."""
+        """Return the settings that the sample numbers and their crops depend on, as plain
+        numbers.
+        """
         return {
             "batch_size": cast(int, self.batch_size),
             "samples_per_epoch": cast(ResumableSampler, self.sampler).samples_per_epoch,

@@ -1,4 +1,4 @@
-"""Photographs with depth maps, from any folder of both."""
+"""Photographs with depth maps are read from any folder of both."""
 
 import math
 from functools import partial
@@ -13,13 +13,14 @@ from experiments.data.photographs import Photograph, read_photograph
 
 
 class RgbdFolderDataModule(ImageFolderDataModule):
-    """Crops of photographs with their depth as a fourth channel, mm; for `scene=layers`.
+    """`RgbdFolderDataModule` cuts crops of photographs with depth (mm) as a fourth channel, for
+    `scene=layers`.
 
     Beside each photograph lies its depth map: `hall.jpg` and `hall_depth.png`.
 
     Args:
         root: the folder, searched recursively; split as `ImageFolderDataModule` says.
-        depth_suffix: what a depth map's name has after the photograph's.
+        depth_suffix: ending of a depth map's name after the photograph's.
         depth_unit: mm per unit of the maps' numbers: 1 for millimetres (Kinect), 1000 for metres,
             0.2 for the TUM benchmark's 5000 a metre.
         **settings: those of `ImageFolderDataModule`.
@@ -43,12 +44,12 @@ class RgbdFolderDataModule(ImageFolderDataModule):
         self.depth_suffix, self.depth_unit = depth_suffix, float(depth_unit)
 
     def load_split(self, split: str) -> FolderPhotographs:
-        """The photographs of a split with their depths, none of them decoded yet."""
+        """Return the photographs of a split with their depths, none of them decoded yet."""
         read = partial(_read, suffix=self.depth_suffix, unit=self.depth_unit)
         return FolderPhotographs(self.root, self.paths[split], self.cache_bytes, read)
 
     def _listed_files(self, folder: Path) -> list[Path]:
-        """Photographs alone, each of which must have a depth map."""
+        """List photographs alone, each of which must have a depth map."""
         files = super()._listed_files(folder)
         photographs = [path for path in files if not is_depth_map(path, self.depth_suffix)]
         missing = [p for p in photographs if depth_map_of(p, self.depth_suffix) is None]
@@ -62,7 +63,7 @@ class RgbdFolderDataModule(ImageFolderDataModule):
 
 
 def _read(path: Path, suffix: str, unit: float) -> Photograph:
-    """A photograph and its depth map."""
+    """Read a photograph and its depth map."""
     photograph, beside = read_photograph(path), depth_map_of(path, suffix)
     if beside is None:
         raise InputError(f"{path}: its depth map is no longer there")

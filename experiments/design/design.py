@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
@@ -26,7 +26,7 @@ from experiments.experiment import Experiment, Figures
 
 logger = logging.getLogger(__name__)
 
-SEMI_DIAMETERS = ("fixed", "follow")
+SEMI_DIAMETERS = ("fixed", "automatic")
 # So many iterations are logged one by one; history.csv holds all.
 _LOGGED_FIRST = 20
 
@@ -48,9 +48,9 @@ class DesignModule(Experiment):
         start: settings of `start_values`; None begins at the prescription.
         published: a prescription to compare with, or None.
         evaluation: what RMS spot radii are reported of; None: the merit's own rays.
-        semi_diameters: `fixed`: light passes where the prescription lets it; or `follow`: the rays
-            that pass the lens where the search begins are kept, and in the end every edge, and the
-            stop's, is put where they pass.
+        semi_diameters: `fixed`: light passes where the prescription lets it; or `automatic`: the
+            rays that pass the lens where the search begins are kept, and in the end every edge, and
+            the stop's, is put where they pass.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
         mtf_max_frequency: the end of the MTF curves in figures, cycles/mm; see `design_figures`.
@@ -104,14 +104,10 @@ class DesignModule(Experiment):
         )
         self.optimizer, self.round_tolerance = optimizer, round_tolerance
         self.mtf_max_frequency = mtf_max_frequency
-        if semi_diameters not in SEMI_DIAMETERS:
-            raise InputError(
-                f"semi_diameters: '{semi_diameters}' is unknown (allowed: "
-                f"{', '.join(SEMI_DIAMETERS)})"
-            )
-        self.follow = semi_diameters == "follow"
-        if self.follow:
-            self.merit_settings = replace(merit, most_vignetted=1.0)
+        check_choice(semi_diameters, SEMI_DIAMETERS, "semi_diameters")
+        self.automatic_semi_diameters = semi_diameters == "automatic"
+        if self.automatic_semi_diameters:
+            self.merit_settings = replace(merit, max_vignetting=1.0)
         if not 0.0 <= round_tolerance < 1.0:
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
         self.merit: MeritFunction | None = None
@@ -136,9 +132,7 @@ class DesignModule(Experiment):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Return an optimizer of one group, which holds the variables and their bounds."""
-        v = self.variables
-        group = {"params": [v.scaled], "lower": v.lower.clone(), "upper": v.upper.clone()}
-        return self.optimizer([group])
+        return self.optimizer([self.variables.parameter_group()])
 
     def on_fit_start(self) -> None:
         """Start the clock."""
@@ -162,7 +156,7 @@ class DesignModule(Experiment):
             if not math.isfinite(float(self.best_merit)):
                 raise InputError(
                     "the search cannot begin: rays fail, or apertures clip more than "
-                    "merit.most_vignetted of a spot"
+                    "merit.max_vignetting of a spot"
                 )
         logger.info(
             "%d variables, %d rays of %d launched, merit %.6g",
@@ -242,17 +236,17 @@ class DesignModule(Experiment):
             self.variables.scaled.copy_(self.best)
             self.variables.write_to(self.lens)
             self.lens.sensor_distance.copy_(self.best_focus)
-        if self.follow:
+        if self.automatic_semi_diameters:
             fit_edges(self.lens, self.initial, self.merit_settings)
 
     def _build(self, lens: Lens) -> MeritFunction:
-        if not self.follow:
+        if not self.automatic_semi_diameters:
             return self.merit_settings.build(lens, self.variables)
         # The rays of the start serve every round.
         return self.merit or self.merit_settings.build(self.initial, self.variables)
 
     def _refuse_lost_light(self) -> None:
-        if self.merit.quality is not None and not self.follow:
+        if self.merit.quality is not None and not self.automatic_semi_diameters:
             refuse_lost_light(self.merit.quality, self.initial_light)
 
     def _keep_if_better(self, value: MeritValue) -> None:

@@ -122,7 +122,7 @@ def pupil_note(settings: MeritSettings) -> str:
         half_width = options.get("half_width")
         width = "the first surface" if half_width is None else f"±{half_width:g} mm"
         notes.append(f"{count}×{count} rays over {width}")
-    if settings.colours == "together":
+    if settings.reference_spectrum == "polychromatic":
         notes.append("one centroid for all colours")
     if settings.reference == "chief":
         notes.append("the chief ray as centre")

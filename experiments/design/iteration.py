@@ -51,7 +51,7 @@ class Progress:
 
 @dataclass
 class _CountedValue:
-    """A merit's value that writes down what its Jacobian costs."""
+    """Evaluates a merit, and writes down what its Jacobian costs."""
 
     value: MeritValue
     rays: int
@@ -70,7 +70,7 @@ class _CountedValue:
 
 @dataclass
 class CountedMerit:
-    """A merit function that counts its evaluations."""
+    """Evaluates a merit function, and counts its evaluations."""
 
     merit: MeritFunction
     cost: Cost = field(default_factory=Cost)

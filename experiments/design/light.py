@@ -9,8 +9,8 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings
+from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
 from dolens.optimize.image_quality import ImageQuality
-from dolens.optimize.rims import fitted_semi_diameters
 from experiments.design.tables import spot_labels
 
 # Rings of the quadrature that tells where the edges of the beams are.
@@ -45,13 +45,13 @@ def refuse_lost_light(quality: ImageQuality, initial_light: Tensor) -> None:
         initial_light: (S,), the light of its spots when the search began; see `SpotRays.light`.
 
     Raises:
-        InputError: a spot has lost more than `most_vignetted` of its light.
+        InputError: a spot has lost more than `max_vignetting` of its light.
     """
-    least = initial_light * (1.0 - quality.most_vignetted)
+    least = initial_light * (1.0 - quality.max_vignetting)
     lost = quality.spots.light < least.to(quality.spots.light)
     if bool(lost.any()):
         label = spot_labels(quality.spots)[int(torch.nonzero(lost)[0])]
         raise InputError(
-            f"spot {label} has lost more than merit.most_vignetted = "
-            f"{quality.most_vignetted:g} of the light that it had at first"
+            f"spot {label} has lost more than merit.max_vignetting = "
+            f"{quality.max_vignetting:g} of the light that it had at first"
         )

@@ -114,12 +114,12 @@ def iteration_row(progress: Progress, merit: MeritFunction, seconds: float) -> d
 def operand_table(merit: MeritFunction) -> list[dict[str, Any]]:
     """Return rows, one for every operand: value, deviation, derivatives by variable.
 
-    Derivatives are those of the value by each variable in its own unit.
+    Derivatives are those of the value with respect to each variable in the unit of files.
     """
     value = merit()
     if not value.operands:
         return []
-    slopes = (value.operand_derivatives() / merit.variables.scale.cpu()).tolist()
+    slopes = (value.operand_derivatives() / merit.variables.file_scale.cpu()).tolist()
     labels = merit.variables.labels()
     return [
         {

@@ -11,19 +11,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
-from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import SpotLoss
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
-from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
+from experiments.poses.accuracy_settings import (
+    BasinSettings,
+    ComparedImages,
+    PhotonLevels,
+    RayCounts,
+)
 from experiments.poses.basin import Basin
-from experiments.poses.measurements import draw, simulated_at
+from experiments.poses.bench import Bench, Light, draw, simulate
 from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
@@ -41,24 +45,16 @@ class PoseAccuracyModule(Analysis):
     Args:
         lens: as designed; its elements may have poses.
         experiment: name of the experiment.
-        sources: (S, 3), mm, in the lens's axes.
-        wavelength: nm.
-        sensor: the pixels.
+        folder: where tables go.
+        bench: sources, wavelength and sensor.
+        light: light and noise; its photons are those that errors by rays are compared with.
         truth: where the lens and the sources are, by name, degrees and mm.
         variables: name → settings of `Pose`: what is fitted; it starts from the truth, or off it.
-        folder: where tables go.
+        images: settings of the model's images.
+        by_photons: measurements with more and more light.
+        by_rays: images by more and more rays.
+        basin: fits from farther and farther starts.
         parts: of `photons`, `rays` and `basin`.
-        photons: of each source, behind the lens, that bounds are quoted for.
-        read_noise: RMS of a pixel, electrons.
-        centroid_weight: μ of S21, 1/mm².
-        imagers: name → settings of `SpotImager`; the first is used where rays are not the question.
-        slopes: settings that differ for derivatives.
-        photon_levels: of a source.
-        measurements: with other photons, of each level.
-        ray_counts: of a source.
-        patterns: of rays, of each count.
-        reference_photons: of the measurement that errors by rays are judged by.
-        basin: settings of `Basin`.
         seed: of simulations.
 
     Raises:
@@ -69,60 +65,45 @@ class PoseAccuracyModule(Analysis):
         self,
         lens: Lens,
         experiment: str,
-        sources: Sequence[Sequence[float]],
-        wavelength: float,
-        sensor: Sensor,
+        folder: str,
+        bench: Bench,
+        light: Light,
         truth: Mapping[str, float],
         variables: Mapping[str, Mapping[str, Any] | None],
-        folder: str,
-        imagers: Mapping[str, Mapping[str, Any]],
-        slopes: Mapping[str, Any],
-        basin: Mapping[str, Any],
+        images: ComparedImages,
+        by_photons: PhotonLevels,
+        by_rays: RayCounts,
+        basin: BasinSettings,
         parts: Sequence[str] = PARTS,
-        photons: int = 4_000_000,
-        read_noise: float = 2.0,
-        centroid_weight: float = 1.0,
-        photon_levels: Sequence[float] = (1e4, 1e5, 1e6, 1e7),
-        measurements: int = 20,
-        ray_counts: Sequence[float] = (1e4, 1e5, 1e6),
-        patterns: int = 4,
-        reference_photons: float = 2e8,
         seed: int = 0,
     ) -> None:
         super().__init__(lens, experiment, folder)
         for part in parts:
-            if part not in PARTS:
-                raise InputError(f"parts: '{part}' is unknown (allowed: {', '.join(PARTS)})")
+            check_choice(part, PARTS, "parts")
         if lens.dtype != torch.float64:
             raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
-        if measurements < 2 or patterns < 1 or not imagers or not variables:
-            raise InputError(
-                "measurements, patterns, imagers, variables: give 2 or more, 1 or more, and at "
-                "least one of each"
-            )
+        if not variables:
+            raise InputError("variables: give at least one")
         self.seed, self.parts = int(seed), tuple(parts)
-        self.photons, self.read_noise = int(photons), float(read_noise)
-        self.centroid_weight = float(centroid_weight)
+        self.bench, self.light, self.images = bench, light, images
+        self.by_photons, self.by_rays = by_photons, by_rays
         self.imagers = {
-            name: SpotImager(sensor, float(wavelength), **settings)
-            for name, settings in imagers.items()
+            name: call_with_settings(
+                SpotImager, settings, f"imagers.{name}", bench.sensor, bench.wavelength
+            )
+            for name, settings in images.imagers.items()
         }
         self.imager = next(iter(self.imagers.values()))
-        self.slopes = replace(self.imager, **slopes)
-        place = Pose(copy.deepcopy(lens), sources, {})
+        check_keys(images.slopes, SpotImager.__dataclass_fields__, "slopes")
+        self.slopes = replace(self.imager, **images.slopes)
+        place = bench.pose(copy.deepcopy(lens))
         place.put(truth)
         # It starts from where the lens now is, whatever initial values are given.
         free = {name: {**(s or {})} for name, s in variables.items()}
         for settings in free.values():
             settings.pop("initial", None)
         self.true = place.varying(free)
-        self.photon_levels = [int(level) for level in photon_levels]
-        self.ray_counts = [int(count) for count in ray_counts]
-        self.measurements, self.patterns = measurements, patterns
-        self.reference_photons = int(reference_photons)
-        self.basin = Basin(
-            self.true, self.imager.wavelength, sensor, self.read_noise, self.seed, **basin
-        )
+        self.basin = Basin(self.true, bench, light.read_noise, basin, self.seed)
         self.rows: list[Row] = []
         self.numbers: dict[str, float] = {}
 
@@ -143,11 +124,15 @@ class PoseAccuracyModule(Analysis):
     def figures(self) -> Figures:
         """Return a figure for each part that was measured, by its name."""
         name = self.lens.name
-        title = f"{name}: error and light, {self.measurements} measurements each"
+        title = f"{name}: error and light, {self.by_photons.measurements} measurements each"
         figures = {
             "photons": lambda: photons_figure(self.rows, self.true, title),
             "rays": lambda: rays_figure(
-                self.numbers, self.imagers, self.ray_counts, self.photons, name
+                self.numbers,
+                self.imagers,
+                self.by_rays.counts,
+                int(self.light.photons),
+                name,
             ),
             "basin": lambda: basin_figure(self.basin, name),
         }
@@ -158,60 +143,59 @@ class PoseAccuracyModule(Analysis):
     @torch.no_grad()
     def _photons(self) -> None:
         """Find errors of estimates from measurements of more and more light."""
-        for number, level in enumerate(self.photon_levels):
-            seeds = range(1000 * number, 1000 * number + self.measurements)
+        for number, level in enumerate(self.by_photons.levels):
+            seeds = range(1000 * number, 1000 * number + self.by_photons.measurements)
             measured = [self._measurement(level, seed) for seed in seeds]
-            known = knowledge(self.true, self.imager, measured[0], self.slopes)
+            information = fisher_information(self.true, self.imager, measured[0], self.slopes)
             inverse = self._s21_inverse(measured[0])
             errors = {
-                "noise_weighted": torch.stack([known.correction(m) for m in measured]),
+                "noise_weighted": torch.stack([information.correction(m) for m in measured]),
                 "s21": torch.stack([self._s21_step(m, self.imager, inverse) for m in measured]),
             }
             for estimator, found in errors.items():
                 rms = found.square().mean(0).sqrt()
-                self._add("photons", estimator, level, rms, known.bounds)
+                self._add("photons", estimator, level, rms, information.bounds)
             logger.info("%.3g photons: %s", level, self._last_ratios())
 
     def _measurement(self, photons: int, seed: int) -> Measurement:
-        imager, generator = self.imager, draw(self.seed, 0, seed)
-        return simulated_at(
-            self.true, imager.wavelength, imager.sensor, photons, self.read_noise, generator
-        )
+        light = replace(self.light, photons=photons)
+        return simulate(self.true, self.bench, light, draw(self.seed, 0, seed))
 
     # ---------------------------------------------------------------- rays
 
     @torch.no_grad()
     def _rays(self) -> None:
         """Find the errors that few rays make."""
-        reference = self._measurement(self.reference_photons, 999_999)
-        exact = knowledge(self.true, self.imager, reference, self.slopes)
+        reference_photons, photons = self.by_rays.reference_photons, int(self.light.photons)
+        reference = self._measurement(reference_photons, 999_999)
+        exact = fisher_information(self.true, self.imager, reference, self.slopes)
         # Bounds and weights are those of the light that is quoted.
-        share = self.photons / self.reference_photons
+        share = photons / reference_photons
         quoted = replace(
             reference,
             images=share * reference.images,
-            read_noise=self.read_noise,
+            read_noise=self.light.read_noise,
         )
-        known = knowledge(self.true, self.imager, quoted, self.slopes)
+        information = fisher_information(self.true, self.imager, quoted, self.slopes)
         inverse = self._s21_inverse(reference)
-        floor = float((exact.bounds / known.bounds).square().mean().sqrt())
+        floor = float((exact.bounds / information.bounds).square().mean().sqrt())
         self.numbers["pose_error/reference_over_bound"] = floor
         for (name, imager), count in (
-            (entry, count) for entry in self.imagers.items() for count in self.ray_counts
+            (entry, count) for entry in self.imagers.items() for count in self.by_rays.counts
         ):
             found: dict[str, list[Tensor]] = {estimator: [] for estimator in ESTIMATORS}
             seconds = []
-            for pattern in range(self.patterns):
+            for pattern in range(self.by_rays.patterns):
                 own = replace(imager, rays=count, seed=pattern + 1)
                 started = time.perf_counter()
                 shares = torch.stack([image.image for image in self.true.images(own)])
                 seconds.append(time.perf_counter() - started)
-                modelled = replace(known, expected=shares)
+                modelled = replace(information, expected=shares)
                 found["noise_weighted"].append(modelled.correction(quoted))
                 found["s21"].append(self._s21_step(reference, own, inverse))
             for estimator, steps in found.items():
                 rms = torch.stack(steps).square().mean(0).sqrt()
-                self._add(f"rays/{name}", estimator, count, rms, known.bounds, min(seconds))
+                self._add(f"rays/{name}", estimator, count, rms, information.bounds, min(seconds))
             logger.info("%s, %.3g rays: %s", name, count, self._last_ratios())
 
     # ---------------------------------------------------------------- where it starts
@@ -229,13 +213,13 @@ class PoseAccuracyModule(Analysis):
         Another measurement's largest pixel scales all rows but those of the centroids a little
         otherwise, which moves the least squares by as little.
         """
-        loss = SpotLoss(measurement, self.slopes, self.centroid_weight)
+        loss = SpotLoss(measurement, self.slopes, self.images.centroid_weight)
         every = torch.ones(len(self.true.names), dtype=torch.bool)
         return torch.linalg.pinv(loss.jacobian(self.true, every)[1])
 
     def _s21_step(self, measurement: Measurement, imager: SpotImager, inverse: Tensor) -> Tensor:
         """Return the step (P,) of S21 from the truth, in the units of θ."""
-        loss = SpotLoss(measurement, imager, self.centroid_weight)
+        loss = SpotLoss(measurement, imager, self.images.centroid_weight)
         return -self.true.scale * (inverse @ loss.residuals(self.true))
 
     def _add(

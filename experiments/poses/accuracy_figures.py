@@ -1,4 +1,4 @@
-"""Figures of errors of a pose fit by photons and by rays, and of its basin of convergence."""
+"""These figures show errors of a pose fit by photons and by rays, and its basin of convergence."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""What was found of misaligned lenses: numbers for metrics, and the table of cases."""
+"""The results of an alignment are numbers for metrics and a table of cases."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,8 @@ SENSOR_COLUMNS = {
 
 @dataclass(frozen=True)
 class Alignment:
-    """K misaligned lenses and what was found of them, in degrees and µm; the demo is the first.
+    """Holds K misaligned lenses and what was found of them, in degrees and µm; the demo is the
+    first.
 
     P numbers describe a case: tilts and decentres of its element, and what of the sensor's place
     is unknown.
@@ -60,12 +61,14 @@ class Alignment:
 
     @property
     def right(self) -> Tensor:
-        """(K,), bool: the element that is off is the one named."""
+        """Return whether the element that is off is the one named, (K,), bool."""
         return self.named == self.element
 
     def errors(self, columns: slice) -> Tensor:
-        """(K,), length of the difference of the whole lens's pose, over these columns of all
-        elements: a wrong name counts with what it invents and with what it misses.
+        """Return errors (K,) of the whole lens's pose: lengths of the difference over these columns
+        of all elements.
+
+        A wrong name counts with what it invents and with what it misses.
         """
         difference = self.true.new_zeros(len(self.true), len(self.elements), len(POSE))
         rows = torch.arange(len(self.true))
@@ -74,7 +77,7 @@ class Alignment:
         return difference[..., columns].flatten(1).norm(dim=1)
 
     def summary(self) -> dict[str, float]:
-        """Numbers for metrics.json, of the batch without the demo."""
+        """Return numbers for metrics.json, of the batch without the demo."""
         right = self.right[1:]
         numbers = {"alignment/named_right": float(right.double().mean())}
         for name, columns in (("tilt_deg", slice(0, 2)), ("decenter_um", slice(2, 4))):
@@ -100,7 +103,7 @@ class Alignment:
         return numbers | self.checks | {"cost/batch_s": self.seconds}
 
     def _of_element(self, number: int) -> dict[str, float]:
-        """Of the cases where this element is off and is named."""
+        """Return numbers of the cases where this element is off and is named."""
         element = self.elements[number]
         mine = (self.element == number) & self.right
         mine[0] = False
@@ -123,7 +126,7 @@ class Alignment:
         return numbers
 
     def rows(self) -> list[Row]:
-        """Of alignment.csv: the demo, and the batch."""
+        """Return rows of alignment.csv: the demo, and the batch."""
         rows: list[Row] = []
         for k in range(len(self.true)):
             element, named = int(self.element[k]), int(self.named[k])
@@ -142,7 +145,7 @@ class Alignment:
         return rows
 
     def verdict(self) -> str:
-        """One line of a log."""
+        """Return one line for a log."""
         n = self.summary()
         true, named = (self.elements[int(which[0])] for which in (self.element, self.named))
         return (

@@ -11,7 +11,8 @@ from torch import Tensor
 from dolens.alignment.element_fit import POSE
 from dolens.alignment.pixel_moments import Pixels
 from dolens.alignment.spot_moments import SENSOR
-from dolens.errors import InputError, check_keys
+from dolens.errors import InputError, check_choice, check_keys
+from dolens.optics.parameter_units import unit_factors
 from experiments.settings import check_count, check_positive
 
 
@@ -97,12 +98,10 @@ class Misalignments:
             InputError: it names none of the elements.
         """
         name = self.demo.get("element")
-        if name not in elements:
-            raise InputError(f"demo.element: '{name}'; allowed: {', '.join(elements)}")
+        check_choice(name, elements, "demo.element")
         values = [float(self.demo.get(part, 0.0)) for part in POSE]
         pose = torch.tensor(values, dtype=torch.float64)
-        pose[:2] *= math.pi / 180.0
-        return list(elements).index(name), pose
+        return list(elements).index(name), pose * unit_factors(POSE)
 
     def _places(self) -> dict[str, float]:
         shift = self.sensor_shift_range

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dolens.alignment.information import Knowledge
+from dolens.alignment.information import FisherInformation
 from dolens.alignment.pose import Pose
 
-# A combination known worse than so many of its scales is not known at all.
+# An eigenvector with a larger standard deviation, in the scales, is not seen at all.
 UNSEEN = 1e4
 
 
@@ -18,20 +18,20 @@ class Arrangement:
     Attributes:
         name: of the arrangement.
         pose: the lens where it is; its variables are what is unknown.
-        known: of it.
-        spread: (P,), standard deviations of combinations of θ/scale, the worst known first.
-        combinations: (P, P), those, one a row.
+        information: that the images carry on it.
+        spread: (P,), standard deviations along the eigenvectors of θ/scale, the largest first.
+        eigenvectors: (P, P), of the Fisher information, one a row.
         estimates: (M, P), degrees and mm, from M measurements with other photons; None: none.
     """
 
     name: str
     pose: Pose
-    known: Knowledge
+    information: FisherInformation
     spread: Tensor
-    combinations: Tensor
+    eigenvectors: Tensor
     estimates: Tensor | None
 
     @property
     def bounds(self) -> Tensor:
         """Return bounds (P,), degrees and mm."""
-        return self.known.bounds / self.pose.units
+        return self.information.bounds / self.pose.units

@@ -1,23 +1,22 @@
-"""From how far off a pose fit converges: fits from a grid of starts."""
+"""Fits from a grid of starts show from how far off a pose fit converges."""
 
 import itertools
 import logging
 import math
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
-from dolens.sensor.pixels import Sensor
+from experiments.poses.accuracy_settings import BasinSettings
+from experiments.poses.bench import Bench, Light, simulate
 from experiments.poses.iteration import iterate, loss_of, optimizer_of
-from experiments.poses.measurements import simulated_at
-from experiments.poses.settings import Stage, spot_imager, stage_of
+from experiments.poses.settings import spot_imager, stage_of
 from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
@@ -31,17 +30,10 @@ class Basin:
 
     Args:
         true: the lens where it is.
-        wavelength: nm.
-        whole_sensor: of the experiment.
+        bench: wavelength and sensor of the experiment.
         read_noise: RMS of a pixel, electrons.
+        settings: the grid, the stages and the images.
         seed: of the measurement.
-        along: two variables' names → errors of their starts, degrees or mm; the first is drawn
-            across, the second upwards.
-        stages: settings of `Stage`, in turn.
-        centroid_weights: μ of S21, 1/mm²; a grid of fits for each.
-        sensor: the pixels; None: the experiment's.
-        imager: settings of `SpotImager`.
-        photons: of each source.
 
     Raises:
         InputError: a name that is not fitted, or not two of them.
@@ -50,28 +42,23 @@ class Basin:
     def __init__(
         self,
         true: Pose,
-        wavelength: float,
-        whole_sensor: Sensor,
+        bench: Bench,
         read_noise: float,
+        settings: BasinSettings,
         seed: int,
-        along: Mapping[str, Sequence[float]],
-        stages: Sequence[Mapping[str, Any]],
-        centroid_weights: Sequence[float] = (1.0,),
-        sensor: Sensor | None = None,
-        imager: Mapping[str, Any] | None = None,
-        photons: float = 1e6,
     ) -> None:
+        along = settings.along
         unknown = set(along) - set(true.names)
         if unknown or len(along) != 2:
             raise InputError(
                 f"basin.along: {', '.join(along)}; allowed: two of {', '.join(true.names)}"
             )
         self.true, self.along = true, {n: [float(e) for e in es] for n, es in along.items()}
-        self.stages: list[Stage] = [stage_of(settings) for settings in stages]
-        self.centroid_weights = [float(weight) for weight in centroid_weights]
-        self.sensor, self.wavelength = sensor or whole_sensor, wavelength
-        self.imager = dict(imager or {})
-        self.read_noise, self.seed, self.photons = read_noise, seed, int(photons)
+        self.stages = [stage_of(stage) for stage in settings.stages]
+        self.centroid_weights = [float(weight) for weight in settings.centroid_weights]
+        self.bench = replace(bench, sensor=settings.sensor or bench.sensor)
+        self.light = Light(int(settings.photons), read_noise)
+        self.imager, self.seed = dict(settings.imager), seed
         self.rows: list[Row] = []
 
     def run(self) -> None:
@@ -81,16 +68,9 @@ class Basin:
         A fit whose light is lost ends where it was, and says so in the log.
         """
         true, generator = self.true, torch.Generator().manual_seed(self.seed)
-        measured = simulated_at(
-            true,
-            self.wavelength,
-            self.sensor,
-            self.photons,
-            self.read_noise,
-            generator,
-        )
-        imager = spot_imager(measured, self.wavelength, self.imager)
-        bounds = knowledge(true, imager, measured).bounds
+        measured = simulate(true, self.bench, self.light, generator)
+        imager = spot_imager(measured, self.bench.wavelength, self.imager)
+        bounds = fisher_information(true, imager, measured).bounds
         across, up = self.along.values()
         for weight in self.centroid_weights:
             # The grid's rows from below, as `table` takes them.
@@ -108,7 +88,7 @@ class Basin:
     def _row(
         self, measured: Measurement, bounds: Tensor, weight: float, errors: tuple[float, float]
     ) -> Row:
-        """Of a fit whose start is off by two errors, degrees or mm."""
+        """Return a row of a fit whose start is off by two errors, degrees or mm."""
         started, true = time.perf_counter(), self.true
         truth = true.scale * true.scaled.detach()
         start = truth.clone()
@@ -131,11 +111,11 @@ class Basin:
         }
 
     def _fit(self, pose: Pose, measured: Measurement, weight: float) -> int:
-        """Iterations that were made."""
+        """Fit, and return how many iterations were made."""
         count = 0
         try:
             for stage in self.stages:
-                loss = loss_of(stage, measured, self.wavelength, self.imager, weight)
+                loss = loss_of(stage, measured, self.bench.wavelength, self.imager, weight)
                 optimizer = optimizer_of(stage, pose)
                 for _ in range(stage.iterations):
                     iterate(pose, stage, loss, optimizer)
@@ -145,7 +125,7 @@ class Basin:
         return count
 
     def summary(self) -> dict[str, float]:
-        """The share of starts that converge, by centroid weight."""
+        """Return the share of starts that converge, by centroid weight."""
         numbers = {}
         for weight in self.centroid_weights:
             mine = [row["converged"] for row in self.rows if row["centroid_weight"] == weight]
@@ -153,7 +133,9 @@ class Basin:
         return numbers
 
     def table(self, weight: float) -> Tensor:
-        """Errors over bounds (second, first) of the grid with this centroid weight; NaN: lost."""
+        """Return errors over bounds (second, first) of the grid with this centroid weight; NaN:
+        lost.
+        """
         across, up = self.along.values()
         mine = [row["error_over_bound"] for row in self.rows if row["centroid_weight"] == weight]
         return torch.tensor(mine, dtype=torch.float64).reshape(len(up), len(across))

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.poses.coverage_figures import coverage_figure
@@ -45,9 +46,9 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         super().__init__(**module)
         if draws < 2:
             raise InputError(f"draws: {draws}; allowed: 2 or more")
-        if not cases or self.measured is not None:
+        if not cases or self.observations.photograph is not None:
             raise InputError("cases: give at least one, and no photograph in `measurement`")
-        if self.unmodelled != Unmodelled():
+        if self.light.unmodelled != Unmodelled():
             raise InputError("unmodelled: effects are those of `cases` here; leave it at its zeros")
         self.draws, names = int(draws), [fit.name for fit in self.fits]
         self.cases: dict[str, tuple[Unmodelled, tuple[str, ...]]] = {}
@@ -56,10 +57,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             fits = tuple(str(fit) for fit in settings.pop("fits", names))
             self.cases[name] = (unmodelled_of(settings, f"cases.{name}"), fits)
             for fit in fits:
-                if fit not in names:
-                    raise InputError(
-                        f"cases.{name}.fits: '{fit}' is unknown; allowed: {', '.join(names)}"
-                    )
+                check_choice(fit, names, f"cases.{name}.fits")
                 needed = self.fits[names.index(fit)].held_from
                 if needed is not None and needed not in fits:
                     raise InputError(f"cases.{name}.fits: '{fit}' holds what '{needed}' finds")
@@ -70,7 +68,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
                 raise InputError(f"fits.{names[number]}.truth: '{missing[0]}' is missing")
             with torch.no_grad():
                 true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
-                pose.scaled.copy_(true / pose.scale_in_units)
+                pose.scaled.copy_(true / pose.file_scale)
         self.found: dict[tuple[str, str], Estimates] = {}
         self.rows: list[Row] = []
         self.draw_rows: list[Row] = []
@@ -80,7 +78,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         """Estimate, case by case; tables are written after each."""
         for number, fit in enumerate(self.fits):
             self._hold(number)
-            self.known[fit.name] = self._knowledge(number)
+            self.information[fit.name] = self._information(number)
         for case in self.cases:
             self._work_out(case)
             self.write_tables()
@@ -109,10 +107,10 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
 
     def _every(self, case: str, fit: str) -> Tensor:
         """Return errors over their bounds (draws, P), for all measurements."""
-        number = self._number(fit)
+        number = self.plan.number(fit)
         pose, truth = self.poses[number], self.truth(number)
         true = torch.tensor([truth[name] for name in pose.names], dtype=torch.float64)
-        return (self.found[case, fit].values - true) * pose.units / self.known[fit].bounds
+        return (self.found[case, fit].values - true) * pose.units / self.information[fit].bounds
 
     def _metrics(self) -> dict[str, float]:
         numbers: dict[str, float] = {}
@@ -124,7 +122,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             together = torch.cat([self.over_bound(case, fit).flatten() for fit in fits])
             for key, value in error_statistics(together).items():
                 numbers[f"coverage/{case}/{key}"] = value
-            freedom = sum(len(self.poses[self._number(fit)].names) for fit in fits)
+            freedom = sum(len(self.poses[self.plan.number(fit)].names) for fit in fits)
             total = torch.stack([self.found[case, fit].chi_squared for fit in fits]).sum(0)
             settled = torch.stack([self.found[case, fit].settled for fit in fits])
             numbers[f"coverage/{case}/chi_squared"] = float(total[settled.all(0)].mean()) / freedom
@@ -135,12 +133,13 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
 
     def _work_out(self, case: str) -> None:
         effects, fits = self.cases[case]
+        light = replace(self.light, unmodelled=effects)
         earlier: dict[str, Estimates] = {}
         for number, fit in enumerate(self.fits):
             if fit.name not in fits:
                 continue
             self._hold(number)
-            found = self._estimates(number, range(self.draws), effects, earlier)
+            found = self._estimates(number, range(self.draws), light, earlier)
             earlier[fit.name] = self.found[case, fit.name] = found
             self.rows += self._variable_rows(case, fit.name)
             freedom = len(self.poses[number].names)
@@ -181,8 +180,8 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
 
     def _variable_rows(self, case: str, fit: str) -> list[Row]:
         """Return rows of coverage.csv, one for each variable."""
-        pose = self.poses[self._number(fit)]
-        bounds = (self.known[fit].bounds / pose.units).tolist()
+        pose = self.poses[self.plan.number(fit)]
+        bounds = (self.information[fit].bounds / pose.units).tolist()
         rows: list[Row] = []
         for name, bound, off in zip(
             pose.names, bounds, self.over_bound(case, fit).unbind(-1), strict=True

@@ -1,4 +1,4 @@
-"""Poses that other measurements lead to, without fitting each from its beginning."""
+"""Other measurements lead to poses that are found without fitting each from its beginning."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.alignment.information import Knowledge
+from dolens.alignment.information import FisherInformation
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotMerit
+from dolens.alignment.spot_loss import ImageMerit
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
+from experiments.poses.settings import Fit
 
 # One linear step is exact enough within so many bounds; longer ones are followed by others.
 _NEAR = 5.0
@@ -25,12 +26,12 @@ _ITERATIONS, _DAMPING, _SMALL, _PART = 12, 1e-6, 0.1, 0.02
 
 @dataclass(frozen=True)
 class Held:
-    """Numbers that a fit holds as an earlier one found them, in θ's units (radians, mm).
+    """Holds values of nuisance parameters that an earlier fit found, in θ's units (radians, mm).
 
     Attributes:
         names: H of them.
         units: (H,), θ's units in those of settings.
-        at: (H,), in the pose that knowledge is of.
+        at: (H,), in the pose that the information is on.
         found: (M, H), as the earlier fit found them in each of M measurements.
         true: (H,); NaN where no truth is known.
     """
@@ -42,14 +43,34 @@ class Held:
     true: Tensor
 
     def values(self, measurement: int) -> dict[str, float]:
-        """Of one measurement, degrees and mm."""
+        """Return the values of one measurement, degrees and mm."""
         found = (self.found[measurement] / self.units).tolist()
         return dict(zip(self.names, found, strict=True))
 
 
+def held_numbers(fit: Fit, before: Pose, found: "Estimates", truth: Mapping[str, float]) -> Held:
+    """Return the nuisance parameters that a fit takes from an earlier one.
+
+    Args:
+        fit: that holds them.
+        before: the pose of the fit that found them.
+        found: its estimates, of the same measurements.
+        truth: by name, degrees and mm.
+    """
+    places = [before.names.index(name) for name in fit.held]
+    units = before.units[places]
+    return Held(
+        fit.held,
+        units,
+        (before.scale * before.scaled.detach())[places],
+        found.values[:, places] * units,
+        torch.tensor([truth.get(n, torch.nan) for n in fit.held]).double() * units,
+    )
+
+
 @dataclass(frozen=True)
 class Estimates:
-    """Poses that M measurements lead to.
+    """Holds poses that M measurements lead to.
 
     Attributes:
         values: (M, P), degrees and mm.
@@ -68,7 +89,7 @@ class Estimates:
 @torch.no_grad()
 def estimates(
     pose: Pose,
-    known: Knowledge,
+    information: FisherInformation,
     imager: SpotImager,
     measured: Callable[[int], Measurement],
     draws: Sequence[int],
@@ -79,8 +100,8 @@ def estimates(
     """Find the pose of each of M measurements, from one pose that is near all of them.
 
     Args:
-        pose: of which there is knowledge.
-        known: of the pose.
+        pose: near all of the measurements'.
+        information: on the pose.
         imager: makes its images.
         measured: a measurement by its number.
         draws: M numbers.
@@ -91,11 +112,11 @@ def estimates(
     true = torch.tensor([truth.get(name, torch.nan) for name in pose.names], dtype=torch.float64)
     values, chi, settled = [], [], []
     for place, draw in enumerate(draws):
-        theta, done = _estimate(pose, known, imager, slopes, measured(draw), held, place)
+        theta, done = _estimate(pose, information, imager, slopes, measured(draw), held, place)
         error = theta - true * pose.units
         if held is not None:
-            error = error - known.inheritance @ (held.found[place] - held.true)
-        chi.append(error @ torch.linalg.solve(known.own_covariance, error))
+            error = error - information.nuisance_sensitivity @ (held.found[place] - held.true)
+        chi.append(error @ torch.linalg.solve(information.own_covariance, error))
         values.append(theta / pose.units)
         settled.append(done)
     return Estimates(torch.stack(values), torch.stack(chi), torch.tensor(settled))
@@ -103,14 +124,14 @@ def estimates(
 
 def _estimate(
     pose: Pose,
-    known: Knowledge,
+    information: FisherInformation,
     imager: SpotImager,
     slopes: SpotImager | None,
     measurement: Measurement,
     held: Held | None,
     place: int,
 ) -> tuple[Tensor, bool]:
-    """θ (P,), and whether it has settled.
+    """Return θ (P,), and whether it has settled.
 
     One step of weighted least squares with the derivatives of the pose is all that an error of some
     bounds needs.  Where it is longer, the measurement is fitted: by damped least squares, with
@@ -119,27 +140,27 @@ def _estimate(
     at = pose.scale * pose.scaled.detach()
     moved = torch.zeros_like(at)
     if held is not None:
-        moved = known.inheritance @ (held.found[place] - held.at)
-    step = known.correction(measurement)
-    if float(((moved + step).abs() / known.bounds).max()) <= _NEAR:
+        moved = information.nuisance_sensitivity @ (held.found[place] - held.at)
+    step = information.correction(measurement)
+    if float(((moved + step).abs() / information.bounds).max()) <= _NEAR:
         return at + moved + step, True
     there = copy.deepcopy(pose)
     if held is not None:
         there.put(held.values(place))
     there.scaled.copy_((at + moved) / pose.scale)
-    loss = NoiseWeightedLoss(measurement, imager, slopes, known.blur)
-    optimizer = DampedLeastSquares([there.scaled], initial_damping=_DAMPING)
+    loss = NoiseWeightedLoss(measurement, imager, slopes, information.blur)
+    optimizer = DampedLeastSquares([there.parameter_group()], initial_damping=_DAMPING)
     every = torch.ones(len(pose.names), dtype=torch.bool)
     theta = at + moved
     for _ in range(_ITERATIONS):
         before = theta
         try:
-            optimizer.step(SpotMerit(loss.weighted_at(there), there, every))
+            optimizer.step(ImageMerit(loss.weighted_at(there), there, every))
         except InputError:
             # No light reaches the sensor from there.
             return before, False
         theta = pose.scale * there.scaled.detach()
-        last, way = ((d / known.bounds).abs().max() for d in (theta - before, theta - at))
+        last, way = ((d / information.bounds).abs().max() for d in (theta - before, theta - at))
         if float(last) < max(_SMALL, _PART * float(way)):
             return theta, True
         # Weights are new in the next one.
@@ -148,6 +169,6 @@ def _estimate(
 
 
 def probability(chi_squared: Tensor, freedom: int) -> Tensor:
-    """The chance that a χ² variable of so many degrees of freedom is larger still."""
+    """Return the chance that a χ² variable of so many degrees of freedom is larger still."""
     half = torch.full_like(chi_squared, 0.5 * freedom)
     return torch.special.gammaincc(half, 0.5 * chi_squared)

@@ -1,4 +1,4 @@
-"""One iteration of a pose fit, by whatever its stage says."""
+"""An iteration of a pose fit moves its variables by the optimizer of the stage."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -9,7 +9,7 @@ from torch import Tensor
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import ImageLoss, SpotLoss, SpotMerit
+from dolens.alignment.spot_loss import ImageLoss, ImageMerit, SpotLoss
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
 from experiments.poses.settings import Stage, blur_for, slopes_imager, spot_imager
@@ -22,7 +22,7 @@ def loss_of(
     imager: Mapping[str, Any],
     centroid_weight: float,
 ) -> ImageLoss:
-    """What a stage makes small.
+    """Return the loss that a stage minimises.
 
     Args:
         stage: says which loss, and what differs from the other arguments.
@@ -42,16 +42,18 @@ def loss_of(
 def slopes_of(
     stage: Stage, measurement: Measurement, wavelength: float, imager: Mapping[str, Any]
 ) -> tuple[SpotImager, float]:
-    """What makes a stage's derivatives when images are weighted by noise, and their blur (px)."""
+    """Return the imager of a stage's derivatives when images are weighted by noise, and their blur
+    (px).
+    """
     slopes = slopes_imager(measurement, wavelength, imager, stage.imager, stage.slopes)
     return slopes, blur_for(measurement, slopes) if stage.blur is None else stage.blur
 
 
 def optimizer_of(stage: Stage, pose: Pose) -> torch.optim.Optimizer:
-    """Of a stage's iterations."""
+    """Return the optimizer of a stage's iterations."""
     if stage.optimizer == "adam":
         return torch.optim.Adam([pose.scaled], lr=stage.learning_rate)
-    return DampedLeastSquares([pose.scaled], initial_damping=stage.damping)
+    return DampedLeastSquares([pose.parameter_group()], initial_damping=stage.damping)
 
 
 def iterate(
@@ -79,7 +81,7 @@ def iterate(
     )
     weighted = loss.weighted_at(pose)
     if isinstance(optimizer, DampedLeastSquares):
-        merit = SpotMerit(weighted, pose, chosen)
+        merit = ImageMerit(weighted, pose, chosen)
         if weighted is not loss:
             # Its weights are new, so what had nothing to gain may have.
             optimizer.restart()
@@ -90,4 +92,5 @@ def iterate(
     residuals.square().sum().backward()
     pose.scaled.grad.mul_(chosen)
     step()
+    pose.project()
     return loss.terms(residuals.detach())

@@ -3,23 +3,23 @@
 import copy
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
-from dolens.sensor.pixels import Sensor
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.poses.arrangement import UNSEEN, Arrangement
+from experiments.poses.bench import Bench, Light, draw, repetitions, simulate
 from experiments.poses.knowledge_figures import knowledge_figures
-from experiments.poses.measurements import draw, repetitions, simulated_at
 from experiments.poses.results import spread_metrics
-from experiments.poses.settings import blur_for, slopes_imager, spot_imager
+from experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
 from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
@@ -33,17 +33,14 @@ class PoseKnowledgeModule(Analysis):
     Args:
         lens: as designed; its elements may have poses.
         experiment: name of the experiment.
+        folder: where tables go.
+        bench: wavelength and sensor; arrangements have sources and planes of their own.
+        light: light and noise; its photons are those of all images of an arrangement together.
         values: where the lens and the sources are, by name, degrees and mm.
         variables: name → settings of `Pose`: what is unknown.
         arrangements: name → `sources` (S, 3), mm; `planes`, mm; and `variables`, names that are
             unknown here besides those of all.
-        wavelength: nm.
-        sensor: the pixels.
-        photons: of all images of an arrangement together, behind the lens.
-        read_noise: RMS of a pixel, electrons.
-        imager: settings of `SpotImager`; see `spot_imager`.
-        slopes: those that differ for derivatives.
-        folder: where tables go.
+        images: settings of the model's images.
         monte_carlo: measurements with other photons, of each arrangement, whose estimates are
             compared with the bounds; 0 for none.
         seed: of simulations.
@@ -56,16 +53,13 @@ class PoseKnowledgeModule(Analysis):
         self,
         lens: Lens,
         experiment: str,
+        folder: str,
+        bench: Bench,
+        light: Light,
         values: Mapping[str, float],
         variables: Mapping[str, Mapping[str, Any] | None],
         arrangements: Mapping[str, Mapping[str, Any]],
-        wavelength: float,
-        sensor: Sensor,
-        folder: str,
-        photons: int = 4_000_000,
-        read_noise: float = 2.0,
-        imager: Mapping[str, Any] | None = None,
-        slopes: Mapping[str, Any] | None = None,
+        images: ImageSettings,
         monte_carlo: int = 0,
         seed: int = 0,
     ) -> None:
@@ -75,10 +69,8 @@ class PoseKnowledgeModule(Analysis):
         if not variables or not arrangements:
             raise InputError("variables, arrangements: give at least one of each")
         self.seed = int(seed)
-        self.photons, self.read_noise = int(photons), float(read_noise)
+        self.bench, self.light, self.images = bench, light, images
         self.monte_carlo = repetitions(monte_carlo)
-        self.sensor, self.wavelength = sensor, float(wavelength)
-        self.imager, self.slopes = dict(imager or {}), dict(slopes or {})
         self.poses = {
             name: self._pose(name, entry, values, variables) for name, entry in arrangements.items()
         }
@@ -96,18 +88,18 @@ class PoseKnowledgeModule(Analysis):
         return numbers
 
     def tables(self) -> dict[str, list[Row]]:
-        """Return `bounds` and `combinations`."""
-        return {"bounds": self.bound_rows(), "combinations": self.combination_rows()}
+        """Return `bounds` and `eigenvectors`."""
+        return {"bounds": self.bound_rows(), "eigenvectors": self.eigenvector_rows()}
 
     def figures(self) -> Figures:
         """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
-        return knowledge_figures(self.arrangements, self.lens.name, self.photons)
+        return knowledge_figures(self.arrangements, self.lens.name, int(self.light.photons))
 
     def bound_rows(self) -> list[Row]:
         """Return rows of bounds.csv, one for each variable of each arrangement."""
         rows: list[Row] = []
         for found in self.arrangements:
-            names, correlations = found.pose.names, found.known.correlations
+            names, correlations = found.pose.names, found.information.correlations
             for place, name in enumerate(names):
                 others = correlations[place].abs().clone()
                 others[place] = -1.0
@@ -116,7 +108,7 @@ class PoseKnowledgeModule(Analysis):
                     {
                         "arrangement": found.name,
                         "variable": name,
-                        "value": found.pose.found()[name],
+                        "value": found.pose.file_values()[name],
                         "bound": float(found.bounds[place]),
                         "most_like": names[other],
                         "correlation": float(correlations[place, other]),
@@ -124,16 +116,16 @@ class PoseKnowledgeModule(Analysis):
                 )
         return rows
 
-    def combination_rows(self) -> list[Row]:
-        """Return rows of combinations.csv, one for each combination, the worst known first."""
+    def eigenvector_rows(self) -> list[Row]:
+        """Return rows of eigenvectors.csv, the one with the largest variance first."""
         return [
             {
                 "arrangement": found.name,
                 "standard_deviation": float(spread),
-                **dict(zip(found.pose.names, combination.tolist(), strict=True)),
+                **dict(zip(found.pose.names, vector.tolist(), strict=True)),
             }
             for found in self.arrangements
-            for spread, combination in zip(found.spread, found.combinations, strict=True)
+            for spread, vector in zip(found.spread, found.eigenvectors, strict=True)
         ]
 
     def _pose(
@@ -144,45 +136,37 @@ class PoseKnowledgeModule(Analysis):
         variables: Mapping[str, Mapping[str, Any] | None],
     ) -> Pose:
         """Return the lens where it is, with the unknowns of an arrangement as variables."""
-        for key in entry:
-            if key not in _KEYS:
-                raise InputError(
-                    f"arrangements.{name}: unknown key '{key}' (allowed: {', '.join(_KEYS)})"
-                )
+        check_keys(entry, _KEYS, f"arrangements.{name}")
         if not entry.get("sources"):
             raise InputError(
                 f"arrangements.{name}: sources are missing; give one (x, y, z) or more"
             )
-        place = Pose(copy.deepcopy(self.lens), entry["sources"], {}, entry.get("planes") or (0.0,))
+        bench = replace(self.bench, sources=entry["sources"], planes=entry.get("planes") or (0.0,))
+        place = bench.pose(copy.deepcopy(self.lens))
         place.put(values)
         return place.varying({**variables, **(entry.get("variables") or {})})
 
     def _evaluate(self, number: int, name: str, pose: Pose) -> Arrangement:
         measured = self._measurement(number, pose, 0)
-        own = spot_imager(measured, self.wavelength, self.imager)
-        slopes = slopes_imager(measured, self.wavelength, self.imager, self.slopes)
-        known = knowledge(pose, own, measured, slopes, blur_for(measured, slopes))
-        spread, combinations = known.combinations(pose.scale)
+        wavelength, settings = self.bench.wavelength, self.images
+        own = spot_imager(measured, wavelength, settings.imager)
+        slopes = slopes_imager(measured, wavelength, settings.imager, settings.slopes)
+        information = fisher_information(pose, own, measured, slopes, blur_for(measured, slopes))
+        spread, eigenvectors = information.eigenvectors(pose.scale)
         estimates = None
         if self.monte_carlo:
             theta = pose.scale * pose.scaled.detach()
             moved = [
-                known.correction(self._measurement(number, pose, seed))
+                information.correction(self._measurement(number, pose, seed))
                 for seed in range(1, self.monte_carlo + 1)
             ]
             estimates = (theta + torch.stack(moved)) / pose.units
-        return Arrangement(name, pose, known, spread, combinations, estimates)
+        return Arrangement(name, pose, information, spread, eigenvectors, estimates)
 
     def _measurement(self, number: int, pose: Pose, seed: int) -> Measurement:
         count = len(pose.sources) * len(pose.planes)
-        return simulated_at(
-            pose,
-            self.wavelength,
-            self.sensor,
-            max(1, self.photons // count),
-            self.read_noise,
-            draw(self.seed, number, seed),
-        )
+        light = replace(self.light, photons=max(1, int(self.light.photons) // count))
+        return simulate(pose, self.bench, light, draw(self.seed, number, seed))
 
     def _metrics(self, found: Arrangement) -> dict[str, float]:
         numbers = {
@@ -192,15 +176,15 @@ class PoseKnowledgeModule(Analysis):
         numbers[f"knowledge/{found.name}/worst"] = min(float(found.spread[0]), UNSEEN)
         numbers[f"knowledge/{found.name}/unseen"] = float((found.spread > UNSEEN).sum())
         if found.estimates is not None:
-            truth = found.pose.found()
+            truth = found.pose.file_values()
             numbers |= spread_metrics(
                 found.name, found.pose.names, found.estimates, found.bounds, truth
             )
         return numbers
 
     def _verdict(self, found: Arrangement) -> str:
-        """Return the combination that is known worst, in words."""
-        worst = found.combinations[0]
+        """Return the eigenvector with the largest variance, in words."""
+        worst = found.eigenvectors[0]
         order = worst.abs().argsort(descending=True)
         names = [
             f"{float(worst[i]):+.2f} {found.pose.names[int(i)]}"

@@ -56,7 +56,7 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
     scales = {
         n: float(s)
         for f in arrangements
-        for n, s in zip(f.pose.names, f.pose.scale_in_units, strict=True)
+        for n, s in zip(f.pose.names, f.pose.file_scale, strict=True)
     }
     far = 0.0
     for found in arrangements:
@@ -87,7 +87,7 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
 
 
 def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
-    """Draw standard deviations of combinations, from the worst known to the best."""
+    """Draw standard deviations along the eigenvectors, from the largest to the smallest."""
     for number, (found, colour) in enumerate(_coloured(arrangements)):
         spread = found.spread.clone()
         unseen = int((spread > UNSEEN).sum())
@@ -103,18 +103,18 @@ def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
             label=label,
         )
     axes.set_yscale("log")
-    axes.set_xlabel("combination, from the worst known to the best", fontsize=SMALL + 1)
+    axes.set_xlabel("eigenvector, from the largest variance to the smallest", fontsize=SMALL + 1)
     axes.set_ylabel("standard deviation, of scales", fontsize=SMALL + 1)
     ruled_axes(axes)
     axes.legend(frameon=False, fontsize=SMALL)
 
 
 def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> None:
-    """Draw the parts of the worst known combination of each arrangement."""
+    """Draw the parts of the eigenvector of largest variance of each arrangement."""
     names = _names(arrangements)
     table = np.full((len(arrangements), len(names)), np.nan)
     for row, found in enumerate(arrangements):
-        worst = found.combinations[0]
+        worst = found.eigenvectors[0]
         # Of one sign: its largest part is positive.
         worst = worst * torch.sign(worst[worst.abs().argmax()])
         for name, part in zip(found.pose.names, worst.tolist(), strict=True):
@@ -135,15 +135,15 @@ def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> N
         )
     axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
     axes.set_xticks(range(len(names)), [variable_label(n) for n in names], fontsize=SMALL)
-    axes.set_title("the combination that each knows worst", fontsize=SMALL + 1)
+    axes.set_title("the eigenvector of largest variance", fontsize=SMALL + 1)
     figure.colorbar(shown, ax=axes, pad=0.01).ax.tick_params(labelsize=SMALL)
 
 
 def _corner(found: Arrangement, name: str) -> Figure:
     units = found.pose.units
-    values = torch.tensor(list(found.pose.found().values()), dtype=torch.float64)
+    values = torch.tensor(list(found.pose.file_values().values()), dtype=torch.float64)
     return corner_figure(
-        found.known.covariance / torch.outer(units, units),
+        found.information.covariance / torch.outer(units, units),
         [variable_label(name) for name in found.pose.names],
         found.pose.unit_names,
         values,

@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.alignment.information import Knowledge
+from dolens.alignment.information import FisherInformation
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.optics.lens import Lens
@@ -37,7 +37,7 @@ class FittedPoses(Protocol):
         stages: of every fit.
         initial: (P,), the variables where each fit began.
         history: a row of numbers for every iteration.
-        known: name of a fit → the information in its measurement.
+        information: name of a fit → the information in its measurement.
         estimates: name of a fit → estimates from other measurements, where there are any.
     """
 
@@ -48,7 +48,7 @@ class FittedPoses(Protocol):
     stages: Sequence[Stage]
     initial: Sequence[Tensor]
     history: Sequence[Row]
-    known: Mapping[str, Knowledge]
+    information: Mapping[str, FisherInformation]
     estimates: Mapping[str, Estimates]
 
     def truth(self, number: int) -> Mapping[str, float]:
@@ -123,8 +123,8 @@ def _convergence(fitted: FittedPoses, number: int) -> Figure:
 def _corner(fitted: FittedPoses, number: int) -> Figure:
     fit, pose = fitted.fits[number], fitted.poses[number]
     units = pose.units.cpu()
-    covariance = fitted.known[fit.name].covariance.cpu() / torch.outer(units, units)
-    found = torch.tensor([pose.found()[name] for name in pose.names], dtype=torch.float64)
+    covariance = fitted.information[fit.name].covariance.cpu() / torch.outer(units, units)
+    found = torch.tensor([pose.file_values()[name] for name in pose.names], dtype=torch.float64)
     truth = fitted.truth(number)
     true = torch.tensor([truth.get(name, math.nan) for name in pose.names], dtype=torch.float64)
     estimates = fitted.estimates.get(fit.name)

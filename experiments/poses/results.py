@@ -1,39 +1,80 @@
-"""What a pose fit found, as rows of a table and as metrics: errors, bounds, spread, coverage."""
+"""The results of a pose fit are rows of a table and metrics: errors, bounds, spread, coverage."""
 
 import math
 from collections.abc import Mapping, Sequence
 
+import torch
 from torch import Tensor
 
-from dolens.alignment.information import Knowledge
+from dolens.alignment.information import FisherInformation
 from dolens.alignment.pose import Pose
+from experiments.poses.settings import Stage
 from experiments.tables import Row
 
 # Of a normal distribution, 95 % lies within so many standard deviations.
 _WITHIN = 1.959964
 
 
+def history_row(
+    fit: str,
+    place: int,
+    stage: Stage,
+    pose: Pose,
+    terms: Mapping[str, Tensor],
+    optimizer: torch.optim.Optimizer,
+    seconds: float,
+) -> dict[str, float | str]:
+    """Return a row of history.csv: an iteration, with the values that it reached.
+
+    Args:
+        fit: its name.
+        place: number of the stage, from 0.
+        stage: its settings.
+        pose: after the iteration.
+        terms: of the loss, by name.
+        optimizer: of the stage, whose damping is told where it has one.
+        seconds: that the iteration took.
+    """
+    row: dict[str, float | str] = {
+        "fit": fit,
+        "stage": place + 1,
+        "optimizer": stage.optimizer,
+        "loss": float(sum(terms.values())),
+        **{f"loss/{name}": float(value) for name, value in terms.items()},
+        **pose.file_values(),
+        "seconds": seconds,
+    }
+    last = getattr(optimizer, "last", None)
+    if last is not None:
+        row["damping"] = last.damping
+    return row
+
+
 def pose_rows(
-    fit: str, pose: Pose, initial: Tensor, known: Knowledge, truth: Mapping[str, float]
+    fit: str,
+    pose: Pose,
+    initial: Tensor,
+    information: FisherInformation,
+    truth: Mapping[str, float],
 ) -> list[Row]:
-    """A row for each variable, in degrees and mm.
+    """Return a row for each variable, in degrees and mm.
 
     Args:
         fit: its name.
         pose: what was found.
         initial: (P,), the point u where it began.
-        known: of the pose.
+        information: on the pose.
         truth: by name; NaN stands for what is not known.
 
     Returns:
         `true`, `initial`, `found`, `error`, `bound`, and `own_bound`, which would be the bound if
         all that the fit holds were exact.
     """
-    begun = (initial * pose.scale_in_units).tolist()
-    bounds = (known.bounds / pose.units).tolist()
-    own = (known.own_covariance.diagonal().sqrt() / pose.units).tolist()
+    begun = (initial * pose.file_scale).tolist()
+    bounds = (information.bounds / pose.units).tolist()
+    own = (information.own_covariance.diagonal().sqrt() / pose.units).tolist()
     rows: list[Row] = []
-    for place, (name, value) in enumerate(pose.found().items()):
+    for place, (name, value) in enumerate(pose.file_values().items()):
         true = truth.get(name, math.nan)
         rows.append(
             {
@@ -51,7 +92,9 @@ def pose_rows(
 
 
 def pose_metrics(rows: Sequence[Row]) -> dict[str, float]:
-    """`pose/<fit>/<variable>`, `pose_bound/...` and, where there is a truth, `pose_error/...`."""
+    """Return `pose/<fit>/<variable>`, `pose_bound/...` and, where there is a truth,
+    `pose_error/...`.
+    """
     numbers: dict[str, float] = {}
     for row in rows:
         name = f"{row['fit']}/{row['variable']}"
@@ -62,7 +105,7 @@ def pose_metrics(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def error_over_bound(rows: Sequence[Row]) -> float | None:
-    """Root mean square over all variables with a truth; None where there are none."""
+    """Return the root mean square over all variables with a truth; None where there are none."""
     ratios = [row["error"] / row["bound"] for row in rows if math.isfinite(row["error"])]
     return math.sqrt(sum(r * r for r in ratios) / len(ratios)) if ratios else None
 
@@ -74,7 +117,7 @@ def spread_columns(
     bounds: Tensor,
     truth: Mapping[str, float],
 ) -> list[Row]:
-    """Rows of `pose_rows` with what estimates from M measurements say of each variable.
+    """Return rows of `pose_rows` with what estimates from M measurements say of each variable.
 
     Further columns are `measurements`, their number; `rms_over_bound` of the errors; and
     `within_1`, `within_2` and `within_95`, the shares of them within one bound, within two, and
@@ -95,7 +138,8 @@ def spread_columns(
 
 
 def error_statistics(off: Tensor) -> dict[str, float]:
-    """Root mean square of errors over their bounds, and how many of them lie within some bounds.
+    """Return the root mean square of errors over their bounds, and how many of them lie within some
+    bounds.
 
     Args:
         off: of any shape; NaN where there is no truth.
@@ -116,10 +160,12 @@ def spread_metrics(
     bounds: Tensor,
     truth: Mapping[str, float],
 ) -> dict[str, float]:
-    """How estimates from M measurements scatter: `pose_spread_over_bound/<fit>/<variable>`, which
-    has a standard error of 1/√(2M); `pose_bias_over_bound/...` of their mean, 1/√M;
-    `pose_coverage/...`, the share of 95 % intervals (± 1.96 bounds) that hold the truth; and
-    `pose_within_1_bound/...` and `pose_within_2_bounds/...`, of narrower and wider ones.
+    """Return how estimates from M measurements scatter.
+
+    The numbers are `pose_spread_over_bound/<fit>/<variable>`, which has a standard error of
+    1/√(2M); `pose_bias_over_bound/...` of their mean, 1/√M; `pose_coverage/...`, the share of 95 %
+    intervals (± 1.96 bounds) that hold the truth; and `pose_within_1_bound/...` and
+    `pose_within_2_bounds/...`, of narrower and wider ones.
 
     Args:
         fit: its name.

@@ -1,12 +1,13 @@
-"""What a pose fit is made of: what is to be found, and by which stages."""
+"""The settings of a pose fit say what is to be found, and by which stages."""
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dolens.alignment.measurement import Measurement
-from dolens.errors import InputError
+from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 
@@ -20,8 +21,21 @@ _RAYS_OF_A_SLOPE, _LEAST_BLUR = 450.0, 0.5
 
 
 @dataclass(frozen=True)
+class ImageSettings:
+    """Gives settings of the images that a pose is compared by.
+
+    Attributes:
+        imager: settings of `SpotImager` besides sensor and wavelength; see `spot_imager`.
+        slopes: those that differ for derivatives.
+    """
+
+    imager: Mapping[str, Any] = field(default_factory=dict)
+    slopes: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Stage:
-    """Some iterations by one optimizer.
+    """Describes some iterations by one optimizer.
 
     Attributes:
         optimizer: `adam` or `dls`.
@@ -50,11 +64,7 @@ class Stage:
 
     def __post_init__(self) -> None:
         for key, allowed in (("optimizer", OPTIMIZERS), ("loss", LOSSES)):
-            if getattr(self, key) not in allowed:
-                raise InputError(
-                    f"stages: {key} '{getattr(self, key)}' is unknown; allowed: "
-                    f"{', '.join(allowed)}"
-                )
+            check_choice(getattr(self, key), allowed, f"stages: {key}")
         if self.loss != "s21" and self.centroid_weight is not None:
             raise InputError(f"stages: centroid_weight is of loss s21, not {self.loss}")
         if self.iterations < 1:
@@ -63,7 +73,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Fit:
-    """One pose to find.
+    """Describes one pose to find.
 
     Attributes:
         name: what it is called.
@@ -79,16 +89,83 @@ class Fit:
     held_from: str | None = None
 
 
+@dataclass(frozen=True)
+class FitPlan:
+    """Lists the poses that are fitted, and the stages of each fit.
+
+    Attributes:
+        fits: in their order; a fit may hold what an earlier one found.
+        stages: of each fit, in turn.
+        imager: settings of `SpotImager` besides sensor and wavelength; see `spot_imager`.
+        centroid_weight: μ of S21, 1/mm².
+    """
+
+    fits: tuple[Fit, ...]
+    stages: tuple[Stage, ...]
+    imager: Mapping[str, Any] = field(default_factory=dict)
+    centroid_weight: float = 1.0
+
+    def number(self, name: str) -> int:
+        """Return the number of a fit by its name."""
+        return [fit.name for fit in self.fits].index(name)
+
+    def stage_at(self, iteration: int) -> int:
+        """Return the number of the stage that an iteration of a fit belongs to."""
+        ends = itertools.accumulate(stage.iterations for stage in self.stages)
+        return next((i for i, end in enumerate(ends) if iteration < end), len(self.stages) - 1)
+
+    def check_imagers(self, sensor: Sensor, wavelength: float) -> None:
+        """Refuse a mistake in the images of the last stage before the first one begins.
+
+        Raises:
+            InputError: an unknown key, or a number out of range.
+        """
+        for stage in self.stages:
+            plain_imager(sensor, wavelength, self.imager, stage.imager, stage.slopes)
+
+
+def fit_plan(
+    fits: Mapping[str, Mapping[str, Any]],
+    stages: Sequence[Mapping[str, Any]],
+    imager: Mapping[str, Any] | None = None,
+    centroid_weight: float = 1.0,
+) -> FitPlan:
+    """Return a plan from its settings.
+
+    Args:
+        fits: name → `variables`, `truth`, and `held: {from, variables}`.
+        stages: settings of `Stage`, in turn.
+        imager: see `FitPlan`.
+        centroid_weight: see `FitPlan`.
+
+    Raises:
+        InputError: an unknown key, no fit, no stage, or a fit that holds what none before it finds.
+    """
+    plan = FitPlan(
+        tuple(fit_of(name, settings) for name, settings in fits.items()),
+        tuple(stage_of(settings) for settings in stages),
+        dict(imager or {}),
+        float(centroid_weight),
+    )
+    if not plan.stages or not plan.fits:
+        raise InputError("misalignment: give at least one fit and one stage")
+    for number, fit in enumerate(plan.fits):
+        earlier = [before.name for before in plan.fits[:number]]
+        if fit.held_from is not None and fit.held_from not in earlier:
+            raise InputError(
+                f"fits.{fit.name}.held.from: '{fit.held_from}' is no earlier fit; allowed: "
+                f"{', '.join(earlier) or 'none'}"
+            )
+    return plan
+
+
 def stage_of(settings: Mapping[str, Any]) -> Stage:
-    """A stage as a configuration gives it.
+    """Return the stage that a configuration describes.
 
     Raises:
         InputError: an unknown key, or a number out of range.
     """
-    try:
-        stage = Stage(**settings)
-    except TypeError as error:
-        raise InputError(f"stages: {error}") from None
+    stage = call_with_settings(Stage, settings, "stages")
     if stage.variables is None:
         return stage
     return replace(stage, variables=tuple(stage.variables))
@@ -97,7 +174,7 @@ def stage_of(settings: Mapping[str, Any]) -> Stage:
 def plain_imager(
     sensor: Sensor, wavelength: float, *settings: Mapping[str, Any]
 ) -> tuple[SpotImager, bool]:
-    """What settings make before there is a measurement, and whether its patches are `auto`.
+    """Return the imager before there is a measurement, and whether its patches are `auto`.
 
     Raises:
         InputError: an unknown key, or a number out of range.
@@ -106,10 +183,7 @@ def plain_imager(
     auto = merged.get("subpixels") == AUTO
     if auto:
         merged.pop("subpixels")
-    try:
-        return SpotImager(sensor, wavelength, **merged), auto
-    except TypeError as error:
-        raise InputError(f"imager: {error}") from None
+    return call_with_settings(SpotImager, merged, "imager", sensor, wavelength), auto
 
 
 def spot_imager(
@@ -118,7 +192,7 @@ def spot_imager(
     *settings: Mapping[str, Any],
     widened: float = 1.0,
 ) -> SpotImager:
-    """What models a measurement's images.
+    """Return the imager that models a measurement's images.
 
     `subpixels: auto` makes a ray's patch of light 1.2 times as wide as rays are apart where the
     measured light is: narrower ones let the rays' pattern show as moiré, wider ones blur rims.
@@ -142,13 +216,15 @@ def spot_imager(
 def slopes_imager(
     measurement: Measurement, wavelength: float, *settings: Mapping[str, Any]
 ) -> SpotImager:
-    """The same for derivatives, with `auto` patches twice as wide."""
+    """Return the imager for derivatives, whose `auto` patches are twice as wide."""
     return spot_imager(measurement, wavelength, *settings, widened=_SLOPES_WIDENED)
 
 
 def blur_for(measurement: Measurement, imager: SpotImager) -> float:
-    """Pixels by which derivatives are averaged so that 450 rays make each, 0 where less than half a
-    pixel would do: a Gaussian of the deviation b averages 4π·b² pixels and one more.
+    """Return the pixels by which derivatives are averaged so that 450 rays make each.
+
+    It is 0 where less than half a pixel would do: a Gaussian of the deviation b averages 4π·b²
+    pixels and one more.
 
     With 37 rays a pixel (the fit at 30° with 800 000) derivatives by two patterns of rays agree so
     to some per cent, where without it they seem to tell three times as much as they do.
@@ -159,19 +235,19 @@ def blur_for(measurement: Measurement, imager: SpotImager) -> float:
 
 
 def _rays_a_pixel(measurement: Measurement, imager: SpotImager) -> float:
-    """Where the measured light is; the lens lets 1/reach² of the disc through that rays aim at."""
+    """Return the rays that reach a pixel where the measured light is; the lens lets 1/reach² of the
+    disc through that rays aim at.
+    """
     return imager.rays / imager.reach**2 / float(measurement.lit_pixels.max())
 
 
 def fit_of(name: str, settings: Mapping[str, Any]) -> Fit:
-    """A fit as a configuration gives it.
+    """Return the fit that a configuration describes.
 
     Raises:
         InputError: an unknown key.
     """
-    unknown = set(settings) - {"variables", "truth", "held"}
-    if unknown:
-        raise InputError(f"fits.{name}: unknown key '{unknown.pop()}'")
+    check_keys(settings, ("variables", "truth", "held"), f"fits.{name}")
     held = dict(settings.get("held") or {})
     return Fit(
         name,

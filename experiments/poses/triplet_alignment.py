@@ -2,7 +2,6 @@
 
 import copy
 import logging
-import math
 import time
 from collections.abc import Iterable, Sequence
 from typing import ClassVar
@@ -16,15 +15,16 @@ from dolens.alignment.element_fit import (
     fit_element,
     information_root,
     least_covariance,
-    named_element,
+    most_likely_element,
 )
 from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
-from dolens.alignment.pixel_moments import Pixels, grid_error
 from dolens.alignment.spot_moments import MomentModel, moment_model, one_thread
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.parameter_units import DEGREE, unit_of
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
+from experiments.poses.alignment_checks import one_exposure_error, sampling_error
 from experiments.poses.alignment_figures import Setup, alignment_figure
 from experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
 from experiments.poses.alignment_settings import Detector, Misalignments
@@ -33,10 +33,8 @@ from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
-# Radians and mm as tables have them: degrees and µm.
-_DEGREES, _MICROMETRES = math.degrees(1.0), 1e3
-# Rings and arms with many rays in every pixel, and how many places of the grid are tried.
-_DENSE, _PLACES = PupilRays(40, 120), 16
+# Rings and arms with many rays in every pixel.
+_DENSE = PupilRays(40, 120)
 
 
 class TripletAlignmentModule(Analysis):
@@ -120,15 +118,17 @@ class TripletAlignmentModule(Analysis):
         element, true = self._cases(generator)
         errors = _of_whole_lens(element, true, len(names))
         measured = simulated_moments(simulation, errors, self.photons, generator)
-        checks = _sampling_error(whole, simulation, errors, measured)
+        checks = sampling_error(whole, simulation, errors, measured)
         if self.pixels is not None:
             dense = self.spots.rays(lens, _DENSE)
             model = moment_model(lens, dense, every, self.sensor, None, whole.size)
-            checks |= _grid_error(model, self.pixels, errors[:1], measured[torch.tensor([0])])
+            checks |= one_exposure_error(
+                model, self.pixels, errors[:1], measured[torch.tensor([0])]
+            )
 
         started = time.perf_counter()
         fits = [fit_element(model, measured, self.iterations) for model in models]
-        named, share = named_element([fit.chi_squared for fit in fits])
+        named, share = most_likely_element([fit.chi_squared for fit in fits])
         seconds = time.perf_counter() - started
         rows = torch.arange(len(true))
         found = torch.stack([fit.errors for fit in fits])[named, rows]
@@ -137,9 +137,7 @@ class TripletAlignmentModule(Analysis):
         covariance = least_covariance(root)
         bound = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         known = least_covariance(root[:, : len(POSE), : len(POSE)])
-        units = torch.tensor(
-            [_DEGREES] * 2 + [_MICROMETRES] * (2 + len(self.sensor)), dtype=torch.float64
-        )
+        units = _table_units((*POSE, *self.sensor))
         return Alignment(
             elements=self.elements,
             columns=[*COLUMNS, *(SENSOR_COLUMNS[name] for name in self.sensor)],
@@ -174,6 +172,12 @@ class TripletAlignmentModule(Analysis):
         )
 
 
+def _table_units(names: Sequence[str]) -> Tensor:
+    """Return what a number of the lens is multiplied by for a table in degrees and µm, (P,)."""
+    factors = [1.0 / unit_of(name).factor if unit_of(name) is DEGREE else 1e3 for name in names]
+    return torch.tensor(factors, dtype=torch.float64)
+
+
 def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
     """Return the poses of all elements and the sensor's place (K, E·4 + Q).
 
@@ -185,45 +189,6 @@ def _of_whole_lens(element: Tensor, true: Tensor, elements: int) -> Tensor:
     poses = true.new_zeros(len(true), elements, len(POSE))
     poses[torch.arange(len(true)), element] = true[:, : len(POSE)]
     return torch.cat([poses.flatten(1), true[:, len(POSE) :]], 1)
-
-
-def _sampling_error(
-    fitted: MomentModel, simulated: MomentModel, errors: Tensor, measured: MeasuredMoments
-) -> dict[str, float]:
-    """Return the difference of two quadratures of the same pupil, over the noise of the moments."""
-    difference = fitted.moments(errors, measured.origin) - simulated.moments(
-        errors, measured.origin
-    )
-    apart = measured.over_noise(difference)
-    return {
-        "alignment/sampling_error_over_noise": float(apart.square().mean().sqrt()),
-        "alignment/sampling_error_over_noise/largest": float(apart.abs().max()),
-    }
-
-
-def _grid_error(
-    dense: MomentModel, pixels: Pixels, errors: Tensor, measured: MeasuredMoments
-) -> dict[str, float]:
-    """Return the error of one exposure instead of many dithered ones, over the noise.
-
-    Args:
-        dense: model with many rays in every pixel.
-        pixels: those of the sensor.
-        errors: (1, P), those of one lens.
-        measured: its moments.
-    """
-    side = (torch.arange(math.isqrt(_PLACES)) + 0.5) / math.isqrt(_PLACES)
-    places = torch.cartesian_prod(side, side)
-    difference = grid_error(
-        dense.points(errors)[0],
-        dense.shares,
-        measured.origin[0],
-        dense.size,
-        pixels.pitch,
-        places,
-    )
-    apart = measured.over_noise(difference[:, None])
-    return {"alignment/pixel_grid_over_noise": float(apart.square().mean().sqrt())}
 
 
 def _information_roots(

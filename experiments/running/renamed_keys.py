@@ -38,8 +38,17 @@ class Renamed:
     targets: Mapping[str, str] = field(default_factory=dict)
 
 
+_SPECTRA = {"apart": "monochromatic", "together": "polychromatic"}
+
 RENAMED = Renamed(
     keys=(
+        Key("merit.colours", "merit.reference_spectrum", values=_SPECTRA),
+        Key("evaluation.colours", "evaluation.reference_spectrum", values=_SPECTRA),
+        Key("merit.most_vignetted", "merit.max_vignetting"),
+        Key("evaluation.most_vignetted", "evaluation.max_vignetting"),
+        Key("optimizer.least_squares.reach", "optimizer.least_squares.trust_radius"),
+        Key("optimizer.least_squares.most", "optimizer.least_squares.max_trust_radius"),
+        Key("optimizer.most", "optimizer.max_variables"),
         Key("optimizer.network.lr", None, instead="learning_rates.network is the rate"),
         Key("callbacks.pictures.most_frequency", "module.mtf_max_frequency"),
         Key("module.rings", "module.spots.pupil.rings"),
@@ -53,6 +62,7 @@ RENAMED = Renamed(
             ("alignment", "pose_accuracy", "pose_knowledge", "speed", "tolerances"), "figures"
         ),
     },
+    values={"semi_diameters": {"follow": "automatic"}},
     targets={
         **dict.fromkeys(
             (

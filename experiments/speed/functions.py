@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import torch
 
-from dolens.optics.backend import choose_backend
-from dolens.rendering.auto.probe import grey_levels
+from dolens.rendering.auto.probes import grey_levels
 from dolens.rendering.auto.survey import spread_pixels, survey
+from dolens.rendering.imaging_system import ImagingSystem
 from experiments.speed.renders import Subject
 from experiments.speed.timing import by_turns
 
@@ -24,12 +24,11 @@ def function_rows(
         samples: strata along each side of the pupil.
         seconds: that timing may take.
     """
-    system = subject.lens.system()
-    backend = choose_backend(system, subject.lens.backend)
+    imaging = ImagingSystem.of(subject.lens.system(), subject.scene, subject.sensor)
     places = spread_pixels(subject.sensor, _POINTS)
 
     def functions(count: int, seed: int) -> torch.Tensor:
-        found = survey(system, subject.scene, subject.sensor, *places, count, backend, seed)
+        found = survey(imaging, places, count, seed)
         return found.functions(_SIZE, found.chief is not None)
 
     truth = functions(_TRUE_SAMPLES, 0)

@@ -17,9 +17,7 @@ from dolens.rendering.auto.agreement import (
     judging_samples,
 )
 from dolens.rendering.auto.auto_renderer import AutoRenderer
-from dolens.rendering.auto.probe import probe_image
-from dolens.rendering.auto.reference import Reference, reference
-from dolens.rendering.auto.trial import without_diffraction
+from dolens.rendering.auto.probes import Reference, probe_image, reference
 from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
@@ -29,6 +27,8 @@ from experiments.speed.timing import by_turns, peak_megabytes
 
 # Renders by more rays than these are timed on a window, and that multiplied.
 _MANY, _WINDOW, _MARGIN = 128, 64, 48
+# Pixels along each side of functions, where no plan says how many are enough.
+_PSF_SIZE = 65
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,8 @@ def render_contenders(
             auto.make_plan(subject.lens, subject.scene, values)
             plans.append(Contender(model, f"{model}, {tolerance:g} grey levels", auto))
     found = [Contender("rays", f"{n * n} rays", RayRenderer(sensor, n)) for n in samples]
-    size = max(
-        (p.renderer.choice.renderer.size for p in plans
-         if isinstance(p.renderer.choice.renderer, PsfRenderer)),
-        default=65,
-    )  # fmt: skip
+    sizes = [p.renderer.psf_size for p in plans]
+    size = max((size for size in sizes if size is not None), default=_PSF_SIZE)
     for registration in ("pinhole", "chief_rays"):
         for count in fields:
             renderer = PsfRenderer(sensor, (count, count), 32, size, registration)
@@ -120,18 +117,17 @@ def render_rows(
         seconds: that times of one group of contenders may take.
     """
     texture = subject.texture()
-    judge = reference(
-        subject.lens, subject.scene, subject.sensor, texture, reference_samples, seed=1
-    )
-    fast = [c for c in contenders if not _is_slow(c)]
-    slow = [c for c in contenders if _is_slow(c)]
+    rays = RayRenderer(subject.sensor, reference_samples)
+    judge = reference(rays, subject.lens, subject.scene, texture, seed=1)
+    fast = [c for c in contenders if not _is_slow(subject, c)]
+    slow = [c for c in contenders if _is_slow(subject, c)]
     times = {}
     for backward in (False, True):
         calls = {c.setting: _call(subject, c, texture, backward) for c in fast}
         times[backward] = by_turns(calls, seconds)
         for contender in slow:
             window, factor = _window(subject)
-            part = replace(contender, renderer=replace(contender.renderer, sensor=window))
+            part = replace(contender, renderer=contender.renderer.on(window))
             call = _call(subject, part, texture, backward)
             times[backward][contender.setting] = factor * by_turns({"": call}, 0.0, 1)[""]
     rows = []
@@ -149,7 +145,7 @@ def render_rows(
                 "with_gradient_s": times[True][contender.setting],
                 "peak_mb": (
                     float("nan")
-                    if _is_slow(contender)
+                    if _is_slow(subject, contender)
                     else peak_megabytes(_call(subject, contender, texture, True))
                 ),
             }
@@ -157,9 +153,11 @@ def render_rows(
     return rows, judge
 
 
-def _is_slow(contender: Contender) -> bool:
-    renderer = contender.renderer
-    return isinstance(renderer, RayRenderer) and renderer.pupil_samples**2 > _MANY
+def _is_slow(subject: Subject, contender: Contender) -> bool:
+    """Whether it traces many rays for each pixel and wavelength."""
+    renderer, sensor = contender.renderer, subject.sensor
+    values = sensor.height * sensor.width * len(subject.scene.wavelengths)
+    return renderer.monte_carlo and renderer.rays_per_image(subject.scene) > _MANY * values
 
 
 def _window(subject: Subject) -> tuple[Sensor, float]:
@@ -190,25 +188,19 @@ def _call(
 def _image(subject: Subject, contender: Contender, texture: Tensor, judge: Reference) -> Tensor:
     """Return the contender's image; with rays, which are many, only the windows that are used."""
     lens, scene = subject.lens, subject.scene
-    renderer = _without_diffraction(contender.renderer)
+    # As the reference is of rays.
+    renderer = contender.renderer.without_diffraction()
     with torch.no_grad():
-        if not isinstance(renderer, RayRenderer):
+        if not renderer.monte_carlo:
             return renderer.render(lens, scene, texture, 5)
         sensor = subject.sensor
         shape = (1, len(scene.depths), texture.shape[1], sensor.height, sensor.width)
         image = texture.new_zeros(shape)
         for top, left, height, width in judge.windows:
             window = sensor.window(top, left, height, width)
-            part = replace(renderer, sensor=window).render(lens, scene, texture, 5)
+            part = renderer.on(window).render(lens, scene, texture, 5)
             image[..., top : top + height, left : left + width] = part
         return image
-
-
-def _without_diffraction(renderer: Renderer) -> Renderer:
-    """Return the renderer without diffraction, since the reference has none."""
-    if isinstance(renderer, AutoRenderer):
-        renderer = renderer.choice.renderer
-    return without_diffraction(renderer)
 
 
 def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> dict[str, Agreement]:
@@ -236,9 +228,9 @@ def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> di
     judge = gradients_of_rays(rendered(RayRenderer(sensor, side)), texture, measure, 101)
     found = {}
     for contender in contenders:
-        if _is_slow(contender):
+        if _is_slow(subject, contender):
             continue
-        render = rendered(_without_diffraction(contender.renderer))
+        render = rendered(contender.renderer.without_diffraction())
         own = gradient(render, texture, measure, (1,))
         found[contender.setting] = agreement(own, judge)
     return found

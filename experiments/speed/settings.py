@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from dolens.errors import call_with_settings, check_keys
+from dolens.optics.parameter_units import to_lens_units
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
@@ -76,8 +77,8 @@ def subject_of(name: str, settings: Mapping[str, Any]) -> Subject:
     lens = lens_from_prescription(settings["lens"], torch.float32, where=f"scenes.{name}.lens")
     with torch.no_grad():
         for pattern, value in (settings.get("values") or {}).items():
-            for parameter in lens.variables([pattern]).values():
-                parameter.fill_(value)
+            for key, parameter in lens.variables([pattern]).items():
+                parameter.fill_(to_lens_units(key, value))
     scene = PlanarScene(settings["depths"], settings["wavelengths"])
     sensor = call_with_settings(Sensor, settings["sensor"], f"scenes.{name}.sensor")
     names = tuple(lens.variables(list(settings["variables"])))

@@ -12,7 +12,7 @@ from torch import Tensor
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.auto_renderer import AutoRenderer
-from dolens.rendering.auto.probe import probe_texture
+from dolens.rendering.auto.probes import probe_texture
 from dolens.rendering.gradient_check import Loss
 from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer

@@ -114,7 +114,7 @@ def nikon() -> Problem:
     curved = [n for n in range(1, 21) if n != 12]
     settings = MeritSettings(
         [[angle, 0.0] for angle in (0.0, 10.0, 20.0, 32.45)], NIKON_LINES, sampling="square_grid",
-        sampling_options={"count": NIKON_GRID}, most_vignetted=1.0,
+        sampling_options={"count": NIKON_GRID}, max_vignetting=1.0,
     )  # fmt: skip
     spots = settings.rays(lens)
 
@@ -192,7 +192,7 @@ def triplet() -> Problem:
     # Theirs is Σ RMS² in mm² and (weight·Δf)²; ours the mean of RMS² in µm².
     scaled = 1e3 * weight / math.sqrt(len(fields))
     settings = MeritSettings(
-        [[0.0, angle] for angle in fields], [WAVELENGTH], most_vignetted=1.0,
+        [[0.0, angle] for angle in fields], [WAVELENGTH], max_vignetting=1.0,
         operands=[{"kind": "efl", "target": focal_length, "weight": scaled}],
     )  # fmt: skip
     variables = {f"surfaces.{n}.curvature": {"scale": 0.01} for n in range(1, 7)}

@@ -36,15 +36,15 @@ class BoundGain:
 
     Attributes:
         light: electrons of a white pixel at full aperture.
-        shared: with one filter for all depths.
-        own: with a filter for each depth.
+        common_filter: with one filter for all depths.
+        filter_per_depth: with a filter for each depth.
         plain_f_number: of the best plain lens with one filter.
         plate: x3 = y3 (mm⁻²) of the best plate with one filter.
     """
 
     light: float
-    shared: float
-    own: float
+    common_filter: float
+    filter_per_depth: float
     plain_f_number: float
     plate: float
 
@@ -86,7 +86,13 @@ def bound_gains(
                 electrons = light * (full / candidate.f_number) ** 2
                 noise = _MEAN / electrons + (read_noise / electrons) ** 2
                 error = linear_error(candidate.functions, spectrum, noise)
-                errors.append((float(error.shared.max()), float(error.own.max()), candidate))
+                errors.append(
+                    (
+                        float(error.common_filter.max()),
+                        float(error.filter_per_depth.max()),
+                        candidate,
+                    )
+                )
             sides.append((min(errors, key=lambda e: e[0]), min(errors, key=lambda e: e[1])))
         (plain_shared, plain_own), (coded_shared, coded_own) = sides
         found.append(

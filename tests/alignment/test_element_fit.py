@@ -13,7 +13,7 @@ from dolens.alignment.element_fit import (
     fit_element,
     information_root,
     least_covariance,
-    named_element,
+    most_likely_element,
 )
 from dolens.alignment.moment_noise import moment_covariance, simulated_moments
 from dolens.alignment.moments import POWERS
@@ -135,7 +135,7 @@ def test_without_noise_every_element_is_named_and_its_pose_exact(request, kind):
         measured = simulated_moments(model, truth, 1e5, None)
         # A wrong hypothesis need not come to rest to be far off.
         fits = [fit_element(other, measured, 20 if other is model else 6) for other in models]
-        named, share = named_element([fit.chi_squared for fit in fits])
+        named, share = most_likely_element([fit.chi_squared for fit in fits])
         assert named.tolist() == [number] * 3
         assert float(share[number].min()) > 1.0 - 1e-9
         assert bool(fits[number].converged.all())
@@ -225,7 +225,7 @@ def test_bad_input_gives_one_clear_line(triplet, spots, models):
         simulated_moments(models[0], poses(1, 0), 0, None)
     with pytest.raises(InputError, match="lenses lose rays"):
         simulated_moments(models[0], poses(1, 0) * 500.0, 1e5, None)
-    with pytest.raises(InputError, match="sensor: 'sensor_z' is unknown; allowed: sensor_x"):
+    with pytest.raises(InputError, match="sensor: 'sensor_z' is unknown; did you mean 'sensor_y'"):
         moment_model(triplet, spots, element_names(triplet, "front"), ["sensor_z"])
     few = gaussian_quadrature(triplet, FIELDS[:1], [587.5618], 1, 4, symmetry=False)
     model = moment_model(triplet, few, element_names(triplet, "front"))

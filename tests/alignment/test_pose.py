@@ -9,12 +9,12 @@ import torch
 import yaml
 from PIL import Image
 
-from dolens.alignment.information import Knowledge, knowledge
+from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement, simulated
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.photograph import read_measurement, read_measurements
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotLoss, SpotMerit, SpotResiduals
+from dolens.alignment.spot_loss import ImageMerit, ImageResiduals, SpotLoss
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.prescriptions import lens_from_prescription
@@ -54,23 +54,47 @@ def fitted(loss, fit, iterations=15):
     chosen = torch.ones(len(fit.names), dtype=torch.bool)
     optimizer = DampedLeastSquares([fit.scaled])
     for _ in range(iterations):
-        optimizer.step(lambda: SpotResiduals(loss, fit, chosen))
-    return fit.found()
+        optimizer.step(lambda: ImageResiduals(loss, fit, chosen))
+    return fit.file_values()
 
 
 def test_degrees_outside_and_radians_inside(singlet):
     one = pose(singlet, tilt_x=3.0, shift_z=0.5)
-    assert float(one.values()[TILT].detach()) == pytest.approx(math.radians(3.0))
-    assert one.found()[TILT] == pytest.approx(3.0)
+    assert float(one()[TILT].detach()) == pytest.approx(math.radians(3.0))
+    assert one.file_values()[TILT] == pytest.approx(3.0)
     one.store()
     assert float(one.lens.elements["lens"].tilt_x) == pytest.approx(math.radians(3.0))
+
+
+def test_a_pose_is_bounded_and_linked_as_a_design_is(singlet):
+    """Patterns name its variables; a fit keeps to bounds, which are degrees; a pickup follows."""
+    settings = {
+        "elements.lens.tilt_[xy]": {"lower": -1.0, "upper": 1.0},
+        SHIFT: {"initial": 0.25},
+        "elements.lens.decenter_x": {"pickup": SHIFT, "factor": -2.0},
+    }
+    one = Pose(copy.deepcopy(singlet), SOURCE, settings)
+    assert list(one.names) == [TILT, "elements.lens.tilt_y", SHIFT]
+    assert float(one()["elements.lens.decenter_x"].detach()) == -0.5
+    loss = SpotLoss(seen(singlet, tilt_x=3.0), IMAGER, 1.0)
+    optimizer = DampedLeastSquares([one.parameter_group()])
+    chosen = torch.tensor([True, False, False])
+    for _ in range(8):
+        optimizer.step(lambda: ImageResiduals(loss, one, chosen))
+    assert one.file_values()[TILT] == pytest.approx(1.0, abs=1e-12)
+    again = one.varying(one.settings)
+    assert again.file_values() == pytest.approx(one.file_values(), rel=1e-15)
+    assert again.upper.tolist() == one.upper.tolist()
+    again.store()
+    assert float(again.lens.elements["lens"].decenter_x) == -0.5
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"sources.2.x": None}, "sources.<1 to 1>"),
-        ({"elements.lens.*": None}, "not one number"),
+        ({"sensor_distance": {"solve": "best_focus"}}, "of merit functions"),
+        ({TILT: {"initial": 3.0, "upper": 2.0}}, "initial value 3 is outside its bounds"),
         ({TILT: {"size": 1.0}}, "unknown key 'size'"),
         ({TILT: {"scale": 0.0}}, "scale must be positive"),
     ],
@@ -136,7 +160,7 @@ def test_a_pose_is_found_within_a_few_of_its_bounds(singlet):
     measured = seen(singlet, 1_000_000, **truth)
     one = pose(singlet, tilt_x=9.0)
     found = fitted(SpotLoss(measured, IMAGER, 1.0), one, 12)
-    bounds = knowledge(one, IMAGER, measured).bounds / one.units
+    bounds = fisher_information(one, IMAGER, measured).bounds / one.units
     for name, bound in zip(one.names, bounds.tolist(), strict=True):
         assert abs(found[name] - truth[name.rpartition(".")[2]]) < 10.0 * bound
 
@@ -148,16 +172,16 @@ def test_the_bound_is_that_of_many_simulated_estimates(singlet):
     truth = {"tilt_x": 10.0, "decenter_y": 0.3}
     one = pose(singlet, **truth)
     measured = seen(singlet, 100_000, **truth)
-    known = knowledge(one, SpotImager(SENSOR, 622.5, 200_000, subpixels=2), measured)
+    information = fisher_information(one, SpotImager(SENSOR, 622.5, 200_000, subpixels=2), measured)
     generator = torch.Generator().manual_seed(1)
-    images = torch.poisson(known.expected.clamp(min=0.0).expand(200, -1, -1, -1), generator)
+    images = torch.poisson(information.expected.clamp(min=0.0).expand(200, -1, -1, -1), generator)
     images = images + 2.0 * torch.randn(images.shape, generator=generator, dtype=torch.float64)
     found = torch.stack(
-        [known.correction(Measurement(image, measured.mask, 2.0, SENSOR)) for image in images]
+        [information.correction(Measurement(image, measured.mask, 2.0, SENSOR)) for image in images]
     )
-    ratio = found.std(0) / known.bounds
+    ratio = found.std(0) / information.bounds
     assert float((ratio - 1.0).abs().max()) < 4.0 / math.sqrt(2.0 * 200.0)
-    within = ((found - found.mean(0)).abs() < 1.96 * known.bounds).double().mean(0)
+    within = ((found - found.mean(0)).abs() < 1.96 * information.bounds).double().mean(0)
     assert float((within - 0.95).abs().max()) < 0.06
 
 
@@ -166,27 +190,29 @@ def test_information_grows_with_light_and_with_sources(singlet):
     one = pose(singlet, tilt_x=10.0)
     few = Measurement(*_flat(1, 1e5), 0.0, SENSOR)
     many = Measurement(*_flat(1, 4e5), 0.0, SENSOR)
-    ratio = knowledge(one, IMAGER, few).bounds / knowledge(one, IMAGER, many).bounds
+    ratio = (
+        fisher_information(one, IMAGER, few).bounds / fisher_information(one, IMAGER, many).bounds
+    )
     assert torch.allclose(ratio, torch.full_like(ratio, 2.0), rtol=1e-3)
     names = {f"elements.lens.{n}": {"initial": 10.0 if n == "tilt_x" else 0.0} for n in ALL}
     two = Pose(singlet, [*SOURCE, [150.0, 0.0, -864.0]], names)
     wide = SpotImager(Sensor(96, 96, 0.5), 622.5, 20_000, subpixels=1)
     alone = Pose(singlet, SOURCE, names)
     sensor = wide.sensor
-    first = knowledge(alone, wide, Measurement(*_flat(1, 1e5, sensor), 0.0, sensor)).bounds
-    both = knowledge(two, wide, Measurement(*_flat(2, 1e5, sensor), 0.0, sensor)).bounds
+    first = fisher_information(alone, wide, Measurement(*_flat(1, 1e5, sensor), 0.0, sensor)).bounds
+    both = fisher_information(two, wide, Measurement(*_flat(2, 1e5, sensor), 0.0, sensor)).bounds
     assert bool((both < first).all())
 
 
 def test_what_cannot_be_seen_has_a_bound_beyond_all_measure():
     """Two numbers of which images show only the sum, and a third that they do not show."""
     weighted = torch.tensor([[3.0, 3.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]).double()
-    known = Knowledge(("a", "b", "c"), weighted, weighted, weighted)
-    assert bool((known.bounds > 1e5).all())
-    assert float(known.correlations[0, 1]) == pytest.approx(-1.0)
-    spread, combinations = known.combinations(torch.ones(3, dtype=torch.float64))
+    information = FisherInformation(("a", "b", "c"), weighted, weighted, weighted)
+    assert bool((information.bounds > 1e5).all())
+    assert float(information.correlations[0, 1]) == pytest.approx(-1.0)
+    spread, eigenvectors = information.eigenvectors(torch.ones(3, dtype=torch.float64))
     assert spread.tolist()[2] == pytest.approx(1.0 / math.sqrt(20.0))
-    assert combinations[2].abs().tolist() == pytest.approx([0.5**0.5, 0.5**0.5, 0.0], abs=1e-9)
+    assert eigenvectors[2].abs().tolist() == pytest.approx([0.5**0.5, 0.5**0.5, 0.0], abs=1e-9)
     assert float(spread[1]) > 1e6
 
 
@@ -266,7 +292,7 @@ def test_weighted_by_noise_a_fit_has_errors_of_its_bounds(singlet):
         found = weighted_fit(one, fine, measured, 2)
         loss = NoiseWeightedLoss(measured, fine)
         assert float(loss.residuals(one).square().sum()) == pytest.approx(1.0, abs=0.12)
-        bounds = knowledge(one, fine, measured).bounds / one.units
+        bounds = fisher_information(one, fine, measured).bounds / one.units
         ratios += [
             (found[name] - truth[name.rpartition(".")[2]]) / float(bound)
             for name, bound in zip(one.names, bounds, strict=True)
@@ -281,8 +307,8 @@ def weighted_fit(one, imager, measured, iterations=3):
     for _ in range(iterations):
         loss = NoiseWeightedLoss(measured, imager).weighted_at(one)
         optimizer.restart()
-        optimizer.step(SpotMerit(loss, one, chosen))
-    return one.found()
+        optimizer.step(ImageMerit(loss, one, chosen))
+    return one.file_values()
 
 
 def test_noise_weighted_jacobian_is_that_of_differences(singlet):
@@ -312,16 +338,16 @@ def test_a_held_number_that_is_off_moves_the_fit_by_what_was_foretold(singlet):
     names = {n: {"initial": v} for n, v in moved[0].items()}
     both = Pose(right.lens, SOURCE, {**names, "sensor_distance": None})
     variance = torch.tensor([[0.05**2]], dtype=torch.float64)
-    known = knowledge(both, fine, measured).holding(5, variance)
-    foretold = (0.05 * known.inheritance[:, 0] / right.units).tolist()
-    for name, expected in zip(known.names, foretold, strict=True):
-        slack = 0.1 * max(abs(expected), float(known.bounds.min()))
+    information = fisher_information(both, fine, measured).with_nuisance_parameters(5, variance)
+    foretold = (0.05 * information.nuisance_sensitivity[:, 0] / right.units).tolist()
+    for name, expected in zip(information.names, foretold, strict=True):
+        slack = 0.1 * max(abs(expected), float(information.bounds.min()))
         assert moved[1][name] - moved[0][name] == pytest.approx(expected, abs=slack)
-    added = known.covariance - known.own_covariance
-    wanted = known.inheritance @ variance @ known.inheritance.T
-    apart = (added - wanted) / torch.outer(known.bounds, known.bounds)
+    added = information.covariance - information.own_covariance
+    wanted = information.nuisance_sensitivity @ variance @ information.nuisance_sensitivity.T
+    apart = (added - wanted) / torch.outer(information.bounds, information.bounds)
     assert float(apart.abs().max()) < 1e-9
-    assert bool((known.bounds > known.own_covariance.diagonal().sqrt()).all())
+    assert bool((information.bounds > information.own_covariance.diagonal().sqrt()).all())
 
 
 def test_a_second_plane_is_the_sensor_moved(singlet):
@@ -346,9 +372,9 @@ def test_a_second_plane_is_the_sensor_moved(singlet):
     )
     assert measured.images.shape == (2, 48, 48)
     assert torch.allclose(measured.centroids()[1], images[1].centroid, atol=5e-3)
-    both = knowledge(two, IMAGER, measured)
+    both = fisher_information(two, IMAGER, measured)
     first = Measurement(measured.images[:1], measured.mask[:1], 2.0, SENSOR)
-    one = knowledge(Pose(singlet, SOURCE, names), IMAGER, first)
+    one = fisher_information(Pose(singlet, SOURCE, names), IMAGER, first)
     # Twice the light alone would make it 0.7 of the bound.
     assert bool((both.bounds < 0.55 * one.bounds).all())
     with pytest.raises(InputError, match="planes: none is given"):
@@ -359,12 +385,12 @@ def test_sources_shift_as_one_target(singlet):
     """By a variable of their own, once however often it is put."""
     names = {"sources.*.x": {"initial": 0.5}, "sources.2.z": None}
     two = Pose(singlet, [[0.0, 0.0, -864.0], [3.0, 1.0, -700.0]], names)
-    assert two.found() == {"sources.*.x": 0.5, "sources.2.z": -700.0}
+    assert two.file_values() == {"sources.*.x": 0.5, "sources.2.z": -700.0}
     for _ in range(2):
         two.put({"sources.*.x": 0.5, "sources.2.z": -710.0})
     assert two.places.tolist() == [[0.5, 0.0, -864.0], [3.5, 1.0, -710.0]]
     other = two.varying({"sources.*.x": None})
-    assert other.found() == {"sources.*.x": 0.5}
+    assert other.file_values() == {"sources.*.x": 0.5}
     given = Pose(singlet, [[0.5, 0.0, -864.0], [3.5, 1.0, -710.0]], {})
     with torch.no_grad():
         pairs = zip(other.images(IMAGER), given.images(IMAGER), strict=True)
@@ -393,19 +419,21 @@ def test_blurred_residuals_have_the_covariance_that_is_said_and_a_chi_squared_ne
     truth = {"tilt_x": 10.0, "decenter_y": 0.3}
     one = pose(singlet, **truth)
     measured = seen(singlet, 100_000, **truth)
-    known = knowledge(one, IMAGER, measured, blur=1.0)
+    information = fisher_information(one, IMAGER, measured, blur=1.0)
     generator = torch.Generator().manual_seed(1)
     found = []
     for _ in range(400):
-        noise = torch.randn(known.noise.shape, generator=generator, dtype=torch.float64)
-        image = known.expected + known.noise * noise
-        found.append(known.correction(Measurement(image, measured.mask, 2.0, SENSOR)))
-    ratio = torch.stack(found).std(0) / known.bounds
+        noise = torch.randn(information.noise.shape, generator=generator, dtype=torch.float64)
+        image = information.expected + information.noise * noise
+        found.append(information.correction(Measurement(image, measured.mask, 2.0, SENSOR)))
+    ratio = torch.stack(found).std(0) / information.bounds
     assert float((ratio - 1.0).abs().max()) < 4.0 / math.sqrt(800.0)
-    assert bool((known.bounds > 0.99 * knowledge(one, IMAGER, measured).bounds).all())
+    assert bool(
+        (information.bounds > 0.99 * fisher_information(one, IMAGER, measured).bounds).all()
+    )
     # Source, lens and sensor that move along the axis together cannot be seen, blurred or not.
     along = {"sensor_distance": None, "sources.1.z": None, "elements.lens.shift_z": None}
-    unseen = knowledge(one.varying(along), IMAGER, measured, blur=1.0)
+    unseen = fisher_information(one.varying(along), IMAGER, measured, blur=1.0)
     assert bool((unseen.bounds > 1e3).all())
     fine = SpotImager(SENSOR, 622.5, 100_000, rim=0.002, subpixels=8)
     loss = NoiseWeightedLoss(measured, fine, blur=1.0)

@@ -8,11 +8,11 @@ import torch
 import yaml
 
 from dolens.alignment.diffracted_light import diffracted_light
-from dolens.alignment.information import knowledge
+from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import simulated
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
-from dolens.alignment.spot_loss import SpotMerit
+from dolens.alignment.spot_loss import ImageMerit
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
 from dolens.optimize.damped_least_squares import DampedLeastSquares
@@ -261,9 +261,9 @@ def test_estimates_end_where_a_fit_from_afar_does(singlet, effects):
     true.store()
     made = effects.made(true.lens, seeded(3)) if effects.of_the_lens else true.lens
     measured = seen(made, effects, photons=300_000, read_noise=2.0)
-    known = knowledge(one, imager, seen(true.lens, photons=300_000, read_noise=2.0))
+    information = fisher_information(one, imager, seen(true.lens, photons=300_000, read_noise=2.0))
     names = {f"elements.lens.{n}": v for n, v in truth.items()}
-    found = estimates(one, known, imager, lambda _: measured, [0], names)
+    found = estimates(one, information, imager, lambda _: measured, [0], names)
     assert bool(found.settled)
     fit = posed(singlet, tilt_x=10.5, tilt_y=1.8, decenter_x=0.15, decenter_y=0.33)
     optimizer = DampedLeastSquares([fit.scaled], initial_damping=1e-6)
@@ -271,9 +271,9 @@ def test_estimates_end_where_a_fit_from_afar_does(singlet, effects):
     for _ in range(6):
         loss = NoiseWeightedLoss(measured, imager).weighted_at(fit)
         optimizer.restart()
-        optimizer.step(SpotMerit(loss, fit, chosen))
-    bounds = known.bounds / one.units
-    by_fit = torch.tensor(list(fit.found().values()), dtype=torch.float64)
+        optimizer.step(ImageMerit(loss, fit, chosen))
+    bounds = information.bounds / one.units
+    by_fit = torch.tensor(list(fit.file_values().values()), dtype=torch.float64)
     off = (by_fit - torch.tensor(list(names.values()), dtype=torch.float64)) / bounds
     far = float(off.abs().max())
     assert far > 5.0
@@ -282,7 +282,7 @@ def test_estimates_end_where_a_fit_from_afar_does(singlet, effects):
 
 
 def test_errors_of_what_is_held_have_no_part_in_an_images_own_chi_squared(singlet):
-    """A held number that is off moves the estimate by the inheritance, and by nothing else."""
+    """A held number that is off moves the estimate by the sensitivity, and by nothing else."""
     truth = {"tilt_x": 10.0, "decenter_y": 0.3}
     imager = SpotImager(SENSOR, WAVELENGTH, 20_000, rim=0.01, subpixels=1)
     one = posed(singlet, **truth)
@@ -290,8 +290,10 @@ def test_errors_of_what_is_held_have_no_part_in_an_images_own_chi_squared(single
     true = posed(singlet, **truth)
     true.store()
     measured = seen(true.lens, photons=100_000, read_noise=2.0)
-    alone = knowledge(both, imager, measured).holding(4, torch.zeros(1, 1, dtype=torch.float64))
-    names = one.found()
+    alone = fisher_information(both, imager, measured).with_nuisance_parameters(
+        4, torch.zeros(1, 1, dtype=torch.float64)
+    )
+    names = one.file_values()
     at = one.lens.sensor_distance.detach().reshape(1)
     unit = torch.ones(1, dtype=torch.float64)
 
@@ -302,4 +304,4 @@ def test_errors_of_what_is_held_have_no_part_in_an_images_own_chi_squared(single
     exact, moved = found(0.0), found(1e-4)
     torch.testing.assert_close(exact.chi_squared, moved.chi_squared, rtol=1e-6, atol=0.0)
     step = (moved.values - exact.values)[0] * one.units
-    torch.testing.assert_close(step, 1e-4 * alone.inheritance[:, 0], rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(step, 1e-4 * alone.nuisance_sensitivity[:, 0], rtol=1e-6, atol=1e-12)

@@ -11,12 +11,12 @@ from dolens import load_lens
 from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.analysis.ray_fans import ray_fans
-from dolens.analysis.ray_intercepts import even_points, land
+from dolens.analysis.ray_intercepts import trace_ray_intercepts, uniform_pupil_points
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.analysis.spot_diagram import spot_diagram
 from dolens.errors import InputError
 from dolens.optics.paraxial import chief_ray_magnification
-from dolens.optimize.spot_residuals import SpotResiduals
+from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.prescriptions import lens_from_prescription
 
 LINES = (656.2725, 587.5618, 486.1327)
@@ -55,8 +55,8 @@ def hyperbola_slopes(height):
     return height / (FOCAL - sag)
 
 
-def test_even_points_fill_the_disc_evenly():
-    points, weight = even_points(1000)
+def test_pupil_points_fill_the_disc_uniformly():
+    points, weight = uniform_pupil_points(1000)
     assert float(weight.sum()) == pytest.approx(1.0)
     inner = points[weight > 0.0]
     assert len(inner) == 1000 and torch.all(points.norm(dim=-1) < 1.0)
@@ -68,7 +68,7 @@ def test_even_points_fill_the_disc_evenly():
         assert float(share) == pytest.approx(radius**2, abs=0.01)
     for wrong in (0, 6):
         with pytest.raises(InputError, match="multiple of four"):
-            even_points(wrong)
+            uniform_pupil_points(wrong)
 
 
 def test_defocus_alone_makes_a_disc(defocused):
@@ -81,7 +81,6 @@ def test_defocus_alone_makes_a_disc(defocused):
     assert spots.rms.tolist() == [pytest.approx([rms] * 2, rel=1e-5)]
     assert float(spots.polychromatic_rms) == pytest.approx(rms, rel=1e-5)
     assert torch.all(spots.centroid.abs() < 1e-12)
-    assert torch.all(spots.from_chief == spots.landing - spots.chief[:, None, None])
 
 
 def test_airy_radius_is_that_of_the_f_number(defocused):
@@ -113,9 +112,9 @@ def test_modulation_of_defocus_is_that_of_a_disc(defocused):
 def test_fitted_rays_land_where_aimed_ones_do(root, name):
     lens = load_lens(root / f"conf/lens/{name}.yaml").requires_grad_(False)
     edge = lens.fields.points[-1] if lens.fields else (0.0, 10.0)
-    pupil = even_points(40)[0][:40]
-    fitted = land(lens, [edge, (3.0, 0.0)], LINES[1:2], pupil)
-    aimed = land(lens, [edge, (3.0, 0.0)], LINES[1:2], pupil, exact=True)
+    pupil = uniform_pupil_points(40)[0][:40]
+    fitted = trace_ray_intercepts(lens, [edge, (3.0, 0.0)], LINES[1:2], pupil)
+    aimed = trace_ray_intercepts(lens, [edge, (3.0, 0.0)], LINES[1:2], pupil, exact=True)
     valid = aimed.valid & fitted.valid
     assert (aimed.valid == fitted.valid).double().mean() > 0.95 and valid.sum() > 10
     spread = (aimed.points - aimed.chief[:, None, None])[valid].norm(dim=-1).max()
@@ -132,8 +131,8 @@ def test_a_fitted_ray_is_exactly_one_of_its_object_point():
             "sensor": {"distance": 20.0},
         }
     )
-    pupil, _ = even_points(8)
-    found = land(window, [(1.0, -3.0)], LINES[:1], pupil, object_distance=50.0)
+    pupil, _ = uniform_pupil_points(8)
+    found = trace_ray_intercepts(window, [(1.0, -3.0)], LINES[:1], pupil, object_distance=50.0)
     point = torch.tensor([1.0, -3.0]).double()
     # From (x, y, -50) through 5p in z = 0 to z = 20.
     expected = point + (5.0 * pupil - point) * 70.0 / 50.0
@@ -147,7 +146,7 @@ def test_spots_of_the_triplet_are_those_of_gauss_s_quadrature(root):
     fields = [(0.0, 0.0), (0.0, 10.0), (0.0, 20.0)]
     spots = spot_diagram(lens, fields, LINES[2:], rays=6000)
     rays = gaussian_quadrature(lens, fields, LINES[2:], rings=6, arms=24)
-    expected = SpotResiduals(rays, torch.ones(rays.count)).values(lens).rms
+    expected = RayInterceptResiduals(rays, torch.ones(rays.count)).values(lens).rms
     assert float(spots.rms[0]) == pytest.approx(float(expected[0]), rel=1e-4)
     assert spots.rms[:, 0].tolist() == pytest.approx(expected.tolist(), rel=1e-2)
     assert torch.all(spots.geo > spots.rms)
@@ -174,7 +173,7 @@ def test_a_finite_object_is_imaged_at_its_magnification(triplet):
 def test_a_lens_in_single_precision_is_analysed_in_double(root, triplet):
     single = load_lens(root / "conf/lens/cooke_triplet.yaml", dtype=torch.float32)
     spots = spot_diagram(single, [(0.0, 14.0)], LINES[:1], rays=200)
-    assert spots.landing.dtype == torch.float64 and single.dtype == torch.float32
+    assert spots.intercepts.dtype == torch.float64 and single.dtype == torch.float32
     expected = spot_diagram(triplet, [(0.0, 14.0)], LINES[:1], rays=200).rms
     assert torch.allclose(spots.rms, expected, rtol=1e-3)
 

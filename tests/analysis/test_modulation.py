@@ -10,7 +10,7 @@ from scipy.special import j1
 from torch.autograd import gradcheck, gradgradcheck
 
 from dolens.analysis.modulation_transfer import diffraction_limited_transfer, modulation_transfer
-from dolens.analysis.ray_intercepts import even_points
+from dolens.analysis.ray_intercepts import uniform_pupil_points
 from dolens.errors import InputError
 
 
@@ -23,7 +23,7 @@ def spots():
 
 
 def test_a_uniform_disc_has_that_of_its_bessel_function():
-    points, weights = even_points(20000)
+    points, weights = uniform_pupil_points(20000)
     frequency = torch.linspace(0.5, 30.0, 60, dtype=torch.float64)
     x = 2.0 * math.pi * 0.05 * frequency.numpy()
     for direction in ("sagittal", "tangential"):

@@ -8,7 +8,7 @@ import yaml
 from hydra.utils import instantiate
 
 from dolens.optics.aiming import aim
-from dolens.optimize import operand_model
+from dolens.optimize import operand_values
 from dolens.prescriptions import lens_from_prescription
 from experiments.camera.operands import CameraOperands
 from experiments.running.run_settings import RunSettings
@@ -61,10 +61,12 @@ def test_a_camera_hands_its_scenes_distance_to_its_operands(composed, monkeypatc
     _, values = module.penalty(module.variables())
     expected = -float(order.efl / (700.0 + order.ffd))
     assert float(values["magnification"]) == pytest.approx(expected, rel=1e-4)
-    seen, view = [], operand_model.View
-    monkeypatch.setattr(operand_model, "View", lambda *a: seen.append(a[2]) or view(*a))
+    seen, properties = [], operand_values.LensProperties
+    monkeypatch.setattr(
+        operand_values, "LensProperties", lambda *a: seen.append(a[2]) or properties(*a)
+    )
     run(composed(*asked))
-    assert set(seen) == ({700.0} if optimizer else set())
+    assert set(seen) == {700.0}
 
 
 class Unreachable:

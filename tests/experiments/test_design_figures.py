@@ -38,5 +38,7 @@ def test_the_title_of_a_narrow_figure_is_not_cut_off(figures):
 def test_only_other_rays_and_centres_are_worth_a_line():
     assert pupil_note(MeritSettings()) == ""
     assert "the first surface" in pupil_note(MeritSettings(sampling="square_grid"))
-    assert "one centroid for all colours" in pupil_note(MeritSettings(colours="together"))
+    assert "one centroid for all colours" in pupil_note(
+        MeritSettings(reference_spectrum="polychromatic")
+    )
     assert "chief ray" in pupil_note(MeritSettings(reference="chief"))

@@ -94,7 +94,9 @@ FREEFORM = [
 def test_a_freeform_corrector_by_least_squares_and_by_adam(composed, tmp_path):
     """256 coefficients; the rule of the configuration picks the optimizer by their number."""
     few = run(composed(*FREEFORM, "data.iterations=8", folder="few"))
-    many = run(composed(*FREEFORM, "optimizer.most=100", "data.iterations=30", folder="many"))
+    many = run(
+        composed(*FREEFORM, "optimizer.max_variables=100", "data.iterations=30", folder="many")
+    )
     start = {name: float(rows_of(tmp_path / name / "history.csv")[0]["train/merit"]) for name in ("few", "many")}  # fmt: skip # noqa: E501
     assert "train/damping" in rows_of(tmp_path / "few/history.csv")[0]
     assert "train/learning_rate" in rows_of(tmp_path / "many/history.csv")[0]

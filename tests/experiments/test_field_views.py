@@ -9,7 +9,7 @@ import yaml
 
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
-from dolens.rendering.auto.probe import probe_image
+from dolens.rendering.auto.probes import probe_image
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene

@@ -96,12 +96,15 @@ def test_a_stage_may_move_some_variables_only(composed, tmp_path):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("stages=[{optimizer: lbfgs, iterations: 2}]", "'lbfgs' is unknown; allowed: adam, dls"),
+        ("stages=[{optimizer: lbfgs, iterations: 2}]", "'lbfgs' is unknown (allowed: adam, dls"),
         ("stages=[{optimizer: dls, iterations: 0}]", "0 iterations"),
-        ("stages=[{optimizer: dls, iterations: 1, variables: [focus]}]", "variable 'focus'"),
+        (
+            "stages=[{optimizer: dls, iterations: 1, variables: [focus]}]",
+            "variable of fit 0: 'focus' is unknown",
+        ),
         (
             "stages=[{optimizer: dls, iterations: 1, loss: l1}]",
-            "loss 'l1' is unknown; allowed: s21",
+            "loss: 'l1' is unknown (allowed: s21",
         ),
         ("stages=[{optimizer: dls, iterations: 1, imager: {ray: 2}}]", "imager: "),
         (

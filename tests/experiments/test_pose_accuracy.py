@@ -81,7 +81,7 @@ def test_a_start_without_light_is_a_lost_fit_and_not_the_end_of_the_run(composed
 BAD_INPUT = {
     "part": (["parts=[light]"], "parts: 'light' is unknown (allowed: photons, rays, basin)"),
     "along": (["+basin.along.focus=[0]"], "focus; allowed: two of"),
-    "count": (["measurements=1"], "measurements, patterns"),
+    "count": (["measurements=1"], "measurements: 1; allowed: 2 or more"),
     "imager": (["imagers.narrow.rim=0"], "imager.rim: 0; allowed"),
     "precision": (["lens_dtype=float32"], "poses are fitted in float64"),
 }

@@ -94,7 +94,7 @@ def test_a_fit_says_how_its_bound_covers_other_measurements(composed, tmp_path):
     ("override", "message"),
     [
         ("+cases.model.radii=0.1", "cases.model: unknown key 'radii'"),
-        ("+cases.model.fits=['7']", "cases.model.fits: '7' is unknown; allowed: 0, 5"),
+        ("+cases.model.fits=['7']", "cases.model.fits: '7' is unknown (allowed: 0, 5"),
         ("+cases.model.fits=['5']", "cases.model.fits: '5' holds what '0' finds"),
         ("draws=1", "draws: 1; allowed: 2 or more"),
         ("unmodelled.radius=0.1", "unmodelled: effects are those of `cases` here"),

@@ -45,7 +45,7 @@ def test_planes_part_what_one_image_cannot_and_a_common_shift_is_never_seen(comp
     everything = "one_source_and_lens_shift"
     assert metrics[f"knowledge/{everything}/unseen"] == 1.0
     assert metrics[f"knowledge/{one}/unseen"] == 0.0
-    first = next(r for r in rows_of(folder / "combinations.csv") if r["arrangement"] == everything)
+    first = next(r for r in rows_of(folder / "eigenvectors.csv") if r["arrangement"] == everything)
     moved = {
         "sensor_distance": 1.0 * float(first["sensor_distance"]),
         "sources.*.z": 10.0 * float(first["sources.*.z"]),
@@ -64,7 +64,7 @@ def test_planes_part_what_one_image_cannot_and_a_common_shift_is_never_seen(comp
 
 
 BAD_INPUT = {
-    "key": (["+arrangements.one_source.plane=[0]"], "unknown key 'plane' (allowed: sources"),
+    "key": (["+arrangements.one_source.plane=[0]"], "unknown key 'plane'; did you mean 'planes'?"),
     "sources": (
         ["arrangements.one_source.sources=[]"],
         "arrangements.one_source: sources are missing; give one",

@@ -90,7 +90,10 @@ def test_focus_alone_may_be_unknown(composed, tmp_path):
 
 PAIR = ("found", "true")
 BAD_INPUT = {
-    "element": (["demo.element=back"], "demo.element: 'back'; allowed: front, middle, rear"),
+    "element": (
+        ["demo.element=back"],
+        "demo.element: 'back' is unknown (allowed: front, middle, rear",
+    ),
     "key": (["+demo.roll=1"], "demo: unknown key 'roll'"),
     "count": (["misalignments=0"], "misalignments: 0; allowed: an integer of 1 or more"),
     "range": (["tilt_range=0"], "tilt_range: 0; allowed: a positive number"),

@@ -112,12 +112,12 @@ def _fate(
     if between is None:
         hit = send(lens, rays, sense, backend)
         return 4 * hit.surface.long() + hit.status
-    system, ended, vignetted = lens.system(), None, None
+    system, ended, vignetted = lens.system().traced_by(backend), None, None
     count = len(system.surfaces)
     for number in range(1, count + 1) if sense > 0.0 else range(count, 0, -1):
         # The sensor's plane belongs to the last surface's step.
         last = None if sense > 0.0 and number == count else number
-        hit = trace_rays(system, rays, backend, sense, False, number, last)
+        hit = trace_rays(system, rays, sense, False, number, last)
         fate = 4 * hit.surface.long() + hit.status
         edge = hit.status == Status.VIGNETTED
         stops, dims = torch.where(edge, 0, fate), torch.where(edge, fate, 0)

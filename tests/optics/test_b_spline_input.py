@@ -28,7 +28,7 @@ BAD = {
     "too narrow": ({"coefficients": FOUR, "half_width": 3.9},
                    "the aperture reaches 4 mm and exceeds the surface, whose knots 'knots_x' end"),
     "unknown name": ({"coefficients": FOUR, "half_width": 5.0, "curvature": 0.1},
-                     "a b_spline has no parameter 'curvature'"),
+                     "b_spline: unknown key 'curvature'"),
 }  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens import Rays, load_lens
-from dolens.optimize.operands import View, operand
+from dolens.optimize.operands import LensProperties, operand
 from dolens.prescriptions import lens_from_prescription
 
 D_LINE = 587.5618
@@ -14,7 +14,7 @@ D_LINE = 587.5618
 
 def values(lens, object_distance=None, **settings):
     made = operand({"target": 0.0, **settings}, lens)
-    found = made.values(View(lens.system(), D_LINE, object_distance))
+    found = made.values(LensProperties(lens.system(), D_LINE, object_distance))
     return {label: float(value.detach()) for label, value in found.items()}
 
 

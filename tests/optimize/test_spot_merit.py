@@ -13,12 +13,11 @@ from dolens.analysis.pupil_quadrature import (
     with_chief_rays,
 )
 from dolens.errors import InputError
-from dolens.optics.system import is_rotationally_symmetric
 from dolens.optimize import DesignVariables, MeritSettings
 from dolens.optimize.bounded_step import damped_step
 from dolens.optimize.image_quality import without_edges
 from dolens.optimize.merit_settings import LOSSES
-from dolens.optimize.spot_residuals import SpotResiduals
+from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
 LINES = (656.2725, 587.5618, 486.1327)
@@ -81,7 +80,7 @@ def test_quadrature_agrees_with_a_fine_sampling(triplet, field):
 
 def test_symmetry_saves_rays_and_nothing_else(triplet):
     """Half of the arms for a field along y, one for the axis: the radii stay."""
-    assert is_rotationally_symmetric(triplet.system())
+    assert triplet.system().rotationally_symmetric
     fields = [(0.0, 0.0), (0.0, 12.0)]
     spots = gaussian_quadrature(triplet, fields, LINES, 5, 16)
     assert len(spots.weight) == 3 * (5 + 5 * 8)
@@ -138,8 +137,8 @@ CASES = {
     "grid": {"sampling": "square_grid", "sampling_options": {"count": 15}},
     "weights": {"field_weights": [1.0, 3.0], "wavelength_weights": [1.0, 2.0, 0.5]},
     "operands": {"operands": OPERANDS},
-    "colours together": {"colours": "together"},
-    "chief ray of the field": {"colours": "together", "reference": "chief"},
+    "polychromatic reference": {"reference_spectrum": "polychromatic"},
+    "chief ray of the field": {"reference_spectrum": "polychromatic", "reference": "chief"},
     "wavefront": {"quality": "wavefront"},
     "wavefront about the chief ray": {"quality": "wavefront", "reference": "chief"},
     "modulation": {"quality": "modulation", "quality_options": {"frequencies": [20.0, 50.0]}},
@@ -236,7 +235,7 @@ def test_the_jacobian_is_that_of_forward_mode(triplet):
         values = dict(zip(names, theta.unbind(), strict=True))
         from dolens.optics.backend import trace_rays
 
-        hit = trace_rays(lens.system(values), spots.rays, "reference", 1.0, False, 1, None)
+        hit = trace_rays(lens.system(values).traced_by("reference"), spots.rays)
         points = hit.position[:, :2]
         means = torch.zeros(spots.count, 2, dtype=points.dtype)
         means = means.index_add(0, spots.spot, spots.weight[:, None] * points)
@@ -281,17 +280,17 @@ def test_chief_rays_weigh_nothing(triplet):
     with_chief = with_chief_rays(triplet, spots)
     assert with_chief.weight[with_chief.chief].tolist() == [0.0] * 6
     assert rms_radii(triplet, with_chief) == pytest.approx(rms_radii(triplet, spots), rel=1e-12)
-    chief = SpotResiduals(with_chief, torch.ones(6).double() / 6, "chief").values(triplet)
-    centroid = SpotResiduals(spots, torch.ones(6).double() / 6).values(triplet)
+    chief = RayInterceptResiduals(with_chief, torch.ones(6).double() / 6, "chief").values(triplet)
+    centroid = RayInterceptResiduals(spots, torch.ones(6).double() / 6).values(triplet)
     assert bool((chief.mean_squares >= centroid.mean_squares).all())
     with pytest.raises(InputError, match="hold no chief rays"):
-        SpotResiduals(spots, torch.ones(6).double() / 6, "chief")
+        RayInterceptResiduals(spots, torch.ones(6).double() / 6, "chief")
 
 
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"kind": "efg", "target": 1.0}, "kind 'efg' is unknown"),
+        ({"kind": "efg", "target": 1.0}, "kind: 'efg' is unknown"),
         ({"kind": "efl"}, "give a target, or limits"),
         ({"kind": "efl", "target": 1.0, "min": 0.5}, "give a target, or limits"),
         ({"kind": "efl", "min": 2.0, "max": 1.0}, "min exceeds max"),
@@ -311,7 +310,7 @@ def test_bad_operands_are_refused(triplet, settings, said):
     [
         ({"surfaces.1.curvature": {"pickup": "surfaces.9.curvature"}}, "no parameter"),
         ({"surfaces.1.curvature": {"pickup": "surfaces.1.curvature"}}, "one other parameter"),
-        ({"surfaces.1.curvature": {"solve": "focus"}}, "solve 'focus' is unknown"),
+        ({"surfaces.1.curvature": {"solve": "focus"}}, "solve: 'focus' is unknown"),
         ({"surfaces.1.curvature": {"solve": "best_focus"}}, "moves sensor_distance only"),
         ({"thicknesses.1": {"solve": "efl", "target": 3.0}}, "moves a curvature"),
         ({"surfaces.1.curvature": {"solve": "efl"}}, "to a target"),

@@ -58,7 +58,10 @@ def test_projection_puts_variables_back_within_their_bounds(lens):
         ({"scale": 0.0}, "scale must be positive, not 0"),
         ({"scale": -1.0}, "scale must be positive, not -1"),
         ({"scale": "big"}, "scale must be a number, not 'big'"),
-        ({"uper": 1.0}, "unknown key 'uper' (allowed: scale, initial, lower, upper)"),
+        (
+            {"uper": 1.0},
+            "unknown key 'uper'; did you mean 'upper'? (allowed: scale, initial, lower, upper)",
+        ),
     ],
 )
 def test_bad_settings(lens, settings, said):

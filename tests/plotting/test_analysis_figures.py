@@ -17,12 +17,10 @@ from dolens.plotting import (
     figure_to_image,
     history_figure,
     layout_figure,
-    matrix_figure,
     modulation_figure,
     ray_fans_figure,
     rms_curves_figure,
     spots_figure,
-    yield_figure,
 )
 from dolens.plotting.style import spectral_colour
 
@@ -67,7 +65,7 @@ def test_spots_are_drawn_about_the_common_centroid_in_micrometres(spots):
             axes = grid[field, wave]
             (drawn,) = by_gid(axes, "spot")
             centre = spots.polychromatic_centroid[field]
-            expected = 1e3 * (spots.landing[field, wave] - centre)
+            expected = 1e3 * (spots.intercepts[field, wave] - centre)
             np.testing.assert_allclose(np.stack(drawn.get_data(), -1), expected)
             assert drawn.get_color() == spectral_colour(float(LINES[wave]))
             (airy,) = by_gid(axes, "airy")
@@ -204,41 +202,3 @@ def test_a_history_is_logarithmic_with_its_damping_below():
     assert alone.get_xlabel() == "iteration" and alone.get_ylabel() == "RMS (µm)"
     with pytest.raises(InputError, match="damping"):
         history_figure([1.0, 2.0], [1.0])
-
-
-def test_a_matrix_is_white_at_zero():
-    values = torch.tensor([[-1.0, 0.0, 3.0], [math.nan, 2.0, 1.0]])
-    figure = matrix_figure(values, ["RMS 0°", "RMS 14°"], ["c1", "c2", "c3"], "J", "µm")
-    axes, bar = figure.axes
-    (picture,) = axes.get_images()
-    assert picture.get_clim() == (-3.0, 3.0)
-    np.testing.assert_array_equal(picture.get_array().mask, [[0, 0, 0], [1, 0, 0]])
-    red, _, blue, _ = picture.cmap(picture.norm(3.0))
-    assert red > blue
-    assert min(picture.cmap(picture.norm(0.0))) > 0.95
-    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["RMS 0°", "RMS 14°"]
-    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["c1", "c2", "c3"]
-    assert bar.get_ylabel() == "µm" and axes.get_title() == "J"
-    assert matrix_figure(torch.zeros(1, 1), ["a"], ["b"]).axes[0].get_images()[0].get_clim()[1] > 0
-    with pytest.raises(InputError, match="3 rows"):
-        matrix_figure(values, ["a", "b", "c"], ["c1", "c2", "c3"])
-
-
-def test_yield_is_the_share_of_all_lenses():
-    series = {"loose": torch.tensor([4.0, 8.0, 6.0, math.inf]), "tight": [3.0, 5.0]}
-    axes = yield_figure(series, nominal=2.0, limit=6.0).axes[0]
-    loose, tight, nominal, limit = axes.get_lines()
-    right = axes.get_xlim()[1]
-    assert loose.get_xdata().tolist() == [4.0, 4.0, 6.0, 8.0, right]
-    assert loose.get_ydata().tolist() == [0.0, 25.0, 50.0, 75.0, 75.0]
-    assert loose.get_drawstyle() == "steps-post"
-    assert legend(axes) == ["loose: 50 %", "tight: 100 %", "nominal", "limit 6 µm"]
-    assert tight.get_ydata()[-1] == 100.0
-    assert (nominal.get_xdata()[0], limit.get_xdata()[0]) == (2.0, 6.0)
-    assert axes.get_xlim()[0] < 2.0
-    assert axes.get_xlabel() == "RMS spot radius (µm)"
-    failed = yield_figure({"all fail": [math.nan]}, limit=1.0).axes[0].get_lines()[0]
-    assert failed.get_ydata().tolist() == [0.0]
-    for wrong in ({}, {"none": []}):
-        with pytest.raises(InputError, match="at least one lens"):
-            yield_figure(wrong)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dolens import InputError, load_lens, save_lens
 from dolens.prescriptions import lens_from_prescription, prescription_of
-from dolens.prescriptions.source_text import prescription_from_source_text, source_text_of
+from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
@@ -26,7 +26,7 @@ REFUSED = {
     ("freeform_corrector", ".txt"): "surface 2: a .txt file cannot hold type 'b_spline'",
 }
 FORMATS = {
-    ".txt": lambda data: prescription_from_source_text(source_text_of(data)),
+    ".txt": lambda data: prescription_from_diffoptics(diffoptics_text_of(data)),
     ".zmx": lambda data: prescription_from_zemax(decode_zemax(encode_zemax(zemax_of(data)))),
     ".yaml": lambda data: yaml.safe_load(yaml.safe_dump(data)),
 }

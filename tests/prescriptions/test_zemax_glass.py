@@ -126,7 +126,7 @@ KINDS = ["air", "occluder", "1.5", "2", "1.51680/64.17", "N-BK7", "SCHOTT:F2", "
 def test_a_lens_of_every_kind_of_material_comes_back(kind, where, suffix, tmp_path):
     lens = lens_of("1.6/40", object_material=kind) if where == "object" else lens_of(kind)
     path = tmp_path / f"lens{suffix}"
-    # The source's format has nd and Vd alone.
+    # The diffoptics format has nd and Vd alone.
     if suffix == ".txt" and kind not in ("air", "occluder", "1.51680/64.17"):
         place = "object" if where == "object" else "surface 1"
         with pytest.raises(InputError, match=rf"{place}: a \.txt file cannot hold material"):

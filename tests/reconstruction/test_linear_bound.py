@@ -35,16 +35,16 @@ def test_without_blur_and_with_white_signal_it_is_wiener_s_scalar():
     point[0, 1, 1] = 1.0
     white = torch.full((SIDE, SIDE // 2 + 1), 0.04, dtype=torch.float64)
     found = linear_error(point, white, 0.01)
-    assert float(found.shared[0]) == pytest.approx(0.04 * 0.01 / 0.05, rel=1e-12)
-    assert torch.allclose(found.shared, found.own)
+    assert float(found.common_filter[0]) == pytest.approx(0.04 * 0.01 / 0.05, rel=1e-12)
+    assert torch.allclose(found.common_filter, found.filter_per_depth)
 
 
 def test_a_filter_that_serves_several_depths_is_worse_than_one_for_each():
     functions = torch.stack([blur(0.7), blur(2.0), blur(4.0)])
     found = linear_error(functions, spectrum(), 1e-4)
-    assert bool((found.shared > found.own).all())
+    assert bool((found.common_filter > found.filter_per_depth).all())
     same = linear_error(blur(2.0).expand(3, -1, -1), spectrum(), 1e-4)
-    assert torch.allclose(same.shared, same.own)
+    assert torch.allclose(same.common_filter, same.filter_per_depth)
 
 
 def test_simulated_restorations_have_these_errors():
@@ -60,7 +60,7 @@ def test_simulated_restorations_have_these_errors():
     best = power * transfer.conj().mean(0)
     best = best / (power * transfer.abs().square().mean(0) + noise)
     left = torch.fft.irfft2(taken * best - image, s=(SIDE, SIDE)).square().mean((0, 2, 3))
-    expected = linear_error(functions, power, noise).shared
+    expected = linear_error(functions, power, noise).common_filter
     assert torch.allclose(left, expected, rtol=0.03)
     # It is the least mean error: a filter a little off is worse.
     for factor in (0.97, 1.03):

@@ -5,7 +5,6 @@ import torch
 from torch.nn import functional
 
 from dolens.reconstruction import wiener_deconvolve
-from dolens.reconstruction.wiener import fast_fft_length
 
 DOUBLE = torch.float64
 
@@ -165,8 +164,3 @@ def test_wrong_channels_and_a_negative_margin_are_refused():
         wiener_deconvolve(image, torch.rand(2, 3, 3), 1e-2, margin=2)
     with pytest.raises(ValueError, match="margin=-1"):
         wiener_deconvolve(image, torch.rand(3, 3, 3), 1e-2, margin=-1)
-
-
-def test_fft_lengths_are_the_next_product_of_small_primes():
-    lengths = [1, 7, 11, 17, 31, 64, 301, 320]
-    assert [fast_fft_length(n) for n in lengths] == [1, 8, 12, 18, 32, 64, 320, 320]

@@ -10,13 +10,13 @@ from dolens import load_lens
 from dolens.errors import InputError
 from dolens.rendering.auto.agreement import (
     Agreement,
-    GradientMeasure,
     agreement,
     gradient,
     gradients_of_rays,
 )
 from dolens.rendering.auto.auto_renderer import AutoRenderer
-from dolens.rendering.auto.probe import CONTRAST, MEAN, fine_detail
+from dolens.rendering.auto.probes import CONTRAST, MEAN, fine_detail
+from dolens.rendering.protocol import GradientMeasure
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
 

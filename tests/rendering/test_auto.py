@@ -12,17 +12,18 @@ from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diff
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.auto_renderer import AutoRenderer
-from dolens.rendering.auto.cost import psf_cost
-from dolens.rendering.auto.probe import (
+from dolens.rendering.auto.costs import psf_cost
+from dolens.rendering.auto.probes import (
     GREY_LEVEL,
     grey_levels,
     probe_image,
     probe_power,
     probe_texture,
+    reference,
 )
-from dolens.rendering.auto.reference import reference
 from dolens.rendering.auto.trial import with_values
 from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
@@ -123,11 +124,7 @@ def test_the_plan_keeps_its_tolerance_against_independent_renders(root, toleranc
     # Another image, other samples.
     texture = probe_image(112, 112, seed=5)
     pair = [RayRenderer(sensor, 16).render(lens, scene, texture, seed)[0] for seed in (11, 12)]
-    geometric = auto.choice.renderer
-    if isinstance(geometric, PsfRenderer):
-        geometric = PsfRenderer(
-            **{**geometric.__dict__, "diffraction": "none"}  # rays have none
-        )
+    geometric = auto.without_diffraction()  # rays have none
     image = geometric.render(lens, scene, texture.float(), 3)[0]
     assert measured(image, pair) < 1.2 * tolerance
 
@@ -137,7 +134,7 @@ def test_less_tolerance_costs_more(root):
     scene, costs = PlanarScene((8000.0, 4500.0), LINES), []
     for tolerance in (4.0, 1.0, 0.25):
         choice = AutoRenderer(sensor, tolerance).make_plan(lens, scene)
-        assert isinstance(choice.renderer, PsfRenderer)
+        assert choice.renderer.model == PsfRenderer.model
         costs.append(psf_cost(choice.renderer, scene, len(lens.surfaces)))
     assert costs[0] < costs[1] < costs[2]
 
@@ -157,7 +154,7 @@ def test_a_scene_gets_no_more_than_it_needs(root):
         lens, PlanarScene((4000.0, 1000.0), LINES)
     )
     renderer = choice.renderer
-    assert isinstance(renderer, PsfRenderer)
+    assert renderer.model == PsfRenderer.model
     assert renderer.fields == (1, 1)
     assert (renderer.depths, renderer.colours) == ("one", "one")
     assert renderer.registration == "pinhole"
@@ -220,7 +217,9 @@ def test_the_image_and_its_gradient_come_in_the_lens_s_precision(root, dtype):
 def test_the_reference_says_how_well_it_knows(root):
     lens, sensor = coded(root), Sensor(48, 48, 0.0069)
     scene, texture = PlanarScene((8000.0,), LINES), probe_image(96, 96)
-    coarse, fine = (reference(lens, scene, sensor, texture, n, seed=n) for n in (4, 16))
+    coarse, fine = (
+        reference(RayRenderer(sensor, n), lens, scene, texture, seed=n) for n in (4, 16)
+    )
     assert fine.noise < 0.4 * coarse.noise
     # An image that is as noisy as one of the renders errs by that noise.
     image = RayRenderer(sensor, 4).render(lens, scene, texture, 99)
@@ -274,3 +273,33 @@ def test_photographs_of_any_size_fit_the_probe():
 def test_a_tolerance_must_be_positive():
     with pytest.raises(InputError, match="tolerance"):
         AutoRenderer(Sensor(4, 4, 0.01), 0.0)
+
+
+SETTINGS = {"fields": [2, 3], "size": 21, "pupil": [10.0, 2.5, 2.0]}
+OLDER_STATES = {
+    "of a whole sensor": {
+        "model": "psf", "settings": SETTINGS, "bits": 64, "error": 0.5, "uncertainty": 0.1
+    },
+    "of windows": {"settings": SETTINGS, "errors": {"axis": 0.5, "edge": 0.2}, "uncertainty": 0.1},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("state", OLDER_STATES.values(), ids=OLDER_STATES.keys())
+def test_plans_of_older_checkpoints_are_taken_up(root, state):
+    sensor = Sensor(16, 16, 0.0069)
+    auto = AutoRenderer(sensor).load_state(coded(root), state)
+    pupil = ExitPupil(10.0, 2.5, 2.0)
+    assert auto.choice.renderer == PsfRenderer(sensor, (2, 3), size=21, pupil=pupil)
+    assert auto.choice.error == 0.5
+    assert auto.choice.dtype == (torch.float64 if "bits" in state else torch.float32)
+    assert auto.state()["settings"]["fields"] == [2, 3]
+
+
+@pytest.mark.parametrize(
+    "change", [{"model": "wavelets"}, {"settings": {"rings": 3}}, {"bits": 16}]
+)
+def test_a_plan_that_cannot_be_read_is_one_line_that_says_what_can(root, change):
+    state = OLDER_STATES["of a whole sensor"] | change
+    with pytest.raises(InputError, match=r"cannot be read .* allowed: psf, rays") as error:
+        AutoRenderer(Sensor(16, 16, 0.0069)).load_state(coded(root), state)
+    assert "\n" not in str(error.value)

@@ -7,7 +7,9 @@ import yaml
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering import chief_ray_map as module
 from dolens.rendering.chief_ray_map import chief_ray_maps, distortion
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points
+from dolens.rendering.protocol import SensorWindow
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.exit_pupil import axial_exit_pupil
 from dolens.scene.planar import PlanarScene
@@ -32,7 +34,7 @@ def by_rays(system, scene, sensor, pupil):
         torch.arange(sensor.height).double(), torch.arange(sensor.width).double(), indexing="ij"
     )
     points = sensor.positions(row.reshape(-1), column.reshape(-1))
-    seen = chief_ray_points(system, scene, points, pupil, sensor.pixel_pitch, "reference")
+    seen = chief_ray_points(ImagingSystem(system, scene, sensor, pupil), points)
     return [c.permute(1, 2, 0).unflatten(-1, row.shape) for c in seen]
 
 
@@ -41,7 +43,7 @@ def test_polynomials_are_the_chief_rays_to_a_thousandth_of_a_pixel(root, name):
     system, sensor = lens_of(root, name).system(), SENSORS[name]
     scene = PlanarScene((5000.0, 9000.0), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
+    (found,) = chief_ray_maps(ImagingSystem(system, scene, sensor, pupil), [sensor])
     for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
         assert float((one - other).abs().max()) < 1e-3
 
@@ -50,7 +52,7 @@ def test_windows_of_a_sensor_look_where_the_sensor_does(root):
     system, sensor = lens_of(root, "large_fov_doublet").system(), SENSORS["large_fov_doublet"]
     scene = PlanarScene((5000.0,), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    whole = distortion(system, scene, sensor, pupil, "reference")
+    whole = distortion(ImagingSystem(system, scene, sensor, pupil))
     window = sensor.window(11, 200, 40, 30)
     for part, all_of_it in zip(whole.seen_by(window), whole.seen_by(sensor), strict=True):
         assert torch.allclose(part, all_of_it[..., 11:51, 200:230], rtol=0, atol=1e-9)
@@ -61,8 +63,8 @@ def test_where_polynomials_are_not_enough_every_pixel_has_its_ray(root, monkeypa
     system, sensor = lens_of(root, "cooke_triplet").system(), Sensor(12, 10, 1.0)
     scene = PlanarScene((5000.0,), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    assert distortion(system, scene, sensor, pupil, "reference") is None
-    (found,) = chief_ray_maps(system, scene, sensor, [sensor], pupil, "reference")
+    assert distortion(ImagingSystem(system, scene, sensor, pupil)) is None
+    (found,) = chief_ray_maps(ImagingSystem(system, scene, sensor, pupil), [sensor])
     for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
         assert torch.equal(one, other)
 
@@ -84,9 +86,8 @@ def test_windows_rendered_together_are_those_rendered_one_by_one(root, registrat
         "illumination": illumination,
         "jitter": False,
     }
-    together = PsfRenderer(sensor, **settings).render_windows(
-        lens, scene, textures, windows, centres, 1
-    )
+    shown = [SensorWindow(*pair) for pair in zip(windows, centres, strict=True)]
+    together = PsfRenderer(sensor, **settings).render_windows(lens, scene, textures, shown, 1)
     for i, window in enumerate(windows):
         placed = PlanarScene(scene.depths, scene.wavelengths, centres[i])
         alone = PsfRenderer(window, **settings).render(lens, placed, textures[i : i + 1], 1)

@@ -59,7 +59,7 @@ def test_noise_at_equal_exposure_time_is_that_of_the_electrons_that_are_left():
     light, well, read, level = 400.0, 8000.0, 5.0, 0.5
     for stops in (0, 1, 2, 4):
         sensor = Readout.at_light(light, well, read_noise=read / well, reference_f_number=8.0)
-        mean, deviation = spread(sensor.behind(8.0 * math.sqrt(2.0) ** stops), level)
+        mean, deviation = spread(sensor.at_f_number(8.0 * math.sqrt(2.0) ** stops), level)
         white = light / 2.0**stops
         # Shot noise of white·level electrons and the sensor's own, over the electrons of white.
         expected = math.sqrt(white * level + read**2) / white
@@ -69,10 +69,10 @@ def test_noise_at_equal_exposure_time_is_that_of_the_electrons_that_are_left():
 
 def test_read_noise_alone_doubles_with_every_stop():
     sensor = Readout(read_noise=0.003, reference_f_number=8.0)
-    _, wide = spread(sensor.behind(8.0), 0.5)
-    _, stop = spread(sensor.behind(8.0 * math.sqrt(2.0)), 0.5)
+    _, wide = spread(sensor.at_f_number(8.0), 0.5)
+    _, stop = spread(sensor.at_f_number(8.0 * math.sqrt(2.0)), 0.5)
     assert stop == pytest.approx(2.0 * wide, rel=1e-9)  # the same random numbers
-    _, without = spread(Readout(read_noise=0.003).behind(16.0), 0.5)
+    _, without = spread(Readout(read_noise=0.003).at_f_number(16.0), 0.5)
     assert without == pytest.approx(wide, rel=1e-9)
 
 
@@ -80,4 +80,4 @@ def test_a_white_pixel_beyond_the_full_well_is_refused():
     with pytest.raises(InputError, match=r"light is 9000\.0; allowed: at most the full well, 8000"):
         Readout.at_light(9000.0, 8000.0)
     with pytest.raises(InputError, match=r"f_number is 0\.0"):
-        Readout().behind(0.0)
+        Readout().at_f_number(0.0)

@@ -10,6 +10,7 @@ from dolens.kernels import rendering
 from dolens.optics.rays import Rays, Status
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.moving_view import moving_view
+from dolens.rendering.pixel_rays import PixelRays
 from dolens.rendering.pupil.exit_pupil import sampled_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -99,7 +100,7 @@ def test_wavelengths_part_at_the_first_surface_they_meet(last):
         system, renderer = lens.system(), RayRenderer(Sensor(9, 20, 0.6), 5)
         pupil = sampled_exit_pupil(system, LINES, renderer.sensor)
         view = renderer._view(system, scene, (40, 43), 5, pupil)
-        ray, _ = renderer._samples(system, view, pupil, 0, 180)
+        ray, _ = PixelRays(scene, renderer.sensor, view).samples(system, pupil, 0, 180)
         for wavelength in LINES:
             hit = lens.sensor_to_scene(Rays.from_components(ray, wavelength), first=3)
             ended.append(hit.status == Status.TIR)
@@ -219,11 +220,12 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
     view = renderer._view(system, scene, (40, 43), 0, sampled_exit_pupil(system, LINES, SMALL))
-    moving = moving_view(system, scene, view, "reference")
-    ray, weight = renderer._samples(system, view, moving.pupil, 0, 180)
-    shown = scene.on_planes(texture(40))
-    images = [renderer._shade(system, scene, view, moving, shown, ray, weight, None, backend)
-              for backend in ("reference", "cpu")]  # fmt: skip
+    moving = moving_view(system, scene, view)
+    rays, shown = PixelRays(scene, SMALL, view), scene.on_planes(texture(40))
+    images = [
+        rays.light(system.traced_by(backend), moving, shown, 0, 180)
+        for backend in ("reference", "cpu")
+    ]
     assert torch.allclose(*images, rtol=1e-11, atol=0)
 
 

@@ -31,7 +31,7 @@ def test_sums_and_gradients_are_the_reference_s(count):
     given = [t.requires_grad_() for t in points(count, size)]
     generator = torch.Generator().manual_seed(8)
     weight = torch.randn(size, size, generator=generator, dtype=torch.float64)
-    expected, found = (splat(*given, size, backend) for backend in ("reference", "cpu"))
+    expected, found = (splat(*given, size, fused) for fused in (False, True))
     assert torch.allclose(found, expected, rtol=1e-12, atol=1e-12)
     pairs = [torch.autograd.grad((image * weight).sum(), given) for image in (expected, found)]
     for one, two in zip(*pairs, strict=True):
@@ -42,15 +42,15 @@ def test_sums_and_gradients_are_the_reference_s(count):
 def test_many_grids_are_each_their_own(count):
     size, grids = 11, 3
     given = [torch.stack([t + 0.3 * g for g in range(grids)]) for t in points(count, size)]
-    for backend in ("reference", "cpu"):
-        together = splat(*given, size, backend)
-        apart = torch.stack([splat(*(t[g] for t in given), size, backend) for g in range(grids)])
+    for fused in (False, True):
+        together = splat(*given, size, fused)
+        apart = torch.stack([splat(*(t[g] for t in given), size, fused) for g in range(grids)])
         assert torch.equal(together, apart)
     inputs = [t.requires_grad_() for t in given]
     weight = torch.arange(grids * size * size, dtype=torch.float64).reshape(grids, size, size)
     gradients = [
-        torch.autograd.grad((splat(*inputs, size, backend) * weight).sum(), inputs)
-        for backend in ("reference", "cpu")
+        torch.autograd.grad((splat(*inputs, size, fused) * weight).sum(), inputs)
+        for fused in (False, True)
     ]
     for one, two in zip(*gradients, strict=True):
         assert torch.allclose(one, two, rtol=1e-10, atol=1e-9)
@@ -59,7 +59,7 @@ def test_many_grids_are_each_their_own(count):
 def test_single_precision_sums_err_by_its_rounding():
     given = points(50_000, 15)
     expected = splat(*given, 15)
-    found = splat(*(t.float() for t in given), 15, "cpu")
+    found = splat(*(t.float() for t in given), 15, fused=True)
     assert float((found - expected).abs().max()) < 1e-5 * float(expected.max())
 
 
@@ -68,7 +68,7 @@ def test_threads_change_no_bit():
     try:
         for count in (1, 2, 4):
             torch.set_num_threads(count)
-            results.append(splat(*given, 15, "cpu"))
+            results.append(splat(*given, 15, fused=True))
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(results[0], results[1])
@@ -79,7 +79,7 @@ def test_points_that_are_no_numbers_are_left_out():
     nan, inf = float("nan"), float("inf")
     rows = torch.tensor([3.2, nan, 3.0, inf, -inf, 1e30], dtype=torch.float64)
     columns = torch.tensor([4.1, 3.0, nan, 3.0, 3.0, -1e30], dtype=torch.float64)
-    image = splat(rows, columns, torch.ones(6, dtype=torch.float64), 9, "cpu")
+    image = splat(rows, columns, torch.ones(6, dtype=torch.float64), 9, fused=True)
     assert float(image.sum()) == pytest.approx(1.0, abs=1e-14)
 
 
@@ -99,7 +99,7 @@ def test_point_spread_functions_are_the_reference_s(wavefront_coding):
 
 def test_second_derivatives_are_an_error():
     rows = torch.tensor([3.2], dtype=torch.float64, requires_grad=True)
-    image = splat(rows, rows, torch.ones_like(rows), 9, "cpu")
+    image = splat(rows, rows, torch.ones_like(rows), 9, fused=True)
     (gradient,) = torch.autograd.grad(image.square().sum(), rows, create_graph=True)
     with pytest.raises(InputError, match="first derivatives only"):
         torch.autograd.grad(gradient.sum(), rows)

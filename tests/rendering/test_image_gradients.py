@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from dolens import load_lens
+from dolens.diffraction.pixel_integration import PixelWindow
 from dolens.diffraction.psf import wave_kernels
 from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription
 from dolens.prescriptions.build import prescription_of
-from dolens.rendering.auto.probe import probe_texture
+from dolens.rendering.auto.probes import probe_texture
 from dolens.rendering.gradient_check import gradient_rows
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
@@ -137,7 +138,9 @@ def test_a_vignetted_pupil_s_light_follows_both_of_its_edges(root, number):
     radius = torch.tensor(lens.surfaces[str(number)].semi_diameter).double().requires_grad_()
 
     def light(radius):
-        return wave_kernels(lens.system({name: radius}), point, LINES[1], None, 0.012, 41).sum()
+        return wave_kernels(
+            lens.system({name: radius}), point, LINES[1], None, PixelWindow(0.012, 41)
+        ).sum()
 
     (slope,) = torch.autograd.grad(light(radius), radius)
     with torch.no_grad():

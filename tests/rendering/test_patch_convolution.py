@@ -1,16 +1,13 @@
 """Convolution that varies over the image, against its defining sum."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.rendering.patch_convolution import (
-    Coordinates,
-    convolve_patches,
-    fast_length,
-    node_positions,
-    patches,
-)
+from dolens.rendering.patch_convolution import convolve_patches, transform_length
+from dolens.rendering.patches import Coordinates, PatchLayout, node_positions, patches
 from dolens.rendering.plane_blur import uniform_image
 from dolens.rendering.psf import splat
 
@@ -47,7 +44,7 @@ def test_patches_make_the_defining_sum(nodes, origin, shapes):
     textures = random(2, *shapes[0], 15, 17)
     kernels = random(nodes[0] * nodes[1], *shapes[1], 5, 5, seed=1)
     layout = patches(11, 9, *nodes, textures)
-    image = convolve_patches(textures, kernels, layout, origin, (11, 9), None, "reference")
+    image = convolve_patches(textures, kernels, PatchLayout(layout, (11, 9), origin))
     assert torch.allclose(image, defining_sum(textures, kernels, layout, origin, (11, 9)))
 
 
@@ -57,8 +54,8 @@ def test_a_texture_of_ones_takes_the_kernels_sums():
     own = [p._replace(weight=p.weight * random(3, 1, 1, seed=i)) for i, p in enumerate(layout)]
     for given, channels in ((layout, 1), (own, 3)):
         three = ones.expand(1, 1, channels, 15, 17)
-        image = convolve_patches(three, kernels, given, (3, 2), (11, 9), None, "reference")
-        found = uniform_image(kernels, given, (11, 9))
+        image = convolve_patches(three, kernels, PatchLayout(given, (11, 9), (3, 2)))
+        found = uniform_image(kernels, PatchLayout(given, (11, 9)))
         assert found.shape == (2, channels, 11, 9)
         assert torch.allclose(found, image[0], atol=1e-12)
 
@@ -96,10 +93,10 @@ def plain_coordinates(planes, channels, height, width, top, left):
 def test_looking_at_every_texel_in_turn_is_the_plain_convolution(backend):
     # The lookup's splines and the filter that undoes them cancel at whole texels.
     textures, kernels = random(1, 1, 2, 30, 30), random(4, 2, 2, 5, 5, seed=1)
-    layout = patches(12, 10, 2, 2, textures)
-    plain = convolve_patches(textures, kernels, layout, (7, 8), (12, 10), None, backend)
+    layout = PatchLayout(patches(12, 10, 2, 2, textures), (12, 10), (7, 8), fused=backend == "cpu")
+    plain = convolve_patches(textures, kernels, layout)
     coordinates = plain_coordinates(2, 2, 12, 10, 7, 8)
-    looked = convolve_patches(textures, kernels, layout, (0, 0), (12, 10), coordinates, backend)
+    looked = convolve_patches(textures, kernels, replace(layout, coordinates=coordinates))
     assert torch.allclose(looked, plain, atol=1e-6)
 
 
@@ -108,13 +105,12 @@ def test_a_point_s_spline_is_looked_up_anywhere(backend):
     # Σ T[k]·β²(c - k), whatever fraction of a texel c lies at.
     textures = random(1, 1, 1, 40, 40)
     kernel = splat(*(torch.full((1,), 4.0, dtype=torch.float64),) * 2, torch.ones(1).double(), 9)
-    layout = patches(10, 10, 1, 1, textures)
+    patch = patches(10, 10, 1, 1, textures)
     rows = 12.3 + 1.02 * torch.arange(10.0).double()[:, None].expand(10, 10)
     columns = 14.7 + 0.97 * torch.arange(10.0).double()[None].expand(10, 10)
     coordinates = Coordinates(rows[None, None], columns[None, None])
-    image = convolve_patches(
-        textures, kernel[None, None, None], layout, (0, 0), (10, 10), coordinates, backend
-    )[0, 0, 0]
+    layout = PatchLayout(patch, (10, 10), (0, 0), coordinates, backend == "cpu")
+    image = convolve_patches(textures, kernel[None, None, None], layout)[0, 0, 0]
 
     def spline(distance):
         d = distance.abs()
@@ -130,21 +126,24 @@ def test_a_point_s_spline_is_looked_up_anywhere(backend):
 def test_gradients_are_those_of_the_sum(looked, shapes, backend):
     textures = random(1, *shapes[0], 8, 7).requires_grad_()
     kernels = random(2, *shapes[1], 3, 3, seed=1).requires_grad_()
-    layout = patches(4, 3, 1, 2, textures)
     coordinates = None
     if looked:
         plain = plain_coordinates(2, 2, 4, 3, 4, 5)
         coordinates = Coordinates(1.01 * plain.rows + 0.2, 0.98 * plain.columns - 0.3)
 
+    layout = PatchLayout(
+        patches(4, 3, 1, 2, textures), (4, 3), (-2, 3), coordinates, backend == "cpu"
+    )
+
     def image(textures, kernels):
-        return convolve_patches(textures, kernels, layout, (-2, 3), (4, 3), coordinates, backend)
+        return convolve_patches(textures, kernels, layout)
 
     assert torch.autograd.gradcheck(image, (textures, kernels))
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 31, 97, 211, 320, 641])
 def test_transforms_are_of_lengths_with_small_factors(length):
-    found = fast_length(length)
+    found = transform_length(length)
     assert length <= found <= 1.25 * length + 2
     rest = found
     for factor in (2, 3, 5):

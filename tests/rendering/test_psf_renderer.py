@@ -9,10 +9,11 @@ import yaml
 
 from dolens import load_lens
 from dolens.errors import InputError
-from dolens.optics.system import is_rotationally_symmetric
+from dolens.optics.elements import Element, ElementState
 from dolens.optics.trace import trace_surfaces
 from dolens.prescriptions import lens_from_prescription
-from dolens.rendering.auto.probe import probe_image
+from dolens.rendering.auto.probes import probe_image
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_grid import field_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
@@ -135,20 +136,20 @@ def test_gradients_are_finite_differences(root, fields, registration):
 
 
 def test_functions_of_a_symmetric_lens_are_turned_along_with_the_field(root):
-    # With and without the symmetry: the same functions at points of one radius and all others.
+    # Of the same lens with and without an element that could be tilted, which ends the symmetry.
     lens = lens_by_name(root, "cooke_triplet")
     system, scene = lens.system(), PlanarScene((4000.0, 2500.0), LINES)
-    sensor = Sensor(64, 64, 0.3)
-    pupil = sampled_exit_pupil(system, LINES, sensor)
+    pose = dict(Element(1, 2).requires_grad_(False).named_parameters())
+    movable = replace(system, elements=[ElementState(1, 2, pose, (0.0, 0.0, 0.0))])
+    assert system.rotationally_symmetric
+    assert not movable.rotationally_symmetric
+    imaging = ImagingSystem.of(system, scene, Sensor(64, 64, 0.02))
     angles = torch.tensor([0.0, 0.7, 2.0, 3.5]).double()
     points = 6.0 * torch.cos(angles), 6.0 * torch.sin(angles)
     found = [
-        field_point_spread_functions(
-            system, scene, points, pupil, 0.02, 21, 96, None, True, symmetric, "cpu"
-        )
-        for symmetric in (True, False)
+        field_point_spread_functions(replace(imaging, system=lens), points, 21, 96, None, True)
+        for lens in (system, movable)
     ]
-    assert is_rotationally_symmetric(system)
     size = float(found[1].functions.max())
     assert float((found[0].functions - found[1].functions).abs().max()) < 0.03 * size
     assert torch.allclose(found[0].light, found[1].light, rtol=5e-3)
@@ -158,12 +159,9 @@ def test_the_function_on_the_axis_is_the_axial_one(root):
     # Backwards from the pixel and forwards from the point: the same light.
     lens = lens_by_name(root, "wavefront_coding")
     sensor, scene = Sensor(1, 1, 0.0069), PlanarScene((8000.0, 4500.0), LINES)
-    system = lens.system()
-    pupil = sampled_exit_pupil(system, LINES, sensor)
     zero = torch.zeros(1, dtype=torch.float64)
-    found = field_point_spread_functions(
-        system, scene, (zero, zero), pupil, 0.0069, 61, 160, None, False, False, "cpu"
-    )
+    imaging = ImagingSystem.of(lens.system(), scene, sensor)
+    found = field_point_spread_functions(imaging, (zero, zero), 61, 160, None, False)
     forward = axial_point_spread_functions(lens, scene, sensor, 61, 160)
     difference = (found.functions[0] - forward).abs().sum((-2, -1))
     assert float(difference.max()) < 0.02
@@ -177,8 +175,8 @@ def test_illumination_follows_cos4_where_nothing_clips(root):
     prescription["surfaces"]["4"]["semi_diameter"] = 0.4
     lens = lens_from_prescription(prescription)
     system, sensor = lens.system(), Sensor(3, 101, 0.1)
-    pupil = sampled_exit_pupil(system, LINES[:1], sensor)
-    found = relative_illumination(system, LINES[:1], sensor, pupil, True, "reference")
+    imaging = ImagingSystem.of(system, PlanarScene((5000.0,), LINES[:1]), sensor)
+    pupil, found = imaging.pupil, relative_illumination(imaging)
     x, y = sensor.positions(*torch.meshgrid(torch.arange(3.0), torch.arange(101.0), indexing="ij"))
     distance = float(system.vertices[-1].detach()) - pupil.z
     cosine = distance / torch.sqrt(distance**2 + x * x + y * y)
@@ -221,7 +219,8 @@ def test_light_from_beyond_the_axial_pupil_is_not_lost(root):
     system, sensor = lens.system(), Sensor(3, 3, 12.0)
     pupil = sampled_exit_pupil(system, LINES, sensor)
     assert pupil.radius > 1.03 * pupil.axial_radius
-    found = relative_illumination(system, LINES[1:2], sensor, pupil, True, "reference", 40_000)
+    scene = PlanarScene((5000.0,), LINES[1:2])
+    found = relative_illumination(ImagingSystem(system, scene, sensor, pupil), 40_000)
     side = (torch.arange(700).double() + 0.5) / 350 - 1.0
     across, down = torch.meshgrid(
         1.5 * pupil.radius * side, 1.5 * pupil.radius * side, indexing="ij"
@@ -244,9 +243,8 @@ def test_windows_beyond_the_sensor_are_errors():
 def test_light_beyond_the_window_is_counted(root):
     lens, sensor = lens_by_name(root, "wavefront_coding"), Sensor(8, 8, 0.0069)
     renderer, scene = PsfRenderer(sensor, (1, 1), 48, 9), PlanarScene((8000.0,), LINES)
-    system = lens.system()
-    pupil = sampled_exit_pupil(system, LINES, sensor)
-    found = renderer.point_spread_functions(system, scene, pupil, 0, "cpu")
+    imaging = ImagingSystem.of(lens.system(), scene, sensor)
+    found = renderer.point_spread_functions(imaging, 0)
     kept = found.functions.sum((-2, -1)).min()
     assert 0.05 < float(found.lost) < 0.95
     assert float(found.lost) == pytest.approx(

@@ -7,7 +7,7 @@ import torch
 from scipy import integrate, stats
 
 from dolens import InputError
-from dolens.tolerancing import tightened, tolerances_from
+from dolens.tolerancing import scaled_tolerances, tolerances_from
 
 
 def test_units_are_those_of_files(triplet):
@@ -31,7 +31,9 @@ def test_units_are_those_of_files(triplet):
     assert found.steps.tolist() == pytest.approx(expected, rel=1e-12)
     labels = [found.label(column) for column in range(4)]
     assert labels == ["± 0.2 %", "± 1e-05 1/mm", "± 0.03 mm", "± 0.1 deg"]
-    assert tightened(found, 0.5).steps.tolist() == pytest.approx([0.5 * s for s in expected])
+    assert scaled_tolerances(found, 0.5).steps.tolist() == pytest.approx(
+        [0.5 * s for s in expected]
+    )
 
 
 @pytest.mark.parametrize("distribution", ["uniform", "normal"])
@@ -85,7 +87,7 @@ BAD = {
     "not a number": ({"thicknesses.1": math.nan}, "half_range must be a positive number"),
     "distribution": (
         {"thicknesses.1": {"half_range": 0.1, "distribution": "gauss"}},
-        "thicknesses.1: distribution 'gauss' is unknown (allowed: uniform, normal)",
+        "thicknesses.1: distribution: 'gauss' is unknown (allowed: uniform, normal)",
     ),
     "relative": (
         {"thicknesses.1": {"half_range": 0.1, "relative": "yes"}},

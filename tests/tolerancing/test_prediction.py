@@ -9,8 +9,8 @@ from dolens.tolerancing import (
     Outcome,
     contributions,
     linear_spots,
+    scaled_tolerances,
     spot_weights,
-    tightened,
     tolerances_from,
     trace_perturbed,
 )
@@ -29,7 +29,7 @@ def test_the_prediction_s_error_falls_with_the_square_of_the_tolerances(triplet,
     for refocused in (False, True):
         errors = []
         for factor in (0.08, 0.04, 0.02):
-            exact, linear = outcomes(triplet, spots, tightened(wide, factor), 20)
+            exact, linear = outcomes(triplet, spots, scaled_tolerances(wide, factor), 20)
             pair = (exact.after, linear.after) if refocused else (exact.before, linear.before)
             errors.append(float((pair[0] - pair[1]).norm()))
         for coarse, fine in pairwise(errors):
@@ -37,7 +37,7 @@ def test_the_prediction_s_error_falls_with_the_square_of_the_tolerances(triplet,
 
 
 def test_without_errors_the_prediction_is_exact(triplet, spots, settings):
-    tolerances = tightened(tolerances_from(triplet, settings), 1e-9)
+    tolerances = scaled_tolerances(tolerances_from(triplet, settings), 1e-9)
     exact, linear = outcomes(triplet, spots, tolerances, 2)
     torch.testing.assert_close(exact.after, linear.after, rtol=1e-8, atol=0.0)
     torch.testing.assert_close(exact.refocus, linear.refocus, rtol=0.0, atol=1e-8)

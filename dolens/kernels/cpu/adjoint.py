@@ -1,6 +1,6 @@
 """Driver of the backward pass: each block is traced again, keeping its states, and swept back.
 
-Only valid rays take part: a block is filled with the next 128 of them, so that rays which fail cost
+Only valid rays take part: a block is filled with the next of them, so that rays which fail cost
 nothing and cannot spoil a sum.  Sums are kept for every chunk of rays, in double precision, and the
 chunks do not depend on the number of threads: neither does the result.
 """
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from numba import carray, njit, types
 
+from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.compiler import (
     OPTIONS,
     call_block,
@@ -21,6 +22,36 @@ from dolens.kernels.cpu.compiler import (
     shifted,
 )
 from dolens.kernels.cpu.forward import real_at, streams
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    ENDED,
+    OF_FRONT,
+    OF_RECORD,
+    OF_SHAPE,
+    PATH,
+    STATE,
+    STENCIL_PLACE,
+    UNBOUNDED,
+    VIGNETTED,
+    L,
+    X,
+    Z,
+)
+from dolens.kernels.cpu.records import (
+    ADJOINT,
+    B_SPLINE,
+    BEFORE,
+    CHANGE_AXES,
+    CODE_ROW,
+    COLUMNS,
+    COUNT,
+    KIND,
+    LENGTH,
+    LENS_AXES,
+    OFFSET,
+    POSE,
+    SHAPE,
+)
 
 
 class Sweeps(NamedTuple):
@@ -44,31 +75,35 @@ def sweeps(real: types.Type) -> Sweeps:
     def load_lanes(job, lanes):  # noqa: ANN001, ANN202
         """Load the rays of these numbers into the first state."""
         find_wavelength(job, lanes)
-        state = carray(at(job[15]), 1280)
+        state = carray(at(job[jobs.STACK]), STATE)
         for k in range(3):
-            source = carray(shifted(at(job[0]), k * job[2]), 1 << 40)
-            for i in range(128):
-                state[128 * k + i] = source[lanes[i] * job[1]]
-            source = carray(shifted(at(job[3]), k * job[5]), 1 << 40)
-            for i in range(128):
-                state[384 + 128 * k + i] = source[lanes[i] * job[4]]
-        for i in range(128):
-            state[768 + i], state[896 + i], state[1024 + i] = zero, zero, zero
+            source = carray(
+                shifted(at(job[jobs.POSITION]), k * job[jobs.POSITION_COLUMN]), UNBOUNDED
+            )
+            for i in range(BLOCK):
+                state[X + BLOCK * k + i] = source[lanes[i] * job[jobs.POSITION_ROW]]
+            source = carray(
+                shifted(at(job[jobs.DIRECTION]), k * job[jobs.DIRECTION_COLUMN]), UNBOUNDED
+            )
+            for i in range(BLOCK):
+                state[L + BLOCK * k + i] = source[lanes[i] * job[jobs.DIRECTION_ROW]]
+        for i in range(BLOCK):
+            state[PATH + i], state[ENDED + i], state[VIGNETTED + i] = zero, zero, zero
 
     @njit(**OPTIONS)
     def gather(job, ray, end, lanes):  # noqa: ANN001, ANN202
         """Load the next valid rays from `ray` on; their number, and where to go on."""
-        status = carray(int8_at(job[21]), 1 << 40)
+        status = carray(int8_at(job[jobs.OUT_STATUS]), UNBOUNDED)
         count = 0
-        while ray < end and count < 128:
+        while ray < end and count < BLOCK:
             if status[ray] == 0:
                 lanes[count] = ray
                 count += 1
             ray += 1
-        for i in range(max(count, 1), 128):
+        for i in range(max(count, 1), BLOCK):
             lanes[i] = lanes[0]
-        if count == 128 and lanes[127] - lanes[0] == 127:
-            load(job, lanes[0], 128, at(job[15]), lanes)
+        if count == BLOCK and lanes[BLOCK - 1] - lanes[0] == BLOCK - 1:
+            load(job, lanes[0], BLOCK, at(job[jobs.STACK]), lanes)
         elif count > 0:
             load_lanes(job, lanes)
         return count, ray
@@ -76,64 +111,65 @@ def sweeps(real: types.Type) -> Sweeps:
     @njit(**OPTIONS)
     def forward(job, lanes):  # noqa: ANN001, ANN202
         """Trace the block, keeping the state behind every step."""
-        stack, work = at(job[15]), at(job[17])
-        for k in range(job[8]):
-            now, then = shifted(stack, 1280 * k), shifted(stack, 1280 * (k + 1))
+        stack, work = at(job[jobs.STACK]), at(job[jobs.WORK])
+        for k in range(job[jobs.STEPS]):
+            now, then = shifted(stack, STATE * k), shifted(stack, STATE * (k + 1))
             step(job, k, lanes, now, then, then, work)
 
     @njit(**OPTIONS)
     def back(job, k, lanes):  # noqa: ANN001, ANN202
         """Sweep the cotangents back through step k."""
-        place = shifted(int64_at(job[9]), 24 * k)
-        codes = carray(place, 24)
-        work = at(job[17])
-        now, then = shifted(at(job[15]), 1280 * k), shifted(at(job[15]), 1280 * (k + 1))
+        place = shifted(int64_at(job[jobs.CODES]), CODE_ROW * k)
+        codes = carray(place, CODE_ROW)
+        work = at(job[jobs.WORK])
+        now = shifted(at(job[jobs.STACK]), STATE * k)
+        then = shifted(at(job[jobs.STACK]), STATE * (k + 1))
         set_indices(job, codes, lanes, work)
-        record = shifted(at(job[10]), codes[1])
-        call_block(codes[17], now, then, at(job[16]), record, work, place)
+        record = shifted(at(job[jobs.VALUES]), codes[OFFSET])
+        call_block(codes[ADJOINT], now, then, at(job[jobs.COTANGENTS]), record, work, place)
 
     @njit(**OPTIONS)
     def add_row(cotangents, row, sums, place):  # noqa: ANN001, ANN202
-        lane = carray(shifted(cotangents, 128 * row), 128)
+        lane = carray(shifted(cotangents, row), BLOCK)
         total = zero
-        for i in range(128):
+        for i in range(BLOCK):
             total += lane[i]
         sums[place] += types.float64(total)
 
     @njit(**OPTIONS)
     def add_sums(job, k, lanes, sums):  # noqa: ANN001, ANN202
         """Add the cotangents of step k, summed over the block, to a chunk's sums."""
-        codes = carray(shifted(int64_at(job[9]), 24 * k), 24)
-        cotangents = at(job[16])
-        kind, offset, length = codes[0], codes[1], codes[2]
-        moved = 12 if kind == 6 or kind == 7 else 1
+        codes = carray(shifted(int64_at(job[jobs.CODES]), CODE_ROW * k), CODE_ROW)
+        cotangents = at(job[jobs.COTANGENTS])
+        kind, offset, length = codes[KIND], codes[OFFSET], codes[LENGTH]
+        moved = POSE if kind in (CHANGE_AXES, LENS_AXES) else 1
         for j in range(moved):
-            add_row(cotangents, 16 + j, sums, offset + j)
-        if kind == 5:
-            first = offset + length - codes[8] * codes[9]
-            place = carray(shifted(cotangents, 7168), 128)
+            add_row(cotangents, OF_RECORD + BLOCK * j, sums, offset + j)
+        if kind == B_SPLINE:
+            first = offset + length - codes[COUNT] * codes[COLUMNS]
+            place = carray(shifted(cotangents, STENCIL_PLACE), BLOCK)
             for j in range(4):
-                for i in range(128):
+                for i in range(BLOCK):
                     for m in range(4):
-                        lane = carray(shifted(cotangents, 5120 + 128 * (4 * j + m)), 128)
-                        to = first + types.int64(place[i]) + j * codes[9] + m
+                        lane = carray(shifted(cotangents, OF_SHAPE + BLOCK * (4 * j + m)), BLOCK)
+                        to = first + types.int64(place[i]) + j * codes[COLUMNS] + m
                         sums[to] += types.float64(lane[i])
         else:
-            for j in range(24, length):
-                add_row(cotangents, 16 + j, sums, offset + j)
-        if job[39] == 0:
+            for j in range(SHAPE, length):
+                add_row(cotangents, OF_RECORD + BLOCK * j, sums, offset + j)
+        if job[jobs.INDEX_SUMS] == 0:
             return
-        count, values = job[12], job[37]
+        count, values = job[jobs.WAVELENGTHS], job[jobs.VALUES_LENGTH]
         for side in range(2):
-            row = values + codes[3 + side] * count
+            row = values + codes[BEFORE + side] * count
             if count == 1:
-                add_row(cotangents, 7 + side, sums, row)
-            elif job[63] > 0:
-                add_row(cotangents, 7 + side, sums, row + job[63] - 1)
+                add_row(cotangents, OF_FRONT + BLOCK * side, sums, row)
+            elif job[jobs.WAVELENGTH] > 0:
+                add_row(cotangents, OF_FRONT + BLOCK * side, sums, row + job[jobs.WAVELENGTH] - 1)
             else:
-                which = carray(int32_at(job[6]), 1 << 40)
-                lane = carray(shifted(cotangents, 896 + 128 * side), 128)
-                for i in range(128):
+                which = carray(int32_at(job[jobs.WHICH]), UNBOUNDED)
+                lane = carray(shifted(cotangents, OF_FRONT + BLOCK * side), BLOCK)
+                for i in range(BLOCK):
                     sums[row + which[lanes[i]]] += types.float64(lane[i])
 
     return Sweeps(load_lanes, gather, forward, back, add_sums)
@@ -147,38 +183,46 @@ def adjoint_driver(real: types.Type) -> Callable[..., None]:
 
     @njit(**OPTIONS)
     def load_cotangents(job, lanes, count, cot):  # noqa: ANN001, ANN202
-        for i in range(128 * 7):
+        for i in range(OF_FRONT):
             cot[i] = zero
         for k in range(3):
-            if job[24] != 0:
-                source = carray(shifted(at(job[24]), k * job[26]), 1 << 40)
+            if job[jobs.POSITION_COTANGENT] != 0:
+                first = shifted(
+                    at(job[jobs.POSITION_COTANGENT]), k * job[jobs.POSITION_COTANGENT_COLUMN]
+                )
+                source = carray(first, UNBOUNDED)
                 for i in range(count):
-                    cot[128 * k + i] = source[lanes[i] * job[25]]
-            if job[27] != 0:
-                source = carray(shifted(at(job[27]), k * job[29]), 1 << 40)
+                    cot[X + BLOCK * k + i] = source[lanes[i] * job[jobs.POSITION_COTANGENT_ROW]]
+            if job[jobs.DIRECTION_COTANGENT] != 0:
+                first = shifted(
+                    at(job[jobs.DIRECTION_COTANGENT]), k * job[jobs.DIRECTION_COTANGENT_COLUMN]
+                )
+                source = carray(first, UNBOUNDED)
                 for i in range(count):
-                    cot[384 + 128 * k + i] = source[lanes[i] * job[28]]
-        if job[30] != 0:
-            source = carray(at(job[30]), 1 << 40)
+                    cot[L + BLOCK * k + i] = source[lanes[i] * job[jobs.DIRECTION_COTANGENT_ROW]]
+        if job[jobs.PATH_COTANGENT] != 0:
+            source = carray(at(job[jobs.PATH_COTANGENT]), UNBOUNDED)
             for i in range(count):
-                cot[768 + i] = source[lanes[i] * job[31]]
+                cot[PATH + i] = source[lanes[i] * job[jobs.PATH_COTANGENT_ROW]]
 
     @njit(**OPTIONS)
     def store(address, lanes, count, cot, row):  # noqa: ANN001, ANN202
-        out = carray(at(address), 1 << 40)
+        out = carray(at(address), UNBOUNDED)
         for i in range(count):
             place = 3 * lanes[i]
-            out[place] = cot[128 * row + i]
-            out[place + 1] = cot[128 * (row + 1) + i]
-            out[place + 2] = cot[128 * (row + 2) + i]
+            out[place] = cot[row + i]
+            out[place + 1] = cot[row + BLOCK + i]
+            out[place + 2] = cot[row + 2 * BLOCK + i]
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 64)
-        lanes = carray(int64_at(job[38]), 128)
-        cot = carray(at(job[16]), 1 << 40)
+        job = carray(job_, jobs.LENGTH)
+        lanes = carray(int64_at(job[jobs.LANES]), BLOCK)
+        cot = carray(at(job[jobs.COTANGENTS]), UNBOUNDED)
         for chunk in range(first, last):
-            sums = carray(shifted(real64_at(job[34]), chunk * job[35]), 1 << 40)
-            ray, end = chunk * job[36], min((chunk + 1) * job[36], job[7])
+            sums = carray(
+                shifted(real64_at(job[jobs.SUMS]), chunk * job[jobs.SUM_LENGTH]), UNBOUNDED
+            )
+            ray, end = chunk * job[jobs.CHUNK], min((chunk + 1) * job[jobs.CHUNK], job[jobs.RAYS])
             while ray < end:
                 count, ray = gather(job, ray, end, lanes)
                 if count == 0:
@@ -187,14 +231,14 @@ def adjoint_driver(real: types.Type) -> Callable[..., None]:
                 load_cotangents(job, lanes, count, cot)
                 total = types.float64(0.0)
                 for i in range(count):
-                    total += types.float64(cot[256 + i])
-                sums[job[37] - 1] += total
-                for k in range(job[8] - 1, -1, -1):
+                    total += types.float64(cot[Z + i])
+                sums[job[jobs.VALUES_LENGTH] - 1] += total
+                for k in range(job[jobs.STEPS] - 1, -1, -1):
                     back(job, k, lanes)
                     add_sums(job, k, lanes, sums)
-                if job[32] != 0:
-                    store(job[32], lanes, count, cot, 0)
-                if job[33] != 0:
-                    store(job[33], lanes, count, cot, 3)
+                if job[jobs.POSITION_GRADIENT] != 0:
+                    store(job[jobs.POSITION_GRADIENT], lanes, count, cot, X)
+                if job[jobs.DIRECTION_GRADIENT] != 0:
+                    store(job[jobs.DIRECTION_GRADIENT], lanes, count, cot, L)
 
     return kernel

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 from numba import njit, types
 
 from dolens.kernels.cpu.compiler import OPTIONS
+from dolens.kernels.cpu.layout import ENDED, VIGNETTED
+from dolens.kernels.cpu.records import MISSED, STOPPED, TOTALLY_REFLECTED
 
 
 class Arithmetic(NamedTuple):
@@ -18,6 +20,7 @@ class Arithmetic(NamedTuple):
     clamp: Any
     safe_sqrt: Any
     arrive: Any
+    set_status: Any
     refract: Any
     refract_adjoint: Any
 
@@ -27,6 +30,8 @@ def arithmetic(real: types.Type) -> Arithmetic:
     """The functions for a real type; every constant in them has it, so that none is promoted."""
     grazing, tiny = real(1e-9), real(1e-18)
     zero, one, two = real(0.0), real(1.0), real(2.0)
+    stopped, totally_reflected = real(STOPPED), real(TOTALLY_REFLECTED)
+    missed = real(MISSED)
 
     @njit(**OPTIONS)
     def clamp(value, limit):  # noqa: ANN001, ANN202
@@ -50,6 +55,20 @@ def arithmetic(real: types.Type) -> Arithmetic:
         x, y = clamp(x + t * l, limit), clamp(y + t * m, limit)
         towards = towards if math.fabs(x) < limit else zero
         return x, y, t, towards if math.fabs(y) < limit else zero
+
+    @njit(**OPTIONS)
+    def set_status(src, dst, i, tag, edge, x, y, met, least, transmitted):  # noqa: ANN001, ANN202
+        """Note in ray i's state behind a surface how it fails there; the first failure stays.
+
+        Args: the states in front and behind; i; the surface's tag, and its circular edge's radius
+        squared; where the ray meets it; a number that exceeds `least` if it does; and cos² behind,
+        which is positive without total reflection.
+        """
+        ended, vignetted = src[ENDED + i], src[VIGNETTED + i]
+        ended = ended if ended > zero or met > least else tag + missed
+        dst[ENDED + i] = ended if ended > zero or transmitted > zero else tag + totally_reflected
+        inside = edge - (x * x + y * y)
+        dst[VIGNETTED + i] = vignetted if vignetted > zero or inside > zero else tag + stopped
 
     @njit(**OPTIONS)
     def refract(l, m, n, nx, ny, nz, ratio, sense):  # noqa: ANN001, ANN202, E741
@@ -92,4 +111,4 @@ def arithmetic(real: types.Type) -> Arithmetic:
             both * inside,
         )
 
-    return Arithmetic(clamp, safe_sqrt, arrive, refract, refract_adjoint)
+    return Arithmetic(clamp, safe_sqrt, arrive, set_status, refract, refract_adjoint)

@@ -11,26 +11,76 @@ from typing import Any
 from numba import carray, njit, types
 
 from dolens.kernels.cpu.compiler import OPTIONS
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    ENDED,
+    INDEX,
+    OF_BEHIND,
+    OF_FRONT,
+    OF_STEP_X,
+    OF_STEP_Y,
+    OF_STEP_Z,
+    OF_TURN_XX,
+    OF_TURN_XY,
+    OF_TURN_XZ,
+    OF_TURN_YX,
+    OF_TURN_YY,
+    OF_TURN_YZ,
+    OF_TURN_ZX,
+    OF_TURN_ZY,
+    OF_TURN_ZZ,
+    PATH,
+    STATE,
+    TRAVELLED,
+    UNBOUNDED,
+    VIGNETTED,
+    WORK_SIZE,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
+)
+from dolens.kernels.cpu.records import (
+    MISSED,
+    SENSE,
+    SHIFT,
+    SHORT_RECORD,
+    STEP_X,
+    STEP_Y,
+    STEP_Z,
+    TAG,
+    TURN_XX,
+    TURN_XY,
+    TURN_XZ,
+    TURN_YX,
+    TURN_YY,
+    TURN_YZ,
+    TURN_ZX,
+    TURN_ZY,
+    TURN_ZZ,
+)
 
 
 @cache
 def _turns(real: types.Type) -> tuple[Any, Any]:
-    """Compiled: R·v and Rᵀ·v, with R by rows from slot 3 of a record."""
+    """Compiled: R·v and Rᵀ·v, with R by rows in a record."""
 
     @njit(**OPTIONS)
     def turn(p, x, y, z):  # noqa: ANN001, ANN202
         return (
-            p[3] * x + p[4] * y + p[5] * z,
-            p[6] * x + p[7] * y + p[8] * z,
-            p[9] * x + p[10] * y + p[11] * z,
+            p[TURN_XX] * x + p[TURN_XY] * y + p[TURN_XZ] * z,
+            p[TURN_YX] * x + p[TURN_YY] * y + p[TURN_YZ] * z,
+            p[TURN_ZX] * x + p[TURN_ZY] * y + p[TURN_ZZ] * z,
         )
 
     @njit(**OPTIONS)
     def turn_back(p, x, y, z):  # noqa: ANN001, ANN202
         return (
-            p[3] * x + p[6] * y + p[9] * z,
-            p[4] * x + p[7] * y + p[10] * z,
-            p[5] * x + p[8] * y + p[11] * z,
+            p[TURN_XX] * x + p[TURN_YX] * y + p[TURN_ZX] * z,
+            p[TURN_XY] * x + p[TURN_YY] * y + p[TURN_ZY] * z,
+            p[TURN_XZ] * x + p[TURN_YZ] * y + p[TURN_ZZ] * z,
         )
 
     return turn, turn_back
@@ -45,23 +95,23 @@ def change_axes_forward(real: types.Type) -> Callable[..., None]:
     zero, one, grazing = real(0.0), real(1.0), real(1e-9)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        p, w = carray(record, 32), carray(work, 6144)
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
+        src, dst = carray(before, STATE), carray(after, STATE)
+        p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
             # Factors, since a branch about the division would stop vectorisation.
             crosses, stays = (one, zero) if math.fabs(n) > grazing else (zero, one)
             cosine = n if n > grazing else grazing
             if n < zero:
                 cosine = n if n < -grazing else -grazing
-            t = crosses * ((p[2] - src[256 + i]) / cosine)
-            x, y = src[i] - p[0] + t * l, src[128 + i] - p[1] + t * m
-            z = stays * (src[256 + i] - p[2])
-            dst[i], dst[128 + i], dst[256 + i] = turn(p, x, y, z)
-            dst[384 + i], dst[512 + i], dst[640 + i] = turn(p, l, m, n)
-            dst[768 + i] = src[768 + i] + w[i] * t
-            dst[896 + i], dst[1024 + i] = src[896 + i], src[1024 + i]
-            dst[1152 + i] = t
+            t = crosses * ((p[STEP_Z] - src[Z + i]) / cosine)
+            x, y = src[X + i] - p[STEP_X] + t * l, src[Y + i] - p[STEP_Y] + t * m
+            z = stays * (src[Z + i] - p[STEP_Z])
+            dst[X + i], dst[Y + i], dst[Z + i] = turn(p, x, y, z)
+            dst[L + i], dst[M + i], dst[N + i] = turn(p, l, m, n)
+            dst[PATH + i] = src[PATH + i] + w[INDEX + i] * t
+            dst[ENDED + i], dst[VIGNETTED + i] = src[ENDED + i], src[VIGNETTED + i]
+            dst[TRAVELLED + i] = t
 
     return kernel
 
@@ -72,37 +122,38 @@ def change_axes_adjoint(real: types.Type) -> Callable[..., None]:
     zero, one, grazing = real(0.0), real(1.0), real(1e-9)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        p, w, cot = carray(record, 32), carray(work, 6144), carray(cotangents, 3584)
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            t = dst[1152 + i]
+        src, dst = carray(before, STATE), carray(after, STATE)
+        p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
+        cot = carray(cotangents, UNBOUNDED)
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            t = dst[TRAVELLED + i]
             crosses, stays = (one, zero) if math.fabs(n) > grazing else (zero, one)
-            x, y = src[i] - p[0] + t * l, src[128 + i] - p[1] + t * m
-            z = stays * (src[256 + i] - p[2])
-            px, py, pz = cot[i], cot[128 + i], cot[256 + i]
-            dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
-            cot[2432 + i] = px * x + dl * l
-            cot[2560 + i] = px * y + dl * m
-            cot[2688 + i] = px * z + dl * n
-            cot[2816 + i] = py * x + dm * l
-            cot[2944 + i] = py * y + dm * m
-            cot[3072 + i] = py * z + dm * n
-            cot[3200 + i] = pz * x + dn * l
-            cot[3328 + i] = pz * y + dn * m
-            cot[3456 + i] = pz * z + dn * n
+            x, y = src[X + i] - p[STEP_X] + t * l, src[Y + i] - p[STEP_Y] + t * m
+            z = stays * (src[Z + i] - p[STEP_Z])
+            px, py, pz = cot[X + i], cot[Y + i], cot[Z + i]
+            dl, dm, dn = cot[L + i], cot[M + i], cot[N + i]
+            cot[OF_TURN_XX + i] = px * x + dl * l
+            cot[OF_TURN_XY + i] = px * y + dl * m
+            cot[OF_TURN_XZ + i] = px * z + dl * n
+            cot[OF_TURN_YX + i] = py * x + dm * l
+            cot[OF_TURN_YY + i] = py * y + dm * m
+            cot[OF_TURN_YZ + i] = py * z + dm * n
+            cot[OF_TURN_ZX + i] = pz * x + dn * l
+            cot[OF_TURN_ZY + i] = pz * y + dn * m
+            cot[OF_TURN_ZZ + i] = pz * z + dn * n
             qx, qy, qz = turn_back(p, px, py, pz)
             dl, dm, dn = turn_back(p, dl, dm, dn)
-            path = cot[768 + i]
+            path = cot[PATH + i]
             cosine = n if n > grazing else grazing
             if n < zero:
                 cosine = n if n < -grazing else -grazing
-            along = crosses * ((qx * l + qy * m + w[i] * path) / cosine) - stays * qz
-            cot[i], cot[128 + i], cot[256 + i] = qx, qy, -along
-            cot[384 + i], cot[512 + i], cot[640 + i] = dl + t * qx, dm + t * qy, dn - t * along
-            cot[896 + i] = path * t
-            cot[1024 + i] = zero
-            cot[2048 + i], cot[2176 + i], cot[2304 + i] = -qx, -qy, along
+            along = crosses * ((qx * l + qy * m + w[INDEX + i] * path) / cosine) - stays * qz
+            cot[X + i], cot[Y + i], cot[Z + i] = qx, qy, -along
+            cot[L + i], cot[M + i], cot[N + i] = dl + t * qx, dm + t * qy, dn - t * along
+            cot[OF_FRONT + i] = path * t
+            cot[OF_BEHIND + i] = zero
+            cot[OF_STEP_X + i], cot[OF_STEP_Y + i], cot[OF_STEP_Z + i] = -qx, -qy, along
 
     return kernel
 
@@ -113,15 +164,14 @@ def lens_axes_forward(real: types.Type) -> Callable[..., None]:
     zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst, p = carray(before, 1280), carray(after, 1280), carray(record, 32)
-        for i in range(128):
-            x, y, z = turn(p, src[i], src[128 + i], src[256 + i])
-            dst[i], dst[128 + i], dst[256 + i] = x + p[0], y + p[1], z + p[2]
-            dst[384 + i], dst[512 + i], dst[640 + i] = turn(
-                p, src[384 + i], src[512 + i], src[640 + i]
-            )
-            dst[768 + i], dst[896 + i], dst[1024 + i] = src[768 + i], src[896 + i], src[1024 + i]
-            dst[1152 + i] = zero
+        src, dst, p = carray(before, STATE), carray(after, STATE), carray(record, SHORT_RECORD)
+        for i in range(BLOCK):
+            x, y, z = turn(p, src[X + i], src[Y + i], src[Z + i])
+            dst[X + i], dst[Y + i], dst[Z + i] = x + p[STEP_X], y + p[STEP_Y], z + p[STEP_Z]
+            dst[L + i], dst[M + i], dst[N + i] = turn(p, src[L + i], src[M + i], src[N + i])
+            path, ended, vignetted = src[PATH + i], src[ENDED + i], src[VIGNETTED + i]
+            dst[PATH + i], dst[ENDED + i], dst[VIGNETTED + i] = path, ended, vignetted
+            dst[TRAVELLED + i] = zero
 
     return kernel
 
@@ -132,47 +182,48 @@ def lens_axes_adjoint(real: types.Type) -> Callable[..., None]:
     zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, p, cot = carray(before, 1280), carray(record, 32), carray(cotangents, 3584)
-        for i in range(128):
-            x, y, z = src[i], src[128 + i], src[256 + i]
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            px, py, pz = cot[i], cot[128 + i], cot[256 + i]
-            dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
-            cot[2048 + i], cot[2176 + i], cot[2304 + i] = px, py, pz
-            cot[2432 + i] = px * x + dl * l
-            cot[2560 + i] = px * y + dl * m
-            cot[2688 + i] = px * z + dl * n
-            cot[2816 + i] = py * x + dm * l
-            cot[2944 + i] = py * y + dm * m
-            cot[3072 + i] = py * z + dm * n
-            cot[3200 + i] = pz * x + dn * l
-            cot[3328 + i] = pz * y + dn * m
-            cot[3456 + i] = pz * z + dn * n
-            cot[i], cot[128 + i], cot[256 + i] = turn_back(p, px, py, pz)
-            cot[384 + i], cot[512 + i], cot[640 + i] = turn_back(p, dl, dm, dn)
-            cot[896 + i], cot[1024 + i] = zero, zero
+        src, p = carray(before, STATE), carray(record, SHORT_RECORD)
+        cot = carray(cotangents, UNBOUNDED)
+        for i in range(BLOCK):
+            x, y, z = src[X + i], src[Y + i], src[Z + i]
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            px, py, pz = cot[X + i], cot[Y + i], cot[Z + i]
+            dl, dm, dn = cot[L + i], cot[M + i], cot[N + i]
+            cot[OF_STEP_X + i], cot[OF_STEP_Y + i], cot[OF_STEP_Z + i] = px, py, pz
+            cot[OF_TURN_XX + i] = px * x + dl * l
+            cot[OF_TURN_XY + i] = px * y + dl * m
+            cot[OF_TURN_XZ + i] = px * z + dl * n
+            cot[OF_TURN_YX + i] = py * x + dm * l
+            cot[OF_TURN_YY + i] = py * y + dm * m
+            cot[OF_TURN_YZ + i] = py * z + dm * n
+            cot[OF_TURN_ZX + i] = pz * x + dn * l
+            cot[OF_TURN_ZY + i] = pz * y + dn * m
+            cot[OF_TURN_ZZ + i] = pz * z + dn * n
+            cot[X + i], cot[Y + i], cot[Z + i] = turn_back(p, px, py, pz)
+            cot[L + i], cot[M + i], cot[N + i] = turn_back(p, dl, dm, dn)
+            cot[OF_FRONT + i], cot[OF_BEHIND + i] = zero, zero
 
     return kernel
 
 
 def sensor_forward(real: types.Type) -> Callable[..., None]:
     """Carry rays to the sensor plane; those that do not travel towards it miss it."""
-    zero, three, grazing = real(0.0), real(3.0), real(1e-9)
+    zero, missed, grazing = real(0.0), real(MISSED), real(1e-9)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        p, w = carray(record, 32), carray(work, 6144)
-        shift, sense, tag = p[0], p[18], p[19]
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
+        src, dst = carray(before, STATE), carray(after, STATE)
+        p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
+        shift, sense, tag = p[SHIFT], p[SENSE], p[TAG]
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
             towards = sense * n
-            t = -sense * (src[256 + i] + shift) / (towards if towards > grazing else grazing)
-            dst[i], dst[128 + i], dst[256 + i] = src[i] + t * l, src[128 + i] + t * m, zero
-            dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
-            dst[768 + i] = src[768 + i] + w[i] * t
-            ended = src[896 + i]
-            dst[896 + i] = ended if ended > zero or towards > grazing else tag + three
-            dst[1024 + i] = src[1024 + i]
-            dst[1152 + i] = t
+            t = -sense * (src[Z + i] + shift) / (towards if towards > grazing else grazing)
+            dst[X + i], dst[Y + i], dst[Z + i] = src[X + i] + t * l, src[Y + i] + t * m, zero
+            dst[L + i], dst[M + i], dst[N + i] = l, m, n
+            dst[PATH + i] = src[PATH + i] + w[INDEX + i] * t
+            ended = src[ENDED + i]
+            dst[ENDED + i] = ended if ended > zero or towards > grazing else tag + missed
+            dst[VIGNETTED + i] = src[VIGNETTED + i]
+            dst[TRAVELLED + i] = t
 
     return kernel

@@ -4,8 +4,6 @@ The record holds the knots in x, the knots in y, and the coefficients, rows alon
 
 Each ray needs six knots of either axis and 16 coefficients.  They are copied to work rows when the
 ray's span changes, which between Newton's steps is seldom; the arithmetic then runs over rows.
-Rows 48 to 53 hold the knots about x, 54 to 59 those about y, 60 to 75 the coefficients, 76 and 77
-the first column and row.  Row 25 says (one) that they hold anything.
 """
 
 from collections.abc import Callable
@@ -15,6 +13,38 @@ from typing import Any, NamedTuple
 from numba import carray, njit, types
 
 from dolens.kernels.cpu.compiler import OPTIONS, shifted
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    FURTHER,
+    MARGIN,
+    OF_SAG,
+    OF_SHAPE,
+    OF_SLOPE_X,
+    OF_SLOPE_Y,
+    POINT_X,
+    POINT_Y,
+    SAG,
+    SAG_XX,
+    SAG_XY,
+    SAG_YY,
+    SLOPE_X,
+    SLOPE_Y,
+    STENCIL_IS_HERE,
+    STENCIL_PLACE,
+    UNBOUNDED,
+)
+from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT, SHAPE
+
+MORE_KNOTS = 4  # than coefficients
+# Work rows: the knots about x and about y, and the coefficients, four rows of four; then the first
+# column and row of these.
+STENCIL_ROWS = 30
+FOUR = 4 * BLOCK
+XA, XB, XC, XD, XE, XF, YA, YB, YC, YD, YE, YF, C0, C1, C2, C3 = (
+    FURTHER + BLOCK * row for row in range(16)
+)
+LEVEL = C0 + FOUR + BLOCK  # a coefficient in the middle, which is taken off the others
+FIRST_COLUMN, FIRST_ROW = C0 + 4 * FOUR, C0 + 4 * FOUR + BLOCK
 
 
 class Spline(NamedTuple):
@@ -50,32 +80,33 @@ def _spline(real: types.Type) -> Spline:
     @njit(**OPTIONS)
     def fetch(record, work, rows, columns):  # noqa: ANN001, ANN202
         """Bring every ray's knots and coefficients to its lane, where they are not there yet."""
-        w = carray(work, 9984)
-        if w[3200] == one:
+        w = carray(work, UNBOUNDED)
+        if w[STENCIL_IS_HERE] == one:
             outside = zero
-            for i in range(128):
-                x, y = w[256 + i], w[384 + i]
-                here = x >= w[6400 + i] and x < w[6528 + i] and y >= w[7168 + i] and y < w[7296 + i]
+            for i in range(BLOCK):
+                x, y = w[POINT_X + i], w[POINT_Y + i]
+                here = x >= w[XC + i] and x < w[XD + i] and y >= w[YC + i] and y < w[YD + i]
                 outside += zero if here else one
             if outside == zero:
                 return
-        w[3200] = one
-        knots_x = carray(shifted(record, 24), 1 << 40)
-        knots_y = carray(shifted(record, 28 + columns), 1 << 40)
-        coefficients = shifted(record, 32 + columns + rows)
-        for i in range(128):
-            column, row = span(knots_x, columns, w[256 + i]), span(knots_y, rows, w[384 + i])
-            around_x = carray(shifted(record, 25 + column), 8)
-            around_y = carray(shifted(record, 29 + columns + row), 8)
+        w[STENCIL_IS_HERE] = one
+        knots_x = carray(shifted(record, SHAPE), UNBOUNDED)
+        knots_y = carray(shifted(record, SHAPE + MORE_KNOTS + columns), UNBOUNDED)
+        coefficients = shifted(record, SHAPE + 2 * MORE_KNOTS + columns + rows)
+        for i in range(BLOCK):
+            column = span(knots_x, columns, w[POINT_X + i])
+            row = span(knots_y, rows, w[POINT_Y + i])
+            around_x = carray(shifted(record, SHAPE + 1 + column), 8)
+            around_y = carray(shifted(record, SHAPE + MORE_KNOTS + 1 + columns + row), 8)
             for k in range(6):
-                w[6144 + 128 * k + i] = around_x[k]
-                w[6912 + 128 * k + i] = around_y[k]
+                w[XA + BLOCK * k + i] = around_x[k]
+                w[YA + BLOCK * k + i] = around_y[k]
             first = shifted(coefficients, row * columns + column)
             for j in range(4):
                 c = carray(shifted(first, j * columns), 4)
                 for k in range(4):
-                    w[7680 + 128 * (4 * j + k) + i] = c[k]
-            w[9728 + i], w[9856 + i] = real(column), real(row)
+                    w[C0 + BLOCK * (4 * j + k) + i] = c[k]
+            w[FIRST_COLUMN + i], w[FIRST_ROW + i] = real(column), real(row)
 
     @njit(**OPTIONS)
     def basis(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
@@ -120,38 +151,38 @@ def b_spline_sag(real: types.Type) -> Callable[..., None]:
     zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, q = carray(work, 9984), carray(codes, 24)
-        rows, columns = q[8], q[9]
-        knots_x = carray(shifted(record, 24), 1 << 40)
-        knots_y = carray(shifted(record, 28 + columns), 1 << 40)
+        w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        rows, columns = q[COUNT], q[COLUMNS]
+        knots_x = carray(shifted(record, SHAPE), UNBOUNDED)
+        knots_y = carray(shifted(record, SHAPE + MORE_KNOTS + columns), UNBOUNDED)
         x_low, x_high = knots_x[3], knots_x[columns]
         y_low, y_high = knots_y[3], knots_y[rows]
         fetch(record, work, rows, columns)
-        for i in range(128):
-            x, y = w[256 + i], w[384 + i]
+        for i in range(BLOCK):
+            x, y = w[POINT_X + i], w[POINT_Y + i]
             bx = basis(
-                w[6144 + i], w[6272 + i], w[6400 + i], w[6528 + i], w[6656 + i], w[6784 + i],
+                w[XA + i], w[XB + i], w[XC + i], w[XD + i], w[XE + i], w[XF + i],
                 x, x_low, x_high,
             )  # fmt: skip
             by = basis(
-                w[6912 + i], w[7040 + i], w[7168 + i], w[7296 + i], w[7424 + i], w[7552 + i],
+                w[YA + i], w[YB + i], w[YC + i], w[YD + i], w[YE + i], w[YF + i],
                 y, y_low, y_high,
             )  # fmt: skip
-            level = w[8320 + i]
+            level = w[LEVEL + i]
             s = sx = sy = zero
             for j in range(4):
-                c0, c1 = w[7680 + 512 * j + i] - level, w[7808 + 512 * j + i] - level
-                c2, c3 = w[7936 + 512 * j + i] - level, w[8064 + 512 * j + i] - level
+                c0, c1 = w[C0 + FOUR * j + i] - level, w[C1 + FOUR * j + i] - level
+                c2, c3 = w[C2 + FOUR * j + i] - level, w[C3 + FOUR * j + i] - level
                 along = c0 * bx[0] + c1 * bx[1] + c2 * bx[2] + c3 * bx[3]
                 slope = c0 * bx[4] + c1 * bx[5] + c2 * bx[6] + c3 * bx[7]
                 s += along * by[j]
                 sx += slope * by[j]
                 sy += along * by[4 + j]
-            w[512 + i], w[640 + i], w[768 + i] = level + s, sx, sy
+            w[SAG + i], w[SLOPE_X + i], w[SLOPE_Y + i] = level + s, sx, sy
             left, right, below, above = x - x_low, x_high - x, y - y_low, y_high - y
             left = right if right < left else left
             below = above if above < below else below
-            w[896 + i] = below if below < left else left
+            w[MARGIN + i] = below if below < left else left
 
     return kernel
 
@@ -162,29 +193,29 @@ def b_spline_bend(real: types.Type) -> Callable[..., None]:
     zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, q = carray(work, 9984), carray(codes, 24)
-        rows, columns = q[8], q[9]
-        knots_x = carray(shifted(record, 24), 1 << 40)
-        knots_y = carray(shifted(record, 28 + columns), 1 << 40)
+        w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        rows, columns = q[COUNT], q[COLUMNS]
+        knots_x = carray(shifted(record, SHAPE), UNBOUNDED)
+        knots_y = carray(shifted(record, SHAPE + MORE_KNOTS + columns), UNBOUNDED)
         x_low, x_high = knots_x[3], knots_x[columns]
         y_low, y_high = knots_y[3], knots_y[rows]
-        w[3200] = zero
+        w[STENCIL_IS_HERE] = zero
         fetch(record, work, rows, columns)
-        for i in range(128):
-            x, y = w[256 + i], w[384 + i]
-            xa, xb, xc = w[6144 + i], w[6272 + i], w[6400 + i]
-            xd, xe, xf = w[6528 + i], w[6656 + i], w[6784 + i]
-            ya, yb, yc = w[6912 + i], w[7040 + i], w[7168 + i]
-            yd, ye, yf = w[7296 + i], w[7424 + i], w[7552 + i]
+        for i in range(BLOCK):
+            x, y = w[POINT_X + i], w[POINT_Y + i]
+            xa, xb, xc = w[XA + i], w[XB + i], w[XC + i]
+            xd, xe, xf = w[XD + i], w[XE + i], w[XF + i]
+            ya, yb, yc = w[YA + i], w[YB + i], w[YC + i]
+            yd, ye, yf = w[YD + i], w[YE + i], w[YF + i]
             bx = basis(xa, xb, xc, xd, xe, xf, x, x_low, x_high)
             by = basis(ya, yb, yc, yd, ye, yf, y, y_low, y_high)
             ex = bend(xa, xb, xc, xd, xe, xf, x, x_low, x_high)
             ey = bend(ya, yb, yc, yd, ye, yf, y, y_low, y_high)
-            level = w[8320 + i]
+            level = w[LEVEL + i]
             sx = sy = sxx = sxy = syy = zero
             for j in range(4):
-                c0, c1 = w[7680 + 512 * j + i] - level, w[7808 + 512 * j + i] - level
-                c2, c3 = w[7936 + 512 * j + i] - level, w[8064 + 512 * j + i] - level
+                c0, c1 = w[C0 + FOUR * j + i] - level, w[C1 + FOUR * j + i] - level
+                c2, c3 = w[C2 + FOUR * j + i] - level, w[C3 + FOUR * j + i] - level
                 along = c0 * bx[0] + c1 * bx[1] + c2 * bx[2] + c3 * bx[3]
                 slope = c0 * bx[4] + c1 * bx[5] + c2 * bx[6] + c3 * bx[7]
                 curve = c0 * ex[0] + c1 * ex[1] + c2 * ex[2] + c3 * ex[3]
@@ -193,42 +224,42 @@ def b_spline_bend(real: types.Type) -> Callable[..., None]:
                 sxx += curve * by[j]
                 sxy += slope * by[4 + j]
                 syy += along * ey[j]
-            w[640 + i], w[768 + i] = sx, sy
-            w[1024 + i], w[1152 + i], w[1280 + i] = sxx, sxy, syy
+            w[SLOPE_X + i], w[SLOPE_Y + i] = sx, sy
+            w[SAG_XX + i], w[SAG_XY + i], w[SAG_YY + i] = sxx, sxy, syy
 
     return kernel
 
 
 def b_spline_parameters(real: types.Type) -> Callable[..., None]:
-    """Cotangents of the 16 coefficients at hand (rows 40 to 55), and where they lie (row 56).
+    """Cotangents of the 16 coefficients at hand and where they lie.
 
     The place counts from the record's first coefficient.  `b_spline_bend` has fetched the knots.
     """
     _, basis, _ = _spline(real)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        w, q = carray(work, 9984), carray(codes, 24)
-        rows, columns = q[8], q[9]
-        cot = carray(cotangents, 7296)
-        knots_x = carray(shifted(record, 24), 1 << 40)
-        knots_y = carray(shifted(record, 28 + columns), 1 << 40)
+        w, q = carray(work, UNBOUNDED), carray(codes, CODE_ROW)
+        rows, columns = q[COUNT], q[COLUMNS]
+        cot = carray(cotangents, UNBOUNDED)
+        knots_x = carray(shifted(record, SHAPE), UNBOUNDED)
+        knots_y = carray(shifted(record, SHAPE + MORE_KNOTS + columns), UNBOUNDED)
         x_low, x_high = knots_x[3], knots_x[columns]
         y_low, y_high = knots_y[3], knots_y[rows]
         width = real(columns)
-        for i in range(128):
-            of_sag, of_sx, of_sy = w[1408 + i], w[1536 + i], w[1664 + i]
+        for i in range(BLOCK):
+            of_sag, of_sx, of_sy = w[OF_SAG + i], w[OF_SLOPE_X + i], w[OF_SLOPE_Y + i]
             bx = basis(
-                w[6144 + i], w[6272 + i], w[6400 + i], w[6528 + i], w[6656 + i], w[6784 + i],
-                w[256 + i], x_low, x_high,
+                w[XA + i], w[XB + i], w[XC + i], w[XD + i], w[XE + i], w[XF + i],
+                w[POINT_X + i], x_low, x_high,
             )  # fmt: skip
             by = basis(
-                w[6912 + i], w[7040 + i], w[7168 + i], w[7296 + i], w[7424 + i], w[7552 + i],
-                w[384 + i], y_low, y_high,
+                w[YA + i], w[YB + i], w[YC + i], w[YD + i], w[YE + i], w[YF + i],
+                w[POINT_Y + i], y_low, y_high,
             )  # fmt: skip
             for j in range(4):
                 along, across = of_sag * by[j] + of_sy * by[4 + j], of_sx * by[j]
                 for k in range(4):
-                    cot[5120 + 128 * (4 * j + k) + i] = along * bx[k] + across * bx[4 + k]
-            cot[7168 + i] = w[9856 + i] * width + w[9728 + i]
+                    cot[OF_SHAPE + BLOCK * (4 * j + k) + i] = along * bx[k] + across * bx[4 + k]
+            cot[STENCIL_PLACE + i] = w[FIRST_ROW + i] * width + w[FIRST_COLUMN + i]
 
     return kernel

@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
+from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.adjoint import adjoint_driver
 from dolens.kernels.cpu.forward import forward_driver
-from dolens.kernels.cpu.layout import BLOCK, Job
+from dolens.kernels.cpu.layout import BLOCK
 from dolens.kernels.cpu.program import Program
 from dolens.kernels.table import SurfaceTable
 
@@ -89,13 +90,13 @@ def trace_adjoint(
         program.point(OUT_STATUS=status, SUMS=sums)
         program.point(POSITION_GRADIENT=gradients[0], DIRECTION_GRADIENT=gradients[1])
         job = program.job
-        job[Job.SUM_LENGTH], job[Job.CHUNK] = length, chunk
-        job[Job.INDEX_SUMS] = int(wanted[2])
+        job[jobs.SUM_LENGTH], job[jobs.CHUNK] = length, chunk
+        job[jobs.INDEX_SUMS] = int(wanted[2])
         of_position, of_direction, of_path = cotangents
         for place, tensor in (
-            (Job.POSITION_COTANGENT, of_position),
-            (Job.DIRECTION_COTANGENT, of_direction),
-            (Job.PATH_COTANGENT, of_path),
+            (jobs.POSITION_COTANGENT, of_position),
+            (jobs.DIRECTION_COTANGENT, of_direction),
+            (jobs.PATH_COTANGENT, of_path),
         ):
             if tensor is not None:
                 job[place] = tensor.data_ptr()

@@ -12,6 +12,39 @@ from numba import carray, njit, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import OPTIONS
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    INDEX,
+    INVERSE_INDEX,
+    OF_BEHIND,
+    OF_FRONT,
+    OF_SECOND,
+    OF_SHAPE,
+    OF_SHIFT,
+    PATH,
+    RATIO,
+    STATE,
+    TRAVELLED,
+    UNBOUNDED,
+    WORK_SIZE,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
+)
+from dolens.kernels.cpu.records import (
+    CODE_ROW,
+    EDGE,
+    LIMIT,
+    REFRACTS,
+    SENSE,
+    SHAPE,
+    SHIFT,
+    SHORT_RECORD,
+    TAG,
+)
 
 
 @cache
@@ -38,20 +71,21 @@ def conic_distance(real: types.Type) -> Any:
 
 def conic_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to a conic and through it."""
-    clamp, safe_sqrt, arrive, refract, _ = arithmetic(real)
+    clamp, safe_sqrt, arrive, set_status, refract, _ = arithmetic(real)
     distance = conic_distance(real)
-    zero, one, two, three, grazing = real(0.0), real(1.0), real(2.0), real(3.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        p, w, q = carray(record, 32), carray(work, 6144), carray(codes, 24)
-        shift, limit, sense, tag, c, k = p[0], p[12], p[18], p[19], p[24], p[25]
-        edge, refracts = p[14], q[5] != 0
+        src, dst = carray(before, STATE), carray(after, STATE)
+        p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
+        shift, limit, sense, tag, c = p[SHIFT], p[LIMIT], p[SENSE], p[TAG], p[SHAPE]
+        k = p[SHAPE + 1]
+        edge, refracts = p[EDGE], q[REFRACTS] != 0
         bent = (one + k) * c
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
             x, y, t0, met = arrive(
-                src[i], src[128 + i], src[256 + i] + shift, l, m, n, sense, limit
+                src[X + i], src[Y + i], src[Z + i] + shift, l, m, n, sense, limit
             )
             t, squared = distance(c, c + (c * k) * (n * n), x, y, l, m, n, sense)
             t = clamp(t, limit)
@@ -64,21 +98,17 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
             met = met if branch > zero else zero
             gx, gy = -c * x, -c * y
             inverse = one / safe_sqrt(gx * gx + gy * gy + branch * branch)
-            dst[i], dst[128 + i], dst[256 + i] = x, y, z
+            dst[X + i], dst[Y + i], dst[Z + i] = x, y, z
             travelled = t0 + t
-            dst[1152 + i] = travelled
-            dst[768 + i] = src[768 + i] + w[i] * travelled
+            dst[TRAVELLED + i] = travelled
+            dst[PATH + i] = src[PATH + i] + w[INDEX + i] * travelled
             transmitted = one
             if refracts:
                 l, m, n, transmitted = refract(  # noqa: E741
-                    l, m, n, gx * inverse, gy * inverse, branch * inverse, w[128 + i], sense
+                    l, m, n, gx * inverse, gy * inverse, branch * inverse, w[RATIO + i], sense
                 )
-            dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
-            ended, vignetted = src[896 + i], src[1024 + i]
-            ended = ended if ended > zero or met > zero else tag + three
-            dst[896 + i] = ended if ended > zero or transmitted > zero else tag + two
-            inside = edge - (x * x + y * y)
-            dst[1024 + i] = vignetted if vignetted > zero or inside > zero else tag + one
+            dst[L + i], dst[M + i], dst[N + i] = l, m, n
+            set_status(src, dst, i, tag, edge, x, y, met, zero, transmitted)
 
     return kernel
 
@@ -89,45 +119,42 @@ def conic_adjoint(real: types.Type) -> Callable[..., None]:
     zero, half, one = real(0.0), real(0.5), real(1.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        p, w, q = carray(record, 32), carray(work, 6144), carray(codes, 24)
-        cot = carray(cotangents, 5376)
-        c, k, refracts = p[24], p[25], q[5] != 0
+        src, dst = carray(before, STATE), carray(after, STATE)
+        p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
+        cot = carray(cotangents, UNBOUNDED)
+        c, k, refracts = p[SHAPE], p[SHAPE + 1], q[REFRACTS] != 0
         e = one + k
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            x, y, z = dst[i], dst[128 + i], dst[256 + i]
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            x, y, z = dst[X + i], dst[Y + i], dst[Z + i]
             gx, gy, gz = -c * x, -c * y, one - e * c * z
             inverse = one / math.sqrt(gx * gx + gy * gy + gz * gz)
             nx, ny, nz = gx * inverse, gy * inverse, gz * inverse
             dl, dm, dn, vx, vy, vz, of_before, of_behind, per_cosine = refract_adjoint(
-                cot[384 + i], cot[512 + i], cot[640 + i], l, m, n, nx, ny, nz,
-                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[3072 + i],
+                cot[L + i], cot[M + i], cot[N + i], l, m, n, nx, ny, nz,
+                dst[L + i], dst[M + i], dst[N + i], w[RATIO + i], w[INVERSE_INDEX + i],
             )  # fmt: skip
             if not refracts:
-                dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
+                dl, dm, dn = cot[L + i], cot[M + i], cot[N + i]
                 vx = vy = vz = of_before = of_behind = zero
             # The cotangent of g: what lies across the normal, over |g|.
             across = vx * nx + vy * ny + vz * nz
-            vx, vy, vz = (
-                (vx - across * nx) * inverse,
-                (vy - across * ny) * inverse,
-                (vz - across * nz) * inverse,
-            )
-            px, py, pz = cot[i] - c * vx, cot[128 + i] - c * vy, cot[256 + i] - e * c * vz
-            path, t = cot[768 + i], dst[1152 + i]
-            along = (px * l + py * m + pz * n + w[i] * path) * per_cosine * inverse
+            vx, vy = (vx - across * nx) * inverse, (vy - across * ny) * inverse
+            vz = (vz - across * nz) * inverse
+            px, py, pz = cot[X + i] - c * vx, cot[Y + i] - c * vy, cot[Z + i] - e * c * vz
+            path, t = cot[PATH + i], dst[TRAVELLED + i]
+            along = (px * l + py * m + pz * n + w[INDEX + i] * path) * per_cosine * inverse
             qx, qy, qz = px - along * gx, py - along * gy, pz - along * gz
-            cot[i], cot[128 + i], cot[256 + i] = qx, qy, qz
-            cot[384 + i] = dl + t * qx
-            cot[512 + i] = dm + t * qy
-            cot[640 + i] = dn + t * qz
-            cot[896 + i] = of_before + path * t
-            cot[1024 + i] = of_behind
-            cot[2048 + i] = qz
-            cot[5120 + i] = half * along * (x * x + y * y + e * z * z) - (
+            cot[X + i], cot[Y + i], cot[Z + i] = qx, qy, qz
+            cot[L + i] = dl + t * qx
+            cot[M + i] = dm + t * qy
+            cot[N + i] = dn + t * qz
+            cot[OF_FRONT + i] = of_before + path * t
+            cot[OF_BEHIND + i] = of_behind
+            cot[OF_SHIFT + i] = qz
+            cot[OF_SHAPE + i] = half * along * (x * x + y * y + e * z * z) - (
                 vx * x + vy * y + e * vz * z
             )
-            cot[5248 + i] = c * z * (half * along * z - vz)
+            cot[OF_SECOND + i] = c * z * (half * along * z - vz)
 
     return kernel

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.jacobian import jacobian_driver
-from dolens.kernels.cpu.layout import BLOCK, COTANGENT_HEADER, Job
+from dolens.kernels.cpu.layout import BLOCK, COTANGENT_HEADER
 from dolens.kernels.cpu.normal_equations import normal_equations_driver
 from dolens.kernels.cpu.program import Program
 from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
@@ -91,9 +92,9 @@ def normal_equations(
         program = derivatives.program
         program.point(SUMS=sums, TARGET=target, WEIGHT=weight, GROUP=group)
         job = program.job
-        job[Job.SUM_LENGTH], job[Job.GROUPS] = length, groups
-        job[Job.TARGET_ROW], job[Job.TARGET_COLUMN] = target.stride()
-        job[Job.WEIGHT_ROW] = 0 if weight is None else weight.stride(0)
+        job[jobs.SUM_LENGTH], job[jobs.GROUPS] = length, groups
+        job[jobs.TARGET_ROW], job[jobs.TARGET_COLUMN] = target.stride()
+        job[jobs.WEIGHT_ROW] = 0 if weight is None else weight.stride(0)
         program.run(normal_equations_driver, chunks, _SMALL)
     if table.values.dtype == torch.float32 and not bool(torch.isfinite(sums).all()):
         # Squares of r¹⁶ and the like overflow in single precision before they are summed.
@@ -139,16 +140,17 @@ class _Derivatives:
         )
         self.program.set_rays(*rays)
         job = self.program.job
-        job[Job.OUTPUTS], job[Job.VARIABLES], job[Job.CHUNK] = len(outputs), variables.count, chunk
+        job[jobs.OUTPUTS], job[jobs.VARIABLES] = len(outputs), variables.count
+        job[jobs.CHUNK] = chunk
         self._seeds = np.array([OUTPUT_ROWS[name] for name in outputs], dtype=np.int64)
-        job[Job.OUTPUT_ROWS] = self._seeds.ctypes.data
+        job[jobs.OUTPUT_ROWS] = self._seeds.ctypes.data
         self._entries = _entries(table.codes.numpy().tobytes(), table.values.numel(), variables)
-        job[Job.FIRST_STEP] = self._entries.first_step
+        job[jobs.FIRST_STEP] = self._entries.first_step
         if self._entries.spline is not None:
-            job[Job.SPLINE_COLUMNS] = self._entries.spline.ctypes.data
+            job[jobs.SPLINE_COLUMNS] = self._entries.spline.ctypes.data
         names = ("ENTRIES", "ENTRY_ROWS", "ENTRY_COLUMNS", "ENTRY_WEIGHTS", "ENTRY_FIRST")
         for name, array in zip(names, self._entries.arrays, strict=True):
-            job[getattr(Job, name)] = array.ctypes.data
+            job[getattr(jobs, name)] = array.ctypes.data
 
 
 class _Entries(NamedTuple):

@@ -11,44 +11,71 @@ from numba import carray, njit, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import OPTIONS, shifted
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    MARGIN,
+    OF_SAG,
+    OF_SECOND,
+    OF_SHAPE,
+    OF_SLOPE_X,
+    OF_SLOPE_Y,
+    OWN,
+    POINT_X,
+    POINT_Y,
+    SAG,
+    SAG_XX,
+    SAG_XY,
+    SAG_YY,
+    SLOPE_X,
+    SLOPE_Y,
+    UNBOUNDED,
+    WORK_SIZE,
+)
+from dolens.kernels.cpu.records import CODE_ROW, COUNT, SHAPE, SHORT_RECORD
+
+# Work rows: q, H, H' and H''/2; for the cotangents, powers of q and the weight of the slope.
+Q, H, H_SLOPE, H_BEND, *_ = OWN
+LOWER, OF_SLOPE = H, H_SLOPE
+# The first coefficient in a record, and its cotangent.
+COEFFICIENTS, OF_COEFFICIENTS = SHAPE + 2, OF_SECOND + BLOCK
 
 
 @cache
 def _horner(real: types.Type) -> tuple[Any, Any]:
-    """Compiled: H and H' (and H''/2) of a block into work rows 17, 18 (and 19); q into row 16."""
+    """Compiled: H and H' (and H''/2) of a block, and q, into their work rows."""
     zero = real(0.0)
 
     @njit(**OPTIONS)
     def first(w, record, count):  # noqa: ANN001, ANN202
-        for i in range(128):
-            x, y = w[256 + i], w[384 + i]
-            w[2048 + i] = x * x + y * y
-            w[2176 + i], w[2304 + i] = zero, zero
+        for i in range(BLOCK):
+            x, y = w[POINT_X + i], w[POINT_Y + i]
+            w[Q + i] = x * x + y * y
+            w[H + i], w[H_SLOPE + i] = zero, zero
         for group in range(count // 4 - 1, -1, -1):
-            a = carray(shifted(record, 26 + 4 * group), 4)
+            a = carray(shifted(record, COEFFICIENTS + 4 * group), 4)
             a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
-            for i in range(128):
-                q, h, d = w[2048 + i], w[2176 + i], w[2304 + i]
+            for i in range(BLOCK):
+                q, h, d = w[Q + i], w[H + i], w[H_SLOPE + i]
                 d, h = d * q + h, h * q + a3
                 d, h = d * q + h, h * q + a2
                 d, h = d * q + h, h * q + a1
-                w[2304 + i], w[2176 + i] = d * q + h, h * q + a0
+                w[H_SLOPE + i], w[H + i] = d * q + h, h * q + a0
 
     @njit(**OPTIONS)
     def second(w, record, count):  # noqa: ANN001, ANN202
-        for i in range(128):
-            x, y = w[256 + i], w[384 + i]
-            w[2048 + i] = x * x + y * y
-            w[2176 + i], w[2304 + i], w[2432 + i] = zero, zero, zero
+        for i in range(BLOCK):
+            x, y = w[POINT_X + i], w[POINT_Y + i]
+            w[Q + i] = x * x + y * y
+            w[H + i], w[H_SLOPE + i], w[H_BEND + i] = zero, zero, zero
         for group in range(count // 4 - 1, -1, -1):
-            a = carray(shifted(record, 26 + 4 * group), 4)
+            a = carray(shifted(record, COEFFICIENTS + 4 * group), 4)
             a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
-            for i in range(128):
-                q, h, d, e = w[2048 + i], w[2176 + i], w[2304 + i], w[2432 + i]
+            for i in range(BLOCK):
+                q, h, d, e = w[Q + i], w[H + i], w[H_SLOPE + i], w[H_BEND + i]
                 e, d, h = e * q + d, d * q + h, h * q + a3
                 e, d, h = e * q + d, d * q + h, h * q + a2
                 e, d, h = e * q + d, d * q + h, h * q + a1
-                w[2432 + i], w[2304 + i], w[2176 + i] = e * q + d, d * q + h, h * q + a0
+                w[H_BEND + i], w[H_SLOPE + i], w[H + i] = e * q + d, d * q + h, h * q + a0
 
     return first, second
 
@@ -60,19 +87,20 @@ def even_asphere_sag(real: types.Type) -> Callable[..., None]:
     one, two = real(1.0), real(2.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        p, w, count = carray(record, 32), carray(work, 6144), carray(codes, 24)[8]
+        p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
+        count = carray(codes, CODE_ROW)[COUNT]
         horner(w, record, count)
-        c = p[24]
-        ec2 = (one + p[25]) * c * c
-        for i in range(128):
-            q, h, d = w[2048 + i], w[2176 + i], w[2304 + i]
+        c = p[SHAPE]
+        ec2 = (one + p[SHAPE + 1]) * c * c
+        for i in range(BLOCK):
+            q, h, d = w[Q + i], w[H + i], w[H_SLOPE + i]
             squared = one - ec2 * q
             root = safe_sqrt(squared)
             both = c / (root * (one + root))
             twice = both * (one + root) + two * q * (two * h + q * d)
-            w[512 + i] = both * root * q + q * q * h
-            w[640 + i], w[768 + i] = w[256 + i] * twice, w[384 + i] * twice
-            w[896 + i] = squared
+            w[SAG + i] = both * root * q + q * q * h
+            w[SLOPE_X + i], w[SLOPE_Y + i] = w[POINT_X + i] * twice, w[POINT_Y + i] * twice
+            w[MARGIN + i] = squared
 
     return kernel
 
@@ -84,21 +112,22 @@ def even_asphere_bend(real: types.Type) -> Callable[..., None]:
     half, one, two, four = real(0.5), real(1.0), real(2.0), real(4.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        p, w, count = carray(record, 32), carray(work, 6144), carray(codes, 24)[8]
+        p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
+        count = carray(codes, CODE_ROW)[COUNT]
         horner(w, record, count)
-        c = p[24]
-        ec2 = (one + p[25]) * c * c
-        for i in range(128):
-            x, y, q = w[256 + i], w[384 + i], w[2048 + i]
-            h, d, e = w[2176 + i], w[2304 + i], w[2432 + i]
+        c = p[SHAPE]
+        ec2 = (one + p[SHAPE + 1]) * c * c
+        for i in range(BLOCK):
+            x, y, q = w[POINT_X + i], w[POINT_Y + i], w[Q + i]
+            h, d, e = w[H + i], w[H_SLOPE + i], w[H_BEND + i]
             root = safe_sqrt(one - ec2 * q)
             conic = half * c / root
             slope = conic + q * (two * h + q * d)
             bend = half * conic * ec2 / (root * root) + two * h + four * q * d + two * q * q * e
-            w[640 + i], w[768 + i] = two * x * slope, two * y * slope
-            w[1024 + i] = two * slope + four * x * x * bend
-            w[1152 + i] = four * x * y * bend
-            w[1280 + i] = two * slope + four * y * y * bend
+            w[SLOPE_X + i], w[SLOPE_Y + i] = two * x * slope, two * y * slope
+            w[SAG_XX + i] = two * slope + four * x * x * bend
+            w[SAG_XY + i] = four * x * y * bend
+            w[SAG_YY + i] = two * slope + four * y * y * bend
 
     return kernel
 
@@ -113,27 +142,28 @@ def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
     half, one, two = real(0.5), real(1.0), real(2.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        p, w, count = carray(record, 32), carray(work, 6144), carray(codes, 24)[8]
-        cot = carray(cotangents, 5376)
-        c, e = p[24], one + p[25]
-        for i in range(128):
-            x, y, q = w[256 + i], w[384 + i], w[2048 + i]
-            of_sag = w[1408 + i]
-            of_slope = two * (w[1536 + i] * x + w[1664 + i] * y)
+        p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
+        count = carray(codes, CODE_ROW)[COUNT]
+        cot = carray(cotangents, UNBOUNDED)
+        c, e = p[SHAPE], one + p[SHAPE + 1]
+        for i in range(BLOCK):
+            x, y, q = w[POINT_X + i], w[POINT_Y + i], w[Q + i]
+            of_sag = w[OF_SAG + i]
+            of_slope = two * (w[OF_SLOPE_X + i] * x + w[OF_SLOPE_Y + i] * y)
             inverse = one / safe_sqrt(one - e * c * c * q)
             sag = c * q / (one + one / inverse)
             cubed = half * of_slope * inverse * inverse * inverse
-            cot[5120 + i] = half * of_sag * inverse * (q + e * sag * sag) + cubed
-            cot[5248 + i] = half * c * (of_sag * inverse * sag * sag + c * c * q * cubed)
+            cot[OF_SHAPE + i] = half * of_sag * inverse * (q + e * sag * sag) + cubed
+            cot[OF_SECOND + i] = half * c * (of_sag * inverse * sag * sag + c * c * q * cubed)
             # From here on: q^(j+1) and the weights of q^(j+2) and its derivative.
-            w[2176 + i], w[2304 + i] = q, of_slope
+            w[LOWER + i], w[OF_SLOPE + i] = q, of_slope
         for j in range(count):
-            out = carray(shifted(cotangents, 5376 + 128 * j), 128)
+            out = carray(shifted(cotangents, OF_COEFFICIENTS + BLOCK * j), BLOCK)
             power = real(j + 2)
-            for i in range(128):
-                q, lower = w[2048 + i], w[2176 + i]
+            for i in range(BLOCK):
+                q, lower = w[Q + i], w[LOWER + i]
                 upper = lower * q
-                out[i] = w[1408 + i] * upper + power * w[2304 + i] * lower
-                w[2176 + i] = upper
+                out[i] = w[OF_SAG + i] * upper + power * w[OF_SLOPE + i] * lower
+                w[LOWER + i] = upper
 
     return kernel

@@ -1,7 +1,7 @@
 """Surfaces that are given by their sag: Newton's iteration, refraction, and the adjoint.
 
 A shape gives three block functions, by address in its codes: `sag` (sag, slopes, and the margin of
-its branch at the points in work rows 2 and 3), `bend` (slopes and second derivatives there), and
+its branch at the points in two work rows), `bend` (slopes and second derivatives there), and
 `parameters` (cotangents of its numbers from those of sag and slopes).
 """
 
@@ -13,75 +13,128 @@ from numba import carray, types
 from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import call_block
 from dolens.kernels.cpu.conic import conic_distance
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    DISTANCE,
+    ENDED,
+    INDEX,
+    INVERSE_INDEX,
+    MARGIN,
+    OF_BEHIND,
+    OF_FRONT,
+    OF_SAG,
+    OF_SHIFT,
+    OF_SLOPE_X,
+    OF_SLOPE_Y,
+    PATH,
+    POINT_X,
+    POINT_Y,
+    RATIO,
+    SAG,
+    SAG_XX,
+    SAG_XY,
+    SAG_YY,
+    SLOPE_X,
+    SLOPE_Y,
+    STATE,
+    STENCIL_IS_HERE,
+    TRAVELLED,
+    UNBOUNDED,
+    WORK_SIZE,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
+)
+from dolens.kernels.cpu.records import (
+    CODE_ROW,
+    EDGE,
+    EVEN_ASPHERE,
+    KIND,
+    LIMIT,
+    PARAMETERS,
+    REFRACTS,
+    SAG_AND_SLOPES,
+    SAG_HESSIAN,
+    SCALE,
+    SENSE,
+    SHAPE,
+    SHIFT,
+    SHORT_RECORD,
+    TAG,
+)
+from dolens.kernels.table import NEWTON_STEPS
 
 
 def explicit_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to the surface and through it; see `Surface.intersect`.
 
-    The iteration ends when no ray moves any more, or after 40 steps; whether a ray has converged is
-    read off its residual at the end.
+    The iteration ends when no ray moves any more, or after `NEWTON_STEPS`; whether a ray has
+    converged is read off its residual at the end.
     """
-    clamp, _, arrive, refract, _ = arithmetic(real)
+    clamp, _, arrive, set_status, refract, _ = arithmetic(real)
     distance = conic_distance(real)
-    zero, one, two, three, grazing = real(0.0), real(1.0), real(2.0), real(3.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
     epsilon = real(2.0**-23 if real is types.float32 else 2.0**-52)
     close, rounding = real(math.sqrt(float(epsilon))), real(64.0) * epsilon
     uncertain = real(1e-2)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        p, w, q = carray(record, 32), carray(work, 6144), carray(codes, 24)
-        shift, limit, scale, sense, tag = p[0], p[12], p[13], p[18], p[19]
-        edge = p[14]
-        refracts = q[5] != 0
+        src, dst = carray(before, STATE), carray(after, STATE)
+        p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
+        shift, limit, scale, sense, tag = p[SHIFT], p[LIMIT], p[SCALE], p[SENSE], p[TAG]
+        edge = p[EDGE]
+        refracts = q[REFRACTS] != 0
         # The point on the vertex plane, and its margin, stay in the rows that they end in.
-        for i in range(128):
+        for i in range(BLOCK):
             x, y, t, met = arrive(
-                src[i], src[128 + i], src[256 + i] + shift,
-                src[384 + i], src[512 + i], src[640 + i], sense, limit,
+                src[X + i], src[Y + i], src[Z + i] + shift,
+                src[L + i], src[M + i], src[N + i], sense, limit,
             )  # fmt: skip
-            dst[i], dst[128 + i], dst[256 + i], dst[1152 + i] = x, y, met, t
-            w[1792 + i] = zero
-        w[3200] = zero
-        if q[0] == 3:
-            c, k = p[24], p[25]
-            for i in range(128):
-                n = src[640 + i]
+            dst[X + i], dst[Y + i], dst[Z + i], dst[TRAVELLED + i] = x, y, met, t
+            w[DISTANCE + i] = zero
+        w[STENCIL_IS_HERE] = zero
+        if q[KIND] == EVEN_ASPHERE:
+            c, k = p[SHAPE], p[SHAPE + 1]
+            for i in range(BLOCK):
+                n = src[N + i]
                 t, squared = distance(
-                    c, c + (c * k) * (n * n), dst[i], dst[128 + i],
-                    src[384 + i], src[512 + i], n, sense,
+                    c, c + (c * k) * (n * n), dst[X + i], dst[Y + i],
+                    src[L + i], src[M + i], n, sense,
                 )  # fmt: skip
-                w[1792 + i] = clamp(t, limit) if squared > zero else zero
-        for _ in range(40):
-            for i in range(128):
-                t = w[1792 + i]
-                w[256 + i] = dst[i] + src[384 + i] * t
-                w[384 + i] = dst[128 + i] + src[512 + i] * t
-            call_block(q[18], before, after, cotangents, record, work, codes)
+                w[DISTANCE + i] = clamp(t, limit) if squared > zero else zero
+        for _ in range(NEWTON_STEPS):
+            for i in range(BLOCK):
+                t = w[DISTANCE + i]
+                w[POINT_X + i] = dst[X + i] + src[L + i] * t
+                w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
+            call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
             moving = zero
-            for i in range(128):
-                t, n = w[1792 + i], src[640 + i]
-                slope = src[384 + i] * w[640 + i] + src[512 + i] * w[768 + i] - n
+            for i in range(BLOCK):
+                t, n = w[DISTANCE + i], src[N + i]
+                slope = src[L + i] * w[SLOPE_X + i] + src[M + i] * w[SLOPE_Y + i] - n
                 size = math.fabs(slope)
-                change = (w[512 + i] - n * t) / math.copysign(
+                change = (w[SAG + i] - n * t) / math.copysign(
                     size if size > grazing else grazing, slope
                 )
                 change = clamp(change, scale)
                 t = t - change
-                w[1792 + i] = t
+                w[DISTANCE + i] = t
                 # A ray that has ended already keeps no other waiting.
                 far = math.fabs(change) > close * (math.fabs(t) + scale)
-                moving += one if far and not src[896 + i] > zero else zero
+                moving += one if far and not src[ENDED + i] > zero else zero
             if moving == zero:
                 break
-        for i in range(128):
-            t = w[1792 + i]
-            w[256 + i] = dst[i] + src[384 + i] * t
-            w[384 + i] = dst[128 + i] + src[512 + i] * t
-        call_block(q[18], before, after, cotangents, record, work, codes)
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            t, sag, sx, sy = w[1792 + i], w[512 + i], w[640 + i], w[768 + i]
+        for i in range(BLOCK):
+            t = w[DISTANCE + i]
+            w[POINT_X + i] = dst[X + i] + src[L + i] * t
+            w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
+        call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            t, sag, sx, sy = w[DISTANCE + i], w[SAG + i], w[SLOPE_X + i], w[SLOPE_Y + i]
             residual = sag - n * t
             slope = l * sx + m * sy - n
             size = math.fabs(slope)
@@ -89,9 +142,9 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             allowed = rounding * (math.fabs(sag) + (math.fabs(t) + scale) * steep)
             allowed -= math.fabs(residual)
             # Compared one by one: a minimum would lose a NaN.
-            met = one if dst[256 + i] > grazing else zero
+            met = one if dst[Z + i] > grazing else zero
             met = met if sense * slope < zero else zero
-            met = met if w[896 + i] > zero else zero
+            met = met if w[MARGIN + i] > zero else zero
             met = met if allowed > zero else zero
             # One step more, too short to matter for the slopes.
             change = clamp(
@@ -101,25 +154,22 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             met = met if math.fabs(residual) <= limit else zero
             t = clamp(t - change, limit)
             met = met if math.fabs(t) < limit else zero
-            dst[i], dst[128 + i], dst[256 + i] = dst[i] + t * l, dst[128 + i] + t * m, t * n
-            dst[1152 + i] += t
-            dst[896 + i] = met
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            x, y, sx, sy, met = dst[i], dst[128 + i], w[640 + i], w[768 + i], dst[896 + i]
-            dst[768 + i] = src[768 + i] + w[i] * dst[1152 + i]
+            dst[X + i], dst[Y + i], dst[Z + i] = dst[X + i] + t * l, dst[Y + i] + t * m, t * n
+            dst[TRAVELLED + i] += t
+            dst[ENDED + i] = met
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            x, y, sx, sy = dst[X + i], dst[Y + i], w[SLOPE_X + i], w[SLOPE_Y + i]
+            met = dst[ENDED + i]
+            dst[PATH + i] = src[PATH + i] + w[INDEX + i] * dst[TRAVELLED + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
-            l2, m2, n2, transmitted = refract(l, m, n, -sx * nz, -sy * nz, nz, w[128 + i], sense)
+            l2, m2, n2, transmitted = refract(l, m, n, -sx * nz, -sy * nz, nz, w[RATIO + i], sense)
             if refracts:
                 l, m, n = l2, m2, n2  # noqa: E741
             else:
                 transmitted = one
-            dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
-            ended, vignetted = src[896 + i], src[1024 + i]
-            ended = ended if ended > zero or met > zero else tag + three
-            dst[896 + i] = ended if ended > zero or transmitted > zero else tag + two
-            inside = edge - (x * x + y * y)
-            dst[1024 + i] = vignetted if vignetted > zero or inside > zero else tag + one
+            dst[L + i], dst[M + i], dst[N + i] = l, m, n
+            set_status(src, dst, i, tag, edge, x, y, met, zero, transmitted)
 
     return kernel
 
@@ -135,42 +185,42 @@ def explicit_adjoint(real: types.Type) -> Callable[..., None]:
     zero, one = real(0.0), real(1.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        w, q = carray(work, 6144), carray(codes, 24)
-        cot = carray(cotangents, 2176)
-        refracts = q[5] != 0
-        for i in range(128):
-            w[256 + i] = dst[i]
-            w[384 + i] = dst[128 + i]
-        call_block(q[19], before, after, cotangents, record, work, codes)
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            sx, sy = w[640 + i], w[768 + i]
+        src, dst = carray(before, STATE), carray(after, STATE)
+        w, q = carray(work, WORK_SIZE), carray(codes, CODE_ROW)
+        cot = carray(cotangents, UNBOUNDED)
+        refracts = q[REFRACTS] != 0
+        for i in range(BLOCK):
+            w[POINT_X + i] = dst[X + i]
+            w[POINT_Y + i] = dst[Y + i]
+        call_block(q[SAG_HESSIAN], before, after, cotangents, record, work, codes)
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            sx, sy = w[SLOPE_X + i], w[SLOPE_Y + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
             nx, ny = -sx * nz, -sy * nz
             dl, dm, dn, vx, vy, vz, of_before, of_behind, per_cosine = refract_adjoint(
-                cot[384 + i], cot[512 + i], cot[640 + i], l, m, n, nx, ny, nz,
-                dst[384 + i], dst[512 + i], dst[640 + i], w[128 + i], w[3072 + i],
+                cot[L + i], cot[M + i], cot[N + i], l, m, n, nx, ny, nz,
+                dst[L + i], dst[M + i], dst[N + i], w[RATIO + i], w[INVERSE_INDEX + i],
             )  # fmt: skip
             if not refracts:
-                dl, dm, dn = cot[384 + i], cot[512 + i], cot[640 + i]
+                dl, dm, dn = cot[L + i], cot[M + i], cot[N + i]
                 vx = vy = vz = of_before = of_behind = zero
             across = vx * nx + vy * ny + vz * nz
             of_sx, of_sy = -(vx - across * nx) * nz, -(vy - across * ny) * nz
-            px = cot[i] + of_sx * w[1024 + i] + of_sy * w[1152 + i]
-            py = cot[128 + i] + of_sx * w[1152 + i] + of_sy * w[1280 + i]
-            pz = cot[256 + i]
-            path, t = cot[768 + i], dst[1152 + i]
-            along = (px * l + py * m + pz * n + w[i] * path) * per_cosine * nz
+            px = cot[X + i] + of_sx * w[SAG_XX + i] + of_sy * w[SAG_XY + i]
+            py = cot[Y + i] + of_sx * w[SAG_XY + i] + of_sy * w[SAG_YY + i]
+            pz = cot[Z + i]
+            path, t = cot[PATH + i], dst[TRAVELLED + i]
+            along = (px * l + py * m + pz * n + w[INDEX + i] * path) * per_cosine * nz
             qx, qy, qz = px + along * sx, py + along * sy, pz - along
-            cot[i], cot[128 + i], cot[256 + i] = qx, qy, qz
-            cot[384 + i] = dl + t * qx
-            cot[512 + i] = dm + t * qy
-            cot[640 + i] = dn + t * qz
-            cot[896 + i] = of_before + path * t
-            cot[1024 + i] = of_behind
-            cot[2048 + i] = qz
-            w[1408 + i], w[1536 + i], w[1664 + i] = along, of_sx, of_sy
-        call_block(q[20], before, after, cotangents, record, work, codes)
+            cot[X + i], cot[Y + i], cot[Z + i] = qx, qy, qz
+            cot[L + i] = dl + t * qx
+            cot[M + i] = dm + t * qy
+            cot[N + i] = dn + t * qz
+            cot[OF_FRONT + i] = of_before + path * t
+            cot[OF_BEHIND + i] = of_behind
+            cot[OF_SHIFT + i] = qz
+            w[OF_SAG + i], w[OF_SLOPE_X + i], w[OF_SLOPE_Y + i] = along, of_sx, of_sy
+        call_block(q[PARAMETERS], before, after, cotangents, record, work, codes)
 
     return kernel

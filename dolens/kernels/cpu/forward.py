@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import carray, njit, types
 
-from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu import compiler, jobs
 from dolens.kernels.cpu.compiler import (
     OPTIONS,
     call_block,
@@ -18,6 +18,36 @@ from dolens.kernels.cpu.compiler import (
     int64_at,
     real64_at,
     shifted,
+)
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    ENDED,
+    INDEX,
+    INVERSE_INDEX,
+    PATH,
+    RATIO,
+    STATE,
+    UNBOUNDED,
+    VIGNETTED,
+    WORK_SIZE,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
+)
+from dolens.kernels.cpu.records import (
+    AFTER,
+    BEFORE,
+    CODE_ROW,
+    FORWARD,
+    HOLE,
+    OFFSET,
+    OUTLINE,
+    RECTANGLE,
+    STATUS_BITS,
+    STATUS_MASK,
 )
 
 
@@ -44,94 +74,91 @@ def streams(real: types.Type) -> Streams:
     @njit(**OPTIONS)
     def find_wavelength(job, lanes):  # noqa: ANN001, ANN202
         """Note whether the rays of these numbers have one wavelength."""
-        job[63] = 1
-        if job[12] > 1:
-            which = carray(int32_at(job[6]), 1 << 40)
+        job[jobs.WAVELENGTH] = 1
+        if job[jobs.WAVELENGTHS] > 1:
+            which = carray(int32_at(job[jobs.WHICH]), UNBOUNDED)
             first = which[lanes[0]]
             different = 0
-            for i in range(128):
+            for i in range(BLOCK):
                 different += 1 if which[lanes[i]] != first else 0
-            job[63] = 0 if different > 0 else types.int64(first) + 1
+            job[jobs.WAVELENGTH] = 0 if different > 0 else types.int64(first) + 1
 
     @njit(**OPTIONS)
     def load(job, start, count, state, lanes):  # noqa: ANN001, ANN202
         """Rays `start` to `start + count` into a block; the lanes beyond repeat its first ray."""
-        for i in range(128):
+        for i in range(BLOCK):
             lanes[i] = start + (i if i < count else 0)
         find_wavelength(job, lanes)
-        out = carray(state, 1280)
-        row, column = job[1], job[2]
-        first = shifted(at(job[0]), start * row)
+        out = carray(state, STATE)
+        row, column = job[jobs.POSITION_ROW], job[jobs.POSITION_COLUMN]
+        first = shifted(at(job[jobs.POSITION]), start * row)
         if row == 3 and column == 1:
-            packed = carray(first, 384)
+            packed = carray(first, 3 * BLOCK)
             for i in range(count):
-                out[i], out[128 + i], out[256 + i] = (
-                    packed[3 * i],
-                    packed[3 * i + 1],
-                    packed[3 * i + 2],
-                )
+                x, y, z = packed[3 * i], packed[3 * i + 1], packed[3 * i + 2]
+                out[X + i], out[Y + i], out[Z + i] = x, y, z
         else:
             for k in range(3):
-                source = carray(shifted(first, k * column), 1 << 40)
-                target = carray(shifted(state, 128 * k), 128)
+                source = carray(shifted(first, k * column), UNBOUNDED)
+                target = carray(shifted(state, X + BLOCK * k), BLOCK)
                 for i in range(count):
                     target[i] = source[i * row]
-        row, column = job[4], job[5]
-        first = shifted(at(job[3]), start * row)
+        row, column = job[jobs.DIRECTION_ROW], job[jobs.DIRECTION_COLUMN]
+        first = shifted(at(job[jobs.DIRECTION]), start * row)
         if row == 3 and column == 1:
-            packed = carray(first, 384)
+            packed = carray(first, 3 * BLOCK)
             for i in range(count):
-                out[384 + i] = packed[3 * i]
-                out[512 + i] = packed[3 * i + 1]
-                out[640 + i] = packed[3 * i + 2]
+                out[L + i] = packed[3 * i]
+                out[M + i] = packed[3 * i + 1]
+                out[N + i] = packed[3 * i + 2]
         else:
             for k in range(3):
-                source = carray(shifted(first, k * column), 1 << 40)
-                target = carray(shifted(state, 384 + 128 * k), 128)
+                source = carray(shifted(first, k * column), UNBOUNDED)
+                target = carray(shifted(state, L + BLOCK * k), BLOCK)
                 for i in range(count):
                     target[i] = source[i * row]
-        for i in range(128):
-            out[768 + i] = zero
-            out[896 + i] = zero
-            out[1024 + i] = zero
+        for i in range(BLOCK):
+            out[PATH + i] = zero
+            out[ENDED + i] = zero
+            out[VIGNETTED + i] = zero
         for k in range(6):
-            lane = carray(shifted(state, 128 * k), 128)
-            for i in range(count, 128):
+            lane = carray(shifted(state, BLOCK * k), BLOCK)
+            for i in range(count, BLOCK):
                 lane[i] = lane[0]
 
     @njit(**OPTIONS)
     def set_indices(job, codes, lanes, work):  # noqa: ANN001, ANN202
         """The index in front and the ratio of a step; `lanes` are the rays' numbers."""
-        w = carray(work, 6144)
-        count = job[12]
-        before = carray(shifted(real64_at(job[11]), codes[3] * count), 1 << 40)
-        after = carray(shifted(real64_at(job[11]), codes[4] * count), 1 << 40)
-        if job[63] > 0:
-            common = job[63] - 1
+        w = carray(work, WORK_SIZE)
+        count = job[jobs.WAVELENGTHS]
+        before = carray(shifted(real64_at(job[jobs.INDICES]), codes[BEFORE] * count), UNBOUNDED)
+        after = carray(shifted(real64_at(job[jobs.INDICES]), codes[AFTER] * count), UNBOUNDED)
+        if job[jobs.WAVELENGTH] > 0:
+            common = job[jobs.WAVELENGTH] - 1
             index, ratio = real(before[common]), real(before[common] / after[common])
             inverse = real(types.float64(1.0) / before[common])
-            for i in range(128):
-                w[i] = index
-                w[128 + i] = ratio
-                w[3072 + i] = inverse
+            for i in range(BLOCK):
+                w[INDEX + i] = index
+                w[RATIO + i] = ratio
+                w[INVERSE_INDEX + i] = inverse
         else:
-            which = carray(int32_at(job[6]), 1 << 40)
-            for i in range(128):
+            which = carray(int32_at(job[jobs.WHICH]), UNBOUNDED)
+            for i in range(BLOCK):
                 wavelength = which[lanes[i]]
-                w[i] = real(before[wavelength])
-                w[128 + i] = real(before[wavelength] / after[wavelength])
-                w[3072 + i] = real(types.float64(1.0) / before[wavelength])
+                w[INDEX + i] = real(before[wavelength])
+                w[RATIO + i] = real(before[wavelength] / after[wavelength])
+                w[INVERSE_INDEX + i] = real(types.float64(1.0) / before[wavelength])
 
     @njit(**OPTIONS)
     def step(job, k, lanes, before, after, cotangents, work):  # noqa: ANN001, ANN202
         """Carry a block through step k."""
-        place = shifted(int64_at(job[9]), 24 * k)
-        codes = carray(place, 24)
-        record = shifted(at(job[10]), codes[1])
+        place = shifted(int64_at(job[jobs.CODES]), CODE_ROW * k)
+        codes = carray(place, CODE_ROW)
+        record = shifted(at(job[jobs.VALUES]), codes[OFFSET])
         set_indices(job, codes, lanes, work)
-        call_block(codes[16], before, after, cotangents, record, work, place)
-        if codes[6] == 2 or codes[7] != 0:
-            call_block(job[14], before, after, cotangents, record, work, place)
+        call_block(codes[FORWARD], before, after, cotangents, record, work, place)
+        if codes[OUTLINE] == RECTANGLE or codes[HOLE] != 0:
+            call_block(job[jobs.CLIP], before, after, cotangents, record, work, place)
 
     return Streams(find_wavelength, load, set_indices, step)
 
@@ -149,39 +176,39 @@ def forward_driver(real: types.Type) -> Callable[..., None]:
         return value if math.fabs(value) <= largest else zero
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 64)
-        rays, steps = job[7], job[8]
-        lanes = carray(int64_at(job[38]), 128)
-        work = at(job[17])
-        exit_z = carray(at(job[13]), 1)[0]
+        job = carray(job_, jobs.LENGTH)
+        rays, steps = job[jobs.RAYS], job[jobs.STEPS]
+        lanes = carray(int64_at(job[jobs.LANES]), BLOCK)
+        work = at(job[jobs.WORK])
+        exit_z = carray(at(job[jobs.EXIT_Z]), 1)[0]
         for block in range(first, last):
-            start = 128 * block
-            count = min(128, rays - start)
-            now, then = at(job[15]), shifted(at(job[15]), 1280)
+            start = BLOCK * block
+            count = min(BLOCK, rays - start)
+            now, then = at(job[jobs.STACK]), shifted(at(job[jobs.STACK]), STATE)
             load(job, start, count, now, lanes)
             for k in range(steps):
                 step(job, k, lanes, now, then, then, work)
                 now, then = then, now
-            state = carray(now, 1280)
-            position = carray(shifted(at(job[18]), 3 * start), 384)
-            direction = carray(shifted(at(job[19]), 3 * start), 384)
+            state = carray(now, STATE)
+            position = carray(shifted(at(job[jobs.OUT_POSITION]), 3 * start), 3 * BLOCK)
+            direction = carray(shifted(at(job[jobs.OUT_DIRECTION]), 3 * start), 3 * BLOCK)
             for i in range(count):
-                position[3 * i] = finite(state[i])
-                position[3 * i + 1] = finite(state[128 + i])
-                position[3 * i + 2] = finite(state[256 + i] + exit_z)
+                position[3 * i] = finite(state[X + i])
+                position[3 * i + 1] = finite(state[Y + i])
+                position[3 * i + 2] = finite(state[Z + i] + exit_z)
             for i in range(count):
-                direction[3 * i] = finite(state[384 + i])
-                direction[3 * i + 1] = finite(state[512 + i])
-                direction[3 * i + 2] = finite(state[640 + i])
-            path = carray(shifted(at(job[20]), start), 128)
-            status = carray(shifted(int8_at(job[21]), start), 128)
-            surface = carray(shifted(int16_at(job[22]), start), 128)
+                direction[3 * i] = finite(state[L + i])
+                direction[3 * i + 1] = finite(state[M + i])
+                direction[3 * i + 2] = finite(state[N + i])
+            path = carray(shifted(at(job[jobs.OUT_PATH]), start), BLOCK)
+            status = carray(shifted(int8_at(job[jobs.OUT_STATUS]), start), BLOCK)
+            surface = carray(shifted(int16_at(job[jobs.OUT_SURFACE]), start), BLOCK)
             for i in range(count):
-                path[i] = finite(state[768 + i])
+                path[i] = finite(state[PATH + i])
             for i in range(count):
-                ended, vignetted = state[896 + i], state[1024 + i]
+                ended, vignetted = state[ENDED + i], state[VIGNETTED + i]
                 code = types.int64(ended if ended > zero else vignetted)
-                surface[i] = code >> 2
-                status[i] = code & 3
+                surface[i] = code >> STATUS_BITS
+                status[i] = code & STATUS_MASK
 
     return kernel

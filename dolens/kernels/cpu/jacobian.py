@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from numba import carray, njit, types
 
+from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.adjoint import sweeps
 from dolens.kernels.cpu.compiler import (
     OPTIONS,
@@ -24,6 +25,31 @@ from dolens.kernels.cpu.compiler import (
     shifted,
 )
 from dolens.kernels.cpu.forward import real_at, streams
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    ENDED,
+    OF_FRONT,
+    OF_SHAPE,
+    STATE,
+    STENCIL_PLACE,
+    UNBOUNDED,
+    VIGNETTED,
+)
+from dolens.kernels.cpu.records import (
+    ADJOINT,
+    B_SPLINE,
+    CODE_ROW,
+    COLUMNS,
+    COUNT,
+    EVEN_ASPHERE,
+    KIND,
+    LENGTH,
+    OFFSET,
+)
+
+# Rays of a block that must pass for it to be swept as it is: tracing some rays again costs about as
+# much as sweeping back dead lanes.
+ENOUGH = 72
 
 
 class Columns(NamedTuple):
@@ -46,10 +72,10 @@ def columns(real: types.Type) -> Columns:
 
     @njit(**OPTIONS)
     def end_vignetted(state_):  # noqa: ANN001, ANN202
-        state = carray(state_, 1280)
-        for i in range(128):
-            ended, vignetted = state[896 + i], state[1024 + i]
-            state[896 + i] = ended if ended > zero else vignetted
+        state = carray(state_, STATE)
+        for i in range(BLOCK):
+            ended, vignetted = state[ENDED + i], state[VIGNETTED + i]
+            state[ENDED + i] = ended if ended > zero else vignetted
 
     @njit(**OPTIONS)
     def trace(job, lanes):  # noqa: ANN001, ANN202
@@ -58,36 +84,38 @@ def columns(real: types.Type) -> Columns:
         In the last state, row 7 is zero for those.  A vignetted ray need not go on: no Newton
         iteration waits for it.
         """
-        stack, work = at(job[15]), at(job[17])
-        for k in range(job[8]):
-            now, then = shifted(stack, 1280 * k), shifted(stack, 1280 * (k + 1))
-            kind = carray(shifted(int64_at(job[9]), 24 * k), 24)[0]
-            if kind >= 3 and kind <= 5:
+        stack, work = at(job[jobs.STACK]), at(job[jobs.WORK])
+        for k in range(job[jobs.STEPS]):
+            now, then = shifted(stack, STATE * k), shifted(stack, STATE * (k + 1))
+            kind = carray(shifted(int64_at(job[jobs.CODES]), CODE_ROW * k), CODE_ROW)[KIND]
+            if kind >= EVEN_ASPHERE and kind <= B_SPLINE:
                 end_vignetted(now)
             step(job, k, lanes, now, then, then, work)
-        end_vignetted(shifted(stack, 1280 * job[8]))
-        ended = carray(shifted(stack, 1280 * job[8] + 896), 128)
+        end_vignetted(shifted(stack, STATE * job[jobs.STEPS]))
+        ended = carray(shifted(stack, STATE * job[jobs.STEPS] + ENDED), BLOCK)
         passed = 0
-        for i in range(128):
+        for i in range(BLOCK):
             passed += 1 if ended[i] == zero else 0
         return passed
 
     @njit(**OPTIONS)
     def begin(job, start, count, lanes):  # noqa: ANN001, ANN202
-        """Load and trace rays `start` to `start + count`; how many pass, of 128."""
-        load(job, start, count, at(job[15]), lanes)
+        """Load and trace rays `start` to `start + count`; how many pass, of a whole block."""
+        load(job, start, count, at(job[jobs.STACK]), lanes)
         return trace(job, lanes)
 
     @njit(**OPTIONS)
     def set_row(target_, source_, ended_, weight):  # noqa: ANN001, ANN202
-        target, source, ended = carray(target_, 128), carray(source_, 128), carray(ended_, 128)
-        for i in range(128):
+        target, source = carray(target_, BLOCK), carray(source_, BLOCK)
+        ended = carray(ended_, BLOCK)
+        for i in range(BLOCK):
             target[i] = weight * source[i] if ended[i] == zero else zero
 
     @njit(**OPTIONS)
     def add_row(target_, source_, ended_, weight):  # noqa: ANN001, ANN202
-        target, source, ended = carray(target_, 128), carray(source_, 128), carray(ended_, 128)
-        for i in range(128):
+        target, source = carray(target_, BLOCK), carray(source_, BLOCK)
+        ended = carray(ended_, BLOCK)
+        for i in range(BLOCK):
             target[i] += weight * source[i] if ended[i] == zero else zero
 
     @njit(**OPTIONS)
@@ -96,14 +124,15 @@ def columns(real: types.Type) -> Columns:
 
         Entries are taken last first.  After the last step's come columns that begin as zero.
         """
-        table = carray(int64_at(job[44]), 1 << 40)
-        rows, places = carray(int64_at(job[45]), 1 << 40), carray(int64_at(job[46]), 1 << 40)
-        weights = carray(real64_at(job[47]), 1 << 40)
-        is_first = carray(int64_at(job[62]), 1 << 40)
-        ended = shifted(at(job[15]), 1280 * job[8] + 896)
+        table = carray(int64_at(job[jobs.ENTRIES]), UNBOUNDED)
+        rows = carray(int64_at(job[jobs.ENTRY_ROWS]), UNBOUNDED)
+        places = carray(int64_at(job[jobs.ENTRY_COLUMNS]), UNBOUNDED)
+        weights = carray(real64_at(job[jobs.ENTRY_WEIGHTS]), UNBOUNDED)
+        is_first = carray(int64_at(job[jobs.ENTRY_FIRST]), UNBOUNDED)
+        ended = shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS] + ENDED)
         for e in range(table[k + 1] - 1, table[k] - 1, -1):
             target = shifted(columns, stride * places[e])
-            source = shifted(cotangents, 128 * rows[e])
+            source = shifted(cotangents, BLOCK * rows[e])
             if is_first[e] != 0:
                 set_row(target, source, ended, real(weights[e]))
             else:
@@ -112,17 +141,17 @@ def columns(real: types.Type) -> Columns:
     @njit(**OPTIONS)
     def add_stencil(job, codes, cotangents, columns, stride):  # noqa: ANN001, ANN202
         """Add the coefficients of a spline: each ray has sixteen of them."""
-        begins = codes[1] + codes[2] - codes[8] * codes[9]
-        column = carray(shifted(int64_at(job[48]), begins), 1 << 40)
-        target = carray(columns, 1 << 40)
-        place = carray(shifted(cotangents, 7168), 128)
-        ended = carray(shifted(at(job[15]), 1280 * job[8] + 896), 128)
+        begins = codes[OFFSET] + codes[LENGTH] - codes[COUNT] * codes[COLUMNS]
+        column = carray(shifted(int64_at(job[jobs.SPLINE_COLUMNS]), begins), UNBOUNDED)
+        target = carray(columns, UNBOUNDED)
+        place = carray(shifted(cotangents, STENCIL_PLACE), BLOCK)
+        ended = carray(shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS] + ENDED), BLOCK)
         for j in range(4):
             for m in range(4):
-                lane = carray(shifted(cotangents, 5120 + 128 * (4 * j + m)), 128)
-                for i in range(128):
+                lane = carray(shifted(cotangents, OF_SHAPE + BLOCK * (4 * j + m)), BLOCK)
+                for i in range(BLOCK):
                     if ended[i] == zero:
-                        c = column[types.int64(place[i]) + j * codes[9] + m]
+                        c = column[types.int64(place[i]) + j * codes[COLUMNS] + m]
                         if c >= 0:
                             target[stride * c + i] += lane[i]
 
@@ -133,47 +162,55 @@ def columns(real: types.Type) -> Columns:
         Columns are `stride` numbers apart, those of an output after those of the one before.
         Derivatives of rays that do not pass are zero.
         """
-        outputs, length, span = job[40], job[51], stride * job[42]
-        seeds = carray(int64_at(job[41]), 1 << 40)
-        work = at(job[17])
+        outputs, length = job[jobs.OUTPUTS], job[jobs.COTANGENT_LENGTH]
+        span = stride * job[jobs.VARIABLES]
+        seeds = carray(int64_at(job[jobs.OUTPUT_ROWS]), UNBOUNDED)
+        work = at(job[jobs.WORK])
         for output in range(outputs):
-            cot = carray(shifted(at(job[16]), output * length), 1 << 40)
-            for i in range(896):
+            cot = carray(shifted(at(job[jobs.COTANGENTS]), output * length), UNBOUNDED)
+            for i in range(OF_FRONT):
                 cot[i] = zero
-            put_entries(job, job[8], at(job[16]), shifted(columns, span * output), stride)
-            for i in range(128):
-                cot[128 * seeds[output] + i] = one
-        for k in range(job[8] - 1, job[43] - 1, -1):
-            place = shifted(int64_at(job[9]), 24 * k)
-            codes = carray(place, 24)
-            now, then = shifted(at(job[15]), 1280 * k), shifted(at(job[15]), 1280 * (k + 1))
-            record = shifted(at(job[10]), codes[1])
+            put_entries(
+                job,
+                job[jobs.STEPS],
+                at(job[jobs.COTANGENTS]),
+                shifted(columns, span * output),
+                stride,
+            )
+            for i in range(BLOCK):
+                cot[BLOCK * seeds[output] + i] = one
+        for k in range(job[jobs.STEPS] - 1, job[jobs.FIRST_STEP] - 1, -1):
+            place = shifted(int64_at(job[jobs.CODES]), CODE_ROW * k)
+            codes = carray(place, CODE_ROW)
+            now = shifted(at(job[jobs.STACK]), STATE * k)
+            then = shifted(at(job[jobs.STACK]), STATE * (k + 1))
+            record = shifted(at(job[jobs.VALUES]), codes[OFFSET])
             set_indices(job, codes, lanes, work)
             for output in range(outputs):
-                cotangents = shifted(at(job[16]), output * length)
+                cotangents = shifted(at(job[jobs.COTANGENTS]), output * length)
                 target = shifted(columns, span * output)
-                call_block(codes[17], now, then, cotangents, record, work, place)
+                call_block(codes[ADJOINT], now, then, cotangents, record, work, place)
                 put_entries(job, k, cotangents, target, stride)
-                if codes[0] == 5 and job[48] != 0:
+                if codes[KIND] == B_SPLINE and job[jobs.SPLINE_COLUMNS] != 0:
                     add_stencil(job, codes, cotangents, target, stride)
 
     @njit(**OPTIONS)
     def wait(job, lanes, count, waiting):  # noqa: ANN001, ANN202
         """Put the block's rays that pass behind those that wait; the number that then do."""
-        last = carray(shifted(at(job[15]), 1280 * job[8]), 1280)
-        pending = carray(int64_at(job[50]), 256)
+        last = carray(shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS]), STATE)
+        pending = carray(int64_at(job[jobs.PENDING]), 2 * BLOCK)
         for i in range(count):
-            if last[896 + i] == zero:
+            if last[ENDED + i] == zero:
                 pending[waiting] = lanes[i]
                 waiting += 1
         return waiting
 
     @njit(**OPTIONS)
     def resume(job, lanes, waiting):  # noqa: ANN001, ANN202
-        """Trace up to 128 of the rays that wait; their number."""
-        pending = carray(int64_at(job[50]), 256)
-        count = min(waiting, 128)
-        for i in range(128):
+        """Trace rays that wait, a block at most; their number."""
+        pending = carray(int64_at(job[jobs.PENDING]), 2 * BLOCK)
+        count = min(waiting, BLOCK)
+        for i in range(BLOCK):
             lanes[i] = pending[min(i, count - 1)]
         for i in range(count, waiting):
             pending[i - count] = pending[i]
@@ -193,55 +230,56 @@ def jacobian_driver(real: types.Type) -> Callable[..., None]:
     @njit(**OPTIONS)
     def store_outputs(job, start, count):  # noqa: ANN001, ANN202
         """Outputs and validity of rays that follow each other."""
-        last = shifted(at(job[15]), 1280 * job[8])
-        ended = carray(shifted(last, 896), 128)
-        valid = carray(shifted(int8_at(job[52]), start), 128)
-        seeds = carray(int64_at(job[41]), 1 << 40)
+        last = shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS])
+        ended = carray(shifted(last, ENDED), BLOCK)
+        valid = carray(shifted(int8_at(job[jobs.OUT_VALID]), start), BLOCK)
+        seeds = carray(int64_at(job[jobs.OUTPUT_ROWS]), UNBOUNDED)
         for i in range(count):
             valid[i] = 1 if ended[i] == zero else 0
-        for output in range(job[40]):
-            value = carray(shifted(last, 128 * seeds[output]), 128)
-            out = carray(shifted(at(job[53]), output * job[7] + start), 128)
+        for output in range(job[jobs.OUTPUTS]):
+            value = carray(shifted(last, BLOCK * seeds[output]), BLOCK)
+            out = carray(shifted(at(job[jobs.OUT_VALUES]), output * job[jobs.RAYS] + start), BLOCK)
             for i in range(count):
                 out[i] = value[i] if ended[i] == zero else zero
 
     @njit(**OPTIONS)
     def store(job, lanes, count):  # noqa: ANN001, ANN202
         """Copy the columns of the first `count` lanes to their rays' places."""
-        for row in range(job[40] * job[42]):
-            value = carray(shifted(at(job[49]), 128 * row), 128)
-            out = carray(shifted(at(job[54]), row * job[7]), 1 << 40)
+        for row in range(job[jobs.OUTPUTS] * job[jobs.VARIABLES]):
+            value = carray(shifted(at(job[jobs.DRIVER_ROWS]), BLOCK * row), BLOCK)
+            out = carray(shifted(at(job[jobs.OUT_JACOBIAN]), row * job[jobs.RAYS]), UNBOUNDED)
             for i in range(count):
                 out[lanes[i]] = value[i]
 
     @njit(**OPTIONS)
     def clear(job, start, count):  # noqa: ANN001, ANN202
-        for row in range(job[40] * job[42]):
-            out = carray(shifted(at(job[54]), row * job[7] + start), 128)
+        for row in range(job[jobs.OUTPUTS] * job[jobs.VARIABLES]):
+            out = carray(shifted(at(job[jobs.OUT_JACOBIAN]), row * job[jobs.RAYS] + start), BLOCK)
             for i in range(count):
                 out[i] = zero
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 64)
-        lanes = carray(int64_at(job[38]), 128)
+        job = carray(job_, jobs.LENGTH)
+        lanes = carray(int64_at(job[jobs.LANES]), BLOCK)
         for chunk in range(first, last):
-            start, end = chunk * job[36], min((chunk + 1) * job[36], job[7])
+            start, end = chunk * job[jobs.CHUNK], min((chunk + 1) * job[jobs.CHUNK], job[jobs.RAYS])
             waiting = 0
             while start < end or waiting > 0:
                 if start < end:
-                    count = min(128, end - start)
+                    count = min(BLOCK, end - start)
                     passed = begin(job, start, count, lanes)
                     store_outputs(job, start, count)
-                    # Tracing some rays again costs about as much as sweeping back dead lanes.
-                    if passed >= 72 and count == 128:
-                        differentiate(job, lanes, shifted(at(job[54]), start), job[7])
+                    if passed >= ENOUGH and count == BLOCK:
+                        differentiate(
+                            job, lanes, shifted(at(job[jobs.OUT_JACOBIAN]), start), job[jobs.RAYS]
+                        )
                     else:
                         clear(job, start, count)
                         waiting = wait(job, lanes, count, waiting)
-                    start += 128
-                if waiting >= 128 or (waiting > 0 and start >= end):
+                    start += BLOCK
+                if waiting >= BLOCK or (waiting > 0 and start >= end):
                     count = resume(job, lanes, waiting)
-                    differentiate(job, lanes, at(job[49]), 128)
+                    differentiate(job, lanes, at(job[jobs.DRIVER_ROWS]), BLOCK)
                     store(job, lanes, count)
                     waiting -= count
 

@@ -1,58 +1,59 @@
-"""Where the numbers of a block lie: rows of 128, one for each of a block's rays.
+"""Where the numbers of a block of rays lie in memory: rows of 128, one number for each ray.
 
-Kernels write row offsets as literals, 128·row: LLVM must see constant distances to vectorise
-without testing for overlap.
-
-State (10 rows): x, y, z, l, m, n; 6 path; 7 ended; 8 vignetted; 9 distance travelled to get here.
-`ended` and `vignetted` hold 4·surface + status of the first failure of their kind, else zero.
-
-Work: 0 index in front, 1 index ratio μ, then scratch:
-    2 x, 3 y, 4 sag, 5 s_x, 6 s_y, 7 margin of the sag branch, 8 s_xx, 9 s_xy, 10 s_yy;
-    11, 12, 13 cotangents of sag, s_x and s_y; 14, 15 the axial distance t and its start;
-    16 to 23: a shape's own; 24 one over the index in front; 25 zero when a ray comes to the
-    surface; 26 the coefficients of a cubic; 48 and on: a polynomial's powers, a spline's stencil.
-
-Cotangents: 0 to 6 as in the state; 7 of the index in front, 8 of the index behind;
-    16 + j: of the record's number j.  A spline's local stencil: 40 to 55, its first place in 56.
+A row's name is the place of its first number, so that ray i of row X is number `X + i`.  Numba
+freezes a module's integers when it compiles: LLVM sees constant distances between rows, without
+which it would not vectorise.  `compiler.stamp` covers these sources, so that a change here makes
+the kernels on disk stale.
 """
 
-BLOCK = 128
+from dolens.kernels.table import Slot
+
+BLOCK = 128  # rays a block
+UNBOUNDED = 1 << 40  # the length of an array that its user keeps track of
+
+
+def _rows(first: int, count: int) -> tuple[int, ...]:
+    """Places of `count` rows that follow each other, from row `first`."""
+    return tuple(BLOCK * row for row in range(first, first + count))
+
+
+# A state: position (mm), direction cosines, optical path (mm); 4·surface + status of the first miss
+# or total reflection, and of the first aperture that stopped the ray, else zero; and the distance
+# travelled to get here (mm).
+X, Y, Z, L, M, N, PATH, ENDED, VIGNETTED, TRAVELLED = _rows(0, 10)
 STATE = 10 * BLOCK
-WORK_ROWS = 48  # before the powers of a polynomial or the stencil of a spline
-STENCIL_ROWS = 30
-COTANGENT_HEADER = 16
 
-# A step's codes as the CPU kernels take them: `table.Code`, then addresses.
-FORWARD, ADJOINT, SAG, BEND, PARAMETERS, EXTRAS_ADDRESS = range(16, 22)
-CODES = 24
+# Work rows that a driver fills before each step: the index in front, the ratio μ of the index in
+# front to the one behind, and one over the index in front.
+INDEX, RATIO = _rows(0, 2)
+(INVERSE_INDEX,) = _rows(24, 1)
+# Where a shape evaluates its sag, and what it gives there: sag (mm), slopes, a margin that is
+# positive on the branch of the sag, and the sag's Hessian (1/mm).
+POINT_X, POINT_Y, SAG, SLOPE_X, SLOPE_Y, MARGIN, SAG_XX, SAG_XY, SAG_YY = _rows(2, 9)
+# Cotangents of sag and slopes; the axial distance from the vertex plane (mm).
+OF_SAG, OF_SLOPE_X, OF_SLOPE_Y, DISTANCE = _rows(11, 4)
+# Eight rows of a shape's own.
+OWN = _rows(16, 8)
+# Its first number is zero when a ray comes to the surface, and one when a spline's stencil is here.
+(STENCIL_IS_HERE,) = _rows(25, 1)
+(CUBIC,) = _rows(26, 1)  # the coefficients of a cubic polynomial
+WORK_ROWS = 48  # those above
+WORK_SIZE = WORK_ROWS * BLOCK
+# As many more as a shape asks for: a polynomial's powers, a spline's stencil.
+(FURTHER,) = _rows(WORK_ROWS, 1)
 
-
-class Job:
-    """Where a driver finds things: places in its array of integers.
-
-    Addresses of arrays (zero: not asked for), strides in numbers, and counts.
-    """
-
-    POSITION, POSITION_ROW, POSITION_COLUMN = 0, 1, 2
-    DIRECTION, DIRECTION_ROW, DIRECTION_COLUMN = 3, 4, 5
-    WHICH, RAYS, STEPS, CODES, VALUES, INDICES, WAVELENGTHS, EXIT_Z, CLIP = range(6, 15)
-    STACK, COTANGENTS, WORK = range(15, 18)
-    OUT_POSITION, OUT_DIRECTION, OUT_PATH, OUT_STATUS, OUT_SURFACE = range(18, 23)
-    POSITION_COTANGENT, POSITION_COTANGENT_ROW, POSITION_COTANGENT_COLUMN = range(24, 27)
-    DIRECTION_COTANGENT, DIRECTION_COTANGENT_ROW, DIRECTION_COTANGENT_COLUMN = range(27, 30)
-    PATH_COTANGENT, PATH_COTANGENT_ROW = range(30, 32)
-    POSITION_GRADIENT, DIRECTION_GRADIENT = range(32, 34)
-    SUMS, SUM_LENGTH, CHUNK, VALUES_LENGTH = range(34, 38)
-    LANES, INDEX_SUMS = 38, 39
-    # Of the drivers of Jacobians.
-    OUTPUTS, OUTPUT_ROWS, VARIABLES, FIRST_STEP = range(40, 44)
-    ENTRIES, ENTRY_ROWS, ENTRY_COLUMNS, ENTRY_WEIGHTS, SPLINE_COLUMNS = range(44, 49)
-    COLUMNS, PENDING, COTANGENT_LENGTH = range(49, 52)
-    OUT_VALID, OUT_VALUES, OUT_JACOBIAN = range(52, 55)
-    TARGET, TARGET_ROW, TARGET_COLUMN, WEIGHT, WEIGHT_ROW, GROUP, GROUPS = range(55, 62)
-    ENTRY_FIRST = 62
-    # Of all rays of the block at hand, plus one; zero where they differ.
-    WAVELENGTH = 63
-    # Of a renderer: arrays of integers and of numbers; see `rendering`.
-    VIEW, LENGTHS = 64, 65
-    LENGTH = 72
+# Cotangents: X to PATH as in a state, then those of the indices in front and behind.
+OF_FRONT, OF_BEHIND = _rows(7, 2)
+# Then a row for each number of the step's record.  By name: those of the shift, of the step and the
+# turn of a change of axes, and of the first two numbers of a shape.
+COTANGENT_HEADER = 16  # rows before them
+(OF_RECORD,) = _rows(COTANGENT_HEADER, 1)
+(OF_SHIFT,) = _rows(COTANGENT_HEADER + Slot.SHIFT, 1)
+OF_STEP_X, OF_STEP_Y, OF_STEP_Z = _rows(COTANGENT_HEADER + Slot.STEP, 3)
+OF_TURN_XX, OF_TURN_XY, OF_TURN_XZ = _rows(COTANGENT_HEADER + Slot.TURN, 3)
+OF_TURN_YX, OF_TURN_YY, OF_TURN_YZ = _rows(COTANGENT_HEADER + Slot.TURN + 3, 3)
+OF_TURN_ZX, OF_TURN_ZY, OF_TURN_ZZ = _rows(COTANGENT_HEADER + Slot.TURN + 6, 3)
+OF_SHAPE, OF_SECOND = _rows(COTANGENT_HEADER + Slot.HEADER, 2)
+# A ray has 16 coefficients of a spline, wherever they are; then comes the place of the first.
+STENCIL_NUMBERS = 17
+(STENCIL_PLACE,) = _rows(COTANGENT_HEADER + Slot.HEADER + 16, 1)

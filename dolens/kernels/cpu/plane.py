@@ -6,37 +6,73 @@ from collections.abc import Callable
 from numba import carray, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
+from dolens.kernels.cpu.layout import (
+    BLOCK,
+    INDEX,
+    INVERSE_INDEX,
+    OF_BEHIND,
+    OF_FRONT,
+    OF_SHIFT,
+    PATH,
+    RATIO,
+    STATE,
+    TRAVELLED,
+    UNBOUNDED,
+    VIGNETTED,
+    WORK_SIZE,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
+)
+from dolens.kernels.cpu.records import (
+    CIRCLE,
+    CODE_ROW,
+    EDGE,
+    HALF_X,
+    HALF_Y,
+    HOLE,
+    HOLE_X,
+    HOLE_Y,
+    LIMIT,
+    OUTLINE,
+    RECTANGLE,
+    REFRACTS,
+    SENSE,
+    SHIFT,
+    SHORT_RECORD,
+    STOPPED,
+    TAG,
+)
 
 
 def plane_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to a plane and through it."""
-    _, safe_sqrt, arrive, _, _ = arithmetic(real)
-    zero, one, two, three, grazing = real(0.0), real(1.0), real(2.0), real(3.0), real(1e-9)
+    _, safe_sqrt, arrive, set_status, *_ = arithmetic(real)
+    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        p, w, q = carray(record, 32), carray(work, 6144), carray(codes, 24)
-        shift, limit, sense, tag = p[0], p[12], p[18], p[19]
-        refracts = q[5] != 0
-        edge = p[14]
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            x, y, t, met = arrive(src[i], src[128 + i], src[256 + i] + shift, l, m, n, sense, limit)
-            dst[i], dst[128 + i], dst[256 + i] = x, y, zero
-            dst[1152 + i] = t
-            dst[768 + i] = src[768 + i] + w[i] * t
-            ratio = w[128 + i]
+        src, dst = carray(before, STATE), carray(after, STATE)
+        p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
+        shift, limit, sense, tag = p[SHIFT], p[LIMIT], p[SENSE], p[TAG]
+        refracts = q[REFRACTS] != 0
+        edge = p[EDGE]
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            x, y, t, met = arrive(src[X + i], src[Y + i], src[Z + i] + shift, l, m, n, sense, limit)
+            dst[X + i], dst[Y + i], dst[Z + i] = x, y, zero
+            dst[TRAVELLED + i] = t
+            dst[PATH + i] = src[PATH + i] + w[INDEX + i] * t
+            ratio = w[RATIO + i]
             squared = (one - ratio * ratio) + (ratio * ratio) * (n * n)
             if refracts:
                 l, m, n = ratio * l, ratio * m, sense * safe_sqrt(squared)  # noqa: E741
             else:
                 squared = one
-            dst[384 + i], dst[512 + i], dst[640 + i] = l, m, n
-            ended, vignetted = src[896 + i], src[1024 + i]
-            ended = ended if ended > zero or met > grazing else tag + three
-            dst[896 + i] = ended if ended > zero or squared > zero else tag + two
-            inside = edge - (x * x + y * y)
-            dst[1024 + i] = vignetted if vignetted > zero or inside > zero else tag + one
+            dst[L + i], dst[M + i], dst[N + i] = l, m, n
+            set_status(src, dst, i, tag, edge, x, y, met, grazing, squared)
 
     return kernel
 
@@ -49,48 +85,48 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
     zero, one = real(0.0), real(1.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        src, dst = carray(before, 1280), carray(after, 1280)
-        w, q = carray(work, 6144), carray(codes, 24)
-        cot = carray(cotangents, 2176)
-        refracts = q[5] != 0
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            a, b, c = cot[384 + i], cot[512 + i], cot[640 + i]
+        src, dst = carray(before, STATE), carray(after, STATE)
+        w, q = carray(work, WORK_SIZE), carray(codes, CODE_ROW)
+        cot = carray(cotangents, UNBOUNDED)
+        refracts = q[REFRACTS] != 0
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            a, b, c = cot[L + i], cot[M + i], cot[N + i]
             of_before = of_behind = zero
             if refracts:
-                ratio, behind = w[128 + i], dst[640 + i]
+                ratio, behind = w[RATIO + i], dst[N + i]
                 of_ratio = a * l + b * m - c * ratio * (one - n * n) / behind
-                of_before = of_ratio * ratio * w[3072 + i]
+                of_before = of_ratio * ratio * w[INVERSE_INDEX + i]
                 of_behind = -of_before * ratio
                 a, b, c = ratio * a, ratio * b, ratio * ratio * n / behind * c
-            path, t = cot[768 + i], dst[1152 + i]
-            x, y = cot[i], cot[128 + i]
-            z = -(x * l + y * m + w[i] * path) / n
-            cot[256 + i] = z
-            cot[384 + i], cot[512 + i], cot[640 + i] = a + t * x, b + t * y, c + t * z
-            cot[896 + i] = of_before + path * t
-            cot[1024 + i] = of_behind
-            cot[2048 + i] = z
+            path, t = cot[PATH + i], dst[TRAVELLED + i]
+            x, y = cot[X + i], cot[Y + i]
+            z = -(x * l + y * m + w[INDEX + i] * path) / n
+            cot[Z + i] = z
+            cot[L + i], cot[M + i], cot[N + i] = a + t * x, b + t * y, c + t * z
+            cot[OF_FRONT + i] = of_before + path * t
+            cot[OF_BEHIND + i] = of_behind
+            cot[OF_SHIFT + i] = z
 
     return kernel
 
 
 def clip(real: types.Type) -> Callable[..., None]:
     """Vignette where the clear aperture is no full circle; the circle is tested on the way."""
-    zero, one = real(0.0), real(1.0)
+    zero, stopped = real(0.0), real(STOPPED)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
-        dst, p, q = carray(after, 1280), carray(record, 32), carray(codes, 24)
-        half_x, half_y, hole_x, hole_y, tag = p[15], p[20], p[16], p[17], p[19]
-        rectangle, hole = q[6] == 2, q[7]
-        for i in range(128):
-            x, y = math.fabs(dst[i]), math.fabs(dst[128 + i])
+        dst, p, q = carray(after, STATE), carray(record, SHORT_RECORD), carray(codes, CODE_ROW)
+        half_x, half_y, hole_x, hole_y, tag = p[HALF_X], p[HALF_Y], p[HOLE_X], p[HOLE_Y], p[TAG]
+        rectangle, hole = q[OUTLINE] == RECTANGLE, q[HOLE]
+        for i in range(BLOCK):
+            x, y = math.fabs(dst[X + i]), math.fabs(dst[Y + i])
             passes = not rectangle or (x < half_x and y < half_y)
-            if hole == 1:
+            if hole == CIRCLE:
                 passes = passes and x * x + y * y > hole_x
-            elif hole == 2:
+            elif hole == RECTANGLE:
                 passes = passes and (x > hole_x or y > hole_y)
-            if not passes and not dst[1024 + i] > zero:
-                dst[1024 + i] = tag + one
+            if not passes and not dst[VIGNETTED + i] > zero:
+                dst[VIGNETTED + i] = tag + stopped
 
     return kernel

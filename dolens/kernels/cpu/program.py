@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu import compiler, jobs
 from dolens.kernels.cpu.axes import (
     change_axes_adjoint,
     change_axes_forward,
@@ -16,7 +16,12 @@ from dolens.kernels.cpu.axes import (
     lens_axes_forward,
     sensor_forward,
 )
-from dolens.kernels.cpu.b_spline import b_spline_bend, b_spline_parameters, b_spline_sag
+from dolens.kernels.cpu.b_spline import (
+    STENCIL_ROWS,
+    b_spline_bend,
+    b_spline_parameters,
+    b_spline_sag,
+)
 from dolens.kernels.cpu.conic import conic_adjoint, conic_forward
 from dolens.kernels.cpu.even_asphere import (
     even_asphere_bend,
@@ -25,21 +30,22 @@ from dolens.kernels.cpu.even_asphere import (
 )
 from dolens.kernels.cpu.explicit import explicit_adjoint, explicit_forward
 from dolens.kernels.cpu.layout import (
-    ADJOINT,
-    BEND,
     BLOCK,
-    CODES,
     COTANGENT_HEADER,
+    STATE,
+    STENCIL_NUMBERS,
+    WORK_ROWS,
+)
+from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
+from dolens.kernels.cpu.records import (
+    ADJOINT,
+    CODE_ROW,
     EXTRAS_ADDRESS,
     FORWARD,
     PARAMETERS,
-    SAG,
-    STATE,
-    STENCIL_ROWS,
-    WORK_ROWS,
-    Job,
+    SAG_AND_SLOPES,
+    SAG_HESSIAN,
 )
-from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
 from dolens.kernels.cpu.sphere import sphere_adjoint, sphere_forward
 from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
 from dolens.kernels.cpu.xy_polynomial import (
@@ -90,7 +96,7 @@ class Steps(NamedTuple):
     """The steps of a lens, compiled.
 
     Attributes:
-        codes: (steps, CODES), int64: the table's, and the addresses of the block functions.
+        codes: (steps, CODE_ROW), int64: the table's, and the addresses of the block functions.
         longest: numbers of the longest record that has cotangents.
         scratch: work rows that the shapes need.
         clip: address of the test of apertures that are no full circles, or zero.
@@ -106,24 +112,24 @@ class Steps(NamedTuple):
 def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     """Compile what the steps of a table need: a pure function of its codes."""
     table = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW)
-    rows = np.zeros((max(len(table), 1), CODES), dtype=np.int64)
+    rows = np.zeros((max(len(table), 1), CODE_ROW), dtype=np.int64)
     rows[: len(table), : Code.ROW] = table
     longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
         kind = Kind(row[Code.KIND])
         row[FORWARD] = compiler.compile_block(_FORWARD[kind], real)
         if kind in _SAG:
-            row[SAG] = compiler.compile_block(_SAG[kind], real)
+            row[SAG_AND_SLOPES] = compiler.compile_block(_SAG[kind], real)
         if derivatives:
             row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], real)
             if kind in _DERIVATIVES:
                 bend, parameters = _DERIVATIVES[kind]
-                row[BEND] = compiler.compile_block(bend, real)
+                row[SAG_HESSIAN] = compiler.compile_block(bend, real)
                 row[PARAMETERS] = compiler.compile_block(parameters, real)
         length = int(row[Code.LENGTH])
         if kind == Kind.B_SPLINE:
             # Its stencil takes 17 rows of cotangents, whatever the number of its coefficients.
-            length, scratch = Slot.HEADER + 17, max(scratch, STENCIL_ROWS)
+            length, scratch = Slot.HEADER + STENCIL_NUMBERS, max(scratch, STENCIL_ROWS)
         elif kind == Kind.XY_POLYNOMIAL:
             scratch = max(scratch, 2 * (int(row[Code.DEGREE]) + 1))
         longest = max(longest, length)
@@ -152,46 +158,46 @@ class Program:
         count = table.codes.shape[0]
         self.codes = steps.codes.copy()
         self.codes[:, EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * self.codes[:, Code.EXTRAS]
-        self.job = np.zeros(Job.LENGTH, dtype=np.int64)
-        self.job[Job.STEPS] = count
-        self.job[Job.CODES] = self.codes.ctypes.data
-        self.job[Job.VALUES] = table.values.data_ptr()
-        self.job[Job.VALUES_LENGTH] = table.values.numel()
-        self.job[Job.INDICES] = table.indices.data_ptr()
-        self.job[Job.WAVELENGTHS] = table.indices.shape[1]
+        self.job = np.zeros(jobs.LENGTH, dtype=np.int64)
+        self.job[jobs.STEPS] = count
+        self.job[jobs.CODES] = self.codes.ctypes.data
+        self.job[jobs.VALUES] = table.values.data_ptr()
+        self.job[jobs.VALUES_LENGTH] = table.values.numel()
+        self.job[jobs.INDICES] = table.indices.data_ptr()
+        self.job[jobs.WAVELENGTHS] = table.indices.shape[1]
         last = table.values.numel() - 1
-        self.job[Job.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
-        self.job[Job.CLIP] = steps.clip
+        self.job[jobs.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
+        self.job[jobs.CLIP] = steps.clip
         # All of them with derivatives, else two in turn; and some that a driver may keep.
         states = count + 3 if derivatives else 5
         cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
-        self.job[Job.COTANGENT_LENGTH] = cotangents
+        self.job[jobs.COTANGENT_LENGTH] = cotangents
         self._sizes = {
-            Job.STACK: states * STATE,
-            Job.COTANGENTS: outputs * cotangents,
-            Job.WORK: (WORK_ROWS + steps.scratch) * BLOCK,
-            Job.COLUMNS: columns * BLOCK,
+            jobs.STACK: states * STATE,
+            jobs.COTANGENTS: outputs * cotangents,
+            jobs.WORK: (WORK_ROWS + steps.scratch) * BLOCK,
+            jobs.DRIVER_ROWS: columns * BLOCK,
         }
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
         """Point to rays (N, 3) of any strides, and their wavelengths' places (N,), int32."""
-        for place, tensor in ((Job.POSITION, position), (Job.DIRECTION, direction)):
+        for place, tensor in ((jobs.POSITION, position), (jobs.DIRECTION, direction)):
             self.job[place] = tensor.data_ptr()
             self.job[place + 1 : place + 3] = tensor.stride()
-        self.job[Job.RAYS] = position.shape[0]
-        self.job[Job.WHICH] = 0 if which is None else which.data_ptr()
+        self.job[jobs.RAYS] = position.shape[0]
+        self.job[jobs.WHICH] = 0 if which is None else which.data_ptr()
 
     def point(self, **tensors: Tensor | None) -> None:
-        """Point to contiguous tensors by the name of their place in `Job`."""
+        """Point to contiguous tensors by the name of their place in `jobs`."""
         for name, tensor in tensors.items():
-            self.job[getattr(Job, name)] = 0 if tensor is None else tensor.data_ptr()
+            self.job[getattr(jobs, name)] = 0 if tensor is None else tensor.data_ptr()
 
     def run(
         self, driver: Callable[[Any], Callable[..., None]], pieces: int, small: int = SMALL
     ) -> None:
         """Run a driver over all pieces, on torch's number of threads, or on one for few rays."""
         function = compiler.compile_driver(driver, self.real)
-        threads = min(thread_count(int(self.job[Job.RAYS]), small), pieces)
+        threads = min(thread_count(int(self.job[jobs.RAYS]), small), pieces)
         step = self.table.values.element_size()
         size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
         # Memories are held until the last share is done.
@@ -205,5 +211,5 @@ class Program:
         for place, length in self._sizes.items():
             job[place] = address
             address += length * step
-        job[Job.LANES], job[Job.PENDING] = address, address + 8 * BLOCK
+        job[jobs.LANES], job[jobs.PENDING] = address, address + 8 * BLOCK
         return job

@@ -20,8 +20,7 @@ from functools import cache
 import numpy as np
 import torch
 
-from dolens.kernels.cpu import compiler
-from dolens.kernels.cpu.team import Task, team
+from dolens.kernels.cpu import compiler, team
 
 logger = logging.getLogger("dolens.kernels")
 
@@ -70,9 +69,9 @@ def spread(driver: int, jobs: Sequence[np.ndarray], pieces: int) -> None:
     threads = min(len(jobs), pieces)
     bounds = _shares(pieces, threads)
     addresses = np.array([job.ctypes.data for job in jobs], dtype=np.int64)
-    task = np.zeros(Task.LENGTH, dtype=np.int64)
-    task[Task.SHARES], task[Task.DRIVER] = len(bounds), driver
-    task[Task.BOUNDS], task[Task.JOBS] = bounds.ctypes.data, addresses.ctypes.data
+    task = np.zeros(team.TASK, dtype=np.int64)
+    task[team.SHARES], task[team.DRIVER] = len(bounds), driver
+    task[team.BOUNDS], task[team.JOBS] = bounds.ctypes.data, addresses.ctypes.data
     if threads <= 1:
         run_alone(task)
     elif (openmp := torchs_openmp()) is not None and not is_forked():
@@ -83,12 +82,12 @@ def spread(driver: int, jobs: Sequence[np.ndarray], pieces: int) -> None:
 
 def run_alone(task: np.ndarray) -> None:
     """Run a task in the calling thread."""
-    compiler.compile_team(team)(_integers(task))
+    compiler.compile_team(team.team)(_integers(task))
 
 
 def run_with_openmp(openmp: ctypes.CDLL, task: np.ndarray, threads: int) -> None:
     """Run a task on a team of OpenMP's."""
-    function = ctypes.cast(compiler.compile_team(team), ctypes.c_void_p)
+    function = ctypes.cast(compiler.compile_team(team.team), ctypes.c_void_p)
     openmp.GOMP_parallel(function, ctypes.c_void_p(task.ctypes.data), threads, 0)
 
 
@@ -103,7 +102,7 @@ def run_in_pool(task: np.ndarray, threads: int) -> None:
         run_alone(task)
     finally:
         # Whatever stops this thread (Ctrl-C), nobody may write to memory that is given back.
-        task[Task.SHARES] = 0
+        task[team.SHARES] = 0
         _wait([other for other in others if not other.cancel()])
 
 

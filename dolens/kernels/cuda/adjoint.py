@@ -7,7 +7,20 @@ and its own row of sums, so that neither grows with the number of rays.
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.layout import AFTER, BEFORE, OFFSET, ROW, STATE
+from dolens.kernels.cuda.layout import (
+    AFTER,
+    BEFORE,
+    OFFSET,
+    ROW,
+    STATE,
+    TRAVELLED,
+    L,
+    M,
+    N,
+    X,
+    Y,
+    Z,
+)
 from dolens.kernels.cuda.rays import (
     first_sense,
     load_columns,
@@ -34,26 +47,26 @@ _ANYWHERE = (
 @triton.jit
 def _keep(state, BLOCK: tl.constexpr, x, y, z, l, m, n, travelled):
     lane = state + tl.arange(0, BLOCK)
-    tl.store(lane, x)
-    tl.store(lane + BLOCK, y)
-    tl.store(lane + 2 * BLOCK, z)
-    tl.store(lane + 3 * BLOCK, l)
-    tl.store(lane + 4 * BLOCK, m)
-    tl.store(lane + 5 * BLOCK, n)
-    tl.store(lane + 6 * BLOCK, travelled)
+    tl.store(lane + X * BLOCK, x)
+    tl.store(lane + Y * BLOCK, y)
+    tl.store(lane + Z * BLOCK, z)
+    tl.store(lane + L * BLOCK, l)
+    tl.store(lane + M * BLOCK, m)
+    tl.store(lane + N * BLOCK, n)
+    tl.store(lane + TRAVELLED * BLOCK, travelled)
 
 
 @triton.jit
 def _kept(state, BLOCK: tl.constexpr):
     lane = state + tl.arange(0, BLOCK)
     return (
-        tl.load(lane),
-        tl.load(lane + BLOCK),
-        tl.load(lane + 2 * BLOCK),
-        tl.load(lane + 3 * BLOCK),
-        tl.load(lane + 4 * BLOCK),
-        tl.load(lane + 5 * BLOCK),
-        tl.load(lane + 6 * BLOCK),
+        tl.load(lane + X * BLOCK),
+        tl.load(lane + Y * BLOCK),
+        tl.load(lane + Z * BLOCK),
+        tl.load(lane + L * BLOCK),
+        tl.load(lane + M * BLOCK),
+        tl.load(lane + N * BLOCK),
+        tl.load(lane + TRAVELLED * BLOCK),
     )
 
 

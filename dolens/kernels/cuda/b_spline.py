@@ -10,16 +10,18 @@ from dolens.kernels.cuda.arithmetic import divide
 from dolens.kernels.cuda.layout import COLUMNS, COUNT, SHAPE
 from dolens.kernels.cuda.sums import add_sum, first_of
 
+MORE_KNOTS = tl.constexpr(4)  # than coefficients
+
 
 @triton.jit
 def _span(knots, count, u):
     """First of the four coefficients that matter at u, from 0 to count - 4, by bisection."""
     low = tl.zeros(u.shape, tl.int32)
-    high = low + (count - 4)
-    width = count - 4
+    high = low + (count - MORE_KNOTS)
+    width = count - MORE_KNOTS
     while width > 0:
         middle = (low + high) // 2
-        beyond = (u >= tl.load(knots + middle + 4)) & (low < high)
+        beyond = (u >= tl.load(knots + middle + MORE_KNOTS)) & (low < high)
         low = tl.where(beyond, middle + 1, low)
         high = tl.where(beyond, high, middle)
         width = width // 2
@@ -71,14 +73,14 @@ def _stencil(record, codes, x, y):
     """Where the knots and coefficients about each point lie, and the knot rectangle's edges."""
     rows, columns = tl.load(codes + COUNT), tl.load(codes + COLUMNS)
     knots_x = record + SHAPE
-    knots_y = knots_x + columns + 4
+    knots_y = knots_x + columns + MORE_KNOTS
     column, row = _span(knots_x, columns, x), _span(knots_y, rows, y)
     return (
         columns,
         knots_x + column,
         knots_y + row,
         row * columns + column,
-        knots_y + rows + 4,
+        knots_y + rows + MORE_KNOTS,
         tl.load(knots_x + 3),
         tl.load(knots_x + columns),
         tl.load(knots_y + 3),
@@ -149,7 +151,7 @@ def b_spline_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive):
     columns, near_x, near_y, place, _, x_low, x_high, y_low, y_high = _stencil(record, codes, x, y)
     bx0, bx1, bx2, bx3, dx0, dx1, dx2, dx3 = _basis(near_x, x, x_low, x_high)
     by0, by1, by2, by3, dy0, dy1, dy2, dy3 = _basis(near_y, y, y_low, y_high)
-    into = sums + (tl.load(codes + COUNT) + columns + 8 + SHAPE)
+    into = sums + (tl.load(codes + COUNT) + columns + 2 * MORE_KNOTS + SHAPE)
     left = alive
     while tl.max(left.to(tl.int32), 0) > 0:
         stencil, here = first_of(place, left)

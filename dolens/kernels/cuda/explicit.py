@@ -11,7 +11,7 @@ from dolens.kernels.cuda.even_asphere import (
     even_asphere_sag,
     even_asphere_sums,
 )
-from dolens.kernels.cuda.layout import EVEN_ASPHERE, SHAPE, XY_POLYNOMIAL
+from dolens.kernels.cuda.layout import EVEN_ASPHERE, MAX_STEPS, SHAPE, XY_POLYNOMIAL
 from dolens.kernels.cuda.xy_polynomial import (
     xy_polynomial_bend,
     xy_polynomial_sag,
@@ -60,8 +60,8 @@ def explicit_intersect(
 ):
     """Distance from the vertex plane, unit normal there, and whether it is met.
 
-    As `Surface.intersect`: the iteration ends when no ray of the block moves any more, or after 40
-    steps; whether a ray has converged is read off its residual at the end.
+    As `Surface.intersect`: the iteration ends when no ray of the block moves any more, or after
+    `MAX_STEPS`; whether a ray has converged is read off its residual at the end.
     """
     # √ε, and 64 ε.
     close = 2.0**-26 if x.dtype == tl.float64 else 2.0**-11.5
@@ -73,7 +73,7 @@ def explicit_intersect(
         t = tl.where(squared > 0.0, clamp(start, limit), 0.0)
     moving = tl.full((), 1, tl.int32)
     steps = tl.full((), 0, tl.int32)
-    while (moving > 0) & (steps < 40):
+    while (moving > 0) & (steps < MAX_STEPS):
         sag, sx, sy, _ = sag_and_slopes(record, codes, extras, x + l * t, y + m * t, FORM)
         change = divide(sag - n * t, away_from_zero(l * sx + m * sy - n))
         change = clamp(change, scale)

@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import finite
-from dolens.kernels.cuda.layout import OFFSET, ROW
+from dolens.kernels.cuda.layout import OFFSET, ROW, STATUS_BITS, STATUS_MASK
 from dolens.kernels.cuda.rays import (
     first_sense,
     load_columns,
@@ -68,5 +68,5 @@ def forward_kernel(
     store_vectors(out_direction, rays, mask, finite(l), finite(m), finite(n))
     tl.store(out_path + rays, finite(path), mask=mask)
     failed = tl.where(ended > 0, ended, vignetted)
-    tl.store(out_status + rays, (failed & 3).to(tl.int8), mask=mask)
-    tl.store(out_surface + rays, (failed >> 2).to(tl.int16), mask=mask)
+    tl.store(out_status + rays, (failed & STATUS_MASK).to(tl.int8), mask=mask)
+    tl.store(out_surface + rays, (failed >> STATUS_BITS).to(tl.int16), mask=mask)

@@ -2,11 +2,13 @@
 
 import triton.language as tl
 
-from dolens.kernels.table import Code, Kind, Outline, Slot
+from dolens.kernels.table import NEWTON_STEPS, Code, Failure, Kind, Outline, Slot
 
 SHIFT = tl.constexpr(int(Slot.SHIFT))
-STEP = tl.constexpr(int(Slot.STEP))
-TURN = tl.constexpr(int(Slot.TURN))
+STEP_X, STEP_Y, STEP_Z = (tl.constexpr(Slot.STEP + k) for k in range(3))
+TURN_XX, TURN_XY, TURN_XZ = (tl.constexpr(Slot.TURN + k) for k in range(3))
+TURN_YX, TURN_YY, TURN_YZ = (tl.constexpr(Slot.TURN + k) for k in range(3, 6))
+TURN_ZX, TURN_ZY, TURN_ZZ = (tl.constexpr(Slot.TURN + k) for k in range(6, 9))
 LIMIT = tl.constexpr(int(Slot.LIMIT))
 SCALE = tl.constexpr(int(Slot.SCALE))
 EDGE = tl.constexpr(int(Slot.EDGE))
@@ -16,7 +18,7 @@ HOLE_X = tl.constexpr(int(Slot.HOLE_X))
 HOLE_Y = tl.constexpr(int(Slot.HOLE_Y))
 SENSE = tl.constexpr(int(Slot.SENSE))
 TAG = tl.constexpr(int(Slot.TAG))
-SHAPE = tl.constexpr(int(Slot.HEADER))
+SHAPE = tl.constexpr(int(Slot.HEADER))  # the first number of a shape
 
 KIND = tl.constexpr(int(Code.KIND))
 OFFSET = tl.constexpr(int(Code.OFFSET))
@@ -54,9 +56,13 @@ CIRCLE = tl.constexpr(int(Outline.CIRCLE))
 RECTANGLE = tl.constexpr(int(Outline.RECTANGLE))
 
 # Added to a surface's tag where a ray fails; `dolens.optics.rays.Status`.
-VIGNETTED = tl.constexpr(1)
-TOTALLY_REFLECTED = tl.constexpr(2)
-MISSED = tl.constexpr(3)
+VIGNETTED = tl.constexpr(int(Failure.VIGNETTED))
+TOTALLY_REFLECTED = tl.constexpr(int(Failure.TOTALLY_REFLECTED))
+MISSED = tl.constexpr(int(Failure.MISSED))
+STATUS_BITS, STATUS_MASK = tl.constexpr(Failure.BITS), tl.constexpr(Failure.MASK)
 
-# What the adjoint keeps of a block behind every step: x, y, z, l, m, n, and the distance there.
-STATE = tl.constexpr(7)
+MAX_STEPS = tl.constexpr(NEWTON_STEPS)
+
+# Rows of a block that the adjoint keeps behind every step: the ray, and the distance there.
+X, Y, Z, L, M, N, TRAVELLED = (tl.constexpr(row) for row in range(7))
+STATE = tl.constexpr(7)  # rows

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.kernels.table import Kind
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, tensor_of
 from dolens.optics.surfaces.clear_aperture import ClearAperture
@@ -136,10 +136,7 @@ def with_knots(parameters: Mapping[str, Any]) -> dict[str, Any]:
             given twice, an unknown name.
     """
     given = dict(parameters)
-    for name in given:
-        if name not in BSpline.optional:
-            allowed = ", ".join(BSpline.optional)
-            raise InputError(f"a b_spline has no parameter '{name}' (allowed: {allowed})")
+    check_keys(given, BSpline.optional, "b_spline")
     if "coefficients" not in given:
         raise InputError("'coefficients' are missing (mm; rows along y, columns along x)")
     shape = tuple(tensor_of(given["coefficients"], "coefficients", torch.float64).shape)

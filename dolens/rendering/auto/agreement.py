@@ -1,33 +1,18 @@
 """How well a renderer's gradients agree with those of rays: direction and norm."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass
 
 import torch
 from torch import Tensor
 
-Values = Mapping[str, Tensor]
+from dolens.rendering.protocol import GradientMeasure, Values
+
 Render = Callable[[Values, int], Tensor]
 
 # Rays of one render that gradients are judged by, and the fewest and most strata a pixel.
 _RAYS, _FEWEST, _MOST = 3.0e6, 4, 16
-
-
-@dataclass(frozen=True)
-class GradientMeasure:
-    """What gradients are taken of, and with respect to what.
-
-    Attributes:
-        variables: tensors that require gradients, in units in which they may be compared.
-        values: the lens's parameters by name, as functions of the variables.
-        loss: of an image (B, images, C, H, W) in linear light, the textures (B, channels, h, w) it
-            shows and the lens's parameters, on which a truth may depend.
-    """
-
-    variables: Sequence[Tensor]
-    values: Callable[[], Values]
-    loss: Callable[[Tensor, Tensor, Values], Tensor]
 
 
 @dataclass(frozen=True)
@@ -58,6 +43,14 @@ class Agreement:
         angle = math.acos(max(-1.0, min(1.0, self.cosine)))
         allowed = math.acos(least_cosine) + math.atan(self.noise)
         return max(angle / allowed, abs(self.norm_ratio - 1.0) / (norm_tolerance + self.noise))
+
+    def numbers(self) -> dict[str, float]:
+        """How gradients agree, as metrics."""
+        return {
+            "auto/gradient_cosine": self.cosine,
+            "auto/gradient_norm_ratio": self.norm_ratio,
+            "auto/gradient_noise": self.noise,
+        }
 
     def __str__(self) -> str:
         return (

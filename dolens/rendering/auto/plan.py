@@ -1,24 +1,24 @@
 """What a scene needs of a renderer, found from a few probe rays, in grey levels."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dolens.diffraction.diffraction_limit import diffraction_transfer, with_diffraction_limit
-from dolens.optics.system import OpticalSystem
-from dolens.rendering.auto.finding import Finding
-from dolens.rendering.auto.grid import (
+from dolens.rendering.auto.field_grid import (
     REGISTRATIONS,
     SAMPLES,
     WINDOW_SHARE,
+    Finding,
     choose_fields,
     window_finding,
 )
-from dolens.rendering.auto.probe import blurred_grey_levels, grey_levels
-from dolens.rendering.auto.survey import Survey, spread_pixels, survey
+from dolens.rendering.auto.probes import blurred_grey_levels, grey_levels
+from dolens.rendering.auto.survey import Pixels, Survey, spread_pixels, survey
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
@@ -27,7 +27,7 @@ from dolens.sensor.pixels import Sensor
 _POINTS = 24
 _PUPIL_SAMPLES = (6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64)
 # The share of the tolerance that each simplification may take; with those of
-# `grid` their squares add up to less than 1.
+# `field_grid` their squares add up to less than 1.
 _SAMPLING, _SHARING, _DIFFRACTION, _PRECISION = 0.5, 0.25, 0.3, 0.1
 # Near an optimum the gradients of colours, and of depths, cancel; one in place of all turns their
 # sum: a cosine of 0.3 with the rays' gradient was measured, in images a quarter grey level off.
@@ -38,6 +38,8 @@ _WAVES = 4
 _MOST_SAMPLES = 1 << 28
 # Pixels by which windows grow, for diffraction; the last is for comparison.
 _MARGINS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64)
+# Models of diffraction, from the least to the most exact.
+_DIFFRACTION_MODELS = ("none", "limit", "wave")
 
 
 @dataclass(frozen=True)
@@ -62,70 +64,101 @@ class Plan:
         return math.sqrt(sum(finding.error**2 for finding in self.findings))
 
 
-@torch.no_grad()
-def plan(
-    system: OpticalSystem,
-    precise: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    tolerance: float,
-    gradients: bool,
-    diffraction: bool,
-    backend: str,
-    registrations: Sequence[str] = REGISTRATIONS,
-) -> Plan:
-    """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
+@dataclass(frozen=True)
+class Requirements:
+    """The conditions that a plan keeps to.
 
-    Args:
-        system: the lens in single precision.
-        precise: the same in double precision.
-        scene: depths and wavelengths.
-        sensor: the pixels.
+    Attributes:
         tolerance: RMS grey levels (1/255 of full scale, linear light) on the probe.
         gradients: whether the lens's gradients matter too.
         diffraction: whether it may be modelled.
-        backend: what traces.
         registrations: that may be chosen, of `PsfRenderer`.
+    """
+
+    tolerance: float
+    gradients: bool
+    diffraction: bool
+    registrations: Sequence[str] = REGISTRATIONS
+
+
+@torch.no_grad()
+def plan(single: ImagingSystem, double: ImagingSystem, requirements: Requirements) -> Plan:
+    """Choose fields, registration, window, pupil samples, what is shared, diffraction, precision.
+
+    Args:
+        single: the lens in single precision, depths and wavelengths, and the pixels.
+        double: the same in double precision.
+        requirements: the tolerance, and what is asked for.
 
     Raises:
         InputError: functions are too wide for any window.
     """
-    rows, columns = spread_pixels(sensor, _POINTS)
-    truth = survey(precise, scene, sensor, rows, columns, SAMPLES, backend)
-    layout = choose_fields(
-        precise, scene, sensor, rows, columns, truth, tolerance, backend, registrations
-    )
+    scene, tolerance = double.scene, requirements.tolerance
+    truth = survey(double, spread_pixels(double.sensor, _POINTS), SAMPLES)
+    layout = choose_fields(truth, tolerance, requirements.registrations)
     renderer, distortion = layout.renderer, layout.renderer.registration == "chief_rays"
     functions = truth.functions(renderer.size, distortion)
     findings = [layout.finding, window_finding(truth, renderer.size, distortion)]
-    shared = (_SHARING_OF_GRADIENTS if gradients else _SHARING) * tolerance
+    shared = (_SHARING_OF_GRADIENTS if requirements.gradients else _SHARING) * tolerance
     for name, finding in (
         ("depths", _shared_depths(functions, scene, shared)),
         ("colours", _shared_colours(functions, scene, shared)),
     ):
         renderer = replace(renderer, **{name: finding.chosen})
         findings.append(finding)
-    finding, without = _diffraction(functions, truth, precise, scene, renderer, tolerance, backend)
-    if not diffraction:
+    finding, without = _diffraction(functions, truth, renderer, tolerance)
+    if not requirements.diffraction:
         finding = Finding(
             "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
         )
     renderer = replace(renderer, diffraction=finding.chosen)
     findings.append(finding)
     if finding.chosen != "none":
-        finding = _wider_window(truth, scene, renderer, tolerance)
+        finding = _wider_window(truth, renderer, tolerance)
         renderer = replace(renderer, size=int(finding.chosen))
         findings.append(finding)
         functions = truth.functions(renderer.size, distortion)
     few = slice(0, 8)
-    part = rows[few], columns[few]
-    finding = _sampling(precise, scene, sensor, part, functions[few], renderer, tolerance, backend)
+    part = tuple(place[few] for place in truth.pixels)
+    finding = _sampling(double, part, functions[few], renderer, tolerance)
     renderer = replace(renderer, pupil_samples=int(finding.chosen))
     findings.append(finding)
-    finding = _precision(system, precise, scene, sensor, part, renderer, tolerance, backend)
+    finding = _precision((single, double), part, renderer, tolerance)
     findings.append(finding)
     dtype = torch.float32 if finding.chosen == "single" else torch.float64
     return Plan(renderer, dtype, tuple(findings), without)
+
+
+def union(plans: Mapping[str, Plan], sensor: Sensor) -> Plan:
+    """The plan for windows of a sensor that is as demanding as the most demanding window's.
+
+    Args:
+        plans: by the windows' names, all centred on chief rays.
+        sensor: the whole one.
+    """
+    parts = [found.renderer for found in plans.values()]
+    renderer = PsfRenderer(
+        sensor,
+        tuple(max(part.fields[side] for part in parts) for side in (0, 1)),
+        max(part.pupil_samples for part in parts),
+        max(part.size for part in parts),
+        illumination="map" if any(p.illumination == "map" for p in parts) else "functions",
+        colours="each" if any(p.colours == "each" for p in parts) else "one",
+        diffraction=max((part.diffraction for part in parts), key=_DIFFRACTION_MODELS.index),
+    )
+    chosen = (
+        f"{renderer.fields[0]}×{renderer.fields[1]} fields, {renderer.pupil_samples}² rays, "
+        f"{renderer.size} pixels, colours {renderer.colours}, diffraction {renderer.diffraction}"
+    )
+    error = max(found.expected_error for found in plans.values())
+    finding = Finding("windows", chosen, error, f"the most demanding of {', '.join(plans)}")
+    double = any(found.dtype == torch.float64 for found in plans.values())
+    return Plan(
+        renderer,
+        torch.float64 if double else torch.float32,
+        (finding,),
+        max(found.without_diffraction for found in plans.values()),
+    )
 
 
 def _shared_depths(functions: Tensor, scene: PlanarScene, tolerance: float) -> Finding:
@@ -148,19 +181,13 @@ def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Fin
 
 
 def _diffraction(
-    functions: Tensor,
-    truth: Survey,
-    system: OpticalSystem,
-    scene: PlanarScene,
-    renderer: PsfRenderer,
-    tolerance: float,
-    backend: str,
+    functions: Tensor, truth: Survey, renderer: PsfRenderer, tolerance: float
 ) -> tuple[Finding, float]:
     """What model of diffraction is enough, and what leaving it out would cost.
 
     A perfect pupil's says whether it can matter at all; where it can, wavefronts are asked.
     """
-    pitch = renderer.sensor.pixel_pitch
+    scene, pitch = truth.imaging.scene, renderer.sensor.pixel_pitch
     airy = 1.22 * max(scene.wavelengths) * 1e-6 * truth.f_number / pitch
     seen = f"the Airy disc's radius is {airy:.2g} pixels"
     side = max(128, functions.shape[-1] + 1)
@@ -178,13 +205,10 @@ def _diffraction(
     # From the middle to a corner: what diffracts there may be beyond Fourier transforms.
     share = torch.linspace(0.5, 1.0, _WAVES, dtype=torch.float64)
     places = share * (sensor.height - 1), share * (sensor.width - 1)
-    found, again = (
-        survey(system, scene, sensor, *places, SAMPLES, backend, seed) for seed in (0, 1)
-    )
+    found, again = (survey(truth.imaging, places, SAMPLES, seed) for seed in (0, 1))
     # As wide as diffraction spreads light, within reason.
     size = renderer.size + 2 * min(math.ceil(8.0 * airy) + 2, _MARGINS[-1])
-    at = (system, scene, sensor, *places, size, distortion)
-    samples, against = found.wave_cost(*at)
+    samples, against = found.wave_cost(size, distortion)
     pupils = math.prod(renderer.fields) * len(scene.depths) * len(scene.wavelengths)
     if against is None and pupils * samples**2 > _MOST_SAMPLES:
         against = f"{pupils} pupils of {samples}² samples are too many"
@@ -192,7 +216,7 @@ def _diffraction(
         # A perfect pupil's effect is then all that is known of it, and its size.
         because = f"{seen}; not by waves: {against}"
         return Finding("diffraction", "limit", error, because), error
-    waves = found.waves(*at)
+    waves = found.waves(size, distortion)
     pair = [s.functions(size, distortion).double() for s in (found, again)]
     rays, noise = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
     limited = with_diffraction_limit(rays, pitch, scene.wavelengths, truth.f_number)
@@ -211,10 +235,9 @@ def _diffraction(
     return Finding("diffraction", "wave", 0.0, because), without
 
 
-def _wider_window(
-    truth: Survey, scene: PlanarScene, renderer: PsfRenderer, tolerance: float
-) -> Finding:
+def _wider_window(truth: Survey, renderer: PsfRenderer, tolerance: float) -> Finding:
     """A window that holds what diffraction spreads."""
+    scene = truth.imaging.scene
     pitch, distortion = renderer.sensor.pixel_pitch, renderer.registration == "chief_rays"
 
     def blurred(size: int) -> Tensor:
@@ -234,20 +257,17 @@ def _wider_window(
 
 
 def _sampling(
-    system: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    places: tuple[Tensor, Tensor],
+    imaging: ImagingSystem,
+    places: Pixels,
     functions: Tensor,
     renderer: PsfRenderer,
     tolerance: float,
-    backend: str,
 ) -> Finding:
     """The fewest rays whose functions are those of many."""
     distortion = renderer.registration == "chief_rays"
     error, samples = math.inf, _PUPIL_SAMPLES[-1]
     for samples in _PUPIL_SAMPLES:
-        found = survey(system, scene, sensor, *places, samples, backend, seed=1)
+        found = survey(imaging, places, samples, seed=1)
         coarse = found.functions(renderer.size, distortion)
         error = float(grey_levels(coarse - functions).square().mean().sqrt())
         if error <= _SAMPLING * tolerance:
@@ -257,20 +277,13 @@ def _sampling(
 
 
 def _precision(
-    system: OpticalSystem,
-    precise: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    places: tuple[Tensor, Tensor],
+    imaging: Sequence[ImagingSystem],
+    places: Pixels,
     renderer: PsfRenderer,
     tolerance: float,
-    backend: str,
 ) -> Finding:
     distortion = renderer.registration == "chief_rays"
-    found = [
-        survey(lens, scene, sensor, *places, 16, backend).functions(renderer.size, distortion)
-        for lens in (system, precise)
-    ]
+    found = [survey(each, places, 16).functions(renderer.size, distortion) for each in imaging]
     error = float(grey_levels(found[0].double() - found[1]).square().mean().sqrt())
     if error <= _PRECISION * tolerance:
         return Finding("precision", "single", error, "rounding does not show")

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from dolens.diffraction.propagation import DiffractionSettings
 from dolens.errors import InputError
-from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.optics.backend import cpu_kernels_serve
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import (
     PlanePoints,
     chief_ray_points,
@@ -20,34 +21,45 @@ from dolens.rendering.psf_grid import (
     wave_cost,
     wave_point_spread_functions,
 )
-from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil, working_f_number
-from dolens.scene.planar import PlanarScene
+from dolens.rendering.pupil.exit_pupil import working_f_number
 from dolens.sensor.pixels import Sensor
 
 # The plastic number's sequence fills a square evenly (Roberts, 2018).
 _FIRST, _SECOND = 0.7548776662466927, 0.5698402909980532
 
+Pixels = tuple[Tensor, Tensor]  # fractional rows and columns, each (N,)
+
 
 @dataclass(frozen=True)
 class Survey:
-    """Rays of points of a sensor, on the planes of a scene.
+    """Rays of N points of a sensor, on D planes of a scene at C wavelengths.
 
     Attributes:
-        seen: rays of N points.
+        imaging: the lens, the scene, the sensor and the pupil.
+        pixels: fractional rows and columns of the points.
+        seen: their rays.
         chief: rows and columns of the chief rays, each (N, D, C); None where some do not pass.
         pinhole: rows and columns as a pinhole sees the points.
-        f_number: that the axial beam works with.
-        backend: what splats.
     """
 
+    imaging: ImagingSystem
+    pixels: Pixels
     seen: PlanePoints
     chief: tuple[Tensor, Tensor] | None
     pinhole: tuple[Tensor, Tensor]
-    f_number: float
-    backend: str
+
+    @property
+    def f_number(self) -> float:
+        """The F-number that the axial beam works with."""
+        return working_f_number(self.imaging.pupil, float(self.imaging.system.vertices[-1]))
+
+    @property
+    def points(self) -> tuple[Tensor, Tensor]:
+        """x and y of the points on the sensor, mm."""
+        return self.imaging.sensor.positions(*self.pixels)
 
     def centres(self, distortion: bool) -> tuple[Tensor, Tensor]:
-        """What functions are centred on: the chief rays, or a pinhole's points."""
+        """The points that functions are centred on: the chief rays', or a pinhole's."""
         return self.chief if distortion else self.pinhole
 
     def offsets(self, distortion: bool) -> PlanePoints:
@@ -57,55 +69,19 @@ class Survey:
 
     def functions(self, size: int, distortion: bool) -> Tensor:
         """(N, D, C, size, size)."""
-        return splatted(self.offsets(distortion), size, self.backend).functions
+        fused = cpu_kernels_serve(self.imaging.system)
+        return splatted(self.offsets(distortion), size, fused).functions
 
-    def waves(
-        self,
-        system: OpticalSystem,
-        scene: PlanarScene,
-        sensor: Sensor,
-        rows: Tensor,
-        columns: Tensor,
-        size: int,
-        distortion: bool,
-    ) -> Tensor:
+    def waves(self, size: int, distortion: bool) -> Tensor:
         """Functions (N, D, C, size, size) with diffraction, of the same points."""
-        pupil = sampled_exit_pupil(system, scene.wavelengths, sensor, self.backend)
-        return wave_point_spread_functions(
-            system,
-            scene,
-            sensor.positions(rows, columns),
-            pupil,
-            sensor.pixel_pitch,
-            size,
-            distortion,
-            is_rotationally_symmetric(system),
-            self.backend,
-            # Near enough for a plan; direct integration would take minutes.
-            DiffractionSettings(method="fourier"),
-        ).functions
+        # Near enough for a plan; direct integration would take minutes.
+        settings = DiffractionSettings(method="fourier")
+        found = wave_point_spread_functions(self.imaging, self.points, size, distortion, settings)
+        return found.functions
 
-    def wave_cost(
-        self,
-        system: OpticalSystem,
-        scene: PlanarScene,
-        sensor: Sensor,
-        rows: Tensor,
-        columns: Tensor,
-        size: int,
-        distortion: bool,
-    ) -> tuple[int, str | None]:
-        """Samples along a pupil, and why Fourier transforms do not do, as `field_psf.wave_cost`."""
-        return wave_cost(
-            system,
-            scene,
-            sensor.positions(rows, columns),
-            sampled_exit_pupil(system, scene.wavelengths, sensor, self.backend),
-            sensor.pixel_pitch,
-            size,
-            distortion,
-            self.backend,
-        )
+    def wave_cost(self, size: int, distortion: bool) -> tuple[int, str | None]:
+        """Samples along a pupil, and why Fourier transforms do not do, as `psf_grid.wave_cost`."""
+        return wave_cost(self.imaging, self.points, size, distortion)
 
     def light(self) -> Tensor:
         """(N, 1, C), relative illumination."""
@@ -113,51 +89,37 @@ class Survey:
 
 
 @torch.no_grad()
-def survey(
-    system: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    rows: Tensor,
-    columns: Tensor,
-    pupil_samples: int,
-    backend: str,
-    seed: int = 0,
-) -> Survey:
-    """Trace rays from pixels (N,), at fractional rows and columns, to the planes of a scene.
+def survey(imaging: ImagingSystem, pixels: Pixels, pupil_samples: int, seed: int = 0) -> Survey:
+    """Trace rays from points of a sensor to the planes of a scene.
 
     All points share their places in the pupil, so that functions of neighbours are alike in what
     the sampling leaves.
+
+    Args:
+        imaging: the lens, the scene, the sensor and the pupil, numbers.
+        pixels: fractional rows and columns of the points.
+        pupil_samples: strata along each side of the pupil.
+        seed: of the points in the strata.
     """
-    pupil = sampled_exit_pupil(system, scene.wavelengths, sensor, backend)
-    points = sensor.positions(rows, columns)
-    symmetric = is_rotationally_symmetric(system)
-    disc = sampled_disc(1, pupil_samples, seed, system)
-    pitch = sensor.pixel_pitch
-    seen = plane_points(system, scene, points, pupil, disc, pitch, symmetric, backend)
+    points = imaging.sensor.positions(*pixels)
+    disc = sampled_disc(1, pupil_samples, seed, imaging.system)
     return Survey(
-        seen,
-        _chief(system, scene, points, pupil, pitch, backend),
-        pinhole_points(points, pitch, len(scene.depths), len(scene.wavelengths)),
-        working_f_number(pupil, float(system.vertices[-1])),
-        backend,
+        imaging,
+        pixels,
+        plane_points(imaging, points, disc),
+        _chief(imaging, points),
+        pinhole_points(imaging, points),
     )
 
 
-def _chief(
-    system: OpticalSystem,
-    scene: PlanarScene,
-    points: tuple[Tensor, Tensor],
-    pupil: ExitPupil,
-    pitch: float,
-    backend: str,
-) -> tuple[Tensor, Tensor] | None:
+def _chief(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor] | None:
     try:
-        return chief_ray_points(system, scene, points, pupil, pitch, backend)
+        return chief_ray_points(imaging, points)
     except InputError:
         return None
 
 
-def spread_pixels(sensor: Sensor, count: int) -> tuple[Tensor, Tensor]:
+def spread_pixels(sensor: Sensor, count: int) -> Pixels:
     """Rows and columns of `count` points that fill a sensor evenly, each (count,)."""
     index = torch.arange(1, count + 1, dtype=torch.float64)
     down, across = (0.5 + index * _FIRST).frac(), (0.5 + index * _SECOND).frac()

@@ -1,80 +1,102 @@
-"""A lens before probe images: what renderers err by there, in the image and in its gradient."""
+"""A lens before probe images: the errors of renderers there, in the image and in its gradient."""
 
 import copy
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import (
     Agreement,
-    GradientMeasure,
+    Render,
     agreement,
     gradient,
     gradients_of_rays,
     image_measure,
     judging_samples,
 )
-from dolens.rendering.auto.cost import psf_cost, rays_cost
-from dolens.rendering.auto.plan import Plan, plan
-from dolens.rendering.auto.probe import probe_texture
-from dolens.rendering.auto.reference import rays_samples, reference
+from dolens.rendering.auto.costs import psf_cost, rays_cost
+from dolens.rendering.auto.plan import Plan, Requirements, plan, union
+from dolens.rendering.auto.probes import Reference, probe_texture, rays_samples, reference
+from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
 from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
-from dolens.scene.planar import Scene, pinhole_image
+from dolens.scene.planar import PlanarScene, Scene, pinhole_image
 from dolens.sensor.pixels import Sensor
 
 # The reference's samples along each side of the pupil.
-REFERENCE_SAMPLES = 24
+_REFERENCE_SAMPLES = 24
+# Sides of the reference's parts, pixels: of the whole sensor, and of each of several windows.
+_SIDE, _SIDE_OF_WINDOW = 24, 12
+
+
+@dataclass(frozen=True)
+class ProbeSet:
+    """The parts of a sensor that renderers are tried on, and the images that are shown to them.
+
+    Attributes:
+        sensor: the whole one.
+        seed: of the probe images and of rays.
+        windows: by name, of the sensor, rendered together; none: the whole sensor by itself.
+        photographs: (P, 3, h, w), linear light, beside the probe images of `probe_texture`; or
+            None.
+    """
+
+    sensor: Sensor
+    seed: int = 0
+    windows: Mapping[str, Sensor] = field(default_factory=dict)
+    photographs: Tensor | None = None
 
 
 class Trial:
     """One lens as it is, and what rays make of the probe images and of their gradients.
 
     Args:
-        current: the lens.
+        lens: the lens.
         scene: what it looks at; the probe images stand in its planes.
-        sensor: the pixels.
-        values: the lens's parameters by name; gradients are of those that require them.
+        probes: the sensor, its windows and the images.
+        requirements: the conditions that plans keep to.
+        values: the lens's parameters by name; where nothing else is said, gradients of the whole
+            sensor's image are of those that require them.
         measure: of gradients; None: `image_measure` of the values.
-        gradients: whether plans are made for gradients.
-        diffraction: whether it may be modelled.
-        tolerance: grey levels.
-        seed: of the probes and of rays.
-        photographs: probes besides, of `probe_texture`.
     """
 
     def __init__(
         self,
-        current: Lens,
+        lens: Lens,
         scene: Scene,
-        sensor: Sensor,
-        values: Mapping[str, Tensor] | None,
-        measure: GradientMeasure | None,
-        gradients: bool,
-        diffraction: bool,
-        tolerance: float,
-        seed: int,
-        photographs: Tensor | None = None,
+        probes: ProbeSet,
+        requirements: Requirements,
+        values: Values | None = None,
+        measure: Measure | None = None,
     ) -> None:
-        self.sensor, self.tolerance, self.seed = sensor, tolerance, seed
-        self.gradients, self.diffraction = gradients, diffraction
-        self._single, self._double = in_both_precisions(current)
-        self._backend = choose_backend(self._double.system(), current.backend)
-        self.texture = probe_texture(sensor, len(scene.wavelengths), seed, photographs)
-        centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
-        self.scene = scene.as_planes(texture_centre=centre)
-        self._planned = scene.as_planes()
-        self._judge = reference(
-            self._single, self.scene, sensor, self.texture, REFERENCE_SAMPLES, seed
+        self.probes, self.requirements = probes, requirements
+        self.scene, self.separate_planes = scene.as_planes(), scene.separate_planes
+        self._single, self._double = (
+            copy.deepcopy(lens).to(dtype) for dtype in (torch.float32, torch.float64)
         )
-        self.uncertainty = self._judge.uncertainty
-        self._measure = measure
-        if measure is None and any(v.requires_grad for v in (values or {}).values()):
-            truth = pinhole_image(self.texture, sensor, centre)[:, None]
+        self.windows = self._windows()
+        channels = len(scene.wavelengths)
+        self._textures = [
+            probe_texture(w.sensor, channels, probes.seed, probes.photographs) for w in self.windows
+        ]
+        self._references = self._rendered_by_rays()
+        self.uncertainty = max(found.uncertainty for found in self._references)
+        # Of windows, each texture has one to itself.
+        self._each = list(self.windows)
+        if probes.windows:
+            self._each = [w for w in self.windows for _ in self._textures[0]]
+        self._measure = None
+        if measure is not None:
+            self._measure = measure(self._each)
+        elif not probes.windows and any(v.requires_grad for v in (values or {}).values()):
+            (window,), (textures,) = self.windows, self._textures
+            truth = pinhole_image(textures, window.sensor, window.texture_centre)[:, None]
             self._measure = image_measure(values, truth)
         self._of_rays: tuple[Tensor, Tensor] | None = None
 
@@ -84,73 +106,113 @@ class Trial:
 
     def plan(self, tolerance: float) -> Plan:
         """Functions that are expected to err by a tolerance."""
-        return plan(
-            self._single.system(),
-            self._double.system(),
-            self._planned,
-            self.sensor,
-            tolerance,
-            self.gradients,
-            self.diffraction,
-            self._backend,
-        )
+        requirements = replace(self.requirements, tolerance=tolerance)
+        plans = []
+        for window in self.windows:
+            single, double = (
+                ImagingSystem.of(lens.system(), self.scene, window.sensor)
+                for lens in (self._single, self._double)
+            )
+            plans.append(plan(single, double, requirements))
+        if not self.probes.windows:
+            return plans[0]
+        return union(dict(zip(self.probes.windows, plans, strict=True)), self.probes.sensor)
 
-    def error(self, renderer: PsfRenderer | RayRenderer, dtype: torch.dtype) -> float:
-        """Grey levels against the reference, both without diffraction."""
-        renderer = without_diffraction(renderer)
-        image = renderer.render(self.lens(dtype), self.scene, self.texture, self.seed + 1)
-        return self._judge.error(image)
+    def errors(self, renderer: Renderer, dtype: torch.dtype) -> dict[str, float]:
+        """Grey levels against the reference, both without diffraction, by the windows' names; of
+        the whole sensor by "".
+        """
+        render = self._rendered(renderer.without_diffraction(), dtype)
+        image = render({}, self.probes.seed + 1)
+        parts = image.split(len(self._textures[0]))
+        found = (judge.error(part) for judge, part in zip(self._references, parts, strict=True))
+        return dict(zip(self.probes.windows or ("",), found, strict=True))
 
-    def agreement(
-        self, renderer: PsfRenderer | RayRenderer, dtype: torch.dtype
-    ) -> Agreement | None:
+    def agreement(self, renderer: Renderer, dtype: torch.dtype) -> Agreement | None:
         """How well gradients agree with those of rays, both without diffraction; None where none
         is asked for.
         """
-        if self._measure is None or not self._measure.variables:
+        measure, seed = self._measure, self.probes.seed
+        if measure is None or not measure.variables:
             return None
+        textures = torch.cat(self._textures)
         if self._of_rays is None:
-            sensor = self.sensor
-            side = judging_samples(sensor.height, sensor.width, len(self.scene.wavelengths))
-            rays = self._rendered(RayRenderer(sensor, side), torch.float32)
-            self._of_rays = gradients_of_rays(rays, self.texture, self._measure, self.seed + 2)
-        rendered = self._rendered(without_diffraction(renderer), dtype)
-        if isinstance(renderer, RayRenderer):
+            window = self._each[0].sensor
+            side = judging_samples(
+                window.height, window.width * len(self._each), len(self.scene.wavelengths)
+            )
+            rays = self._rendered(RayRenderer(self.probes.sensor, side), torch.float32)
+            self._of_rays = gradients_of_rays(rays, textures, measure, seed + 2)
+        rendered = self._rendered(renderer.without_diffraction(), dtype)
+        if renderer.monte_carlo:
             # Two renders, so that what their noise does to a squared error is left out here too.
-            own = gradients_of_rays(rendered, self.texture, self._measure, self.seed + 4)
+            own = gradients_of_rays(rendered, textures, measure, seed + 4)
             return agreement(0.5 * (own[0] + own[1]), self._of_rays)
-        found = gradient(rendered, self.texture, self._measure, (self.seed + 4,))
-        return agreement(found, self._of_rays)
+        return agreement(gradient(rendered, textures, measure, (seed + 4,)), self._of_rays)
 
     def rays_instead(self, renderer: PsfRenderer) -> tuple[int, float, float]:
-        """How many strata rays would need, the noise they would leave in grey levels, and their
-        cost over that of functions.
+        """How many strata rays would need for the whole sensor, the noise they would leave in grey
+        levels, and their cost over that of functions.
         """
-        surfaces, planes = len(self._single.surfaces), self._planned
+        surfaces, (window,), (textures,) = len(self._single.surfaces), self.windows, self._textures
         samples, noise = rays_samples(
-            self._single, self.scene, self.sensor, self.texture, self.tolerance
+            self._single,
+            self._placed(window),
+            window.sensor,
+            textures,
+            self.requirements.tolerance,
         )
-        of_rays = rays_cost(self.sensor, samples**2, planes, surfaces)
-        return samples, noise, of_rays / psf_cost(renderer, planes, surfaces)
+        of_rays = rays_cost(window.sensor, samples**2, self.scene, surfaces)
+        return samples, noise, of_rays / psf_cost(renderer, self.scene, surfaces)
 
-    def _rendered(self, renderer: PsfRenderer | RayRenderer, dtype: torch.dtype):  # noqa: ANN202
-        lens = self.lens(dtype)
+    def _windows(self) -> Sequence[SensorWindow]:
+        """The parts of the sensor, and where they look, to a whole texel."""
+        sensor, windows = self.probes.sensor, list(self.probes.windows.values())
+        if not windows:
+            centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
+            return [SensorWindow(sensor, centre)]
+        system, wavelengths = self._double.system(), (self.scene.middle_wavelength,)
+        middle = self.scene.as_planes(wavelengths=wavelengths)
+        pupil = paraxial_exit_pupil(system, wavelengths)
+        looks = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), windows)
+        return [
+            SensorWindow(window, tuple(float(c.mean().round()) for c in look))
+            for window, look in zip(windows, looks, strict=True)
+        ]
 
-        def render(values: Mapping[str, Tensor], seed: int) -> Tensor:
+    def _rendered_by_rays(self) -> Sequence[Reference]:
+        side = _SIDE_OF_WINDOW if self.probes.windows else _SIDE
+        return [
+            reference(
+                RayRenderer(window.sensor, _REFERENCE_SAMPLES),
+                self._single,
+                self._placed(window),
+                textures,
+                self.probes.seed,
+                side,
+            )
+            for window, textures in zip(self.windows, self._textures, strict=True)
+        ]
+
+    def _rendered(self, renderer: Renderer, dtype: torch.dtype) -> Render:
+        """Images of all probe images as functions of the lens's values and a seed."""
+        lens, textures = self.lens(dtype), torch.cat(self._textures)
+
+        def render(values: Values, seed: int) -> Tensor:
             cast = {name: value.to(dtype) for name, value in values.items()}
-            return renderer.render(lens, self.scene, self.texture, seed, cast)
+            if self.probes.windows:
+                return renderer.render_windows(lens, self.scene, textures, self._each, seed, cast)
+            placed = self._placed(self.windows[0])
+            return renderer.render(lens, placed, textures, seed, cast)
 
         return render
 
-
-def without_diffraction(renderer: PsfRenderer | RayRenderer) -> PsfRenderer | RayRenderer:
-    """What a renderer makes of rays alone."""
-    if isinstance(renderer, PsfRenderer):
-        return replace(renderer, diffraction="none")
-    return renderer
+    def _placed(self, window: SensorWindow) -> PlanarScene:
+        """The scene with its textures where a window looks."""
+        return replace(self.scene, texture_centre=window.texture_centre)
 
 
-def with_values(lens: Lens, values: Mapping[str, Tensor] | None) -> Lens:
+def with_values(lens: Lens, values: Values | None) -> Lens:
     """The lens with some parameters, and semi-diameters, replaced as `Lens.system` does."""
     changed = copy.deepcopy(lens)
     parameters = dict(changed.named_parameters())
@@ -161,9 +223,3 @@ def with_values(lens: Lens, values: Mapping[str, Tensor] | None) -> Lens:
         surface = changed.surfaces[name.split(".")[1]]
         surface.aperture = surface.aperture.resized(float(value.detach()))
     return changed
-
-
-def in_both_precisions(lens: Lens) -> tuple[Lens, Lens]:
-    """Copies in single and in double precision."""
-    single, double = (copy.deepcopy(lens).to(d) for d in (torch.float32, torch.float64))
-    return single, double

@@ -10,7 +10,7 @@ from torch import Tensor
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.rays import Components, Rays
-from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces
 from dolens.rendering.pupil.aim import aim
 
@@ -41,7 +41,7 @@ def axial_limit(
         radius: of the disc, mm, that axial rays fill.
     """
     options = {"dtype": system.dtype, "device": system.device}
-    count = 1 if is_rotationally_symmetric(system) else _AZIMUTHS
+    count = 1 if system.rotationally_symmetric else _AZIMUTHS
     angle = torch.arange(count, **options) * (2.0 * math.pi / _AZIMUTHS)
     origin, sensor_z = torch.zeros((), **options), system.vertices[-1]
     across, up = radius * torch.cos(angle), radius * torch.sin(angle)
@@ -65,7 +65,6 @@ def limit_distance(
     limit: AxialLimit,
     radius: Tensor,
     z: float | Tensor,
-    backend: str,
 ) -> Tensor:
     """How far inside the limiting edge the axial ray towards a radius of the disc passes, mm.
 
@@ -74,7 +73,7 @@ def limit_distance(
     zero = torch.zeros_like(radius)[None]
     across, up = math.cos(limit.azimuth) * radius[None], math.sin(limit.azimuth) * radius[None]
     ray = aim(zero, zero, system.vertices[-1], across, up, z)
-    return edge_distances(system, ray, limit.surface, limit.wavelength, backend)[0]
+    return edge_distances(system, ray, limit.surface, limit.wavelength)[0]
 
 
 @torch.no_grad()
@@ -84,7 +83,6 @@ def limiting_radius(
     z: float,
     low: float,
     high: float,
-    backend: str,
 ) -> float:
     """The radius between two whose axial ray grazes the limiting edge: regula falsi.
 
@@ -93,7 +91,7 @@ def limiting_radius(
 
     def distance(radius: float) -> float:
         reach = torch.tensor(radius, dtype=system.dtype, device=system.device)
-        return float(limit_distance(system, limit, reach, z, backend))
+        return float(limit_distance(system, limit, reach, z))
 
     start, inside, outside = low, distance(low), distance(high)
     if not inside >= 0.0 > outside:
@@ -113,7 +111,6 @@ def edge_distances(
     ray: Components,
     surface: int,
     wavelength: float | Tensor,
-    backend: str,
 ) -> Tensor:
     """How far inside a surface's edge rays from the sensor meet it, mm; negative outside.
 
@@ -124,10 +121,9 @@ def edge_distances(
         ray: from the sensor, travelling towards -z.
         surface: the number of the surface.
         wavelength: nm, a number or a tensor that broadcasts with the rays.
-        backend: what traces.
     """
     rays = Rays.from_components(ray, wavelength)
-    hit = trace_rays(system.opened(), rays, backend, -1.0, record=False, first=surface, last=None)
+    hit = trace_rays(system.opened(), rays, -1.0, first=surface)
     return _edge_distance(system, surface, hit.position.unbind(-1))
 
 

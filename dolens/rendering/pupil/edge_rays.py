@@ -11,6 +11,7 @@ gradient is f's factor R ∂R/∂θ.  What collects rays by their weights needs 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -53,7 +54,6 @@ def edge_rays(
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
     edge: tuple[Tensor, Tensor, Tensor, Tensor],
-    backend: str,
 ) -> EdgeRays | None:
     """Rays at the edge of the light, from where it roughly is.
 
@@ -64,7 +64,6 @@ def edge_rays(
         pupil: the disc, of `moving_exit_pupil`.
         edge: middles (P, 1, 2), arms (P, J, 2), radii (P, J) and surfaces (P, J) in units of the
             disc's radius, as `EdgeMap.at` gives them; J azimuths that are spread evenly.
-        backend: what traces.
 
     Returns:
         None where no edge cuts the disc.
@@ -91,7 +90,6 @@ def edge_rays(
                 middle.to(**options).expand(*where.shape, 2)[where],
                 arms.to(**options)[where],
                 int(number),
-                backend,
             )
             found = beam.at_edge(radius.to(**options)[where])
             new = found.counts & ~done[:, where]
@@ -130,23 +128,17 @@ def _filled(whole: Tensor, where: Tensor, values: Tensor) -> Tensor:
     return whole.masked_scatter(where.expand(whole.shape), values)
 
 
+@dataclass(frozen=True)
 class _Beam:
     """Rays of n points of the sensor to places on arms from middles, towards one surface's edge."""
 
-    def __init__(
-        self,
-        system: OpticalSystem,
-        wavelength: Tensor,
-        points: tuple[Tensor, ...],
-        pupil: ExitPupil,
-        middle: Tensor,
-        arms: Tensor,
-        surface: int,
-        backend: str,
-    ) -> None:
-        self.system, self.wavelength, self.points = system, wavelength, points
-        self.pupil, self.middle, self.arms = pupil, middle, arms
-        self.surface, self.backend = surface, backend
+    system: OpticalSystem
+    wavelength: Tensor
+    points: tuple[Tensor, ...]
+    pupil: ExitPupil
+    middle: Tensor
+    arms: Tensor
+    surface: int
 
     def rays(self, radius: Tensor, pupil: ExitPupil) -> Components:
         """Towards radii (C, n) on the arms."""
@@ -158,7 +150,7 @@ class _Beam:
     def distance(self, radius: Tensor, pupil: ExitPupil) -> Tensor:
         """How far inside the edge, mm."""
         ray = self.rays(radius, pupil)
-        return edge_distances(self.system, ray, self.surface, self.wavelength, self.backend)
+        return edge_distances(self.system, ray, self.surface, self.wavelength)
 
     @torch.no_grad()
     def refined(self, radius: Tensor, pupil: ExitPupil) -> tuple[Tensor, Tensor]:
@@ -196,7 +188,7 @@ class _Beam:
     def _through(self, radius: Tensor, pupil: ExitPupil) -> tuple[Components, Tensor, Tensor]:
         """Rays before the lens, which got there, and the edge that stopped the others, or 0."""
         rays = Rays.from_components(self.rays(radius, pupil), self.wavelength)
-        hit = trace_rays(self.system, rays, self.backend, -1.0, record=False, first=1, last=None)
-        there = Components(*hit.position.unbind(-1), *hit.direction.unbind(-1))
+        hit = trace_rays(self.system, rays, -1.0)
+        there = hit.components()
         clipped = torch.where(hit.status == Status.VIGNETTED, hit.surface.long(), 0)
         return there, hit.valid & (there.n < 0.0), clipped

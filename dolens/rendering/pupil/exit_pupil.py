@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.backend import trace_rays
+from dolens.optics.backend import trace_components
 from dolens.optics.paraxial_numbers import ParaxialNumbers
-from dolens.optics.rays import Components, Rays
+from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import trace_surfaces
 from dolens.rendering.pupil.aim import aim
 from dolens.rendering.pupil.axial_limit import axial_limit, limiting_radius
 from dolens.sensor.pixels import Sensor
@@ -72,7 +71,6 @@ def sampled_exit_pupil(
     system: OpticalSystem,
     wavelengths: Sequence[float],
     sensor: Sensor,
-    backend: str = "reference",
     axial: ExitPupil | None = None,
 ) -> ExitPupil:
     """The disc to be sampled from all pixels of a sensor.
@@ -85,13 +83,12 @@ def sampled_exit_pupil(
         system: the lens.
         wavelengths: nm.
         sensor: the pixels.
-        backend: what traces.
         axial: what `axial_exit_pupil` found for this lens; None: it is asked here.
 
     Raises:
         InputError: no ray from the sensor's centre gets through.
     """
-    axial = axial or axial_exit_pupil(system, wavelengths, backend)
+    axial = axial or axial_exit_pupil(system, wavelengths)
     options = {"dtype": system.dtype, "device": system.device}
     places = torch.tensor([0.0, 0.25, 0.75, 1.0], **options)
     rows = torch.stack((places, places)).flatten() * sensor.height - 0.5
@@ -103,7 +100,7 @@ def sampled_exit_pupil(
     ray = aim(
         x, y, system.vertices[-1], radii * torch.cos(angle), radii * torch.sin(angle), axial.z
     )
-    passes = _get_through(system, ray, wavelengths[len(wavelengths) // 2 :][:1], backend)
+    passes = _get_through(system, ray, wavelengths[len(wavelengths) // 2 :][:1])
     light = torch.where(passes, share, 0.0)
     outside = torch.where(share > 1.0, light, 0.0)
     lost = outside.sum((-2, -1)) / light.sum((-2, -1)).clamp(min=torch.finfo(light.dtype).tiny)
@@ -116,9 +113,7 @@ def sampled_exit_pupil(
 
 
 @torch.no_grad()
-def axial_exit_pupil(
-    system: OpticalSystem, wavelengths: Sequence[float], backend: str = "reference"
-) -> ExitPupil:
+def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> ExitPupil:
     """The largest disc in the paraxial exit pupil's plane that real axial rays fill.
 
     Rays from the sensor's centre are traced backwards at many radii and azimuths, and again in
@@ -130,7 +125,6 @@ def axial_exit_pupil(
     Args:
         system: the lens.
         wavelengths: nm.
-        backend: what traces: `reference`, `cpu` or `cuda`.
 
     Raises:
         InputError: no ray from the sensor's centre gets through.
@@ -146,7 +140,7 @@ def axial_exit_pupil(
     for _ in range(3):
         radii = torch.linspace(low, high, _RADII, **options)[:, None]
         ray = aim(origin, origin, sensor_z, radii * torch.cos(angle), radii * torch.sin(angle), z)
-        passes = _get_through(system, ray, wavelengths, backend)
+        passes = _get_through(system, ray, wavelengths)
         failing = torch.nonzero(~passes.all(dim=1)).flatten()
         if len(failing) == 0:
             return ExitPupil(z, high, high)
@@ -158,21 +152,15 @@ def axial_exit_pupil(
         low, high = float(radii[first - 1]), float(radii[first])
     limit = axial_limit(system, wavelengths, z, low)
     if limit is not None:
-        low = limiting_radius(system, limit, z, low, high, backend)
+        low = limiting_radius(system, limit, z, low, high)
     return ExitPupil(z, low, low)
 
 
-def _get_through(
-    system: OpticalSystem, ray: Components, wavelengths: Sequence[float], backend: str
-) -> Tensor:
+def _get_through(system: OpticalSystem, ray: Components, wavelengths: Sequence[float]) -> Tensor:
     """Which rays get through the lens backwards, at every wavelength."""
-    if backend == "reference":
-        passes = [trace_surfaces(system, ray, w, sense=-1.0).valid for w in wavelengths]
-        return torch.stack(passes).all(dim=0)
     every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
-    rays = Rays.from_components(ray, every.reshape(-1, *(1,) * ray.x.ndim))
-    hit = trace_rays(system, rays, backend, -1.0, record=False, first=1, last=None)
-    return hit.valid.all(dim=0)
+    _, valid = trace_components(system, ray, every.reshape(-1, *(1,) * ray.x.ndim), -1.0)
+    return valid.all(dim=0)
 
 
 def working_f_number(pupil: ExitPupil, sensor_z: float | Tensor) -> float | Tensor:

@@ -2,7 +2,6 @@
 
 import torch
 
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.pupil.exit_pupil import axial_exit_pupil, working_f_number
 
@@ -22,6 +21,5 @@ def axial_f_number(lens: Lens) -> float:
         InputError: no ray reaches the sensor's centre.
     """
     system = lens.system()
-    backend = choose_backend(system, lens.backend)
-    pupil = axial_exit_pupil(system, (lens.primary_wavelength,), backend)
+    pupil = axial_exit_pupil(system, (lens.primary_wavelength,))
     return working_f_number(pupil, float(system.vertices[-1]))

@@ -1,7 +1,6 @@
 """Where on the exit pupil's disc the light of a sensor's points ends, and which surface ends it."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,10 +8,10 @@ from torch import Tensor
 
 from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Rays, Status
-from dolens.optics.system import OpticalSystem, is_rotationally_symmetric
+from dolens.optics.system import OpticalSystem
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.pupil.aim import aim
 from dolens.rendering.pupil.exit_pupil import ExitPupil
-from dolens.sensor.pixels import Sensor
 
 # Azimuths of the edge, points along each side of the disc in the search for its middle, and
 # halvings of the interval that the edge lies in: Newton's iteration does the rest.
@@ -47,7 +46,6 @@ def light_edges(
     wavelength: float,
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
-    backend: str,
 ) -> LightEdges | None:
     """Search for the edges of the light of points of the sensor, at one wavelength.
 
@@ -58,9 +56,8 @@ def light_edges(
         wavelength: nm.
         points: x and y, mm, each (F,).
         pupil: the disc, numbers.
-        backend: what traces.
     """
-    probe = _Probe(system, wavelength, points, pupil, backend)
+    probe = _Probe(system, wavelength, points, pupil)
     options = {"dtype": system.dtype, "device": system.device}
     angle = torch.arange(AZIMUTHS, **options) * (2.0 * math.pi / AZIMUTHS)
     arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
@@ -97,9 +94,8 @@ class _Probe:
         wavelength: float,
         points: tuple[Tensor, Tensor],
         pupil: ExitPupil,
-        backend: str,
     ) -> None:
-        self.system, self.wavelength, self.pupil, self.backend = system, wavelength, pupil, backend
+        self.system, self.wavelength, self.pupil = system, wavelength, pupil
         self.x, self.y = (p.to(device=system.device, dtype=system.dtype)[:, None] for p in points)
 
     def passes(self, places: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,7 +103,7 @@ class _Probe:
         across, up = (self.pupil.radius * places).unbind(-1)
         ray = aim(self.x, self.y, self.system.vertices[-1], across, up, self.pupil.z)
         rays = Rays.from_components(ray, self.wavelength)
-        hit = trace_rays(self.system, rays, self.backend, -1.0, record=False, first=1, last=None)
+        hit = trace_rays(self.system, rays, -1.0)
         clipped = hit.status == Status.VIGNETTED
         valid = hit.valid & (hit.direction[..., 2] < 0.0)
         return valid, torch.where(clipped, hit.surface.long(), 0)
@@ -204,22 +200,14 @@ def _neighbours(place: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 @torch.no_grad()
-def edge_map(
-    system: OpticalSystem,
-    wavelengths: Sequence[float],
-    sensor: Sensor,
-    pupil: ExitPupil,
-    backend: str,
-) -> EdgeMap | None:
-    """The edges of the light all over a sensor; None where nothing cuts the disc.
+def edge_map(imaging: ImagingSystem) -> EdgeMap | None:
+    """Find the edges of the light all over a sensor; None where nothing cuts the disc.
 
     Args:
-        system: the lens.
-        wavelengths: nm; the middle one's edges start the search for the others'.
-        sensor: the pixels.
-        pupil: the disc, numbers.
-        backend: what traces.
+        imaging: the lens, the pixels, the pupil's disc, numbers, and wavelengths, of which the
+            middle one's edges start the search for the others'.
     """
+    system, sensor, wavelengths = imaging.system, imaging.sensor, imaging.scene.wavelengths
     options = {"dtype": torch.float64, "device": system.device}
     ends = torch.tensor([0.0, 1.0], **options)
     rows, columns = (
@@ -228,7 +216,7 @@ def edge_map(
     )
     x, y = sensor.positions(rows, columns)
     wavelength = wavelengths[len(wavelengths) // 2]
-    symmetric = is_rotationally_symmetric(system)
+    symmetric = system.rotationally_symmetric
     if symmetric:
         low, high = _distances(x, y)
         radius = torch.linspace(low, high, _RADII, **options)
@@ -242,7 +230,7 @@ def edge_map(
             corner[1] + grid * step[1], corner[0] + grid * step[0], indexing="ij"
         )
         points = (across.reshape(-1), up.reshape(-1))
-    edges = light_edges(system, wavelength, points, pupil, backend)
+    edges = light_edges(system, wavelength, points, imaging.pupil)
     return None if edges is None else EdgeMap(edges, symmetric, corner, step)
 
 

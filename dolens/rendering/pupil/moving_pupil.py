@@ -26,7 +26,7 @@ def depends_on_parameters(system: OpticalSystem) -> bool:
 
 
 def moving_exit_pupil(
-    system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil, backend: str
+    system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil
 ) -> ExitPupil:
     """The pupil's numbers, with gradients with respect to the lens's parameters.
 
@@ -39,7 +39,6 @@ def moving_exit_pupil(
         system: the lens.
         wavelengths: nm.
         pupil: numbers, of this lens or of one that hardly differs.
-        backend: what traces.
 
     Returns:
         The pupil itself where the lens asks for no gradient, else tensors of the lens's precision.
@@ -52,7 +51,7 @@ def moving_exit_pupil(
     axial = torch.tensor(pupil.axial_radius, **options)
     limit = axial_limit(system, wavelengths, pupil.z, pupil.axial_radius)
     if limit is not None:
-        axial = _radius(system, limit, axial, z, backend)
+        axial = _radius(system, limit, axial, z)
     elif ratio is not None:
         # No edge ends the beam: the search for the disc ended at the paraxial pupil.
         axial = axial * ratio
@@ -86,12 +85,10 @@ def _pupil_plane(
     return z, ratio
 
 
-def _radius(
-    system: OpticalSystem, limit: AxialLimit, radius: Tensor, z: Tensor, backend: str
-) -> Tensor:
+def _radius(system: OpticalSystem, limit: AxialLimit, radius: Tensor, z: Tensor) -> Tensor:
     """The axial radius as a function of the lens, by the implicit function theorem."""
     reach = radius.detach().requires_grad_()
-    distance = limit_distance(system, limit, reach, z, backend)
+    distance = limit_distance(system, limit, reach, z)
     (slope,) = torch.autograd.grad(distance, reach, retain_graph=True)
     if not bool(slope != 0.0):
         return radius

@@ -6,14 +6,11 @@ import torch
 
 from dolens.kernels.view import View
 from dolens.optics.rays import Components
-from dolens.optics.system import OpticalSystem
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.pupil.edge_rays import EdgeRays, edge_rays
-from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.pupil.light_edges import EdgeMap
 from dolens.rendering.pupil.moving_pupil import depends_on_parameters
 from dolens.rendering.random_numbers import random_words, uniform
-from dolens.scene.planar import Scene
-from dolens.sensor.pixels import Sensor
 
 # Rays a pixel and wavelength, where edges cut light: as many as half the strata along a side of the
 # pupil, since an edge is a line.
@@ -26,29 +23,19 @@ def edge_samples(pupil_samples: int) -> int:
 
 
 def pixel_edge_rays(
-    system: OpticalSystem,
-    scene: Scene,
-    sensor: Sensor,
-    view: View,
-    pupil: ExitPupil,
-    edges: EdgeMap | None,
-    start: int,
-    end: int,
-    backend: str,
+    imaging: ImagingSystem, view: View, edges: EdgeMap | None, start: int, end: int
 ) -> EdgeRays | None:
     """Rays (C, pixels, samples) of pixels `start` to `end`; None where no gradient asks for them.
 
     Args:
-        system: the lens.
-        scene: its wavelengths count.
-        sensor: the pixels.
+        imaging: the lens, C wavelengths, the pixels, and the pupil's disc as it moves with the
+            lens.
         view: of the render, for its seed.
-        pupil: the disc, as it moves with the lens.
         edges: where edges are; None where they cut nothing.
         start: number of the first pixel.
         end: number behind the last.
-        backend: what traces.
     """
+    system = imaging.system
     if edges is None or not depends_on_parameters(system):
         return None
     pixel = torch.arange(start, end, device=system.device)[:, None]
@@ -63,9 +50,9 @@ def pixel_edge_rays(
     if view.pixel_area:
         # One place serves all azimuths of a pixel.
         rows, columns = rows + (area[0][:, 0] - 0.5), columns + (area[1][:, 0] - 0.5)
-    points = sensor.positions(rows, columns)
+    points = imaging.sensor.positions(rows, columns)
     edge = edges.at(*points, angle)
-    return edge_rays(system, scene.wavelengths, points, pupil, edge, backend)
+    return edge_rays(system, imaging.scene.wavelengths, points, imaging.pupil, edge)
 
 
 def of_channel(ray: Components, channel: int) -> Components:

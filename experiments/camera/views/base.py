@@ -1,20 +1,23 @@
 """What every way of looking offers to the camera module."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.lens import Lens
+from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
+from dolens.scene.planar import Scene
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 
 # Streams of random numbers that must not meet: an offset of the seed for each stage, and others for
 # the sensor's noise and for what is drawn into scenes.
 _STAGES = {"train": 0, "val": 1, "test": 2}
-_STRIDE, NOISE_OFFSET, SCENE_OFFSET = 1 << 40, 1 << 39, 1 << 38
+_STRIDE, _NOISE_OFFSET, SCENE_OFFSET = 1 << 40, 1 << 39, 1 << 38
 
 
 class Views(NamedTuple):
@@ -134,11 +137,88 @@ class Imaging(Protocol):
         """Go on with what another one's `state` held."""
 
 
-def exposed(readout: Readout, lens: Lens) -> Readout:
-    """The readout behind a lens: as it is where it has no reference F-number."""
-    if readout.reference_f_number is None:
-        return readout
-    return readout.behind(axial_f_number(lens))
+class RenderedViews:
+    """Images of a scene by a renderer, read out: what ways of looking at it share.
+
+    Subclasses say which parts of the sensor are looked at (`take`) and what gradients are measured
+    by (`_measure`).
+
+    Attributes:
+        scene: what the camera looks at.
+        renderer: of the training images; its sensor has the pixels of one image.
+        readout: what the sensor makes of light.
+        seed: of rendering and noise.
+        keeps_pupil: whether the training renderer keeps the lens's pupil from one `prepare` to the
+            next.
+    """
+
+    keeps_pupil: ClassVar[bool] = False
+
+    def __init__(self, scene: Scene, renderer: Renderer, readout: Readout, seed: int) -> None:
+        self.scene = scene
+        self.renderer = renderer
+        self.readout = readout
+        self.seed = seed
+        # What makes the training images, with what it found of the lens.
+        self._training = renderer
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixels of one image."""
+        return self.renderer.sensor
+
+    @property
+    def object_distance(self) -> float:
+        """The first depth."""
+        return self.scene.depths[0]
+
+    def check(self, lens: Lens) -> None:
+        """Raise `InputError` where a depth lies inside the lens; fix the scene's scale for it."""
+        self.scene.check(lens.system())
+        self.scene = self.scene.fixed_for(lens.system())
+
+    def expose(self, lens: Lens) -> None:
+        """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
+        if self.readout.reference_f_number is not None:
+            self.readout = self.readout.at_f_number(axial_f_number(lens))
+
+    def prepare(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        comparison: Comparison | None = None,
+        photographs: Tensor | None = None,
+    ) -> None:
+        """Let the training renderer look at the lens as it is now."""
+        measure = None if comparison is None else self._measure(lens, comparison)
+        self._training.prepare(lens, self.scene, values, measure, photographs)
+        if self.keeps_pupil:
+            self._training = self._training.with_pupil(lens, self.scene, values)
+
+    def _measure(self, lens: Lens, comparison: Comparison) -> Measure | None:
+        """The training's loss as a function of images of textures; None where there is none."""
+        return None
+
+    def _raw(self, image: Tensor, seed: int) -> Tensor:
+        """An image in linear light, read out with the noise of a seed and developed."""
+        generator = torch.Generator(image.device).manual_seed(seed + _NOISE_OFFSET)
+        return self.readout.develop(self.readout(image, generator))
+
+    def rays(self) -> int:
+        """Rays that a training image takes; 0 before a renderer is chosen."""
+        return self._training.rays_per_image(self.scene, self.sensor)
+
+    def numbers(self) -> dict[str, float]:
+        """The renderer's."""
+        return self._training.numbers()
+
+    def state(self) -> dict[str, Any]:
+        """The renderer's."""
+        return self._training.state()
+
+    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
+        """Give it back to the renderer."""
+        self._training = self._training.load_state(lens, state)
 
 
 def seed_of(seed: int, stage: str, index: int) -> int:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,19 +10,17 @@ from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.rendering.auto.agreement import GradientMeasure
-from dolens.rendering.protocol import Renderer
+from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import Scene, pinhole_image
 from dolens.sensor.colour import linear_to_srgb
-from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
-from experiments.camera.views.base import NOISE_OFFSET, Comparison, Views, exposed, seed_of
+from experiments.camera.views.base import Comparison, RenderedViews, Views, seed_of
 from experiments.camera.views.truth import check_truth, chief_ray_looks, looked_up
 
 
-class DepthViews:
+class DepthViews(RenderedViews):
     """Textured planes at several depths, in front of the whole sensor.
 
     With `truth` "pinhole" the truth is what a distortion-free pinhole sees; with "chief_rays" it is
@@ -61,19 +58,16 @@ class DepthViews:
         judges: Mapping[str, Renderer] | None = None,
         psf_diffraction: str = "none",
     ) -> None:
+        super().__init__(scene, renderer, readout, seed)
         self.truth = check_truth(truth)
         if self.truth != "pinhole" and not scene.separate_planes:
             raise InputError(
                 f"views.truth: '{truth}' needs planes that make images of their own; allowed for "
                 "layers: pinhole"
             )
-        self.scene = scene
-        self.renderer = renderer
-        self.readout = readout
         self.evaluation_renderer = evaluation_renderer or renderer
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
-        self.seed = seed
         self._judges = dict(judges or {})
         if psf_diffraction not in ("none", "limit"):
             raise InputError(
@@ -89,16 +83,6 @@ class DepthViews:
                     f"the training renderer, {renderer.sensor}"
                 )
 
-    @property
-    def sensor(self) -> Sensor:
-        """The pixels of one image."""
-        return self.renderer.sensor
-
-    @property
-    def object_distance(self) -> float:
-        """The first depth."""
-        return self.scene.depths[0]
-
     def labels(self) -> list[str]:
         """The depths."""
         return self.scene.labels()
@@ -107,40 +91,24 @@ class DepthViews:
         """The planes' depths."""
         return self.scene.plane_labels()
 
-    def check(self, lens: Lens) -> None:
-        """Raise `InputError` where a depth lies inside the lens; fix the scene's scale for it."""
-        self.scene.check(lens.system())
-        self.scene = self.scene.fixed_for(lens.system())
-
     def expose(self, lens: Lens) -> None:
         """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
-        self.readout = exposed(self.readout, lens)
+        super().expose(lens)
         if self.psf_diffraction != "none":
             self._f_number = axial_f_number(lens)
 
-    def prepare(
-        self,
-        lens: Lens,
-        values: Mapping[str, Tensor],
-        comparison: Comparison | None = None,
-        photographs: Tensor | None = None,
-    ) -> None:
-        """Let the training renderer look at the lens as it is now."""
-        measure = self._measure(lens, comparison)
-        self.renderer.prepare(lens, self.scene, values, measure, photographs)
-
-    def _measure(self, lens: Lens, comparison: Comparison | None) -> GradientMeasure | None:
+    def _measure(self, lens: Lens, comparison: Comparison) -> Measure | None:
         """The training's loss as a function of images of textures; of planes of their own."""
-        if comparison is None or not self.scene.separate_planes:
+        if not self.scene.separate_planes:
             return None
 
         def loss(image: Tensor, textures: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-            generator = torch.Generator(image.device).manual_seed(self.seed + NOISE_OFFSET)
-            raw = self.readout.develop(self.readout(image.to(lens.dtype), generator))
+            raw = self._raw(image.to(lens.dtype), self.seed)
             truth = self._truth(lens, values, textures.to(raw)).expand_as(raw)
             return comparison.loss(Views(truth, raw), values)
 
-        return GradientMeasure(comparison.variables, comparison.values, loss)
+        found = GradientMeasure(comparison.variables, comparison.values, loss)
+        return lambda windows: found
 
     def take(
         self,
@@ -152,12 +120,11 @@ class DepthViews:
         judge: str | None = None,
     ) -> Views:
         """Image textures at every depth."""
-        renderer = self.renderer if stage == "train" else self.evaluation_renderer
+        renderer = self._training if stage == "train" else self.evaluation_renderer
         renderer = renderer if judge is None else self._judges[judge]
         seed = seed_of(self.seed, stage, index)
         image = renderer.render(lens, self.scene, textures, seed, values)
-        generator = torch.Generator(image.device).manual_seed(seed + NOISE_OFFSET)
-        raw = self.readout.develop(self.readout(image, generator))
+        raw = self._raw(image, seed)
         return Views(self._truth(lens, values, textures).expand_as(raw), raw)
 
     def _truth(self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor) -> Tensor:
@@ -207,19 +174,3 @@ class DepthViews:
                 )
             )
         return found
-
-    def rays(self) -> int:
-        """Rays that a training image takes."""
-        return self.renderer.rays_per_image(self.scene)
-
-    def numbers(self) -> dict[str, float]:
-        """The renderer's."""
-        return self.renderer.numbers()
-
-    def state(self) -> dict[str, Any]:
-        """The renderer's."""
-        return self.renderer.state()
-
-    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
-        """Give it back to the renderer."""
-        self.renderer.load_state(lens, state)

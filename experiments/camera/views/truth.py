@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.rendering.chief_ray_map import chief_ray_maps
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.pupil.moving_pupil import moving_chief_pupil
 from dolens.scene.planar import Scene, texture_origin
@@ -42,11 +42,10 @@ def chief_ray_looks(
         (D, height, width), in double precision.
     """
     system = lens.system(values)
-    backend = choose_backend(system, lens.backend)
     wavelengths = (lens.primary_wavelength,)
     planes = scene.as_planes(wavelengths=wavelengths)
     pupil = moving_chief_pupil(system, wavelengths, paraxial_exit_pupil(system, wavelengths))
-    looks = chief_ray_maps(system, planes, whole, windows, pupil, backend)
+    looks = chief_ray_maps(ImagingSystem(system, planes, whole, pupil), windows)
     return [(rows[:, 0], columns[:, 0]) for rows, columns in looks]
 
 

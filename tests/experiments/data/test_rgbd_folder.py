@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
-from dolens.rendering.auto.probe import probe_texture
+from dolens.rendering.auto.probes import probe_texture
 from dolens.sensor.pixels import Sensor
 from experiments.data.crops import centred_crop, random_crop
 from experiments.data.depth_maps import read_depth_map

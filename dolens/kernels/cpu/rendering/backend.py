@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dolens.kernels.cpu.layout import BLOCK, Job
+from dolens.kernels.cpu import jobs
+from dolens.kernels.cpu.layout import BLOCK
 from dolens.kernels.cpu.program import Program
-from dolens.kernels.cpu.rendering.layout import SCRATCH_ROWS, Length, Place
+from dolens.kernels.cpu.rendering import layout
 from dolens.kernels.cpu.rendering.render import render_driver
 from dolens.kernels.cpu.rendering.render_adjoint import render_adjoint_driver
 from dolens.kernels.table import SurfaceTable
@@ -38,7 +39,7 @@ def render(table: SurfaceTable, textures: Tensor, sensor_z: Tensor, view: View) 
     image = textures.new_empty(
         (textures.shape[0], len(view.depths), textures.shape[1], view.height, view.width)
     )
-    job.view[Place.IMAGE] = image.data_ptr()
+    job.view[layout.IMAGE] = image.data_ptr()
     job.program.run(render_driver, len(job.blocks))
     return image
 
@@ -72,7 +73,7 @@ def render_adjoint(
         magnifications.
     """
     job = _RenderJob(table, textures, sensor_z, view, pieces, derivatives=True)
-    job.lengths[Length.SCALE] = scale
+    job.lengths[layout.SCALE] = scale
     of_lens, of_indices, of_textures = wanted
     groups = min(_TEXTURE_GROUPS if of_textures else _GROUPS, len(job.blocks))
     bounds = np.array([len(job.blocks) * g // groups for g in range(groups + 1)])
@@ -82,15 +83,15 @@ def render_adjoint(
     end = cut + table.indices.numel()
     sums = torch.zeros((groups, end + len(view.depths) + 4), dtype=torch.float64)
     image = of_image.contiguous()
-    job.view[Place.IMAGE], job.view[Place.GROUPS] = image.data_ptr(), bounds.ctypes.data
-    job.view[Place.OF_LENS] = int(of_lens)
+    job.view[layout.IMAGE], job.view[layout.GROUPS] = image.data_ptr(), bounds.ctypes.data
+    job.view[layout.OF_LENS] = int(of_lens)
     texture_sums = None
     if of_textures:
         texture_sums = torch.zeros((groups, *job.textures.shape), dtype=textures.dtype)
-        job.view[Place.TEXTURE_SUMS] = texture_sums.data_ptr()
+        job.view[layout.TEXTURE_SUMS] = texture_sums.data_ptr()
     job.program.point(SUMS=sums)
-    job.program.job[Job.SUM_LENGTH] = sums.shape[1]
-    job.program.job[Job.INDEX_SUMS] = int(of_indices)
+    job.program.job[jobs.SUM_LENGTH] = sums.shape[1]
+    job.program.job[jobs.INDEX_SUMS] = int(of_indices)
     job.program.run(render_adjoint_driver, groups)
     total = sums.sum(0)
     of_texture = torch.zeros_like(textures)
@@ -121,11 +122,11 @@ class _RenderJob:
     ) -> None:
         images, channels, height, width = textures.shape
         self.textures = _pad(textures).contiguous()
-        rows = SCRATCH_ROWS + images * len(view.depths) * channels
+        rows = layout.SCRATCH_ROWS + images * len(view.depths) * channels
         self.program = Program(table, derivatives, columns=rows)
         self.blocks = _blocks(pieces)
-        self.view = np.zeros(Place.LENGTH, dtype=np.int64)
-        self.view[: Place.PIXELS + 1] = (
+        self.view = np.zeros(layout.VIEW_LENGTH, dtype=np.int64)
+        self.view[: layout.PIXELS + 1] = (
             view.width,
             view.pupil_samples,
             int(view.pixel_area),
@@ -133,17 +134,17 @@ class _RenderJob:
             (view.seed >> 32) & _LOW,
             view.height * view.width,
         )
-        self.view[Place.IMAGES : Place.TEXTURE_WIDTH + 1] = (
+        self.view[layout.IMAGES : layout.TEXTURE_WIDTH + 1] = (
             images,
             len(view.depths),
             channels,
             *self.textures.shape[-2:],
         )
-        self.view[Place.BLOCKS] = self.blocks.ctypes.data
-        self.view[Place.TEXTURES] = self.textures.data_ptr()
+        self.view[layout.BLOCKS] = self.blocks.ctypes.data
+        self.view[layout.TEXTURES] = self.textures.data_ptr()
         z = float(sensor_z)
-        self.lengths = np.zeros(Length.PLANES + 2 * len(view.depths), dtype=self.program.real)
-        self.lengths[: Length.LAST_COLUMN + 1] = (
+        self.lengths = np.zeros(layout.PLANES + 2 * len(view.depths), dtype=self.program.real)
+        self.lengths[: layout.LAST_COLUMN + 1] = (
             view.pixel_pitch,
             view.middle_row,
             view.middle_column,
@@ -156,12 +157,12 @@ class _RenderJob:
             height - 1,
             width - 1,
         )
-        self.lengths[Length.PLANES :: 2] = view.depths
-        self.lengths[Length.PLANES + 1 :: 2] = [m / view.pixel_pitch for m in view.magnifications]
+        self.lengths[layout.PLANES :: 2] = view.depths
+        self.lengths[layout.PLANES + 1 :: 2] = [m / view.pixel_pitch for m in view.magnifications]
         job = self.program.job
-        job[Job.VIEW], job[Job.LENGTHS] = self.view.ctypes.data, self.lengths.ctypes.data
+        job[jobs.VIEW], job[jobs.LENGTHS] = self.view.ctypes.data, self.lengths.ctypes.data
         pixels = int(self.blocks[:, 1].sum())
-        job[Job.RAYS] = pixels * view.pupil_samples**2 * channels
+        job[jobs.RAYS] = pixels * view.pupil_samples**2 * channels
 
 
 def _blocks(pieces: Tensor) -> np.ndarray:

@@ -11,6 +11,25 @@ from numba import carray, njit, types
 from numba.extending import intrinsic
 
 from dolens.kernels.cpu.compiler import FASTMATH, OPTIONS, int32_at, shifted
+from dolens.kernels.cpu.layout import ENDED, STATE, UNBOUNDED, VIGNETTED, L, M, N, X, Y, Z
+from dolens.kernels.cpu.rendering.layout import (
+    ACROSS,
+    ARRIVES,
+    BLOCK,
+    COLUMNS_PER_MM,
+    DOWN,
+    LAST_COLUMN,
+    LAST_ROW,
+    OF_COLUMN,
+    OF_ROW,
+    OF_WEIGHT,
+    PER_COSINE,
+    PLANE_DISTANCE,
+    ROWS_PER_MM,
+    SAMPLE_WEIGHT,
+    TEXTURE_COLUMN,
+    TEXTURE_ROW,
+)
 
 
 class Lookup(NamedTuple):
@@ -66,71 +85,72 @@ def lookup(real: types.Type) -> Lookup:
     @njit(**OPTIONS)
     def arrive(state, scratch):  # noqa: ANN001, ANN202
         """Mark the rays that got through the lens; their number."""
-        src, rows = carray(state, 1280), carray(scratch, 512)
+        src, rows = carray(state, STATE), carray(scratch, UNBOUNDED)
         total = zero
-        for i in range(128):
+        for i in range(BLOCK):
             # Both are zero where nothing failed, and never negative.
-            failed = src[896 + i] + src[1024 + i]
-            passes = one if src[640 + i] < zero else zero
+            failed = src[ENDED + i] + src[VIGNETTED + i]
+            passes = one if src[N + i] < zero else zero
             passes = passes if failed == zero else zero
-            rows[384 + i] = passes
+            rows[ARRIVES + i] = passes
             total += passes
         return total
 
     @njit(**OPTIONS)
     def meet(lengths, depth, per_mm, width, state, scratch, texels):  # noqa: ANN001, ANN202
         """Carry rays to a plane: the texel above and to the left, and the fractions beyond it."""
-        src, rows = carray(state, 1280), carray(scratch, 1280)
-        first = carray(int32_at(texels), 128)
-        middle_row, middle_column = lengths[7], lengths[8]
-        last_row, last_column = lengths[9], lengths[10]
+        src, rows = carray(state, STATE), carray(scratch, UNBOUNDED)
+        first = carray(int32_at(texels), BLOCK)
+        middle_row, middle_column = lengths[TEXTURE_ROW], lengths[TEXTURE_COLUMN]
+        last_row, last_column = lengths[LAST_ROW], lengths[LAST_COLUMN]
         before_row, before_column = last_row - one, last_column - one
         before_row = before_row if before_row > zero else zero
         before_column = before_column if before_column > zero else zero
         wide = types.int32(width)
-        for i in range(128):
-            cosine = -src[640 + i]
+        for i in range(BLOCK):
+            cosine = -src[N + i]
             inverse = one / (cosine if cosine > grazing else grazing)
-            t = (depth + src[256 + i]) * inverse
-            row = middle_row - (src[128 + i] + t * src[512 + i]) * per_mm
-            column = middle_column + (src[i] + t * src[384 + i]) * per_mm
-            rows[768 + i], rows[896 + i] = t, inverse
-            rows[1024 + i] = -per_mm if row > zero and row < last_row else zero
-            rows[1152 + i] = per_mm if column > zero and column < last_column else zero
+            t = (depth + src[Z + i]) * inverse
+            row = middle_row - (src[Y + i] + t * src[M + i]) * per_mm
+            column = middle_column + (src[X + i] + t * src[L + i]) * per_mm
+            rows[PLANE_DISTANCE + i], rows[PER_COSINE + i] = t, inverse
+            rows[ROWS_PER_MM + i] = -per_mm if row > zero and row < last_row else zero
+            rows[COLUMNS_PER_MM + i] = per_mm if column > zero and column < last_column else zero
             row, column = row if row > zero else zero, column if column > zero else zero
             row = row if row < last_row else last_row
             column = column if column < last_column else last_column
             upper = row if row < before_row else before_row
             left = column if column < before_column else before_column
             upper_texel, left_texel = types.int32(upper), types.int32(left)
-            rows[512 + i] = row - real(upper_texel)
-            rows[640 + i] = column - real(left_texel)
+            rows[DOWN + i] = row - real(upper_texel)
+            rows[ACROSS + i] = column - real(left_texel)
             first[i] = types.int32(types.int32(upper_texel * wide) + left_texel)
 
     @njit(**OPTIONS)
     def see(texture, width, texels, scratch, pixels):  # noqa: ANN001, ANN202
         """Add the samples' radiance, weighted, to their pixels."""
-        rows, out = carray(scratch, 1280), carray(pixels, 128)
-        first = carray(int32_at(texels), 128)
+        rows, out = carray(scratch, UNBOUNDED), carray(pixels, BLOCK)
+        first = carray(int32_at(texels), BLOCK)
         below = shifted(texture, width)
-        for i in range(128):
-            left, right, _, _ = between_rows(texture, below, types.int64(first[i]), rows[512 + i])
-            out[i] += rows[256 + i] * rows[384 + i] * (left + rows[640 + i] * (right - left))
+        for i in range(BLOCK):
+            left, right, _, _ = between_rows(texture, below, types.int64(first[i]), rows[DOWN + i])
+            shine = rows[SAMPLE_WEIGHT + i] * rows[ARRIVES + i]
+            out[i] += shine * (left + rows[ACROSS + i] * (right - left))
 
     @njit(**OPTIONS)
     def of_texels(texture, width, texels, scratch, pixels):  # noqa: ANN001, ANN202
         """Add cotangents of row, column and weight, from those of the pixels."""
-        rows, cot = carray(scratch, 1664), carray(pixels, 128)
-        first = carray(int32_at(texels), 128)
+        rows, cot = carray(scratch, UNBOUNDED), carray(pixels, BLOCK)
+        first = carray(int32_at(texels), BLOCK)
         below = shifted(texture, width)
-        for i in range(128):
+        for i in range(BLOCK):
             left, right, of_left, of_right = between_rows(
-                texture, below, types.int64(first[i]), rows[512 + i]
+                texture, below, types.int64(first[i]), rows[DOWN + i]
             )
-            across = rows[640 + i]
-            rows[1280 + i] += cot[i] * (of_left + across * (of_right - of_left))
-            rows[1408 + i] += cot[i] * (right - left)
-            rows[1536 + i] += cot[i] * (left + across * (right - left))
+            across = rows[ACROSS + i]
+            rows[OF_ROW + i] += cot[i] * (of_left + across * (of_right - of_left))
+            rows[OF_COLUMN + i] += cot[i] * (right - left)
+            rows[OF_WEIGHT + i] += cot[i] * (left + across * (right - left))
 
     @njit(**OPTIONS)
     def of_rays(state, scratch, cotangents):  # noqa: ANN001, ANN202
@@ -142,22 +162,23 @@ def lookup(real: types.Type) -> Lookup:
         Returns:
             x̄·p_x + ȳ·p_y, summed: the cotangent of the logarithm of the plane's magnification.
         """
-        src, rows, cot = carray(state, 1280), carray(scratch, 1664), carray(cotangents, 768)
+        src, rows = carray(state, STATE), carray(scratch, UNBOUNDED)
+        cot = carray(cotangents, UNBOUNDED)
         total = zero
-        for i in range(128):
-            shine = rows[256 + i] * rows[384 + i]
-            y = shine * rows[1280 + i] * rows[1024 + i]
-            x = shine * rows[1408 + i] * rows[1152 + i]
-            t = rows[768 + i]
-            along = (x * src[384 + i] + y * src[512 + i]) * rows[896 + i]
-            cot[i] += x
-            cot[128 + i] += y
-            cot[256 + i] += along
-            cot[384 + i] += t * x
-            cot[512 + i] += t * y
-            cot[640 + i] += t * along
-            total += x * (src[i] + t * src[384 + i]) + y * (src[128 + i] + t * src[512 + i])
-            rows[1280 + i], rows[1408 + i] = zero, zero
+        for i in range(BLOCK):
+            shine = rows[SAMPLE_WEIGHT + i] * rows[ARRIVES + i]
+            y = shine * rows[OF_ROW + i] * rows[ROWS_PER_MM + i]
+            x = shine * rows[OF_COLUMN + i] * rows[COLUMNS_PER_MM + i]
+            t = rows[PLANE_DISTANCE + i]
+            along = (x * src[L + i] + y * src[M + i]) * rows[PER_COSINE + i]
+            cot[X + i] += x
+            cot[Y + i] += y
+            cot[Z + i] += along
+            cot[L + i] += t * x
+            cot[M + i] += t * y
+            cot[N + i] += t * along
+            total += x * (src[X + i] + t * src[L + i]) + y * (src[Y + i] + t * src[M + i])
+            rows[OF_ROW + i], rows[OF_COLUMN + i] = zero, zero
         return total
 
     return Lookup(arrive, meet, see, of_texels, of_rays)
@@ -170,15 +191,15 @@ def texel_sums(real: types.Type) -> Any:
 
     @njit(**OPTIONS)
     def add_texels(sums, width, texels, scratch, pixels):  # noqa: ANN001, ANN202
-        rows, cot = carray(scratch, 1280), carray(pixels, 128)
-        first = carray(int32_at(texels), 128)
-        above, below = carray(sums, 1 << 40), carray(shifted(sums, width), 1 << 40)
-        for i in range(128):
+        rows, cot = carray(scratch, UNBOUNDED), carray(pixels, BLOCK)
+        first = carray(int32_at(texels), BLOCK)
+        above, below = carray(sums, UNBOUNDED), carray(shifted(sums, width), UNBOUNDED)
+        for i in range(BLOCK):
             k = types.uint64(first[i])
-            amount = cot[i] * rows[256 + i] * rows[384 + i]
-            lower = amount * rows[512 + i]
+            amount = cot[i] * rows[SAMPLE_WEIGHT + i] * rows[ARRIVES + i]
+            lower = amount * rows[DOWN + i]
             upper = amount - lower
-            across = rows[640 + i]
+            across = rows[ACROSS + i]
             above[k] += upper * (one - across)
             above[k + types.uint64(1)] += upper * across
             below[k] += lower * (one - across)

@@ -1,6 +1,6 @@
 """Driver of the renderer: for every sample of a block of pixels, a ray of each wavelength.
 
-A block is 128 neighbouring pixels, and takes their samples in turn: a lane is a pixel, so that sums
+A block is pixels, and takes their samples in turn: a lane is a pixel, so that sums
 over samples need no scatter, and neighbours read neighbouring texels.  All wavelengths share the
 samples, and a ray serves every depth and every image.
 """
@@ -9,9 +9,27 @@ from collections.abc import Callable
 
 from numba import carray, types
 
+from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.compiler import int64_at, shifted
 from dolens.kernels.cpu.forward import real_at, streams
+from dolens.kernels.cpu.layout import STATE, UNBOUNDED
 from dolens.kernels.cpu.rendering.first_surface import first_surface
+from dolens.kernels.cpu.rendering.layout import (
+    BLOCK,
+    BLOCKS,
+    CHANNELS,
+    DEPTHS,
+    IMAGE,
+    IMAGES,
+    PIXEL_SUMS,
+    PIXELS,
+    PLANES,
+    SIDE,
+    TEXTURE_HEIGHT,
+    TEXTURE_WIDTH,
+    TEXTURES,
+    VIEW_LENGTH,
+)
 from dolens.kernels.cpu.rendering.lookup import lookup
 from dolens.kernels.cpu.rendering.samples import sampler
 
@@ -26,51 +44,53 @@ def render_driver(real: types.Type) -> Callable[..., None]:
     zero = real(0.0)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 72)
-        view, lengths = carray(int64_at(job[64]), 24), carray(at(job[65]), 1 << 40)
-        lanes = carray(int64_at(job[38]), 128)
-        scratch, work, stack = at(job[49]), at(job[17]), at(job[15])
-        kept = shifted(stack, 3840)
-        sums, exit_z = shifted(scratch, 2048), carray(at(job[13]), 1)[0]
-        images, depths, channels = view[6], view[7], view[8]
-        height, width = view[9], view[10]
-        blocks = carray(int64_at(view[12]), 1 << 40)
+        job = carray(job_, jobs.LENGTH)
+        view = carray(int64_at(job[jobs.VIEW]), VIEW_LENGTH)
+        lengths = carray(at(job[jobs.LENGTHS]), UNBOUNDED)
+        lanes = carray(int64_at(job[jobs.LANES]), BLOCK)
+        scratch, work, stack = at(job[jobs.DRIVER_ROWS]), at(job[jobs.WORK]), at(job[jobs.STACK])
+        kept = shifted(stack, 3 * STATE)
+        sums, exit_z = shifted(scratch, PIXEL_SUMS), carray(at(job[jobs.EXIT_Z]), 1)[0]
+        images, depths, channels = view[IMAGES], view[DEPTHS], view[CHANNELS]
+        height, width = view[TEXTURE_HEIGHT], view[TEXTURE_WIDTH]
+        blocks = carray(int64_at(view[BLOCKS]), UNBOUNDED)
         for block in range(first, last):
             start, count = blocks[2 * block], blocks[2 * block + 1]
             place_pixels(view, start, count, scratch)
-            clear = carray(sums, 1 << 40)
-            for i in range(128 * images * depths * channels):
+            clear = carray(sums, UNBOUNDED)
+            for i in range(BLOCK * images * depths * channels):
                 clear[i] = zero
-            for number in range(view[1] * view[1]):
+            for number in range(view[SIDE] * view[SIDE]):
                 sample(view, lengths, number, start, count, stack, scratch)
                 shared = False
                 for channel in range(channels):
-                    job[63] = channel + 1
-                    before = kept if channel == 0 else shifted(stack, 1280)
+                    job[jobs.WAVELENGTH] = channel + 1
+                    before = kept if channel == 0 else shifted(stack, STATE)
                     if shared:
                         refract_again(job, channel, stack, kept, before)
                     else:
                         step(job, 0, lanes, stack, before, before, work)
                     if channel == 0 and channels > 1:
                         shared = reusable(job, stack, kept)
-                    for k in range(1, job[8]):
-                        now = shifted(stack, 2560 if k % 2 == 1 else 1280)
+                    for k in range(1, job[jobs.STEPS]):
+                        now = shifted(stack, 2 * STATE if k % 2 == 1 else STATE)
                         step(job, k, lanes, before, now, now, work)
                         before = now
                     if arrive(before, scratch) == zero:
                         continue
                     for d in range(depths):
-                        depth, per_mm = lengths[16 + 2 * d] + exit_z, lengths[17 + 2 * d]
-                        meet(lengths, depth, per_mm, width, before, scratch, job[38])
+                        depth = lengths[PLANES + 2 * d] + exit_z
+                        per_mm = lengths[PLANES + 1 + 2 * d]
+                        meet(lengths, depth, per_mm, width, before, scratch, job[jobs.LANES])
                         for b in range(images):
                             texture = shifted(
-                                at(view[14]), (b * channels + channel) * height * width
+                                at(view[TEXTURES]), (b * channels + channel) * height * width
                             )
-                            pixels = shifted(sums, 128 * ((b * depths + d) * channels + channel))
-                            see(texture, width, job[38], scratch, pixels)
+                            pixels = shifted(sums, BLOCK * ((b * depths + d) * channels + channel))
+                            see(texture, width, job[jobs.LANES], scratch, pixels)
             for j in range(images * depths * channels):
-                out = carray(shifted(at(view[15]), j * view[5] + start), 128)
-                row = carray(shifted(sums, 128 * j), 128)
+                out = carray(shifted(at(view[IMAGE]), j * view[PIXELS] + start), BLOCK)
+                row = carray(shifted(sums, BLOCK * j), BLOCK)
                 for i in range(count):
                     out[i] = row[i]
 

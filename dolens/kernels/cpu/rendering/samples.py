@@ -11,6 +11,27 @@ from typing import Any, NamedTuple
 from numba import carray, njit, types
 
 from dolens.kernels.cpu.compiler import OPTIONS
+from dolens.kernels.cpu.layout import ENDED, PATH, STATE, UNBOUNDED, VIGNETTED, L, M, N, X, Y, Z
+from dolens.kernels.cpu.rendering.layout import (
+    ARRIVES,
+    BLOCK,
+    MIDDLE_COLUMN,
+    MIDDLE_ROW,
+    OF_WEIGHT,
+    PITCH,
+    PIXEL_AREA,
+    PIXEL_COLUMN,
+    PIXEL_ROW,
+    PUPIL_Z,
+    RADIUS,
+    SAMPLE_WEIGHT,
+    SEED_HIGH,
+    SEED_LOW,
+    SENSOR_Z,
+    SIDE,
+    WEIGHT,
+    WIDTH,
+)
 from dolens.kernels.cpu.rendering.random_numbers import random_words, upper_bits
 
 
@@ -60,44 +81,45 @@ def sampler(real: types.Type) -> Sampler:
     @njit(**OPTIONS)
     def place_pixels(view, start, count, scratch):  # noqa: ANN001, ANN202
         """Rows and columns of pixels from `start` on; lanes beyond `count` repeat the last."""
-        out = carray(scratch, 256)
-        width = view[0]
-        for i in range(128):
+        out = carray(scratch, UNBOUNDED)
+        width = view[WIDTH]
+        for i in range(BLOCK):
             pixel = start + (i if i < count else count - 1)
             row = pixel // width
-            out[i], out[128 + i] = real(row), real(pixel - row * width)
+            out[X + i], out[Y + i] = real(row), real(pixel - row * width)
 
     @njit(**OPTIONS)
     def sample(view, lengths, number, start, count, state, scratch):  # noqa: ANN001, ANN202
         """Rays of sample `number` into a state, and their weights."""
-        out, rows = carray(state, 1280), carray(scratch, 384)
-        side = view[1]
-        seed_low, seed_high = types.uint32(view[3]), types.uint32(view[4])
+        out, rows = carray(state, STATE), carray(scratch, UNBOUNDED)
+        side = view[SIDE]
+        seed_low, seed_high = types.uint32(view[SEED_LOW]), types.uint32(view[SEED_HIGH])
         cells, cell_u, cell_v = real(side), real(number % side), real(number // side)
-        pitch, middle_row, middle_column = lengths[0], lengths[1], lengths[2]
-        radius, z, weight = lengths[4], lengths[5], lengths[6]
-        dz = lengths[3] - z
+        pitch, middle_row = lengths[PITCH], lengths[MIDDLE_ROW]
+        middle_column = lengths[MIDDLE_COLUMN]
+        radius, z, weight = lengths[RADIUS], lengths[SENSOR_Z], lengths[WEIGHT]
+        dz = lengths[PUPIL_Z] - z
         sign = -one if dz > zero else one
-        spread, centre = (unit, half) if view[2] != 0 else (zero, zero)
+        spread, centre = (unit, half) if view[PIXEL_AREA] != 0 else (zero, zero)
         counter = types.uint32(number)
         first, last = types.int32(start), types.int32(count - 1)
-        for i in range(128):
+        for i in range(BLOCK):
             lane = types.int32(i)
             pixel = types.int32(first + (lane if lane < last else last))
             a, b, c, d = random_words(types.uint32(pixel), counter, seed_low, seed_high)
             u = (real(upper_bits(a)) * unit + cell_u) / cells
             v = (real(upper_bits(b)) * unit + cell_v) / cells
             pupil_x, pupil_y = disc(u, v)
-            row = rows[i] + (real(upper_bits(c)) * spread - centre)
-            column = rows[128 + i] + (real(upper_bits(d)) * spread - centre)
+            row = rows[PIXEL_ROW + i] + (real(upper_bits(c)) * spread - centre)
+            column = rows[PIXEL_COLUMN + i] + (real(upper_bits(d)) * spread - centre)
             x, y = (middle_column - column) * pitch, (row - middle_row) * pitch
             dx, dy = pupil_x * radius - x, pupil_y * radius - y
             inverse = sign / math.sqrt(dx * dx + dy * dy + dz * dz)
             n = dz * inverse
-            out[i], out[128 + i], out[256 + i] = x, y, z
-            out[384 + i], out[512 + i], out[640 + i] = dx * inverse, dy * inverse, n
-            out[768 + i], out[896 + i], out[1024 + i] = zero, zero, zero
-            rows[256 + i] = (n * n) * (n * n) * weight
+            out[X + i], out[Y + i], out[Z + i] = x, y, z
+            out[L + i], out[M + i], out[N + i] = dx * inverse, dy * inverse, n
+            out[PATH + i], out[ENDED + i], out[VIGNETTED + i] = zero, zero, zero
+            rows[SAMPLE_WEIGHT + i] = (n * n) * (n * n) * weight
 
     @njit(**OPTIONS)
     def of_aim(lengths, state, cotangents, scratch):  # noqa: ANN001, ANN202
@@ -107,27 +129,25 @@ def sampler(real: types.Type) -> Sampler:
         Rays start at P, aim at the pupil's point A, and with A - P = Q·d
         of_A = (of_d - (of_d·d) d)/Q, of_P = of_position - of_A, and of_radius = of_A·A/radius.
         """
-        src, cot, rows = carray(state, 1280), carray(cotangents, 768), carray(scratch, 1664)
-        distance, per_radius, per_weight = (
-            lengths[3] - lengths[5],
-            one / lengths[4],
-            one / lengths[6],
-        )
+        src, cot = carray(state, STATE), carray(cotangents, UNBOUNDED)
+        rows = carray(scratch, UNBOUNDED)
+        distance, per_radius = lengths[PUPIL_Z] - lengths[SENSOR_Z], one / lengths[RADIUS]
+        per_weight = one / lengths[WEIGHT]
         of_z, of_pupil_z, of_radius, of_share = zero, zero, zero, zero
-        for i in range(128):
-            l, m, n = src[384 + i], src[512 + i], src[640 + i]  # noqa: E741
-            of_weight = rows[384 + i] * rows[1536 + i]
-            weighted = of_weight * rows[256 + i]
+        for i in range(BLOCK):
+            l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
+            of_weight = rows[ARRIVES + i] * rows[OF_WEIGHT + i]
+            weighted = of_weight * rows[SAMPLE_WEIGHT + i]
             of_share += weighted
-            of_n = cot[640 + i] + four * weighted / n
-            along = cot[384 + i] * l + cot[512 + i] * m + of_n * n
+            of_n = cot[N + i] + four * weighted / n
+            along = cot[L + i] * l + cot[M + i] * m + of_n * n
             q = distance / n
             inverse = one / q
-            x, y = (cot[384 + i] - along * l) * inverse, (cot[512 + i] - along * m) * inverse
+            x, y = (cot[L + i] - along * l) * inverse, (cot[M + i] - along * m) * inverse
             z = (of_n - along * n) * inverse
-            of_z += cot[256 + i] - z
+            of_z += cot[Z + i] - z
             of_pupil_z += z
-            of_radius += x * (src[i] + q * l) + y * (src[128 + i] + q * m)
+            of_radius += x * (src[X + i] + q * l) + y * (src[Y + i] + q * m)
         return of_z, of_pupil_z, of_radius * per_radius, of_share * per_weight
 
     return Sampler(place_pixels, sample, of_aim)

@@ -13,15 +13,13 @@ from numba import carray, njit, types
 
 from dolens.kernels.cpu.compiler import OPTIONS, shifted
 from dolens.kernels.cpu.forward import real_at
+from dolens.kernels.cpu.layout import UNBOUNDED
 
-
-class SplatJob:
-    """Places in the splat's array of integers: addresses of arrays, and counts."""
-
-    ROWS, COLUMNS, WEIGHT, GRIDS, OF_ROWS, OF_COLUMNS, OF_WEIGHT = range(7)
-    # Points of a grid, pixels along its side, points of a chunk, chunks of a grid.
-    POINTS, SIZE, CHUNK, CHUNKS = range(7, 11)
-    LENGTH = 64
+# Places in the splat's job, an array of integers: addresses of arrays;
+ROWS, COLUMNS, WEIGHT, GRIDS, OF_ROWS, OF_COLUMNS, OF_WEIGHT = range(7)
+# points of a grid, pixels along its side, points of a chunk, chunks of a grid.
+POINTS, SIZE, CHUNK, CHUNKS = range(7, 11)
+SPLAT_JOB = 64  # its length
 
 
 @cache
@@ -52,14 +50,16 @@ def splat_driver(real: types.Type) -> Callable[..., None]:
     centre, spline = _taps(real)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 64)
-        rows, columns = carray(at(job[0]), 1 << 40), carray(at(job[1]), 1 << 40)
-        weights, points, size = carray(at(job[2]), 1 << 40), job[7], job[8]
+        job = carray(job_, SPLAT_JOB)
+        rows, columns = carray(at(job[ROWS]), UNBOUNDED), carray(at(job[COLUMNS]), UNBOUNDED)
+        weights, points, size = carray(at(job[WEIGHT]), UNBOUNDED), job[POINTS], job[SIZE]
         for chunk in range(first, last):
-            grid = carray(shifted(at(job[3]), chunk * size * size), 1 << 40)
-            start = (chunk // job[10]) * points
-            place = chunk % job[10]
-            for p in range(start + place * job[9], start + min((place + 1) * job[9], points)):
+            grid = carray(shifted(at(job[GRIDS]), chunk * size * size), UNBOUNDED)
+            start = (chunk // job[CHUNKS]) * points
+            place = chunk % job[CHUNKS]
+            for p in range(
+                start + place * job[CHUNK], start + min((place + 1) * job[CHUNK], points)
+            ):
                 row, down = centre(rows[p], size)
                 column, across = centre(columns[p], size)
                 if row < -1 or column < -1:
@@ -82,16 +82,19 @@ def splat_adjoint_driver(real: types.Type) -> Callable[..., None]:
     zero = real(0.0)
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202
-        job = carray(job_, 64)
-        rows, columns = carray(at(job[0]), 1 << 40), carray(at(job[1]), 1 << 40)
-        weights, points, size = carray(at(job[2]), 1 << 40), job[7], job[8]
-        of_rows, of_columns = carray(at(job[4]), 1 << 40), carray(at(job[5]), 1 << 40)
-        of_weights = carray(at(job[6]), 1 << 40)
+        job = carray(job_, SPLAT_JOB)
+        rows, columns = carray(at(job[ROWS]), UNBOUNDED), carray(at(job[COLUMNS]), UNBOUNDED)
+        weights, points, size = carray(at(job[WEIGHT]), UNBOUNDED), job[POINTS], job[SIZE]
+        of_rows = carray(at(job[OF_ROWS]), UNBOUNDED)
+        of_columns = carray(at(job[OF_COLUMNS]), UNBOUNDED)
+        of_weights = carray(at(job[OF_WEIGHT]), UNBOUNDED)
         for chunk in range(first, last):
-            own = chunk // job[10]
-            grid = carray(shifted(at(job[3]), own * size * size), 1 << 40)
-            start, place = own * points, chunk % job[10]
-            for p in range(start + place * job[9], start + min((place + 1) * job[9], points)):
+            own = chunk // job[CHUNKS]
+            grid = carray(shifted(at(job[GRIDS]), own * size * size), UNBOUNDED)
+            start, place = own * points, chunk % job[CHUNKS]
+            for p in range(
+                start + place * job[CHUNK], start + min((place + 1) * job[CHUNK], points)
+            ):
                 row, down = centre(rows[p], size)
                 column, across = centre(columns[p], size)
                 of_row, of_column, of_weight = zero, zero, zero

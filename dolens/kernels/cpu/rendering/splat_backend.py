@@ -6,7 +6,8 @@ from torch import Tensor
 
 from dolens.kernels.cpu import compiler
 from dolens.kernels.cpu.program import REAL
-from dolens.kernels.cpu.rendering.splat import SplatJob, splat_adjoint_driver, splat_driver
+from dolens.kernels.cpu.rendering import splat as layout
+from dolens.kernels.cpu.rendering.splat import splat_adjoint_driver, splat_driver
 from dolens.kernels.cpu.threads import spread, thread_count
 
 # Chunks of points of a grid that have a grid of their own.
@@ -18,7 +19,7 @@ def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
     job, chunks = _job(rows, columns, weight, size)
     count = rows.shape[0]
     grids = rows.new_zeros((count, chunks, size, size))
-    job[SplatJob.GRIDS] = grids.data_ptr()
+    job[layout.GRIDS] = grids.data_ptr()
     _run(splat_driver, job, count * chunks, rows)
     return grids[:, 0].clone() if chunks == 1 else grids.sum(1)
 
@@ -28,9 +29,9 @@ def splat_adjoint(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cotangents (G, N) of rows, columns and weight from that of the grids (G, size, size)."""
     job, chunks = _job(rows, columns, weight, of_grid.shape[-1])
-    job[SplatJob.GRIDS] = of_grid.data_ptr()
+    job[layout.GRIDS] = of_grid.data_ptr()
     gradients = torch.empty_like(rows), torch.empty_like(rows), torch.empty_like(rows)
-    job[SplatJob.OF_ROWS : SplatJob.OF_WEIGHT + 1] = [g.data_ptr() for g in gradients]
+    job[layout.OF_ROWS : layout.OF_WEIGHT + 1] = [g.data_ptr() for g in gradients]
     _run(splat_adjoint_driver, job, rows.shape[0] * chunks, rows)
     return gradients
 
@@ -40,9 +41,9 @@ def _job(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> tuple[np.n
     points = rows.shape[1]
     chunk = max(_SMALLEST, -(-points // _CHUNKS))
     chunks = max(1, -(-points // chunk))
-    job = np.zeros(SplatJob.LENGTH, dtype=np.int64)
-    job[: SplatJob.WEIGHT + 1] = (rows.data_ptr(), columns.data_ptr(), weight.data_ptr())
-    job[SplatJob.POINTS : SplatJob.CHUNKS + 1] = (points, size, chunk, chunks)
+    job = np.zeros(layout.SPLAT_JOB, dtype=np.int64)
+    job[: layout.WEIGHT + 1] = (rows.data_ptr(), columns.data_ptr(), weight.data_ptr())
+    job[layout.POINTS : layout.CHUNKS + 1] = (points, size, chunk, chunks)
     return job, chunks
 
 

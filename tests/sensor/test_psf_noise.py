@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
-from dolens.sensor.measured_psf import measured_functions
+from dolens.sensor.psf_noise import noisy_point_spread_functions
 
 
 def test_a_measured_function_has_poisson_s_spread_about_the_true_one():
     ramp = torch.arange(1.0, 10.0, dtype=torch.float64).reshape(3, 3)
     exact = (0.9 * ramp / ramp.sum()).expand(4000, 3, 3)
     electrons, read = 1000.0, 4.0
-    found = measured_functions(exact, electrons, read, torch.Generator().manual_seed(0))
+    found = noisy_point_spread_functions(exact, electrons, read, torch.Generator().manual_seed(0))
     assert torch.allclose(found.sum((-2, -1)), torch.tensor(0.9, dtype=torch.float64))
     share = exact[0] / 0.9
     # n_i over their sum Σn: to first order the variance is p(1 - p)/N for counting, and
@@ -27,9 +27,9 @@ def test_a_measured_function_has_poisson_s_spread_about_the_true_one():
 
 def test_many_electrons_measure_the_function_itself():
     exact = torch.rand(2, 3, 5, 5, generator=torch.Generator().manual_seed(1))
-    found = measured_functions(exact, 1e12, 0.0, torch.Generator().manual_seed(0))
+    found = noisy_point_spread_functions(exact, 1e12, 0.0, torch.Generator().manual_seed(0))
     assert found.dtype == exact.dtype
     assert torch.allclose(found, exact, rtol=1e-4, atol=1e-5)
     with pytest.raises(AssertionError):
-        few = measured_functions(exact, 1e2, 0.0, torch.Generator().manual_seed(0))
+        few = noisy_point_spread_functions(exact, 1e2, 0.0, torch.Generator().manual_seed(0))
         assert torch.allclose(few, exact, rtol=1e-2)

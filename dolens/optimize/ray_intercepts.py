@@ -1,4 +1,4 @@
-"""Where rays land from the reference of their spot: what spots and losses of them share."""
+"""Merit terms of ray intercepts share the deviations of rays from the reference of their spot."""
 
 from collections.abc import Sequence
 
@@ -11,8 +11,10 @@ from dolens.optics.rays import TracedRays
 from dolens.optimize.image_quality import ImageQuality
 
 
-class LandingPoints(ImageQuality):
-    """Deviations are x and y on the sensor, mm, from the centroid or the chief ray."""
+class RayInterceptQuality(ImageQuality):
+    """Measures image quality by ray intercepts: x and y on the sensor, mm, from the centroid or the
+    chief ray.
+    """
 
     def _traced(self, lens: Lens, hit: TracedRays) -> tuple[Tensor, Tensor]:
         direction = hit.direction.double()

@@ -2,7 +2,7 @@
 
 import math
 
-from dolens.rendering.patch_convolution import fast_length
+from dolens.rendering.patch_convolution import transform_length
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.relative_illumination import RADII, RAYS
 from dolens.scene.planar import PlanarScene
@@ -30,7 +30,7 @@ def psf_cost(renderer: PsfRenderer, scene: PlanarScene, surfaces: int, images: i
     sensor, depths, channels = renderer.sensor, len(scene.depths), len(scene.wavelengths)
     nodes = renderer.fields[0] * renderer.fields[1]
     sides = [
-        fast_length(
+        transform_length(
             math.ceil(length if count == 1 else min(length, 2 * length / (count - 1)))
             + renderer.size
         )

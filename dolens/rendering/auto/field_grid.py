@@ -5,18 +5,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.system import OpticalSystem
-from dolens.rendering.auto.cost import psf_cost
-from dolens.rendering.auto.finding import Finding
-from dolens.rendering.auto.probe import MEAN, grey_levels
+from dolens.rendering.auto.costs import psf_cost
+from dolens.rendering.auto.probes import MEAN, grey_levels
 from dolens.rendering.auto.survey import Survey, survey
-from dolens.rendering.patch_convolution import node_positions
+from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.patches import node_positions, triangle_weights
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.scene.planar import PlanarScene
-from dolens.sensor.pixels import Sensor
 
 # Strata of the pupil along each side, for functions that are compared.
 SAMPLES = 48
@@ -28,6 +24,26 @@ _LARGEST = 511  # window, pixels
 
 
 @dataclass(frozen=True)
+class Finding:
+    """One decision of a plan.
+
+    Attributes:
+        what: the setting that was decided on.
+        chosen: its value.
+        error: the error that it leaves, grey levels on the probe.
+        because: the reason.
+    """
+
+    what: str
+    chosen: str
+    error: float
+    because: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.chosen} ({self.error:.2g} grey levels; {self.because})"
+
+
+@dataclass(frozen=True)
 class Layout:
     """A renderer with its fields, registration, illumination and window, and why these."""
 
@@ -36,21 +52,23 @@ class Layout:
 
 
 def choose_fields(
-    system: OpticalSystem,
-    scene: PlanarScene,
-    sensor: Sensor,
-    rows: Tensor,
-    columns: Tensor,
-    truth: Survey,
-    tolerance: float,
-    backend: str,
-    registrations: Sequence[str] = REGISTRATIONS,
+    truth: Survey, tolerance: float, registrations: Sequence[str] = REGISTRATIONS
 ) -> Layout:
-    """The cheapest grid whose interpolated functions are those of the points in between."""
-    surfaces = len(system.surfaces)
+    """Choose the cheapest grid whose interpolated functions are those of the points in between.
+
+    Args:
+        truth: the points in between.
+        tolerance: RMS grey levels on the probe.
+        registrations: that may be chosen, of `PsfRenderer`.
+
+    Raises:
+        InputError: functions are too wide for any window.
+    """
+    imaging = truth.imaging
+    surfaces = len(imaging.system.surfaces)
     candidates = sorted(
-        _candidates(truth, sensor, tolerance, registrations),
-        key=lambda r: psf_cost(r, scene, surfaces),
+        _candidates(truth, tolerance, registrations),
+        key=lambda r: psf_cost(r, imaging.scene, surfaces),
     )
     if not candidates:
         raise InputError(
@@ -61,8 +79,8 @@ def choose_fields(
     best: tuple[float, PsfRenderer] | None = None
     for renderer in candidates:
         if renderer.fields not in nodes:
-            nodes[renderer.fields] = _node_survey(system, scene, sensor, renderer, backend)
-        error = _interpolation_error(renderer, sensor, rows, columns, truth, nodes[renderer.fields])
+            nodes[renderer.fields] = _node_survey(imaging, renderer)
+        error = _interpolation_error(renderer, truth, nodes[renderer.fields])
         if best is None or error < best[0]:
             best = error, renderer
         if error <= FIELDS_SHARE * tolerance:
@@ -79,8 +97,9 @@ def choose_fields(
 
 
 def _candidates(
-    truth: Survey, sensor: Sensor, tolerance: float, registrations: Sequence[str]
+    truth: Survey, tolerance: float, registrations: Sequence[str]
 ) -> Iterator[PsfRenderer]:
+    sensor = truth.imaging.sensor
     longer = max(sensor.height, sensor.width)
     for registration in registrations:
         distortion = registration == "chief_rays"
@@ -136,48 +155,32 @@ def window_finding(truth: Survey, size: int, distortion: bool) -> Finding:
     return Finding("window", f"{size} pixels", error, "light beyond it is lost")
 
 
-def _node_survey(
-    system: OpticalSystem, scene: PlanarScene, sensor: Sensor, renderer: PsfRenderer, backend: str
-) -> Survey:
+def _node_survey(imaging: ImagingSystem, renderer: PsfRenderer) -> Survey:
+    sensor = imaging.sensor
     down, across = (
         torch.tensor(node_positions(side, count), dtype=torch.float64)
         for side, count in zip((sensor.height, sensor.width), renderer.fields, strict=True)
     )
     rows, columns = torch.meshgrid(down, across, indexing="ij")
-    return survey(system, scene, sensor, rows.reshape(-1), columns.reshape(-1), SAMPLES, backend)
+    return survey(imaging, (rows.reshape(-1), columns.reshape(-1)), SAMPLES)
 
 
-def _interpolation_error(
-    renderer: PsfRenderer,
-    sensor: Sensor,
-    rows: Tensor,
-    columns: Tensor,
-    truth: Survey,
-    nodes: Survey,
-) -> float:
+def _interpolation_error(renderer: PsfRenderer, truth: Survey, nodes: Survey) -> float:
     """RMS over the points of the error of functions interpolated from the nodes, grey levels."""
     distortion = renderer.registration == "chief_rays"
     if distortion and nodes.chief is None:
         return math.inf
+    sensor, (rows, columns) = truth.imaging.sensor, truth.pixels
     functions, wanted = (s.functions(renderer.size, distortion) for s in (nodes, truth))
     if renderer.illumination == "map":
         light = nodes.light()[..., None, None]
         functions = functions / light.clamp(min=torch.finfo(light.dtype).tiny)
     weights = torch.einsum(
         "nr,nc->nrc",
-        _hats(rows, sensor.height, renderer.fields[0]),
-        _hats(columns, sensor.width, renderer.fields[1]),
+        triangle_weights(rows, sensor.height, renderer.fields[0]),
+        triangle_weights(columns, sensor.width, renderer.fields[1]),
     ).flatten(1)
     found = torch.einsum("nm,mdcij->ndcij", weights.to(functions), functions)
     if renderer.illumination == "map":
         found = found * truth.light()[..., None, None]
     return float(grey_levels(found - wanted).square().mean().sqrt())
-
-
-def _hats(places: Tensor, length: int, count: int) -> Tensor:
-    """(N, count): bilinear weights of nodes at places along a side."""
-    if count == 1:
-        return torch.ones(len(places), 1, dtype=places.dtype)
-    spacing = (length - 1) / (count - 1)
-    node = torch.arange(count, dtype=places.dtype) * spacing
-    return (1.0 - (places[:, None] - node).abs() / spacing).clamp(min=0.0)

@@ -1,4 +1,4 @@
-"""What a lens is used with: wavelengths, fields, the distance of the object, the pupil.
+"""The system data of a lens are its wavelengths, fields, object distance and pupil.
 
 In a prescription, every key optional::
 
@@ -21,14 +21,14 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.optics.fields import Fields
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
-from dolens.prescriptions.checks import as_number, as_positive, check_keys, require_mapping
+from dolens.prescriptions.checks import as_number, as_positive, require_mapping
 
 PUPIL_KEYS = ("entrance_pupil_diameter", "f_number")
-CONDITION_KEYS = (
+SYSTEM_DATA_KEYS = (
     "wavelengths",
     "reference_wavelength",
     "fields",
@@ -40,8 +40,8 @@ _FIELD_KINDS = ("angles", "heights")
 _UNDECIDED = 1e-6
 
 
-def conditions(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The conditions of use as arguments of `Lens`: wavelengths, fields and object distance.
+def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return the system data as arguments of `Lens`: wavelengths, fields and object distance.
 
     Raises:
         InputError: one line that names `where` and the key; two pupils are one too many.
@@ -76,8 +76,8 @@ def conditions(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     }
 
 
-def conditions_of(lens: Lens) -> dict[str, Any]:
-    """The conditions of use of a lens as plain data; only those that it has."""
+def system_data_of(lens: Lens) -> dict[str, Any]:
+    """Return the system data of a lens as plain data; only those that it has."""
     found: dict[str, Any] = {}
     if lens.wavelengths is not None:
         found["wavelengths"] = list(lens.wavelengths)
@@ -90,7 +90,9 @@ def conditions_of(lens: Lens) -> dict[str, Any]:
 
 
 def stop_row(row: Mapping[str, Any], number: int, prescription: Mapping[str, Any]) -> Any:
-    """The row of a surface; the stop's may lack a semi-diameter where a pupil will decide it."""
+    """Return the row of a surface; the stop's may lack a semi-diameter where a pupil will decide
+    it.
+    """
     sizes = (row.get("semi_diameter"), row.get("aperture"))
     undecided = sizes == (None, None) and _pupil(prescription) is not None
     if undecided and str(prescription.get("stop", 1)) == str(number):
@@ -98,8 +100,8 @@ def stop_row(row: Mapping[str, Any], number: int, prescription: Mapping[str, Any
     return row
 
 
-def close_stop(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
-    """Close the stop of a new lens to the pupil that its prescription asks for, if it does.
+def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
+    """Set the stop of a new lens to the pupil that its prescription asks for, if it does.
 
     The paraxial pupil is proportional to the stop, so one ratio is enough; it is found in double
     precision.

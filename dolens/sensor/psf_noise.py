@@ -1,16 +1,16 @@
-"""Point spread functions as a measurement gives them."""
+"""Point spread functions are measured with photon noise and read noise."""
 
 import torch
 from torch import Tensor
 
 
-def measured_functions(
+def noisy_point_spread_functions(
     functions: Tensor, electrons: float, read_noise: float, generator: torch.Generator
 ) -> Tensor:
-    """Point spread functions with the noise of counting.
+    """Return point spread functions with simulated photon noise and read noise.
 
     A function h of sum Σh is measured with N electrons in the whole of it: pixel i counts a Poisson
-    number n_i of mean N·h_i/Σh, and a normal number of the read noise is added.  What is given back
+    number n_i of mean N·h_i/Σh, and a normal number of the read noise is added.  The result
     is Σh·n_i/Σn, so that the measured function has the same sum.  Nothing is cut at zero.
 
     Args:

@@ -1,10 +1,10 @@
-"""The source's .txt format: what its files mean, and what is wrong with bad ones."""
+"""The .txt format of diffoptics: what its files mean, and what is wrong with bad ones."""
 
 import pytest
 import torch
 
 from dolens import InputError, load_lens
-from dolens.prescriptions.source_text import prescription_from_source_text, source_text_of
+from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
 from tests.prescriptions.samples import require_refused
 
 ASPHERE = """Aspheric condenser
@@ -56,7 +56,7 @@ def test_the_index_model_is_the_source_s_unless_told_otherwise(tmp_path, referen
 
 
 def test_the_rows_of_a_phase_plate():
-    found = prescription_from_source_text(PLATE)
+    found = prescription_from_diffoptics(PLATE)
     assert found["stop"] == 1
     assert found["surfaces"]["1"] == {
         "type": "aperture", "semi_diameter": 5.0, "material": "occluder", "thickness": 1.5,
@@ -72,7 +72,7 @@ def test_the_rows_of_a_phase_plate():
 
 
 def test_what_is_written_is_a_file_of_the_source(root):
-    """Read as the source's program reads: two lines skipped, columns by position."""
+    """Read as diffoptics reads: two lines skipped, columns by position."""
     data = {
         "name": "Singlet",
         "surfaces": {
@@ -82,7 +82,7 @@ def test_what_is_written_is_a_file_of_the_source(root):
         },
         "sensor": {"distance": 30},
     }  # fmt: skip
-    lines = source_text_of(data).splitlines()
+    lines = diffoptics_text_of(data).splitlines()
     assert lines[0] == "Singlet"
     assert lines[1].startswith("type distance roc diameter material # ")
     assert [line.split() for line in lines[2:]] == [
@@ -100,8 +100,8 @@ def test_any_curvature_survives():
     for c in (torch.rand(300, generator=generator, dtype=torch.float64) - 0.5).tolist():
         skipped += 1.0 / (1.0 / c) != c
         row = {"type": "sphere", "curvature": c, "semi_diameter": 1.0, "material": "air"}
-        text = source_text_of({"surfaces": {"1": row}, "sensor": {"distance": 1.0}})
-        found = prescription_from_source_text(text)["surfaces"]["1"]
+        text = diffoptics_text_of({"surfaces": {"1": row}, "sensor": {"distance": 1.0}})
+        found = prescription_from_diffoptics(text)["surfaces"]["1"]
         assert found.get("curvature", 1.0 / found.get("radius", 1.0)) == c
     assert skipped > 0
 
@@ -109,7 +109,7 @@ def test_any_curvature_survives():
 def test_remarks_of_others_are_left_alone():
     lines = ASPHERE.splitlines()
     lines[1] += "  # in mm"
-    assert prescription_from_source_text("\n".join(lines)) == prescription_from_source_text(ASPHERE)
+    assert prescription_from_diffoptics("\n".join(lines)) == prescription_from_diffoptics(ASPHERE)
 
 
 def replaced(old, new, text=ASPHERE):
@@ -151,7 +151,7 @@ BAD = {
                              "line 6: an X row has b and ten coefficients, not 10"),
     "constant": (replaced("AIR  0.5 0 ", "AIR  0.5 7 ", PLATE),
                  "line 6: the constant term must be 0, not 7"),
-    "broken header": (replaced(COLUMNS, COLUMNS + ' # {"stop": '), "line 2: what stands behind #"),
+    "broken header": (replaced(COLUMNS, COLUMNS + ' # {"stop": '), "line 2: the text behind #"),
     "unknown header": (replaced(COLUMNS, COLUMNS + ' # {"stopp": 1}'),
                        "line 2: unknown key 'stopp'; did you mean 'stop'?"),
     "no such surface": (replaced(COLUMNS, COLUMNS + ' # {"surfaces": {"9": {}}}'),
@@ -185,4 +185,4 @@ def test_a_file_that_is_no_text(tmp_path):
 
 def test_hostile_exponents_are_no_work():
     text = replaced("20.923", "1" + "0" * 30 + "e-999999999")
-    assert prescription_from_source_text(text)["surfaces"]["1"]["radius"] == float("inf")
+    assert prescription_from_diffoptics(text)["surfaces"]["1"]["radius"] == float("inf")

@@ -1,4 +1,4 @@
-"""Losses of landing points, against closed forms; optimizers by number; edges that follow light."""
+"""Losses of ray intercepts, against closed forms; optimizers by number; edges that follow light."""
 
 import math
 
@@ -10,10 +10,10 @@ from dolens import load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
+from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
 from dolens.optimize.choice import by_number_of_variables
-from dolens.optimize.landing_losses import EncircledEnergy, Modulation
-from dolens.optimize.loss_residuals import Spots
-from dolens.optimize.rims import fitted_semi_diameters
+from dolens.optimize.loss_residuals import RayGroups
+from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation
 
 
 def disc(radius_mm, rings=60, arms=64):
@@ -24,7 +24,7 @@ def disc(radius_mm, rings=60, arms=64):
     points = torch.stack((x.flatten(), y.flatten()))
     count = points.shape[1]
     weight = torch.full((count,), 1.0 / count, dtype=torch.float64)
-    return points, Spots(weight, torch.zeros(count, dtype=torch.int64), torch.ones(1).double())
+    return points, RayGroups(weight, torch.zeros(count, dtype=torch.int64), torch.ones(1).double())
 
 
 def test_the_modulation_of_a_disc():

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.optimize.operand_model import OperandModel
-from dolens.optimize.operands import Operand, View, operand
-from dolens.optimize.trusted_step import ray_moves, trusted_step
+from dolens.optimize.operands import LensProperties, Operand, operand
+from dolens.optimize.trust_region_step import ray_moves, trust_region_step
 from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import lens_from_prescription
 
@@ -31,7 +31,7 @@ def spots_of(lens):
     return [gaussian_quadrature(lens, [(0, 0), (0, 14)], LINES, 4, 8, symmetry=False)]
 
 
-def landing(lens, spots):
+def intercepts(lens, spots):
     """Points about their spots' centroids, with the roots of their weights: (N, 2)."""
     (part,) = spots
     points = lens.trace(part.rays).position[:, :2]
@@ -52,17 +52,17 @@ def unbounded(count):
 
 
 def test_rays_move_as_far_as_they_may_whatever_the_variables_units(triplet):
-    """Traced again at the new place: the RMS of their moves is the reach."""
-    variables, spots, reach = DesignVariables(triplet, NAMES), spots_of(triplet), 1e-5
+    """Traced again at the new place: the RMS of their moves is the trust radius."""
+    variables, spots, trust_radius = DesignVariables(triplet, NAMES), spots_of(triplet), 1e-5
     moves = ray_moves(triplet, variables, spots, 1e-9)
     gradient = torch.tensor([0.3, -2.0, 5.0]).double()
-    found = trusted_step(gradient, moves, reach, *unbounded(3))
-    before = landing(triplet, spots)
+    found = trust_region_step(gradient, moves, trust_radius, *unbounded(3))
+    before = intercepts(triplet, spots)
     with torch.no_grad():
         variables.scaled += found
     variables.write_to(triplet)
-    moved = (landing(triplet, spots) - before).norm()
-    assert float(moved) == pytest.approx(reach, rel=1e-3)
+    moved = (intercepts(triplet, spots) - before).norm()
+    assert float(moved) == pytest.approx(trust_radius, rel=1e-3)
     assert float(gradient @ found) < 0.0
 
 
@@ -77,7 +77,7 @@ def test_of_the_squared_spot_radius_it_is_gauss_and_newton_s_step(triplet):
         kept = {n: changed[n].clone() for n in names}
         for name, value in values.items():
             changed[name].data.copy_(value.detach())
-        found = landing(triplet, spots).reshape(-1)
+        found = intercepts(triplet, spots).reshape(-1)
         for name in names:
             changed[name].data.copy_(kept[name])
         return found
@@ -90,9 +90,9 @@ def test_of_the_squared_spot_radius_it_is_gauss_and_newton_s_step(triplet):
         columns.append((points(start + shift) - points(start - shift)) / (2.0 * h))
     jacobian = torch.stack(columns, 1)
     wanted = -torch.linalg.lstsq(jacobian, residuals[:, None]).solution[:, 0]
-    reach = float((jacobian @ wanted).norm())
+    trust_radius = float((jacobian @ wanted).norm())
     moves = ray_moves(triplet, variables, spots, 1e-12)
-    found = trusted_step(2.0 * jacobian.T @ residuals, moves, reach, *unbounded(3))
+    found = trust_region_step(2.0 * jacobian.T @ residuals, moves, trust_radius, *unbounded(3))
     assert torch.allclose(found, wanted, rtol=1e-4)
 
 
@@ -101,11 +101,11 @@ def test_bounds_hold(triplet):
     variables, spots = DesignVariables(triplet, NAMES), spots_of(triplet)
     moves = ray_moves(triplet, variables, spots, 1e-3)
     gradient = torch.tensor([1.0, 1.0, -1.0]).double()
-    free = trusted_step(gradient, moves, 1e-3, *unbounded(3))
+    free = trust_region_step(gradient, moves, 1e-3, *unbounded(3))
     lower, upper = unbounded(3)
     held = int(free.abs().argmax())
     lower[held] = upper[held] = 0.0
-    found = trusted_step(gradient, moves, 1e-3, lower, upper)
+    found = trust_region_step(gradient, moves, 1e-3, lower, upper)
     assert float(found[held]) == 0.0
     assert float(gradient @ found) < 0.0
     # The others go all the way.
@@ -114,7 +114,7 @@ def test_bounds_hold(triplet):
 
 def test_no_gradient_no_step(triplet):
     moves = ray_moves(triplet, DesignVariables(triplet, NAMES), spots_of(triplet), 1e-3)
-    found = trusted_step(torch.zeros(3), moves, 1e-3, *unbounded(3))
+    found = trust_region_step(torch.zeros(3), moves, 1e-3, *unbounded(3))
     assert not bool(found.any())
 
 
@@ -122,7 +122,7 @@ def test_between_all_its_bounds_a_step_ends_short(triplet):
     """Every variable on a bound before rays have moved as far as they may."""
     moves = ray_moves(triplet, DesignVariables(triplet, NAMES), spots_of(triplet), 1e-3)
     gradient, bound = torch.tensor([1.0, -1.0, 1.0]).double(), torch.full((3,), 1e-9).double()
-    found = trusted_step(gradient, moves, 1.0, -bound, bound)
+    found = trust_region_step(gradient, moves, 1.0, -bound, bound)
     assert torch.allclose(found, -bound * gradient, rtol=1e-9)
     assert float((moves @ found).norm()) < 1e-3
 
@@ -139,17 +139,17 @@ LIMITS = [
 @pytest.mark.parametrize("limits", LIMITS)
 @pytest.mark.parametrize("weight", [0.1, 1.0, 100.0])
 def test_with_operands_no_step_within_reach_is_better(limits, weight):
-    """Against the best of a grid over all steps of two variables that the reach allows."""
+    """Against the best of a grid over all steps of two variables that the trust radius allows."""
     entry = Operand("efl", limits.get("target"), limits.get("min"), limits.get("max"), weight)
     values = torch.tensor([0.05]).double()
     model = OperandModel((entry,), values, torch.tensor([[2.0, 0.5]]).double())
     moves = torch.tensor([[1.0, 0.4], [0.0, 0.5]]).double()
-    gradient, reach = torch.tensor([-1.0, 0.2]).double(), 0.5
-    step = trusted_step(gradient, moves, reach, *unbounded(2), model)
-    assert float((moves @ step).norm()) <= reach * (1.0 + 1e-9)
+    gradient, trust_radius = torch.tensor([-1.0, 0.2]).double(), 0.5
+    step = trust_region_step(gradient, moves, trust_radius, *unbounded(2), model)
+    assert float((moves @ step).norm()) <= trust_radius * (1.0 + 1e-9)
 
     turn = torch.linspace(0.0, 2.0 * torch.pi, 2001, dtype=torch.float64)
-    radius = torch.linspace(0.0, reach, 1001, dtype=torch.float64)[:, None]
+    radius = torch.linspace(0.0, trust_radius, 1001, dtype=torch.float64)[:, None]
     rays = torch.stack([radius * turn.cos(), radius * turn.sin()])
     steps = torch.linalg.solve(moves, rays.flatten(1)).T
     after = values + steps @ model.derivatives[0]
@@ -162,7 +162,7 @@ def test_with_operands_no_step_within_reach_is_better(limits, weight):
     own = float(gradient @ step) + penalty(model, step)
     # Rays move as far as they may to 1e-6.
     assert own <= float(grid.min()) + 1e-6
-    # A grid of thousandths of the reach is no better than this.
+    # A grid of thousandths of the trust radius is no better than this.
     assert own >= float(grid.min()) - 1e-3 * weight
 
 
@@ -182,15 +182,15 @@ def test_no_small_change_of_a_step_among_many_limits_is_better(seed):
         entries.append(Operand("efl", None, low, high, weight))
     model = OperandModel(tuple(entries), random(4), random(4, 3))
     moves = torch.linalg.qr(random(6, 3), mode="r").R
-    gradient, upper, reach = random(3), random(3).abs(), 0.3
-    step = trusted_step(gradient, moves, reach, -upper, upper, model)
+    gradient, upper, trust_radius = random(3), random(3).abs(), 0.3
+    step = trust_region_step(gradient, moves, trust_radius, -upper, upper, model)
     assert bool((step.abs() <= upper * (1.0 + 1e-12)).all())
     own, scale = float(gradient @ step) + penalty(model, step), float(gradient.norm())
     for size in (1e-1, 1e-2, 1e-3):
         for _ in range(100):
             other = (step + size * random(3)).clamp(-upper, upper)
             length = float((moves @ other).norm())
-            other = other * min(1.0, reach / length)
+            other = other * min(1.0, trust_radius / length)
             better = float(gradient @ other) + penalty(model, other)
             assert own <= better + 1e-5 * scale + 1e-5 * abs(own)
 
@@ -207,14 +207,14 @@ def test_a_steep_limit_stops_a_step_that_would_break_it(root):
     def rim(step):
         changed = variables.scaled.detach() + step
         values = {"surfaces.1.curvature": changed[0] * 0.001}
-        view = View(lens.system(values), lens.primary_wavelength, None)
+        view = LensProperties(lens.system(values), lens.primary_wavelength, None)
         return float(min(entry.values(view).values()))
 
     # What bends the first surface more thins its rim.
     gradient = torch.tensor([-1e-3]).double()
-    free = trusted_step(gradient, moves, 0.03, *unbounded(1))
-    held = trusted_step(
-        gradient, moves, 0.03, *unbounded(1), OperandModel.of(lens, variables, [entry], None)
+    free = trust_region_step(gradient, moves, 0.03, *unbounded(1))
+    held = trust_region_step(
+        gradient, moves, 0.03, *unbounded(1), OperandModel.at(lens, variables, [entry], None)
     )
     assert rim(free) < -0.03
     assert rim(held) == pytest.approx(-0.015, abs=1e-3)

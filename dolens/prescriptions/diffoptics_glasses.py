@@ -1,12 +1,11 @@
-"""Glass by name in the source's lens files."""
+"""Glasses are named in diffoptics lens files."""
 
 import re
 
-from dolens.errors import InputError
-from dolens.prescriptions.checks import did_you_mean
+from dolens.errors import InputError, did_you_mean
 
-# nd/Vd as the source's program tabulates them (its index model counts them from 589.3 nm).
-SOURCE_GLASSES = {
+# nd/Vd as diffoptics tabulates them (its index model counts them from 589.3 nm).
+DIFFOPTICS_GLASSES = {
     "b270": "1.52290/58.50",
     "baf10": "1.67/47.05",
     "bk10": "1.49780/66.954",
@@ -43,20 +42,20 @@ _MEDIA = {"air": "air", "occluder": "occluder", "vacuum": "occluder"}
 _PAIR = re.compile(r"\d+(\.\d+)?/\d+(\.\d+)?")
 
 
-def source_material(name: str, place: str) -> str:
-    """A medium of the source's format as a prescription writes it.
+def diffoptics_material(name: str, place: str) -> str:
+    """Return a medium of the diffoptics format as a prescription writes it.
 
-    A name stands for the source's own nd and Vd, not for a catalogue's dispersion.  Vacuum is the
+    A name stands for diffoptics's own nd and Vd, not for a catalogue's dispersion.  Vacuum is the
     medium that a prescription writes `occluder`: index 1 in every index model.
 
     Raises:
         InputError: one line that names the place and a near name.
     """
     word = name.lower()
-    known = _MEDIA | SOURCE_GLASSES
+    known = _MEDIA | DIFFOPTICS_GLASSES
     if word not in known and not _PAIR.fullmatch(word):
         raise InputError(
             f"{place}: material '{name}' is unknown{did_you_mean(word, known)} (allowed: nd/Vd, "
-            "such as 1.5168/64.17, air, occluder, vacuum, or a glass in the source's own table)"
+            "such as 1.5168/64.17, air, occluder, vacuum, or a glass in diffoptics's own table)"
         )
     return known.get(word, word)

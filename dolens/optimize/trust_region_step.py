@@ -1,8 +1,8 @@
-"""A step of damped least squares for a lens whose loss only its gradient is known of.
+"""This step of damped least squares needs no more of a lens's loss than its gradient.
 
-A network's loss L has the gradient g_k = ∂L/∂p_k with respect to the landing point p_k of each ray.
-With residuals g_k/(2√(κ w_k)) and rows √(κ w_k)·J_k, the rays' own derivatives by the variables,
-least squares minimises
+A network's loss L has the gradient g_k = ∂L/∂p_k with respect to the intercept p_k of each ray.
+With residuals g_k/(2√(κ w_k)) and rows √(κ w_k)·J_k, the rays' own derivatives with respect to the
+variables, least squares minimises
 
     L + g·δ + κ·Σ w_k |J_k δ|²,    g = Σ J_kᵀ g_k = ∂L/∂u,
 
@@ -40,7 +40,7 @@ _CLOSE, _TURNS = 1e-6, 80
 def ray_moves(
     lens: Lens, variables: DesignVariables, spots: list[SpotRays], damping: float
 ) -> Tensor:
-    """A triangular matrix R (P, P) with |Rδ|² = Σ w |J δ|², mm²: how far a step moves rays.
+    """Return a triangular matrix R (P, P) with |Rδ|² = Σ w |J δ|², mm²: how far a step moves rays.
 
     Moves count from the centroid of each spot, since an image as a whole may move; spots count
     alike.  Where variables undo one another, Σ damping·(d_j δ_j)² keeps R regular, with d_j what
@@ -70,23 +70,23 @@ def ray_moves(
     return torch.linalg.qr(damped, mode="r").R
 
 
-def trusted_step(
+def trust_region_step(
     gradient: Tensor,
     moves: Tensor,
-    reach: float,
+    trust_radius: float,
     lower: Tensor,
     upper: Tensor,
     operands: OperandModel | None = None,
 ) -> Tensor:
-    """The step δ (P,) within bounds that lowers g·δ + Σ (operands' residuals)² most while |Rδ|,
-    how far rays move, is no more than `reach`.
+    """Return the step δ (P,) within bounds that lowers g·δ + Σ (operands' residuals)² most while
+    rays move by |Rδ| ≤ `trust_radius`.
 
-    Without operands and bounds it is δ = -reach · M⁻¹g/√(gᵀM⁻¹g) with M = RᵀR.
+    Without operands and bounds it is δ = -trust_radius · M⁻¹g/√(gᵀM⁻¹g) with M = RᵀR.
 
     Args:
         gradient: g = ∂L/∂u, (P,), without the operands' share.
         moves: R of `ray_moves`.
-        reach: RMS, mm, above 0.
+        trust_radius: RMS, mm, above 0.
         lower: (P,), at most zero: bounds of δ.
         upper: (P,), at least zero.
         operands: where δ = 0; None for none.
@@ -98,13 +98,13 @@ def trusted_step(
         model = operands.near(still)
         slope = gradient + 2.0 * model.root.T @ model.right
     # What is minimised is convex, so that |R⁻ᵀ slope|·|Rδ| ≥ -slope·δ ≥ κ|Rδ|².
-    enough = float(_in_rays(slope, moves).norm()) / reach
+    enough = float(_in_rays(slope, moves).norm()) / trust_radius
     if not enough > 0.0:
         return still
 
     def at(damping: float) -> tuple[Tensor, float]:
         step = _damped(gradient, moves, damping, lower, upper, operands)
-        return step, float((moves @ step).norm()) / reach
+        return step, float((moves @ step).norm()) / trust_radius
 
     low, high = math.log(_LEAST_DAMPING * enough), math.log(enough)
     step, moved = at(math.exp(low))
@@ -128,7 +128,7 @@ def trusted_step(
 
 
 def _in_rays(gradient: Tensor, moves: Tensor) -> Tensor:
-    """R⁻ᵀg, of which the rays' residuals are a multiple."""
+    """Return R⁻ᵀg, of which the rays' residuals are a multiple."""
     return torch.linalg.solve_triangular(moves.T, gradient[:, None], upper=False)[:, 0]
 
 
@@ -140,7 +140,7 @@ def _damped(
     upper: Tensor,
     operands: OperandModel | None,
 ) -> Tensor:
-    """The step that minimises g·δ + κ|Rδ|² + Σ (operands' residuals)² within bounds."""
+    """Return the step that minimises g·δ + κ|Rδ|² + Σ (operands' residuals)² within bounds."""
     root = damping**0.5
     rays = LinearModel(0.0, root * moves, 0.5 / root * _in_rays(gradient, moves))
     negligible = 1e-12 * rays.column_norms.square()
@@ -170,7 +170,7 @@ def _damped(
 
 
 def _root(slope: Callable[[float], float]) -> float:
-    """Where a function that rises from below zero to above it on [0, 1] vanishes."""
+    """Return the zero of a function that rises from below zero to above it on [0, 1]."""
     low, high = 0.0, 1.0
     while high - low > 1e-9 * high and high > 1e-18:
         middle = 0.5 * (low + high)

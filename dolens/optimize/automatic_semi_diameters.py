@@ -1,4 +1,4 @@
-"""Clear apertures that follow the light, as a designer fixes them when the design is done."""
+"""Automatic semi-diameters give each surface the clear aperture that its light needs."""
 
 import torch
 
@@ -15,7 +15,7 @@ _ROOM = 1.0 + 1e-6
 
 @torch.no_grad()
 def fitted_semi_diameters(lens: Lens, spots: SpotRays) -> dict[str, float]:
-    """How far from its vertex each surface meets these rays.
+    """Return the largest distance from its vertex at which rays meet each surface.
 
     Args:
         lens: whose apertures do not matter.

@@ -1,4 +1,4 @@
-"""The lens format of the source's program (dO): one row a surface.
+"""The lens format of diffoptics, the program of dO, has one row a surface.
 
     Cooke triplet
     type distance roc diameter material
@@ -13,7 +13,7 @@ distance from the row before, radius of curvature (0 is a plane), diameter and t
 Behind them S may have a conic constant and coefficients from r⁴; X has b and the ten coefficients
 of x^i·y^(j-i), j = 0..3, i = 0..j.  B (spline) and M (mixed) rows are refused.
 
-The source's program skips the first two lines.  What its rows cannot say (index model, stop,
+Diffoptics skips the first two lines.  What its rows cannot say (index model, stop,
 fields, and which surfaces are more than a bare S) stands behind a # in the second, as JSON.
 """
 
@@ -21,32 +21,32 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from dolens.errors import InputError
-from dolens.prescriptions.checks import as_number, check_keys, require_mapping
+from dolens.errors import InputError, check_keys
+from dolens.prescriptions.checks import as_number, require_mapping
 from dolens.prescriptions.compare import require_same
-from dolens.prescriptions.conditions import CONDITION_KEYS
 from dolens.prescriptions.decimals import curvature_in_text, number_in_text, reciprocal
-from dolens.prescriptions.source_glasses import source_material
+from dolens.prescriptions.diffoptics_glasses import diffoptics_material
+from dolens.prescriptions.system_data import SYSTEM_DATA_KEYS
 
 _COLUMNS = "type distance roc diameter material"
 _LETTERS = {"plane": "S", "sphere": "S", "conic": "S", "even_asphere": "S"}
 _LETTERS |= {"aperture": "A", "xy_polynomial": "X"}
-_HEADER_KEYS = ("source", "index_model", "stop", *CONDITION_KEYS)
+_HEADER_KEYS = ("source", "index_model", "stop", *SYSTEM_DATA_KEYS)
 _MONOMIALS = ("", "y", "x", "y2", "xy", "x2", "y3", "xy2", "x2y", "x3")
 _COMMON = ("type", "radius", "curvature", "semi_diameter", "thickness", "material")
 
 
-def prescription_from_source_text(text: str, where: str = "lens") -> dict[str, Any]:
-    """Read a lens in the source's format.
+def prescription_from_diffoptics(text: str, where: str = "lens") -> dict[str, Any]:
+    """Read a lens in the diffoptics format.
 
     The index model is `do` unless the second line says otherwise: the numbers of such files were
     chosen with that program's indices, so it is what reproduces them.  The stop is the first A
     row, else surface 1.  The object's row gives the medium before surface 1; its distance and
-    diameter, which the source's program skips too, are not read.
+    diameter, which diffoptics skips too, are not read.
 
     Args:
         text: the file's content.
-        where: what messages call it, usually its path.
+        where: name in messages, usually its path.
 
     Raises:
         InputError: one line that names `where`, the line, and what is allowed.
@@ -97,8 +97,8 @@ def prescription_from_source_text(text: str, where: str = "lens") -> dict[str, A
     return {**prescription, "surfaces": rows, "sensor": sensor}
 
 
-def source_text_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
-    """Write a prescription in the source's format.
+def diffoptics_text_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
+    """Write a prescription in the diffoptics format.
 
     Raises:
         InputError: one line that names the surface and key which the format cannot hold.
@@ -134,19 +134,19 @@ def source_text_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     )
     extra = json.dumps({**header, **({"surfaces": shapes} if shapes else {})})
     text = "\n".join((str(prescription.get("name", "")), f"{_COLUMNS} # {extra}", *lines, ""))
-    require_same(prescription, prescription_from_source_text(text, where), ".txt", where)
+    require_same(prescription, prescription_from_diffoptics(text, where), ".txt", where)
     return text
 
 
 def _header(line: str, place: str) -> dict[str, Any]:
-    """What stands behind a # in the second line; other programs' remarks are left alone."""
+    """Read the text behind a # in the second line; other programs' remarks are ignored."""
     _, _, extra = line.partition("#")
     if not extra.strip().startswith("{"):
         return {}
     try:
         header = json.loads(extra)
     except (ValueError, RecursionError):
-        raise InputError(f"{place}: what stands behind # is not valid JSON") from None
+        raise InputError(f"{place}: the text behind # is not valid JSON") from None
     check_keys(header, (*_HEADER_KEYS, "surfaces"), place)
     shapes = header.get("surfaces", {})
     require_mapping(shapes, f"{place}: surfaces")
@@ -159,7 +159,7 @@ def _header(line: str, place: str) -> dict[str, Any]:
 
 
 def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], str]:
-    """Letter, distance and diameter, and medium of a row."""
+    """Return letter, distance and diameter, and medium of a row."""
     letter = words[0]
     if letter not in ("O", "S", "A", "X", "I"):
         raise InputError(f"{place}: row type '{letter}' cannot be read (allowed: O, S, A, X and I)")
@@ -169,11 +169,13 @@ def _columns(words: list[str], place: str) -> tuple[str, tuple[float, float], st
         raise InputError(f"{place}: a row of type {letter} ends with its material")
     distance = number_in_text(words[1], f"{place}: 'distance'")
     diameter = number_in_text(words[3], f"{place}: 'diameter'")
-    return letter, (distance, diameter), source_material(words[4], place)
+    return letter, (distance, diameter), diffoptics_material(words[4], place)
 
 
 def _shape(letter: str, words: list[str], said: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Type, radius and coefficients of a surface's row, where `said` is what line 2 knows of it."""
+    """Return type, radius and coefficients of a surface's row; `said` holds the header's values for
+    it.
+    """
     values = [number_in_text(word, f"{place}: column {6 + i}") for i, word in enumerate(words[5:])]
     if letter == "A":
         _require_plane(words, place, "an aperture")
@@ -217,7 +219,7 @@ def _line(
     name = str(material)
     written = name.upper() if name in ("air", "occluder") else name
     try:
-        held = source_material(written, place) == name
+        held = diffoptics_material(written, place) == name
     except InputError:
         held = False
     if not held:
@@ -236,7 +238,7 @@ def _roc(row: Mapping[str, Any], place: str) -> str:
 
 
 def _more(kind: str, row: Mapping[str, Any], place: str) -> list[str]:
-    """The columns behind the material."""
+    """Read the columns behind the material."""
     if kind == "xy_polynomial":
         names = ["b", *_MONOMIALS]
     elif kind == "even_asphere":

@@ -1,4 +1,4 @@
-"""How far a lens's rays land from where they should, and how that follows from the lens."""
+"""Ray intercepts about their references are the residuals of RMS spot radii."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -7,15 +7,15 @@ from torch import Tensor
 
 from dolens.optics.jacobian import normal_equations
 from dolens.optics.lens import Lens
-from dolens.optimize.landing_points import LandingPoints
 from dolens.optimize.linear_model import LinearModel
+from dolens.optimize.ray_intercepts import RayInterceptQuality
 
 # More derivatives than this are summed on the way and never stored (400 MB).
 MOST_STORED = 50_000_000
 
 
-class SpotResiduals(LandingPoints):
-    """Residuals √(W_s·w_i)·(p_i - p̄_s) of every ray i of every spot s, in µm, x and y apart.
+class RayInterceptResiduals(RayInterceptQuality):
+    """Gives residuals √(W_s·w_i)·(p_i - p̄_s) of every ray i of every spot s, in µm, x and y apart.
 
     Their sum of squares is Σ W_s·(RMS radius)².  p̄ is the spot's centroid, or where its chief ray
     lands.  Deviations are in mm.
@@ -27,7 +27,9 @@ class SpotResiduals(LandingPoints):
     def linear_model(
         self, lens: Lens, names: Sequence[str], without: Tensor | None = None
     ) -> tuple[LinearModel, Tensor | None]:
-        """R and b; see `ImageQuality.linear_model`.  Very many rays are summed, never stored."""
+        """Return R and b; see `ImageQuality.linear_model`.  Very many rays are summed, never
+        stored.
+        """
         columns = sum(parameter.numel() for parameter in lens.variables(names).values())
         many = 2 * len(self.spots.weight) * columns > MOST_STORED
         if many and without is None and self._sums_suffice:

@@ -1,0 +1,28 @@
+"""Where a driver finds things: places in its job, an array of integers.
+
+Addresses of arrays (zero: not asked for), strides in numbers, and counts.
+"""
+
+POSITION, POSITION_ROW, POSITION_COLUMN = range(3)
+DIRECTION, DIRECTION_ROW, DIRECTION_COLUMN = range(3, 6)
+WHICH, RAYS, STEPS, CODES, VALUES, INDICES, WAVELENGTHS, EXIT_Z, CLIP = range(6, 15)
+STACK, COTANGENTS, WORK = range(15, 18)
+OUT_POSITION, OUT_DIRECTION, OUT_PATH, OUT_STATUS, OUT_SURFACE = range(18, 23)
+POSITION_COTANGENT, POSITION_COTANGENT_ROW, POSITION_COTANGENT_COLUMN = range(24, 27)
+DIRECTION_COTANGENT, DIRECTION_COTANGENT_ROW, DIRECTION_COTANGENT_COLUMN = range(27, 30)
+PATH_COTANGENT, PATH_COTANGENT_ROW = range(30, 32)
+POSITION_GRADIENT, DIRECTION_GRADIENT = range(32, 34)
+SUMS, SUM_LENGTH, CHUNK, VALUES_LENGTH = range(34, 38)
+LANES, INDEX_SUMS = range(38, 40)
+# Of the drivers of Jacobians.
+OUTPUTS, OUTPUT_ROWS, VARIABLES, FIRST_STEP = range(40, 44)
+ENTRIES, ENTRY_ROWS, ENTRY_COLUMNS, ENTRY_WEIGHTS, SPLINE_COLUMNS = range(44, 49)
+DRIVER_ROWS, PENDING, COTANGENT_LENGTH = range(49, 52)
+OUT_VALID, OUT_VALUES, OUT_JACOBIAN = range(52, 55)
+TARGET, TARGET_ROW, TARGET_COLUMN, WEIGHT, WEIGHT_ROW, GROUP, GROUPS = range(55, 62)
+ENTRY_FIRST = 62
+# The wavelength's column of all rays of the block at hand, plus one; zero where they differ.
+WAVELENGTH = 63
+# Of a renderer: arrays of integers and of numbers; see `rendering.layout`.
+VIEW, LENGTHS = range(64, 66)
+LENGTH = 72  # of a job

@@ -1,0 +1,82 @@
+"""Units of a lens's parameters in files and configuration, known by their names.
+
+A lens holds lengths in mm and angles in radians.  Files, configuration and tables give angles in
+degrees.  This module alone converts between the two.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from dolens.optics.elements import DISPLACEMENTS, TILTS
+
+Value = TypeVar("Value", float, Tensor)
+
+
+class Unit(NamedTuple):
+    """A unit that files give a parameter in.
+
+    Attributes:
+        name: as tables and figures print it; nothing where it depends on the surface.
+        factor: the lens's own unit in one of it: radians in a degree, or 1.
+    """
+
+    name: str
+    factor: float = 1.0
+
+
+DEGREE = Unit("deg", math.pi / 180.0)
+MILLIMETRE = Unit("mm")
+PER_MILLIMETRE = Unit("1/mm")
+UNNAMED = Unit("")
+_UNIT_OF = {
+    **dict.fromkeys(TILTS, DEGREE),
+    **dict.fromkeys(DISPLACEMENTS, MILLIMETRE),
+    "sensor_distance": MILLIMETRE,
+    "curvature": PER_MILLIMETRE,
+}
+# Of names whose last part is a number or a coordinate.
+_UNIT_OF_GROUP = {"thicknesses": MILLIMETRE, "sources": MILLIMETRE}
+
+
+def unit_of(name: str) -> Unit:
+    """Return the unit of a parameter in files and configuration.
+
+    Args:
+        name: as `surfaces.1.curvature`, `elements.front.tilt_x` or `sources.1.z`.
+    """
+    first, _, _ = name.partition(".")
+    _, _, last = name.rpartition(".")
+    return _UNIT_OF_GROUP.get(first) or _UNIT_OF.get(last, UNNAMED)
+
+
+def to_lens_units(name: str, value: Value) -> Value:
+    """Convert a parameter's value from files (degrees, mm) to the lens's own unit (radians, mm)."""
+    return value * unit_of(name).factor
+
+
+def to_file_units(name: str, value: Value) -> Value:
+    """Convert a parameter's value from the lens's own unit (radians, mm) to that of files."""
+    return value / unit_of(name).factor
+
+
+def unit_factors(names: Iterable[str], device: torch.device | str = "cpu") -> Tensor:
+    """Return the factors (P,), float64, from the units of files to the lens's own."""
+    factors = [unit_of(name).factor for name in names]
+    return torch.tensor(factors, dtype=torch.float64, device=device)
+
+
+def file_value(name: str, value: float) -> float | None:
+    """Return the value in files' units that `to_lens_units` turns into this one to the last bit.
+
+    Returns:
+        None where rounding skips the value, so that no number of degrees stands for it.
+    """
+    guess = value * (1.0 / unit_of(name).factor)
+    for candidate in (guess, math.nextafter(guess, -math.inf), math.nextafter(guess, math.inf)):
+        if to_lens_units(name, candidate) == value:
+            return candidate
+    return None

@@ -1,0 +1,154 @@
+"""A bench holds sources and a sensor; its light gives simulated measurements."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from dolens.alignment.measurement import Measurement, simulated
+from dolens.alignment.pose import Pose
+from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.sensor.pixels import Sensor
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Places point sources in front of a lens, and the sensor behind it.
+
+    Attributes:
+        wavelength: nm.
+        sensor: the pixels.
+        sources: (S, 3), mm, in the lens's axes.
+        planes: where the sensor stands for the images of a source, mm from `sensor_distance`.
+    """
+
+    wavelength: float
+    sensor: Sensor
+    sources: Sequence[Sequence[float]] = ()
+    planes: Sequence[float] = (0.0,)
+
+    @property
+    def images(self) -> int:
+        """Return how many images a measurement has: one of each source on each plane."""
+        return len(self.sources) * len(self.planes)
+
+    def pose(
+        self, lens: Lens, variables: Mapping[str, Mapping[str, Any] | None] | None = None
+    ) -> Pose:
+        """Return the pose of a lens on this bench.
+
+        Args:
+            lens: the lens; the pose may change it.
+            variables: settings of `Pose`; None: nothing varies.
+        """
+        return Pose(lens, self.sources, variables or {}, self.planes)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Describes light and noise of simulated measurements.
+
+    Attributes:
+        photons: of each image, behind the lens; those beyond the sensor's edge are among them.
+        read_noise: RMS of a pixel, electrons.
+        full_well: electrons at which a pixel saturates; None: never.
+        unmodelled: what a measurement has and the model of a fit has not.
+
+    Raises:
+        InputError: a number out of range.
+    """
+
+    photons: float = 4_000_000
+    read_noise: float = 2.0
+    full_well: float | None = None
+    unmodelled: Unmodelled = field(default_factory=Unmodelled)
+
+    def __post_init__(self) -> None:
+        for name, least in (("photons", 1.0), ("read_noise", 0.0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: {getattr(self, name)}; allowed: {least:g} or more")
+
+
+def light_of(
+    photons: float = 4_000_000,
+    read_noise: float = 2.0,
+    full_well: float | None = None,
+    unmodelled: Mapping[str, Any] | None = None,
+) -> Light:
+    """Return light and noise from their settings; see `Light`.
+
+    Raises:
+        InputError: an unknown key of `unmodelled`, or a number out of range.
+    """
+    return Light(photons, read_noise, full_well, unmodelled_of(unmodelled))
+
+
+def simulate(
+    pose: Pose,
+    bench: Bench,
+    light: Light,
+    generator: torch.Generator,
+    making: torch.Generator | None = None,
+) -> Measurement:
+    """Simulate a measurement of a pose's lens and sources as they are stored; θ has no part in it.
+
+    Args:
+        pose: where all is; its sources and planes count.
+        bench: its wavelength and its sensor count.
+        light: of the measurement.
+        generator: of photons and noise.
+        making: of the lens's errors of radius and index; needed where it has tolerances.
+    """
+    effects, lens = light.unmodelled, pose.lens
+    if effects.of_the_lens:
+        lens = effects.made(lens, making)
+    return simulated(
+        lens,
+        pose.places,
+        bench.wavelength,
+        bench.sensor,
+        int(light.photons),
+        light.read_noise,
+        generator,
+        light.full_well,
+        pose.planes,
+        effects,
+    )
+
+
+def draw(seed: int, number: int, measurement: int) -> torch.Generator:
+    """Return the generator of the photons of one of a run's measurements.
+
+    Args:
+        seed: of the run.
+        number: of the fit, or of whatever is measured.
+        measurement: of it; the 1009th is the first of the next.
+    """
+    return torch.Generator().manual_seed(1000003 * (seed + 1) + 1009 * number + measurement)
+
+
+def making(seed: int, measurement: int) -> torch.Generator:
+    """Return the generator of the lens's errors in one of a run's measurements.
+
+    The lens is the same in all fits of a measurement.
+
+    Args:
+        seed: of the run.
+        measurement: of each fit.
+    """
+    return torch.Generator().manual_seed(7000003 * (seed + 1) + measurement)
+
+
+def repetitions(monte_carlo: int) -> int:
+    """Return the number of measurements by which estimates are compared with their bounds.
+
+    Raises:
+        InputError: one, which has no spread, or fewer than none.
+    """
+    if monte_carlo < 0 or monte_carlo == 1:
+        raise InputError(f"monte_carlo: {monte_carlo}; allowed: 0 for none, or 2 or more")
+    return int(monte_carlo)

@@ -1,0 +1,43 @@
+"""Figures become files and image tensors."""
+
+import sys
+
+import numpy as np
+import torch
+from PIL import Image
+
+from dolens.plotting import figure_to_image, history_figure, save_figure
+
+
+def test_an_image_tensor_has_the_figures_size_and_colours():
+    figure = history_figure([1.0, 0.1, 0.01])
+    dpi = figure.get_dpi()
+    image = figure_to_image(figure, dpi=50)
+    assert image.dtype == torch.uint8 and image.is_contiguous()
+    width, height = figure.get_size_inches()
+    assert image.shape == (3, round(50 * height), round(50 * width))
+    assert (image[:, 0, 0] == 255).all()
+    # The first line's blue, red first.
+    blue = torch.tensor([0x00, 0x72, 0xB2]).view(3, 1, 1)
+    assert ((image.int() - blue).abs().amax(0) < 8).any()
+    assert figure.get_dpi() == dpi
+    assert torch.equal(image, figure_to_image(figure, dpi=50))
+
+
+def test_a_file_is_written_with_its_folders(tmp_path):
+    path = tmp_path / "figures" / "deep" / "history.png"
+    figure = history_figure([1.0, 0.1, 0.01])
+    save_figure(figure, path, dpi=60)
+    with Image.open(path) as picture:
+        assert picture.size == tuple(round(60 * side) for side in figure.get_size_inches())
+        assert np.asarray(picture.convert("L")).std() > 1.0
+
+
+def test_figures_are_not_registered_anywhere():
+    if "matplotlib.pyplot" in sys.modules:
+        before = sys.modules["matplotlib.pyplot"].get_fignums()
+        figure_to_image(history_figure([1.0, 0.1, 0.01]), dpi=20)
+        assert sys.modules["matplotlib.pyplot"].get_fignums() == before
+    else:
+        figure_to_image(history_figure([1.0, 0.1, 0.01]), dpi=20)
+        assert "matplotlib.pyplot" not in sys.modules

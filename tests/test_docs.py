@@ -1,0 +1,114 @@
+"""The documents name what exists: modules, experiments, files; docstrings begin with a sentence."""
+
+import ast
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SUPPLEMENT = (ROOT / "docs/supplement.md").read_text(encoding="utf-8")
+NAMES = sorted(
+    {
+        name
+        for document in DOCUMENTS
+        for name in re.findall(
+            r"`((?:dolens|experiments|torch)(?:\.\w+)+)`", document.read_text(encoding="utf-8")
+        )
+        if not name.endswith((".py", ".txt"))
+    }
+)
+COMMANDS = sorted(set(re.findall(r"`python train\.py ([^`]+)`", SUPPLEMENT)))
+# Packages whose docstrings follow the rules of docs/glossary.md.
+PROSE = ("analysis", "sensor", "plotting", "reconstruction", "prescriptions")
+TITLES = re.compile(r"(Of|As|By|What|Where|Which|How|Whether)\b|\(|√|Σ")
+
+
+def resolved(name):
+    """The module, class, function or method of a dotted name."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError as error:
+            assert ".".join(parts[:length]).startswith(error.name)
+            continue
+        for part in parts[length:]:
+            found = getattr(found, part)
+        return found
+    raise AssertionError(f"no module {name}")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_dotted_name_of_the_documents_is_in_the_code(name):
+    resolved(name)
+
+
+@pytest.fixture(scope="module")
+def configuration():
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_experiment_of_the_supplement_composes(configuration, command):
+    cfg = compose("train", shlex.split(command))
+    assert cfg.module._target_.startswith("experiments.")
+
+
+def test_the_supplement_is_complete():
+    """S1 to S21, Algorithm 1, the figures 1 to 12 and every table have a row of their own."""
+    rows = [line.split("|")[1].strip() for line in SUPPLEMENT.splitlines() if line.startswith("| ")]
+    for item in (
+        *(f"S{number}" for number in range(1, 22)),
+        "Algorithm 1",
+        *(f"Figure {number}" for number in range(1, 13)),
+        *("Table I (Section III A)", "Table II (Section III B)", "Table I (Section III C)"),
+        *("Table II", "Table III"),
+    ):
+        assert rows.count(item) == 1, item
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_path_of_the_repository_exists(document):
+    """`tests/…`, `conf/…` and so on; a path with a placeholder or a pattern is not looked up."""
+    text = document.read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:dolens|experiments|tests|conf|scripts|docs)/[\w./-]+)`", text):
+        assert (ROOT / path).exists(), path
+
+
+def anchors(document):
+    """The anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", document.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_every_link_leads_somewhere(document):
+    for target in re.findall(r"\]\(([^)\s]+)\)", document.read_text(encoding="utf-8")):
+        if "://" in target:
+            continue
+        path, _, anchor = target.partition("#")
+        file = (document.parent / path).resolve() if path else document
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), target
+
+
+FILES = [
+    *(path for package in PROSE for path in sorted((ROOT / "dolens" / package).rglob("*.py"))),
+    *sorted((ROOT / "experiments/data").glob("*.py")),
+]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_docstring_begins_with_a_sentence_and_not_with_a_title(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+            text = ast.get_docstring(node)
+            assert text is None or not TITLES.match(text), text.splitlines()[0]
