@@ -10,7 +10,7 @@ from dolens.kernels.view import View
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.pupil.moving_pupil import moving_exit_pupil
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 
 
 class MovingView(NamedTuple):

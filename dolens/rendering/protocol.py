@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 Values = Mapping[str, Tensor]

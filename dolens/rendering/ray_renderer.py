@@ -27,7 +27,8 @@ from dolens.rendering.pupil.exit_pupil import ExitPupil, axial_exit_pupil, sampl
 from dolens.rendering.pupil.light_edges import edge_map
 from dolens.rendering.pupil.moving_pupil import depends_on_parameters
 from dolens.rendering.pupil.pixel_edges import edge_samples
-from dolens.scene.planar import Scene, texture_origin
+from dolens.scene.scene import Scene
+from dolens.scene.texture import texture_origin
 from dolens.sensor.pixels import Sensor
 
 _SEED_RANGE = 2**63 - 1

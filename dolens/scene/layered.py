@@ -15,7 +15,7 @@ from dolens.scene.occlusion import (
     layer_opacities,
     stopped_share,
 )
-from dolens.scene.planar import Blur, Scene
+from dolens.scene.scene import Blur, Scene
 from dolens.scene.texture import bilinear
 
 

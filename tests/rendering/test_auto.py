@@ -300,6 +300,6 @@ def test_plans_of_older_checkpoints_are_taken_up(root, state):
 )
 def test_a_plan_that_cannot_be_read_is_one_line_that_says_what_can(root, change):
     state = OLDER_STATES["of a whole sensor"] | change
-    with pytest.raises(InputError, match="cannot be read .* allowed: psf, rays") as error:
+    with pytest.raises(InputError, match=r"cannot be read .* allowed: psf, rays") as error:
         AutoRenderer(Sensor(16, 16, 0.0069)).load_state(coded(root), state)
     assert "\n" not in str(error.value)

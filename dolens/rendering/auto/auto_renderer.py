@@ -17,7 +17,7 @@ from dolens.rendering.auto.field_grid import REGISTRATIONS
 from dolens.rendering.auto.plan import Requirements
 from dolens.rendering.auto.trial import ProbeSet, Trial, with_values
 from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 logger = logging.getLogger(__name__)

@@ -26,7 +26,8 @@ from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
-from dolens.scene.planar import PlanarScene, Scene, pinhole_image
+from dolens.scene.planar import PlanarScene, as_planes, pinhole_image
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 # The reference's samples along each side of the pupil.
@@ -76,7 +77,7 @@ class Trial:
         measure: Measure | None = None,
     ) -> None:
         self.probes, self.requirements = probes, requirements
-        self.scene, self.separate_planes = scene.as_planes(), scene.separate_planes
+        self.scene, self.separate_planes = as_planes(scene), scene.separate_planes
         self._single, self._double = (
             copy.deepcopy(lens).to(dtype) for dtype in (torch.float32, torch.float64)
         )
@@ -172,7 +173,7 @@ class Trial:
             centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
             return [SensorWindow(sensor, centre)]
         system, wavelengths = self._double.system(), (self.scene.middle_wavelength,)
-        middle = self.scene.as_planes(wavelengths=wavelengths)
+        middle = as_planes(self.scene, wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
         looks = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), windows)
         return [

@@ -10,7 +10,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 

@@ -13,7 +13,8 @@ from dolens.optics.lens import Lens
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.pupil.f_number import axial_f_number
-from dolens.scene.planar import Scene, pinhole_image
+from dolens.scene.planar import pinhole_image
+from dolens.scene.scene import Scene
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
 from experiments.camera.views.base import Comparison, RenderedViews, Views, seed_of
