@@ -17,11 +17,11 @@ from dolens.scene.planar import pinhole_image
 from dolens.scene.scene import Scene
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
-from experiments.camera.views.base import Comparison, RenderedViews, Views, seed_of
+from experiments.camera.views.base import Comparison, Imaging, Views, seed_of
 from experiments.camera.views.truth import check_truth, chief_ray_looks, looked_up
 
 
-class DepthViews(RenderedViews):
+class DepthViews(Imaging):
     """Textured planes at several depths, in front of the whole sensor.
 
     With `truth` "pinhole" the truth is what a distortion-free pinhole sees; with "chief_rays" it is
