@@ -84,7 +84,7 @@ def surface_matrix(
 def _unit_rays_behind(
     system: OpticalSystem, wavelength: float | Tensor, first: int, last: int
 ) -> TwoRays:
-    """Where the unit rays before surface `first` are just after `last`."""
+    """Trace the unit rays from just before surface `first` to just after `last`."""
     surfaces = system.surfaces[first - 1 : last]
     return behind_surfaces(
         [s.shape.paraxial_curvature(s.parameters) for s in surfaces],

@@ -99,7 +99,7 @@ class ParaxialNumbers:
         return a * height + b * reduced + (c * height + d * reduced) / behind * self.sensor_distance
 
     def _unit_rays_at_stop(self, wavelength: float) -> TwoRays:
-        """Where the unit rays before the first vertex are just before the stop."""
+        """Trace the unit rays from before the first vertex to just before the stop."""
         rays = self._unit_rays_behind(wavelength, 1, self.stop - 1)
         if self.stop == 1:
             return rays
@@ -107,7 +107,7 @@ class ParaxialNumbers:
         return rays.transferred(self.thicknesses[self.stop - 2], index)
 
     def _unit_rays_behind(self, wavelength: float, first: int, last: int) -> TwoRays:
-        """Where the unit rays just before surface `first` are just after `last`."""
+        """Trace the unit rays from just before surface `first` to just after `last`."""
         media = self.materials[first - 1 : last + 1]
         return behind_surfaces(
             self.curvatures[first - 1 : last],

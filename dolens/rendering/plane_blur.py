@@ -32,7 +32,7 @@ class PlaneBlur:
         return image if self.illumination is None else image * self.illumination
 
     def white(self) -> Tensor:
-        """What maps of ones become, (D or 1, C or 1, height, width)."""
+        """Return the blurred maps of ones, (D or 1, C or 1, height, width)."""
         image = uniform_image(self.kernels, self.layout)
         return image if self.illumination is None else image * self.illumination
 

@@ -156,7 +156,7 @@ class Renderer(ABC):
         return self
 
     def without_diffraction(self) -> "Renderer":
-        """What renders the same by rays alone."""
+        """Return a renderer of the same images by rays alone; here the renderer itself."""
         return self
 
     def prepare(  # noqa: B027 - a renderer need not look at the lens

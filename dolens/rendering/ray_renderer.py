@@ -98,7 +98,7 @@ class RayRenderer(Renderer):
     def axial_pupil(
         self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
     ) -> ExitPupil:
-        """What `render` finds of a lens before anything else, for many renders of the same lens.
+        """Find the axial exit pupil once, for many renders of the same lens.
 
         Raises:
             InputError: no ray from the sensor's centre gets through.
@@ -193,7 +193,7 @@ class RayRenderer(Renderer):
         seed: int,
         pupil: ExitPupil,
     ) -> View:
-        """What does not depend on the lens's gradient: pixels, samples, pupil and planes."""
+        """Return pixels, samples, pupil and planes as numbers, without the lens's gradient."""
         sensor = self.sensor
         return View(
             sensor.height,

@@ -86,7 +86,7 @@ def as_planes(
 def pinhole_image(
     textures: Tensor, sensor: Sensor, texture_centre: tuple[float, float] = (0.0, 0.0)
 ) -> Tensor:
-    """What a distortion-free pinhole of the lens's magnification sees: the ground truth.
+    """Return what a distortion-free pinhole of the lens's magnification sees: the ground truth.
 
     Args:
         textures: (..., H, W), as `Scene` maps them.

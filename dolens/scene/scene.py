@@ -16,13 +16,13 @@ REFERENCE_WAVELENGTH = 587.5618
 
 
 class Blur(Protocol):
-    """What a lens does to planes."""
+    """A lens's blur of planes."""
 
     def __call__(self, maps: Tensor) -> Tensor:
         """Blurred maps (B, D or 1, C, height, width) of maps (B, D or 1, C or 1, H, W)."""
 
     def white(self) -> Tensor:
-        """What maps of ones become, (D or 1, C or 1, height, width)."""
+        """Return the blurred maps of ones, (D or 1, C or 1, height, width)."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Scene(ABC):
 
     @abstractmethod
     def on_planes(self, textures: Tensor) -> tuple[Tensor, ...]:
-        """What the planes show, for `gather` and `blend`: each (B, D or 1, C or 1, H, W).
+        """Return what the planes show, for `gather` and `blend`: each (B, D or 1, C or 1, H, W).
 
         Raises:
             InputError: the textures' channels are not those of this kind of scene.

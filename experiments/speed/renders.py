@@ -204,8 +204,8 @@ def _image(subject: Subject, contender: Contender, texture: Tensor, judge: Refer
 
 
 def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> dict[str, Agreement]:
-    """How well contenders' gradients agree with those of rays, by setting: of the squared error to
-    what a pinhole sees, with respect to the subject's variables in units of their magnitudes.
+    """Compare contenders' gradients with those of rays, by setting: of the squared error to what a
+    pinhole sees, with respect to the subject's variables in units of their magnitudes.
 
     All without diffraction; of contenders by many rays, which are slow, none is asked.
     """

@@ -95,7 +95,7 @@ def _row(
     seconds: tuple[float, float],
     rays: int,
 ) -> dict[str, float | str]:
-    """Of an error in mm, and seconds of all rays forward and with the gradient."""
+    """Return a row for an error in mm and seconds of all rays, forward and with the gradient."""
     forward, with_gradient = (1e9 * s / (rays * len(subject.lens.surfaces)) for s in seconds)
     return {
         "scene": subject.name,

@@ -132,7 +132,7 @@ class AutoRenderer(Renderer):
         return image.to(lens.dtype)
 
     def _choice(self, lens: Lens, scene: Scene, values: Values | None) -> Choice:
-        """What is chosen, now where nothing is."""
+        """Return the choice; make a plan where there is none."""
         return self.choice or self.make_plan(lens, scene, values)
 
     def _as_planned(

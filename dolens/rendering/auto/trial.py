@@ -130,8 +130,8 @@ class Trial:
         return dict(zip(self.probes.windows or ("",), found, strict=True))
 
     def agreement(self, renderer: Renderer, dtype: torch.dtype) -> Agreement | None:
-        """How well gradients agree with those of rays, both without diffraction; None where none
-        is asked for.
+        """Compare a renderer's gradients with those of rays, both without diffraction; None where
+        none are asked for.
         """
         measure, seed = self._measure, self.probes.seed
         if measure is None or not measure.variables:
@@ -152,8 +152,8 @@ class Trial:
         return agreement(gradient(rendered, textures, measure, (seed + 4,)), self._of_rays)
 
     def rays_instead(self, renderer: PsfRenderer) -> tuple[int, float, float]:
-        """How many strata rays would need for the whole sensor, the noise they would leave in grey
-        levels, and their cost over that of functions.
+        """Estimate the strata that rays would need for the whole sensor, the noise they would leave
+        in grey levels, and their cost over that of functions.
         """
         surfaces, (window,), (textures,) = len(self._single.surfaces), self.windows, self._textures
         samples, noise = rays_samples(

@@ -1,4 +1,4 @@
-"""What every way of looking offers to the camera module."""
+"""The base class of a camera's views: the images that are taken of a texture."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -82,7 +82,7 @@ class Imaging(ABC):
 
     @property
     def object_distance(self) -> float:
-        """Of the scene (the first of several depths), mm in front of the first vertex.
+        """The distance of the scene (the first of several depths), mm in front of the first vertex.
 
         Operands and drawings of the lens take it.
         """
@@ -182,7 +182,7 @@ class Imaging(ABC):
         return self._training.numbers()
 
     def state(self) -> dict[str, Any]:
-        """What the renderer found, as plain values for a checkpoint."""
+        """Return what the renderer found, as plain values for a checkpoint."""
         return self._training.state()
 
     def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:

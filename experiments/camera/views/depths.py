@@ -162,7 +162,7 @@ class DepthViews(Imaging):
         return with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
-        """Of each depth: on the axis, and towards the sensor's edges."""
+        """Return spots of each depth: on the axis, and towards the sensor's edges."""
         half = 0.35 * self.sensor.pixel_pitch * min(self.sensor.height, self.sensor.width)
         found = []
         scales = self.scene.magnifications(lens.system())

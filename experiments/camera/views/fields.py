@@ -186,7 +186,7 @@ class FieldViews(Imaging):
         return torch.stack(found)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
-        """Of the zones."""
+        """Return the spots of the zones."""
         depth = self.scene.depths[0]
         (magnification,) = self.scene.magnifications(lens.system())
         half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch

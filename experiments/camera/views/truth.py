@@ -1,4 +1,4 @@
-"""What an ideal camera would have taken: the truth that images are compared with."""
+"""The truth that images are compared with: those of an ideal camera."""
 
 from collections.abc import Mapping, Sequence
 
@@ -33,7 +33,7 @@ def chief_ray_looks(
     whole: Sensor,
     windows: Sequence[Sensor],
 ) -> list[tuple[Tensor, Tensor]]:
-    """Where the reference wavelength's chief rays of windows' pixels meet the planes of a scene.
+    """Return the chief-ray map of windows' pixels at the reference wavelength, on a scene's planes.
 
     Differentiable in the values: the truth moves with the lens's distortion and magnification, as
     the image does.
