@@ -1,4 +1,4 @@
-"""Which rays of an object point pass a lens, as seen from its front.
+"""The rays of an object point that pass a lens, as seen from its front.
 
 A ray of a given object point is fixed by where it crosses the plane through the first vertex that
 faces the point (see `dolens.optics.aiming`).  Tracing costs so little that the part of this plane
@@ -150,7 +150,7 @@ class _Search:
         return edge
 
     def stops(self, edge: _Edge) -> tuple[tuple[int, ...], Tensor]:
-        """What stops the rays just outside: apertures, and (N,), bool, anything else.
+        """Return what stops the rays just outside: apertures, and (N,), bool, anything else.
 
         They are so near the edge that only what makes it stops them.
         """

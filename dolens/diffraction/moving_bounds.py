@@ -1,4 +1,4 @@
-"""How the bounds of a pupil move with the lens: the derivative of the grid that samples it.
+"""The derivative of a pupil's bounds, and of the grid that samples it, with respect to the lens.
 
 A regular grid reaches from one end of the light to the other.  Sums over it err by the cells that
 edges cut, and the error depends on where edges lie between the cells.  A grid that follows the
@@ -91,7 +91,7 @@ def _along(fit: PupilFit, place: Tensor, reach: Tensor) -> tuple[Tensor, Tensor,
 
 
 def _depths(fit: PupilFit, cosines: Tensor) -> Tensor:
-    """How far inside each clipping surface's edge (N, surfaces, M), mm, at cosines (N, M, 2)."""
+    """Return distances inside the clipping edges (N, surfaces, M), mm, at cosines (N, M, 2)."""
     unit = (cosines - fit.centre[:, None]) / fit.half_width[:, None]
     degree = fit.coefficients.shape[-1] - 1
     x, y = (chebyshev(unit[..., axis].clamp(-1.0, 1.0), degree)[0] for axis in (0, 1))

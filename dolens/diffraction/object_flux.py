@@ -63,7 +63,7 @@ def axial_flux(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) 
 
 
 def path_before(points: ObjectPoints, q: Tensor) -> Tensor:
-    """How much longer a ray is than the line to the first vertex, up to the plane that faces it.
+    """Return a ray's excess length over the line to the first vertex, to the plane that faces it.
 
     √(D² + q²) - D = q²·w/(1 + √(1 + w²q²)), mm, with D = 1/w the distance to the vertex.
 

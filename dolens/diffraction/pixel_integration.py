@@ -42,7 +42,7 @@ def quadratic_b_spline(u: Tensor) -> Tensor:
 
 
 def fine_grid(size: int, subsamples: int, like: Tensor) -> Tensor:
-    """Where light on a window of pixels is sampled: centres of cells, in pixels from its middle.
+    """Return the samples along a window of pixels: centres of cells, in pixels from its middle.
 
     Args:
         size: pixels along a side.

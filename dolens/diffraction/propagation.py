@@ -1,4 +1,4 @@
-"""Which way of propagating light from the pupil to the sensor holds, and why."""
+"""The choice of a way to propagate light from the pupil to the sensor, and its reasons."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _SOME = 3
 
 @dataclass(frozen=True)
 class DiffractionSettings:
-    """How finely diffraction is computed.
+    """Settings of a diffraction computation: how finely it is sampled.
 
     Attributes:
         method: `fourier`, `direct`, or `auto`: Fourier transform where its phases hold.
@@ -59,7 +59,7 @@ class DiffractionSettings:
 
 @dataclass(frozen=True)
 class Propagation:
-    """What was found for N pupils and a window of the sensor.
+    """The choice for N pupils and a window of the sensor, and the errors that it rests on.
 
     Attributes:
         fourier: (N,), bool: the Fourier transform holds.
@@ -188,7 +188,9 @@ def subsamples(fit: PupilFit, pitch: float) -> int:
 
 @torch.no_grad()
 def sphere_term(fit: PupilFit, half_window: float) -> tuple[Tensor, Tensor]:
-    """What a Fourier transform leaves of the distance D from the pupil to a point ρ of the sensor.
+    """Return the part of the distance from pupil to sensor that a Fourier transform leaves out.
+
+    D is the distance from the pupil to a point ρ of the sensor.
 
     About the middle ᾱ of the pupil, D - R = ρ·(α - ᾱ)/s̄ + ... besides what all of it shares, with
     s̄ = D̄/R.  Taking ρ·(α - ᾱ) for it displaces the image by the part 1/s̄ - 1 of its distance from

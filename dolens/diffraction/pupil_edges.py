@@ -1,4 +1,4 @@
-"""How much of a cell of a pupil's grid light passes: apertures' edges without staircases."""
+"""The share of a pupil's grid cells that light passes: apertures' edges without staircases."""
 
 import torch
 from torch import Tensor
@@ -83,7 +83,7 @@ def _ramp(t: Tensor) -> Tensor:
 
 
 def _beside_others(mask: Tensor) -> Tensor:
-    """Where a mask (..., S, S) may differ between a cell and any of its eight neighbours."""
+    """Return where a mask (..., S, S) may differ between a cell and any of its eight neighbours."""
     found = torch.zeros_like(mask)
     for dim in (-1, -2):
         # Beyond the grid nothing is known.

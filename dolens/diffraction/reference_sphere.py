@@ -46,7 +46,7 @@ def to_sphere(away: Tensor, direction: Tensor, curvature: Tensor) -> tuple[Tenso
 
 
 def path_beyond(alpha_rho: Tensor, rho_squared: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
-    """How much further than Q a point of the sensor is from a point of the sphere.
+    """Return how much further than Q a point of the sensor is from a point of the sphere.
 
     From the sphere's point Q - R·α to Q + ρ the distance is D = R·s with s² = 1 + 2κ·α·ρ + κ²ρ².
 
@@ -92,7 +92,7 @@ def sphere_curvature(
 
 @torch.no_grad()
 def chief_ray_landings(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -> Tensor:
-    """Where rays through the centre of the stop land, whether apertures clip them or not.
+    """Return the sensor intercepts of chief rays, whether apertures clip them or not.
 
     Args:
         system: the lens.

@@ -201,7 +201,7 @@ def pupil_wavefront(
 
 
 def _crossing(system: OpticalSystem, rays: Rays, number: int) -> tuple[Tensor, Tensor]:
-    """Where rays cross a surface, x and y in its axes, mm."""
+    """Return the intercepts of rays with a surface, x and y in its axes, mm."""
     hit = trace_rays(system, rays, last=number)
     there = from_lens_axes(hit.components(), system.axes[number - 1])
     return there.x, there.y

@@ -1,1 +1,1 @@
-"""What light does: surfaces, materials, rays, tracing, first-order optics."""
+"""Optics of a lens: surfaces, materials, rays, tracing, first-order properties."""

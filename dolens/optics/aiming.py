@@ -158,7 +158,7 @@ def aim(
 
 
 class _Problem(NamedTuple):
-    """What does not change along the homotopy."""
+    """The constants of the homotopy."""
 
     system: OpticalSystem
     wavelength: float | Tensor
@@ -181,7 +181,7 @@ class _Evaluation(NamedTuple):
 
 
 def _corrected(problem: _Problem, q: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-    """As `_follow`, from a point near the solution; None where a ray is not that near."""
+    """Correct a point near the solution, as `_follow` does; None where a ray is not that near."""
     t = torch.ones_like(q[..., 0])
     settled = math.sqrt(torch.finfo(t.dtype).eps)
     allowed = torch.full_like(t, NEAR)
@@ -280,7 +280,7 @@ def _miss(
     target: Tensor,
     q: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """By how much (mm) rays miss their points on the stop surface, and whether they reach it."""
+    """Return by how much (mm) rays miss their points on the stop, and whether they reach it."""
     ray = launch(tangents, near, q)
     traced = trace_surfaces(system, ray, wavelength, 1.0, first=1, last=system.stop)
     landed = from_lens_axes(traced.ray, system.axes[system.stop - 1])
@@ -288,7 +288,7 @@ def _miss(
 
 
 def _reaches(traced: Trace) -> Tensor:
-    """Where a ray meets every surface and is transmitted, inside its aperture or not."""
+    """Return which rays meet every surface and are transmitted, inside the apertures or not."""
     reached = torch.ones_like(traced.valid)
     for _, met, _, transmitted in traced.margins:
         for margin in (met, transmitted):

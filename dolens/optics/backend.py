@@ -1,4 +1,4 @@
-"""Which implementation traces: PyTorch's operations as the reference, or the fast kernels."""
+"""The implementation that traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence

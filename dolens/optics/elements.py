@@ -68,7 +68,7 @@ class ElementState:
 
 
 class Axes(NamedTuple):
-    """Where a surface is: a point p of its own axes lies at origin + rotation·p in the lens's.
+    """The axes of a surface: a point p in them lies at origin + rotation·p in the lens's.
 
     Attributes:
         elements: indices of the elements that carry it, innermost first.
@@ -121,7 +121,7 @@ def rotation_matrix(tilt_x: Tensor, tilt_y: Tensor, tilt_z: Tensor) -> Tensor:
 
 
 def carriers(spans: Sequence[tuple[int, int]], number: int) -> tuple[int, ...]:
-    """Which elements carry a surface, innermost first, from their first and last surfaces."""
+    """Find the elements that carry a surface, innermost first, by their first and last surfaces."""
     inner_first = sorted(range(len(spans)), key=lambda e: (spans[e][1] - spans[e][0], e))
     return tuple(e for e in inner_first if spans[e][0] <= number <= spans[e][1])
 

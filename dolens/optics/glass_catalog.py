@@ -208,7 +208,7 @@ def _catalog() -> dict[str, dict[str, tuple[str, tuple[str, str, str]]]]:
 
 
 def _names(maker: str) -> list[str]:
-    """What a misspelt name may have meant: a glass of that maker, or anything."""
+    """Suggest what a misspelt name may have meant: a glass of that maker, or anything."""
     makers = [maker] if maker else list(_catalog())
     media = [] if maker else ["air", "occluder"]
     return media + [name for known in makers for name, _ in _catalog()[known].values()]

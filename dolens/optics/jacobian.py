@@ -27,7 +27,7 @@ OUTPUTS = ("x", "y", "path_length", "l", "m", "n")
 
 @dataclass(frozen=True)
 class RayJacobian:
-    """How rays move on the sensor when a lens changes.  K outputs, P columns.
+    """Derivatives of rays on the sensor with respect to a lens.  K outputs, P columns.
 
     Attributes:
         outputs: names, of `OUTPUTS`.

@@ -110,7 +110,7 @@ class Lens(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters live."""
+        """The device that the parameters live on."""
         return self.sensor_distance.device
 
     @property
@@ -327,7 +327,7 @@ class Lens(nn.Module):
 
 
 def _named_parameters(module: nn.Module, prefix: str = "") -> Iterator[tuple[str, nn.Parameter]]:
-    """As `Module.named_parameters`, which takes five times as long over a hundred names."""
+    """Yield what `Module.named_parameters` does, in a fifth of the time over a hundred names."""
     for name, parameter in module._parameters.items():
         if parameter is not None:
             yield prefix + name, parameter

@@ -12,7 +12,7 @@ from dolens.optics.glass_catalog import Glass, find_glass
 
 @dataclass(frozen=True)
 class IndexModel:
-    """How a prescription's nd/Vd pairs and its air become indices.
+    """A model of indices: of a prescription's nd/Vd pairs, and of its air.
 
     Attributes:
         name: as written in a prescription.

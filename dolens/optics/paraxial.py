@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.paraxial_recurrence import TwoRays, behind_surfaces
 from dolens.optics.system import OpticalSystem
 
 
@@ -76,30 +77,31 @@ def surface_matrix(
     """Paraxial matrix acting on (y, n·u) from just before surface `first` to just after `last`.
 
     Surfaces count from 1; both planes are the vertices; `first` > `last` is the identity.
-    Refraction is [[1, 0], [-(n' - n)c, 1]], transfer [[1, t/n], [0, 1]] (Welford, ch. 3).
     """
-    indices = system.indices(wavelength)
-    matrix = torch.eye(2, dtype=system.dtype, device=system.device)
-    for number in range(first, last + 1):
-        if number > first:
-            gap = system.thicknesses[number - 2] / indices[number - 1]
-            matrix = _matrix(1.0, gap, 0.0, 1.0, matrix) @ matrix
-        surface = system.surfaces[number - 1]
-        curvature = surface.shape.paraxial_curvature(surface.parameters)
-        power = (indices[number] - indices[number - 1]) * curvature
-        matrix = _matrix(1.0, 0.0, -power, 1.0, matrix) @ matrix
-    return matrix
+    return _matrix(_unit_rays_behind(system, wavelength, first, last), system)
+
+
+def _unit_rays_behind(
+    system: OpticalSystem, wavelength: float | Tensor, first: int, last: int
+) -> TwoRays:
+    """Trace the unit rays from just before surface `first` to just after `last`."""
+    surfaces = system.surfaces[first - 1 : last]
+    return behind_surfaces(
+        [s.shape.paraxial_curvature(s.parameters) for s in surfaces],
+        system.thicknesses[first - 1 : max(last - 1, 0)],
+        system.indices(wavelength)[first - 1 : last + 1],
+    )
 
 
 def matrix_to_stop(system: OpticalSystem, wavelength: float | Tensor) -> Tensor:
     """Paraxial matrix on (y, n·u) from just before the first vertex to just before the stop."""
     stop = system.stop
     # The stop's own refraction belongs to the light behind it.
-    matrix = surface_matrix(system, wavelength, 1, stop - 1)
-    if stop == 1:
-        return matrix
-    gap = system.thicknesses[stop - 2] / system.indices(wavelength)[stop - 1]
-    return _matrix(1.0, gap, 0.0, 1.0, matrix) @ matrix
+    rays = _unit_rays_behind(system, wavelength, 1, stop - 1)
+    if stop > 1:
+        index = system.indices(wavelength)[stop - 1]
+        rays = rays.transferred(system.thicknesses[stop - 2], index)
+    return _matrix(rays, system)
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
@@ -192,9 +194,13 @@ def first_order(
 
 def image_distance(system: OpticalSystem, wavelength: float | Tensor, depth: float) -> Tensor:
     """z (mm from the first vertex) of the paraxial image of an object at -depth mm."""
-    matrix, n = _object_to_last_vertex(system, wavelength, depth)
+    indices = system.indices(wavelength)
+    matrix = surface_matrix(system, wavelength, 1, len(system.surfaces))
+    # From the axial object point: the height at the first vertex, per unit of reduced slope.
+    gap = depth / indices[0]
+    height, slope = matrix[:, 0] * gap + matrix[:, 1]
     z_last = system.vertices[len(system.surfaces) - 1]
-    return z_last - n * matrix[0, 1] / matrix[1, 1]
+    return z_last - indices[-1] * height / slope
 
 
 def chief_ray_magnification(
@@ -221,21 +227,11 @@ def chief_ray_magnification(
     return y + u * system.sensor_distance
 
 
-def _object_to_last_vertex(
-    system: OpticalSystem, wavelength: float | Tensor, depth: float
-) -> tuple[Tensor, float | Tensor]:
-    indices = system.indices(wavelength)
-    matrix = surface_matrix(system, wavelength, 1, len(system.surfaces))
-    return matrix @ _matrix(1.0, depth / indices[0], 0.0, 1.0, matrix), indices[-1]
-
-
 def _over(numerator: float, denominator: Tensor) -> Tensor:
     return ratio(torch.full_like(denominator, numerator), denominator)
 
 
-def _matrix(
-    a: float | Tensor, b: float | Tensor, c: float | Tensor, d: float | Tensor, like: Tensor
-) -> Tensor:
-    """A 2×2 matrix of numbers and scalar tensors."""
-    entries = [torch.as_tensor(e, dtype=like.dtype, device=like.device) for e in (a, b, c, d)]
+def _matrix(rays: TwoRays, like: OpticalSystem) -> Tensor:
+    """The 2×2 matrix that takes the unit rays to these."""
+    entries = [torch.as_tensor(e, dtype=like.dtype, device=like.device) for e in rays]
     return torch.stack(entries).reshape(2, 2)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class Status(IntEnum):
-    """How a ray ended.
+    """The end of a ray.
 
     A miss or a total reflection ends a ray.  A vignetted ray is traced on as if unclipped, and is
     VIGNETTED when nothing ends it later.

@@ -1,4 +1,4 @@
-"""How a table's records follow from a lens's numbers: known from its structure alone.
+"""The layout of a table's records: how they follow from a lens's numbers, by its structure alone.
 
 Structure is what stays while a lens is optimised: kinds of surfaces, apertures, media, which
 elements carry what.  So records are laid out once, and packing is then one gather and one sum.
@@ -41,7 +41,7 @@ class Form(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """What the layout of the records depends on.
+    """The structure of a lens, which the layout of the records depends on.
 
     Attributes:
         forms: of all the lens's surfaces.
@@ -214,7 +214,7 @@ class _Writer:
         self.turns.append((now, then))
 
     def aperture(self, row: list[int], aperture: ClearAperture) -> None:
-        """What of a surface light passes."""
+        """Write a surface's clear aperture."""
         values, record = self.constants, row[Code.OFFSET]
         edge, hole = aperture.edge, aperture.obscuration
         values[record + Slot.LIMIT] = FAR * edge.reach

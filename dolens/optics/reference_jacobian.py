@@ -66,7 +66,7 @@ def reference_sums(
     group: Tensor | None,
     groups: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As `normal_equations` of the kernels, from Jacobians of some rays at a time.
+    """Compute what the kernels' `normal_equations` do, from Jacobians of some rays at a time.
 
     Args:
         lens: whatever its backend.

@@ -59,7 +59,7 @@ class OpticalSystem:
 
     @property
     def axes(self) -> list[Axes]:
-        """Where every surface is, with the poses of the elements that carry it."""
+        """The axes of every surface, with the poses of the elements that carry it."""
         return surface_axes(self.elements, self.vertices, len(self.surfaces))
 
     @property
@@ -69,7 +69,7 @@ class OpticalSystem:
 
     @property
     def device(self) -> torch.device:
-        """Where the lens lives."""
+        """The device that the lens lives on."""
         return self.sensor_distance.device
 
     @cached_property

@@ -148,7 +148,7 @@ def trace_surfaces(
 
 
 def _all_positive(margins: list[Margins], like: Tensor) -> Tensor:
-    """Where every margin is positive; a NaN is not.  True for rays that met no surface."""
+    """Return where every margin is positive; a NaN is not.  True for rays that met no surface."""
     kept = [m for row in margins for m in row[1:] if m is not None]
     if not kept:
         return torch.ones_like(like, dtype=torch.bool)
@@ -213,7 +213,7 @@ def stop_gradient_where_invalid(values: Tensor, valid: Tensor) -> Tensor:
 
 
 def traced_rays(traced: Trace, path_before: Tensor | None) -> TracedRays:
-    """What users see of a trace: joined components, statuses, and no gradient of invalid rays.
+    """Join a trace for users: components, statuses, and no gradient of invalid rays.
 
     Args:
         traced: with path lengths.

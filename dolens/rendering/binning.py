@@ -39,7 +39,7 @@ def _index(centre: Tensor) -> Tensor:
 def bin_rays(
     rows: Tensor, columns: Tensor, weight: Tensor, height: int, width: int, subpixels: int = 1
 ) -> Tensor:
-    """What pixels get of rays that each land as a small smooth patch of light.
+    """Bin rays into pixels, each ray as a small smooth patch of light.
 
     The patch is a tent, one pixel over `subpixels` wide at half its height; what a pixel integrates
     of it is a quadratic B-spline, so that images are once continuously differentiable in where rays

@@ -1,4 +1,4 @@
-"""Where every pixel of a sensor looks: distortion and lateral colour, as smooth maps."""
+"""Chief-ray maps: distortion and lateral colour of a sensor's pixels, as smooth functions."""
 
 from collections.abc import Sequence
 from functools import cache

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 

@@ -1,4 +1,4 @@
-"""What of a renderer's view moves with the lens, and the weight of its samples."""
+"""The pupil and the magnifications of a render, with gradients, and the weight of its samples."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,11 +10,11 @@ from dolens.kernels.view import View
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.pupil.exit_pupil import ExitPupil
 from dolens.rendering.pupil.moving_pupil import moving_exit_pupil
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 
 
 class MovingView(NamedTuple):
-    """What of a view moves with the lens: numbers, or tensors with gradients."""
+    """The part of a view that moves with the lens: numbers, or tensors with gradients."""
 
     pupil: ExitPupil
     magnifications: Sequence[float | Tensor]
@@ -29,7 +29,7 @@ class MovingView(NamedTuple):
         return _stacked([*self.pupil, *self.magnifications], system)
 
     def seen_by_kernel(self, system: OpticalSystem, view: View) -> Tensor:
-        """As `kernels.rendering.render` takes it: a sample's share for the axial radius."""
+        """Stack it for `kernels.rendering.render`, with a sample's share for the axial radius."""
         share = sample_share(system, view, self.pupil)
         return _stacked([*self.pupil[:2], share, *self.magnifications], system)
 

@@ -27,7 +27,7 @@ class Patch(NamedTuple):
 
 
 class Coordinates(NamedTuple):
-    """Where in the texture each pixel of the image looks, fractional rows and columns.
+    """Fractional rows and columns of the texture that each pixel of the image looks at.
 
     Attributes:
         rows: (D, C, height, width).

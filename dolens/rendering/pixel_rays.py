@@ -23,7 +23,8 @@ from dolens.rendering.pupil.light_edges import EdgeMap
 from dolens.rendering.pupil.pixel_edges import of_channel, pixel_edge_rays
 from dolens.rendering.random_numbers import random_words, uniform
 from dolens.rendering.sampling import square_to_disc, stratified_square
-from dolens.scene.planar import Scene, texture_coordinates
+from dolens.scene.scene import Scene
+from dolens.scene.texture import texture_coordinates
 from dolens.sensor.pixels import Sensor
 
 

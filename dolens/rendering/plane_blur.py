@@ -1,11 +1,14 @@
 """A lens's blur of planes, one kernel a plane and field."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
+from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.patch_convolution import convolve_patches
-from dolens.rendering.patches import PatchLayout
+from dolens.rendering.patches import Coordinates, PatchLayout
+from dolens.scene.texture import texture_origin
 
 
 @dataclass(frozen=True)
@@ -29,9 +32,63 @@ class PlaneBlur:
         return image if self.illumination is None else image * self.illumination
 
     def white(self) -> Tensor:
-        """What maps of ones become, (D or 1, C or 1, height, width)."""
+        """Return the blurred maps of ones, (D or 1, C or 1, height, width)."""
         image = uniform_image(self.kernels, self.layout)
         return image if self.illumination is None else image * self.illumination
+
+    def illuminated(self, light: Tensor, wanted: Tensor) -> "PlaneBlur":
+        """The same with kernels of unit light, and a relative illumination found otherwise.
+
+        Pixels whose kernels are partly dark get their light from the others.
+
+        Args:
+            light: (N, C or 1), of each node's kernels.
+            wanted: (C or 1, height, width), of each pixel.
+        """
+        bright = light.detach() > 0.0
+        light = torch.where(bright, light, 1.0)
+        covered, lit = torch.zeros_like(wanted), []
+        for patch, some in zip(self.layout.patches, bright[..., None, None], strict=True):
+            share = torch.where(some, patch.weight, 0.0)
+            covered[:, patch.top : patch.bottom, patch.left : patch.right] += share
+            lit.append(patch._replace(weight=share))
+        scale = wanted / torch.where(covered > 0.0, covered, 1.0)
+        kernels = self.kernels / light[:, None, :, None, None]
+        return PlaneBlur(kernels, replace(self.layout, patches=lit), scale)
+
+
+def places_in_texture(
+    imaging: ImagingSystem, size: tuple[int, int], look: tuple[Tensor, Tensor] | None
+) -> tuple[tuple[int, int], Coordinates | None]:
+    """Find where the pixels of a sensor look in a texture.
+
+    Args:
+        imaging: the sensor, and the scene that says where the texture's centre lies.
+        size: height and width of the texture.
+        look: rows and columns where the pixels' chief rays meet the planes, each
+            (D, C, height, width); None: where a pinhole sees them.
+
+    Returns:
+        Row and column that pixel (0, 0) looks at, where the others follow texel by texel, and None;
+        else (0, 0) and the coordinates of all pixels.
+    """
+    scene, sensor = imaging.scene, imaging.sensor
+    row, column = texture_origin(size, scene.texture_centre)
+    if look is not None:
+        down, across = look
+        return (0, 0), Coordinates(down + row, across + column)
+    top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
+    left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
+    if top.is_integer() and left.is_integer():
+        return (int(top), int(left)), None
+    options = {"dtype": torch.float64, "device": imaging.system.device}
+    rows, columns = torch.meshgrid(
+        torch.arange(sensor.height, **options),
+        torch.arange(sensor.width, **options),
+        indexing="ij",
+    )
+    shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
+    return (0, 0), Coordinates((rows + top).expand(shape), (columns + left).expand(shape))
 
 
 def uniform_image(kernels: Tensor, layout: PatchLayout) -> Tensor:

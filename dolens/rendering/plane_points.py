@@ -1,4 +1,4 @@
-"""What points of the sensor see of a scene's planes, through every part of the pupil."""
+"""Intercepts of rays from sensor points with a scene's planes, through all of the pupil."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _SAME_RADIUS = 1e-7
 
 
 class PlanePoints(NamedTuple):
-    """Where rays of N sensor points meet D planes at C wavelengths, S rays each.
+    """Intercepts of the rays of N sensor points with D planes at C wavelengths, S rays each.
 
     Attributes:
         rows: (N, D, C, S), rows below the axis in the image of a pinhole, in pixels.
@@ -169,7 +169,7 @@ def chief_ray_points(
 
 
 def distinct_radii(points: tuple[Tensor, Tensor]) -> int:
-    """How many distances from the axis there are among points."""
+    """Count the distances from the axis that there are among points."""
     return len(torch.unique(_rounded(torch.hypot(*points))))
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.lens import Lens
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 Values = Mapping[str, Tensor]
@@ -156,7 +156,7 @@ class Renderer(ABC):
         return self
 
     def without_diffraction(self) -> "Renderer":
-        """What renders the same by rays alone."""
+        """Return a renderer of the same images by rays alone; here the renderer itself."""
         return self
 
     def prepare(  # noqa: B027 - a renderer need not look at the lens

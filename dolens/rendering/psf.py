@@ -14,7 +14,7 @@ from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
 from dolens.rendering.binning import bin_rays
 from dolens.rendering.sampling import regular_square, square_to_disc
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 # The paraxial pupil is widened a little, so that the real one lies within it.

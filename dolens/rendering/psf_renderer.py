@@ -14,8 +14,8 @@ from dolens.optics.backend import cpu_kernels_serve, say_once, with_chosen_backe
 from dolens.optics.lens import Lens
 from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.patches import Coordinates, Patch, PatchLayout, node_positions, patches
-from dolens.rendering.plane_blur import PlaneBlur
+from dolens.rendering.patches import PatchLayout, node_positions, patches
+from dolens.rendering.plane_blur import PlaneBlur, places_in_texture
 from dolens.rendering.protocol import Renderer, SensorWindow
 from dolens.rendering.psf_grid import (
     FieldFunctions,
@@ -25,7 +25,8 @@ from dolens.rendering.psf_grid import (
 from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil, working_f_number
 from dolens.rendering.pupil.moving_pupil import moving_exit_pupil
 from dolens.rendering.relative_illumination import relative_illumination
-from dolens.scene.planar import PlanarScene, Scene, texture_origin
+from dolens.scene.planar import PlanarScene, as_planes
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 logger = logging.getLogger(__name__)
@@ -190,14 +191,19 @@ class PsfRenderer(Renderer):
         """The image by functions that are known; `look` is where chief rays meet the scene, None
         for a pinhole's.
         """
-        scene = imaging.scene
-        area = (self.sensor.height, self.sensor.width)
-        coordinates, origin = self._coordinates(scene, textures, look)
-        parts, functions, lit = patches(*area, *self.fields, textures), found.functions, None
+        scene, area = imaging.scene, (self.sensor.height, self.sensor.width)
+        size = (textures.shape[-2], textures.shape[-1])
+        layout = PatchLayout(
+            patches(*area, *self.fields, textures),
+            area,
+            *places_in_texture(imaging, size, look),
+            cpu_kernels_serve(imaging.system),
+        )
+        blur = PlaneBlur(found.functions, layout)
         if self.illumination == "map":
-            functions, parts, lit = self._illuminated(found, parts, imaging)
-        layout = PatchLayout(parts, area, origin, coordinates, cpu_kernels_serve(imaging.system))
-        return scene.blend(scene.on_planes(textures), PlaneBlur(functions, layout, lit))
+            wanted = relative_illumination(imaging.showing(self.shared(scene)))
+            blur = blur.illuminated(found.light, wanted)
+        return scene.blend(scene.on_planes(textures), blur)
 
     def _warn_of_loss(self, found: FieldFunctions) -> None:
         if float(found.lost) > _NOTABLE_LOSS:
@@ -274,47 +280,4 @@ class PsfRenderer(Renderer):
         """The scene of the depths and wavelengths that have functions of their own."""
         depths = (scene.middle_depth,) if self.depths == "one" else scene.depths
         wavelengths = (scene.middle_wavelength,) if self.colours == "one" else scene.wavelengths
-        return scene.as_planes(depths, wavelengths)
-
-    def _illuminated(
-        self, found: FieldFunctions, layout: list[Patch], imaging: ImagingSystem
-    ) -> tuple[Tensor, list[Patch], Tensor]:
-        """Functions of unit light, patches of those that have any, and each pixel's illumination.
-
-        Pixels whose functions are partly dark get their light from the others.
-        """
-        wanted = relative_illumination(imaging.showing(self.shared(imaging.scene)))
-        bright = found.light.detach() > 0.0
-        light = torch.where(bright, found.light, 1.0)
-        covered, lit = torch.zeros_like(wanted), []
-        for patch, some in zip(layout, bright[..., None, None], strict=True):
-            share = torch.where(some, patch.weight, 0.0)
-            covered[:, patch.top : patch.bottom, patch.left : patch.right] += share
-            lit.append(patch._replace(weight=share))
-        scale = wanted / torch.where(covered > 0.0, covered, 1.0)
-        return found.functions / light[:, None, :, None, None], lit, scale
-
-    def _coordinates(
-        self, scene: Scene, textures: Tensor, look: tuple[Tensor, Tensor] | None
-    ) -> tuple[Coordinates | None, tuple[int, int]]:
-        """Where pixels look in the texture, or where the first does if the others follow on.
-
-        `look` is where chief rays meet the scene, None for a pinhole's.
-        """
-        sensor = self.sensor
-        row, column = texture_origin((textures.shape[-2], textures.shape[-1]), scene.texture_centre)
-        if look is not None:
-            down, across = look
-            return Coordinates(down + row, across + column), (0, 0)
-        top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
-        left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
-        if top.is_integer() and left.is_integer():
-            return None, (int(top), int(left))
-        options = {"dtype": torch.float64, "device": textures.device}
-        rows, columns = torch.meshgrid(
-            torch.arange(sensor.height, **options),
-            torch.arange(sensor.width, **options),
-            indexing="ij",
-        )
-        shape = (len(scene.depths), len(scene.wavelengths), sensor.height, sensor.width)
-        return Coordinates((rows + top).expand(shape), (columns + left).expand(shape)), (0, 0)
+        return as_planes(scene, depths, wavelengths)

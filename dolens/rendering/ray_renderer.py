@@ -27,7 +27,8 @@ from dolens.rendering.pupil.exit_pupil import ExitPupil, axial_exit_pupil, sampl
 from dolens.rendering.pupil.light_edges import edge_map
 from dolens.rendering.pupil.moving_pupil import depends_on_parameters
 from dolens.rendering.pupil.pixel_edges import edge_samples
-from dolens.scene.planar import Scene, texture_origin
+from dolens.scene.scene import Scene
+from dolens.scene.texture import texture_origin
 from dolens.sensor.pixels import Sensor
 
 _SEED_RANGE = 2**63 - 1
@@ -97,7 +98,7 @@ class RayRenderer(Renderer):
     def axial_pupil(
         self, lens: Lens, scene: Scene, values: Mapping[str, Tensor] | None = None
     ) -> ExitPupil:
-        """What `render` finds of a lens before anything else, for many renders of the same lens.
+        """Find the axial exit pupil once, for many renders of the same lens.
 
         Raises:
             InputError: no ray from the sensor's centre gets through.
@@ -192,7 +193,7 @@ class RayRenderer(Renderer):
         seed: int,
         pupil: ExitPupil,
     ) -> View:
-        """What does not depend on the lens's gradient: pixels, samples, pupil and planes."""
+        """Return pixels, samples, pupil and planes as numbers, without the lens's gradient."""
         sensor = self.sensor
         return View(
             sensor.height,

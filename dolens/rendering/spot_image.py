@@ -24,7 +24,7 @@ _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
 class LandedRays(NamedTuple):
-    """Where rays meet the sensor plane, mm, and how much light each carries, steradians; (N,)."""
+    """Intercepts of rays with the sensor plane, mm, and the light of each, steradians; (N,)."""
 
     x: Tensor
     y: Tensor
@@ -47,7 +47,7 @@ class SpotImage(NamedTuple):
 
 @dataclass(frozen=True)
 class SpotImager:
-    """How point sources are imaged.
+    """Images point sources by rays traced forward.
 
     Light fades from whole to none over a narrow band about every rim, half of it inside: an edge
     that is sharp would have rays come and go, which derivatives do not see.  It moves the light's

@@ -1,1 +1,1 @@
-"""What is in front of the lens: textured planes and stacks of layers."""
+"""Scenes in front of the lens: textured planes and stacks of layers."""

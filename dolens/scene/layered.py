@@ -15,7 +15,7 @@ from dolens.scene.occlusion import (
     layer_opacities,
     stopped_share,
 )
-from dolens.scene.planar import Blur, Scene
+from dolens.scene.scene import Blur, Scene
 from dolens.scene.texture import bilinear
 
 
@@ -155,7 +155,7 @@ class LayeredScene(Scene):
         places: Iterable[tuple[Tensor, Tensor]],
         weight: Tensor,
     ) -> Tensor:
-        """What rays carry home through the stack, (B, 1, P); see `Scene.gather`."""
+        """Return the light that rays collect through the stack, (B, 1, P); see `Scene.gather`."""
         light, opacity = shown
         seen, covered, through = 0.0, 0.0, torch.ones_like(weight)
         for plane, (rows, columns) in enumerate(places):

@@ -1,4 +1,4 @@
-"""Bilinear lookup of textures."""
+"""Textures: where points of a plane lie in them, and lookup between their texels."""
 
 import torch
 from torch import Tensor
@@ -25,3 +25,32 @@ def bilinear(textures: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
         textures[None], grid[None], mode="bilinear", padding_mode="border", align_corners=True
     )
     return sampled[0]
+
+
+def texture_origin(size: tuple[int, int], centre: tuple[float, float]) -> tuple[float, float]:
+    """Row and column of the axis in a texture of `size` texels; see `Scene`."""
+    (height, width), (row, column) = size, centre
+    return 0.5 * (height - 1) - row, 0.5 * (width - 1) - column
+
+
+def texture_coordinates(
+    x: Tensor,
+    y: Tensor,
+    magnification: float | Tensor,
+    pitch: float,
+    origin: tuple[float, float],
+) -> tuple[Tensor, Tensor]:
+    """Rows and columns of the texture at points (x, y) mm of the plane.
+
+    The plane is seen from the lens: columns grow with x, rows grow against y.
+
+    Args:
+        x: mm.
+        y: mm.
+        magnification: |image height / object height| of the plane.
+        pitch: of the pixels, mm.
+        origin: row and column of the axis in the texture, as `texture_origin` has it.
+    """
+    scale = magnification / pitch
+    row, column = origin
+    return row - y * scale, column + x * scale

@@ -1,1 +1,1 @@
-"""How long a trace, a point spread function or an image takes, and how wrong it is."""
+"""Time and error of a trace, a point spread function and an image."""

@@ -1,4 +1,4 @@
-"""How well a renderer's gradients agree with those of rays: direction and norm."""
+"""Agreement of a renderer's gradients with those of rays: direction and norm."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ class Agreement:
         return math.sqrt(max(1.0 + ratio * ratio - 2.0 * ratio * self.cosine, 0.0))
 
     def excess(self, least_cosine: float, norm_tolerance: float) -> float:
-        """How much worse than tolerated, as a ratio: at most 1 where both tolerances are kept.
+        """Return the error over the tolerance: at most 1 where both tolerances are kept.
 
         What the noise of the rays alone would make of equal gradients is not held against them.
         """
@@ -45,7 +45,7 @@ class Agreement:
         return max(angle / allowed, abs(self.norm_ratio - 1.0) / (norm_tolerance + self.noise))
 
     def numbers(self) -> dict[str, float]:
-        """How gradients agree, as metrics."""
+        """Return the agreement as metrics."""
         return {
             "auto/gradient_cosine": self.cosine,
             "auto/gradient_norm_ratio": self.norm_ratio,
@@ -126,8 +126,8 @@ def agreement(found: Tensor, of_rays: tuple[Tensor, Tensor]) -> Agreement:
 
 
 def image_measure(values: Values, truth: Tensor) -> GradientMeasure:
-    """Where nothing else is said: the squared error to the truth, with respect to parameters in
-    units of their own magnitudes.
+    """Return the measure where none is given: the squared error to the truth, with respect to
+    parameters in units of their own magnitudes.
 
     Args:
         values: the parameters by name; those that require a gradient count.

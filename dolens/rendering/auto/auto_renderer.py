@@ -17,7 +17,7 @@ from dolens.rendering.auto.field_grid import REGISTRATIONS
 from dolens.rendering.auto.plan import Requirements
 from dolens.rendering.auto.trial import ProbeSet, Trial, with_values
 from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 logger = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ class AutoRenderer(Renderer):
         return image.to(lens.dtype)
 
     def _choice(self, lens: Lens, scene: Scene, values: Values | None) -> Choice:
-        """What is chosen, now where nothing is."""
+        """Return the choice; make a plan where there is none."""
         return self.choice or self.make_plan(lens, scene, values)
 
     def _as_planned(

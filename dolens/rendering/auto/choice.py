@@ -42,7 +42,7 @@ class Tolerances:
     norm: float
 
     def excess(self, agreement: Agreement | None) -> float:
-        """How many times their tolerance gradients err by; 0 where they do not matter."""
+        """Return the gradients' error over its tolerance; 0 where gradients do not matter."""
         return agreement.excess(self.cosine, self.norm) if agreement else 0.0
 
     def serves_still(self, before: Agreement | None, now: Agreement | None) -> bool:
@@ -50,7 +50,7 @@ class Tolerances:
         return self.excess(now) <= max(1.0, 1.5 * self.excess(before))
 
     def misses(self, choice: "Choice") -> list[str]:
-        """Which of the tolerances a choice misses, in words."""
+        """Name the tolerances that a choice misses, a line each."""
         found = []
         if choice.error > self.error:
             found.append(

@@ -1,4 +1,4 @@
-"""How many point spread functions a sensor needs, and where they are centred."""
+"""The grid of point spread functions that a sensor needs, and their centres."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -150,7 +150,7 @@ def _window(truth: Survey, distortion: bool, tolerance: float) -> int | None:
 
 
 def window_finding(truth: Survey, size: int, distortion: bool) -> Finding:
-    """What a window of `size` pixels leaves out."""
+    """Return the error of leaving out the light beyond a window of `size` pixels."""
     error = 255.0 * MEAN * _lost(truth, distortion, size)
     return Finding("window", f"{size} pixels", error, "light beyond it is lost")
 

@@ -1,4 +1,4 @@
-"""What a scene needs of a renderer, found from a few probe rays, in grey levels."""
+"""A plan: the settings of a renderer that a scene needs, found from a few probe rays."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -183,7 +183,7 @@ def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Fin
 def _diffraction(
     functions: Tensor, truth: Survey, renderer: PsfRenderer, tolerance: float
 ) -> tuple[Finding, float]:
-    """What model of diffraction is enough, and what leaving it out would cost.
+    """Choose the model of diffraction, and return the error of leaving diffraction out.
 
     A perfect pupil's says whether it can matter at all; where it can, wavefronts are asked.
     """

@@ -26,7 +26,8 @@ from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
-from dolens.scene.planar import PlanarScene, Scene, pinhole_image
+from dolens.scene.planar import PlanarScene, as_planes, pinhole_image
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 # The reference's samples along each side of the pupil.
@@ -76,7 +77,7 @@ class Trial:
         measure: Measure | None = None,
     ) -> None:
         self.probes, self.requirements = probes, requirements
-        self.scene, self.separate_planes = scene.as_planes(), scene.separate_planes
+        self.scene, self.separate_planes = as_planes(scene), scene.separate_planes
         self._single, self._double = (
             copy.deepcopy(lens).to(dtype) for dtype in (torch.float32, torch.float64)
         )
@@ -129,8 +130,8 @@ class Trial:
         return dict(zip(self.probes.windows or ("",), found, strict=True))
 
     def agreement(self, renderer: Renderer, dtype: torch.dtype) -> Agreement | None:
-        """How well gradients agree with those of rays, both without diffraction; None where none
-        is asked for.
+        """Compare a renderer's gradients with those of rays, both without diffraction; None where
+        none are asked for.
         """
         measure, seed = self._measure, self.probes.seed
         if measure is None or not measure.variables:
@@ -151,8 +152,8 @@ class Trial:
         return agreement(gradient(rendered, textures, measure, (seed + 4,)), self._of_rays)
 
     def rays_instead(self, renderer: PsfRenderer) -> tuple[int, float, float]:
-        """How many strata rays would need for the whole sensor, the noise they would leave in grey
-        levels, and their cost over that of functions.
+        """Estimate the strata that rays would need for the whole sensor, the noise they would leave
+        in grey levels, and their cost over that of functions.
         """
         surfaces, (window,), (textures,) = len(self._single.surfaces), self.windows, self._textures
         samples, noise = rays_samples(
@@ -172,7 +173,7 @@ class Trial:
             centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
             return [SensorWindow(sensor, centre)]
         system, wavelengths = self._double.system(), (self.scene.middle_wavelength,)
-        middle = self.scene.as_planes(wavelengths=wavelengths)
+        middle = as_planes(self.scene, wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
         looks = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), windows)
         return [

@@ -1,4 +1,4 @@
-"""Which aperture's edge ends the axial beam, and how far rays meet such edges from the inside."""
+"""The aperture's edge that limits the axial beam, and distances of rays from such edges."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ _ITERATIONS = 4
 
 
 class AxialLimit(NamedTuple):
-    """What ends the axial beam: a surface's number, the azimuth of the ray, and its wavelength."""
+    """The limit of the axial beam: a surface's number, the ray's azimuth, and its wavelength."""
 
     surface: int
     azimuth: float
@@ -66,7 +66,7 @@ def limit_distance(
     radius: Tensor,
     z: float | Tensor,
 ) -> Tensor:
-    """How far inside the limiting edge the axial ray towards a radius of the disc passes, mm.
+    """Return the distance inside the limiting edge of the axial ray to a radius of the disc, mm.
 
     Differentiable in the radius (), in z and in the lens.
     """
@@ -112,7 +112,7 @@ def edge_distances(
     surface: int,
     wavelength: float | Tensor,
 ) -> Tensor:
-    """How far inside a surface's edge rays from the sensor meet it, mm; negative outside.
+    """Return the distance inside a surface's edge of rays from the sensor, mm; negative outside.
 
     Differentiable in the rays and the lens, for rays that other edges would stop as well.
 

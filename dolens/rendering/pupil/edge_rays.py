@@ -148,7 +148,7 @@ class _Beam:
         return aim(x, y, sensor_z, across * pupil.radius, up * pupil.radius, pupil.z)
 
     def distance(self, radius: Tensor, pupil: ExitPupil) -> Tensor:
-        """How far inside the edge, mm."""
+        """Return the distance inside the edge, mm."""
         ray = self.rays(radius, pupil)
         return edge_distances(self.system, ray, self.surface, self.wavelength)
 

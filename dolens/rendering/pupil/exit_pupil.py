@@ -157,7 +157,7 @@ def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> Exi
 
 
 def _get_through(system: OpticalSystem, ray: Components, wavelengths: Sequence[float]) -> Tensor:
-    """Which rays get through the lens backwards, at every wavelength."""
+    """Return which rays get through the lens backwards, at every wavelength."""
     every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)
     _, valid = trace_components(system, ray, every.reshape(-1, *(1,) * ray.x.ndim), -1.0)
     return valid.all(dim=0)

@@ -1,4 +1,4 @@
-"""How much light a lens's aperture lets through to the axis."""
+"""The F-number of the axial beam."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Where on the exit pupil's disc the light of a sensor's points ends, and which surface ends it."""
+"""Edges of the light of sensor points on the exit pupil's disc, and the surfaces that make them."""
 
 import math
 from dataclasses import dataclass
@@ -99,7 +99,7 @@ class _Probe:
         self.x, self.y = (p.to(device=system.device, dtype=system.dtype)[:, None] for p in points)
 
     def passes(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Which pass, and the number of the surface whose edge stops a ray; 0 where none does."""
+        """Return which rays pass, and the surface whose edge stops a ray; 0 where none does."""
         across, up = (self.pupil.radius * places).unbind(-1)
         ray = aim(self.x, self.y, self.system.vertices[-1], across, up, self.pupil.z)
         rays = Rays.from_components(ray, self.wavelength)

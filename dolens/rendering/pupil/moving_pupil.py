@@ -1,4 +1,4 @@
-"""How the exit pupil moves with the lens: the derivative of the disc that renderers sample."""
+"""The exit pupil's derivative with respect to the lens, of the disc that renderers sample."""
 
 from collections.abc import Sequence
 

@@ -1,7 +1,8 @@
-"""What every way of looking offers to the camera module."""
+"""The base class of a camera's views: the images that are taken of a texture."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
-from dolens.scene.planar import Scene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 
@@ -49,99 +50,11 @@ class Comparison(NamedTuple):
     loss: Callable[[Views, Mapping[str, Tensor]], Tensor]
 
 
-class Imaging(Protocol):
+class Imaging(ABC):
     """A scene, renderers and a readout.
 
-    All random numbers are functions of the seed, the stage and the index.
-    """
-
-    @property
-    def sensor(self) -> Sensor:
-        """The pixels of one image."""
-
-    @property
-    def object_distance(self) -> float:
-        """Of the scene (the first of several depths), mm in front of the first vertex.
-
-        Operands and drawings of the lens take it.
-        """
-
-    def labels(self) -> Sequence[str]:
-        """Names of the evaluation's views, for metrics."""
-
-    def psf_labels(self) -> Sequence[str]:
-        """Names of the point spread functions."""
-
-    def check(self, lens: Lens) -> None:
-        """Raise `InputError` where the lens cannot look at the scene."""
-
-    def expose(self, lens: Lens) -> None:
-        """Set the sensor's exposure by the aperture of the lens as it begins.
-
-        It is held from then on: what variables change of the F-number is left out of value and
-        derivative alike.
-        """
-
-    def prepare(
-        self,
-        lens: Lens,
-        values: Mapping[str, Tensor],
-        comparison: Comparison | None = None,
-        photographs: Tensor | None = None,
-    ) -> None:
-        """Look at the lens as it is now, at the start of an epoch.
-
-        `comparison` says which gradients a renderer that chooses its model has to get right,
-        `photographs` (P, 3, h, w), linear light, on which images beside its own.
-        """
-
-    def take(
-        self,
-        lens: Lens,
-        values: Mapping[str, Tensor],
-        textures: Tensor,
-        stage: str,
-        index: int,
-        judge: str | None = None,
-    ) -> Views:
-        """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`.
-
-        With a judge, one of `judges`, it makes the images; the noise is the same.
-        """
-
-    def judges(self) -> Sequence[str]:
-        """Names of renderers that make the test images besides."""
-
-    def point_spread_functions(
-        self,
-        lens: Lens,
-        values: Mapping[str, Tensor],
-        pupil_samples: int | None = None,
-        depths: Sequence[float] | None = None,
-    ) -> Tensor:
-        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's."""
-
-    def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
-        """Rays of spots that stand for what the views see, one entry for each object distance."""
-
-    def rays(self) -> int:
-        """Rays that a training image takes."""
-
-    def numbers(self) -> dict[str, float]:
-        """What it has to say of itself, as metrics."""
-
-    def state(self) -> dict[str, Any]:
-        """What it found, as plain values for a checkpoint."""
-
-    def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
-        """Go on with what another one's `state` held."""
-
-
-class RenderedViews:
-    """Images of a scene by a renderer, read out: what ways of looking at it share.
-
-    Subclasses say which parts of the sensor are looked at (`take`) and what gradients are measured
-    by (`_measure`).
+    Subclasses say which images are taken (`take`) and what the gradients of a renderer are measured
+    by (`_measure`).  All random numbers are functions of the seed, the stage and the index.
 
     Attributes:
         scene: what the camera looks at.
@@ -169,8 +82,52 @@ class RenderedViews:
 
     @property
     def object_distance(self) -> float:
-        """The first depth."""
+        """The distance of the scene (the first of several depths), mm in front of the first vertex.
+
+        Operands and drawings of the lens take it.
+        """
         return self.scene.depths[0]
+
+    @abstractmethod
+    def labels(self) -> Sequence[str]:
+        """Names of the evaluation's views, for metrics."""
+
+    @abstractmethod
+    def psf_labels(self) -> Sequence[str]:
+        """Names of the point spread functions."""
+
+    @abstractmethod
+    def take(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        textures: Tensor,
+        stage: str,
+        index: int,
+        judge: str | None = None,
+    ) -> Views:
+        """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`.
+
+        With a judge, one of `judges`, it makes the images; the noise is the same.
+        """
+
+    @abstractmethod
+    def point_spread_functions(
+        self,
+        lens: Lens,
+        values: Mapping[str, Tensor],
+        pupil_samples: int | None = None,
+        depths: Sequence[float] | None = None,
+    ) -> Tensor:
+        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's."""
+
+    @abstractmethod
+    def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
+        """Rays of spots that stand for what the views see, one entry for each object distance."""
+
+    def judges(self) -> Sequence[str]:
+        """Names of renderers that make the test images besides."""
+        return []
 
     def check(self, lens: Lens) -> None:
         """Raise `InputError` where a depth lies inside the lens; fix the scene's scale for it."""
@@ -178,7 +135,12 @@ class RenderedViews:
         self.scene = self.scene.fixed_for(lens.system())
 
     def expose(self, lens: Lens) -> None:
-        """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
+        """Set the sensor's exposure by the aperture of the lens as it begins, where the readout has
+        a reference F-number.
+
+        It is held from then on: what variables change of the F-number is left out of value and
+        derivative alike.
+        """
         if self.readout.reference_f_number is not None:
             self.readout = self.readout.at_f_number(axial_f_number(lens))
 
@@ -189,7 +151,14 @@ class RenderedViews:
         comparison: Comparison | None = None,
         photographs: Tensor | None = None,
     ) -> None:
-        """Let the training renderer look at the lens as it is now."""
+        """Let the training renderer look at the lens as it is now, at the start of an epoch.
+
+        Args:
+            lens: the lens.
+            values: its variables.
+            comparison: which gradients a renderer that chooses its model has to get right.
+            photographs: (P, 3, h, w), linear light, on which it has to, beside its own images.
+        """
         measure = None if comparison is None else self._measure(lens, comparison)
         self._training.prepare(lens, self.scene, values, measure, photographs)
         if self.keeps_pupil:
@@ -209,15 +178,15 @@ class RenderedViews:
         return self._training.rays_per_image(self.scene, self.sensor)
 
     def numbers(self) -> dict[str, float]:
-        """The renderer's."""
+        """The renderer's metrics of itself."""
         return self._training.numbers()
 
     def state(self) -> dict[str, Any]:
-        """The renderer's."""
+        """Return what the renderer found, as plain values for a checkpoint."""
         return self._training.state()
 
     def load_state(self, lens: Lens, state: Mapping[str, Any]) -> None:
-        """Give it back to the renderer."""
+        """Go on with what another one's `state` held."""
         self._training = self._training.load_state(lens, state)
 
 

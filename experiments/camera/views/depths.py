@@ -13,14 +13,15 @@ from dolens.optics.lens import Lens
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.pupil.f_number import axial_f_number
-from dolens.scene.planar import Scene, pinhole_image
+from dolens.scene.planar import pinhole_image
+from dolens.scene.scene import Scene
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
-from experiments.camera.views.base import Comparison, RenderedViews, Views, seed_of
+from experiments.camera.views.base import Comparison, Imaging, Views, seed_of
 from experiments.camera.views.truth import check_truth, chief_ray_looks, looked_up
 
 
-class DepthViews(RenderedViews):
+class DepthViews(Imaging):
     """Textured planes at several depths, in front of the whole sensor.
 
     With `truth` "pinhole" the truth is what a distortion-free pinhole sees; with "chief_rays" it is
@@ -161,7 +162,7 @@ class DepthViews(RenderedViews):
         return with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
-        """Of each depth: on the axis, and towards the sensor's edges."""
+        """Return spots of each depth: on the axis, and towards the sensor's edges."""
         half = 0.35 * self.sensor.pixel_pitch * min(self.sensor.height, self.sensor.width)
         found = []
         scales = self.scene.magnifications(lens.system())

@@ -1,4 +1,4 @@
-"""Where on a large sensor windows lie."""
+"""The places of windows on a large sensor."""
 
 import math
 

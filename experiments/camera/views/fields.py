@@ -17,7 +17,7 @@ from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
-from experiments.camera.views.base import Comparison, RenderedViews, Views, seed_of
+from experiments.camera.views.base import Comparison, Imaging, Views, seed_of
 from experiments.camera.views.field_windows import FieldWindows
 from experiments.camera.views.truth import check_truth, chief_ray_looks, looked_up, nearest_texel
 
@@ -26,7 +26,7 @@ EVERYWHERE = "field"
 _PSF_SIZE = 65
 
 
-class FieldViews(RenderedViews):
+class FieldViews(Imaging):
     """Each texture on a window of a large sensor, imaged as it is there.
 
     Training windows are drawn from the whole field.  Every evaluation texture is imaged in zones:
@@ -166,10 +166,6 @@ class FieldViews(RenderedViews):
         looks = chief_ray_looks(lens, values, self.scene, self.whole, windows)
         return looks, [nearest_texel(rows, columns) for rows, columns in looks]
 
-    def judges(self) -> list[str]:
-        """None: windows are judged by the evaluation renderer alone."""
-        return []
-
     def point_spread_functions(
         self,
         lens: Lens,
@@ -190,7 +186,7 @@ class FieldViews(RenderedViews):
         return torch.stack(found)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
-        """Of the zones."""
+        """Return the spots of the zones."""
         depth = self.scene.depths[0]
         (magnification,) = self.scene.magnifications(lens.system())
         half = 0.5 * math.hypot(self.whole.height, self.whole.width) * self.whole.pixel_pitch

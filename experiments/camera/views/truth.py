@@ -1,4 +1,4 @@
-"""What an ideal camera would have taken: the truth that images are compared with."""
+"""The truth that images are compared with: those of an ideal camera."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,8 +11,9 @@ from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
 from dolens.rendering.pupil.moving_pupil import moving_chief_pupil
-from dolens.scene.planar import Scene, texture_origin
-from dolens.scene.texture import bilinear
+from dolens.scene.planar import as_planes
+from dolens.scene.scene import Scene
+from dolens.scene.texture import bilinear, texture_origin
 from dolens.sensor.pixels import Sensor
 
 TRUTHS = ("pinhole", "chief_rays")
@@ -32,7 +33,7 @@ def chief_ray_looks(
     whole: Sensor,
     windows: Sequence[Sensor],
 ) -> list[tuple[Tensor, Tensor]]:
-    """Where the reference wavelength's chief rays of windows' pixels meet the planes of a scene.
+    """Return the chief-ray map of windows' pixels at the reference wavelength, on a scene's planes.
 
     Differentiable in the values: the truth moves with the lens's distortion and magnification, as
     the image does.
@@ -43,7 +44,7 @@ def chief_ray_looks(
     """
     system = lens.system(values)
     wavelengths = (lens.primary_wavelength,)
-    planes = scene.as_planes(wavelengths=wavelengths)
+    planes = as_planes(scene, wavelengths=wavelengths)
     pupil = moving_chief_pupil(system, wavelengths, paraxial_exit_pupil(system, wavelengths))
     looks = chief_ray_maps(ImagingSystem(system, planes, whole, pupil), windows)
     return [(rows[:, 0], columns[:, 0]) for rows, columns in looks]

@@ -1,0 +1,79 @@
+"""The recurrence of paraxial optics: refraction at a surface, transfer to the next one.
+
+A paraxial ray at a surface is its height y and its reduced slope n·u.  Refraction leaves the height
+alone, n'u' = nu - y(n' - n)c; transfer leaves the reduced slope alone, y' = y + (t/n)·nu (Welford,
+ch. 3).  Any two rays give all others, so that two are traced at a time.  Everything here is
+arithmetic of numbers and tensors alike.
+"""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeVar
+
+Number = TypeVar("Number")  # of Python's, or a tensor
+
+
+class TwoRays(NamedTuple):
+    """Heights y and reduced slopes n·u of two rays at one plane.
+
+    Of the rays of unit height and of unit reduced slope, these are the rows of the matrix
+    [[A, B], [C, D]] that acts on (y, n·u).
+
+    Attributes:
+        y: height of the first ray.
+        y2: height of the second.
+        nu: reduced slope of the first ray.
+        nu2: reduced slope of the second.
+    """
+
+    y: Number
+    y2: Number
+    nu: Number
+    nu2: Number
+
+    def transferred(self, thickness: Number, index: Number) -> "TwoRays":
+        """The rays behind a gap of a medium."""
+        gap = thickness / index
+        return TwoRays(self.y + gap * self.nu, self.y2 + gap * self.nu2, self.nu, self.nu2)
+
+
+UNIT_RAYS = TwoRays(1.0, 0.0, 0.0, 1.0)
+
+
+def through_surfaces(
+    rays: TwoRays,
+    curvatures: Sequence[Number],
+    thicknesses: Sequence[Number],
+    indices: Sequence[Number],
+) -> Iterator[TwoRays]:
+    """Trace two rays from just before the first of some surfaces to just behind the last.
+
+    Args:
+        rays: before the first surface, mm.
+        curvatures: paraxial, of N surfaces, 1/mm.
+        thicknesses: of the N - 1 gaps between them, mm.
+        indices: of the N + 1 media around them.
+
+    Yields:
+        The rays just behind each surface, at the heights that they have on it.
+    """
+    y, y2, nu, nu2 = rays
+    for i, curvature in enumerate(curvatures):
+        before, behind = indices[i], indices[i + 1]
+        if i:
+            gap = thicknesses[i - 1] / before
+            y, y2 = y + gap * nu, y2 + gap * nu2
+        power = (behind - before) * curvature
+        nu, nu2 = nu - power * y, nu2 - power * y2
+        yield TwoRays(y, y2, nu, nu2)
+
+
+def behind_surfaces(
+    curvatures: Sequence[Number], thicknesses: Sequence[Number], indices: Sequence[Number]
+) -> TwoRays:
+    """Trace the unit rays to just behind the last of some surfaces; themselves where there is none.
+
+    Arguments as of `through_surfaces`.
+    """
+    last = deque(through_surfaces(UNIT_RAYS, curvatures, thicknesses, indices), maxlen=1)
+    return last[0] if last else UNIT_RAYS
