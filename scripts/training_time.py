@@ -137,7 +137,7 @@ def train(folder: Path, models: Sequence[str], overrides: Sequence[str]) -> None
             f"data.steps_per_epoch={_STEPS}",
             f"trainer.max_epochs={_EPOCHS}",
             f"callbacks.pictures.every_n_epochs={_EPOCHS}",
-            "calibrations=none",
+            "miscalibrations=none",
         ]
         train_unless_finished(folder / model, [*own, *overrides])
 

@@ -118,7 +118,7 @@ def diffracted_light(
     fit = fit_pupil(front, _DEGREE)
     wave = MM_PER_NM * float(front.wavelength) / float(front.index)
     width = (fit.high - fit.low)[0]
-    landing = front.landing[0][front.coverage[0] > 0.0]
+    landing = front.intercept[0][front.coverage[0] > 0.0]
     if not len(landing):
         raise InputError("unmodelled.diffraction: no light from the source reaches the sensor")
     low, high = landing.amin(0), landing.amax(0)
@@ -152,7 +152,7 @@ def diffracted_light(
 def _mean_intercept(front: Wavefront) -> Tensor:
     """Return the mean ray intercept (N, 2), mm from the spheres' centres."""
     flux = (front.amplitude * front.weight)[..., None]
-    return (flux * front.landing).sum((1, 2)) / flux.sum((1, 2)).clamp(min=1e-300)
+    return (flux * front.intercept).sum((1, 2)) / flux.sum((1, 2)).clamp(min=1e-300)
 
 
 def _on_sensor(

@@ -64,7 +64,7 @@ def find_beam(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -
         Beams; those of points whose light does not pass are not `lit`, and cover the first surface.
     """
     centre, half_width = _first_surface(system, points)
-    search = _Search(system, points, wavelength)
+    search = _PupilSearch(system, points, wavelength)
     side = _first_side(system, float(wavelength[0]), float(half_width.max()))
     q = box_grid(centre, half_width, side)
     valid = search.passing(q)
@@ -115,7 +115,7 @@ class _Edge(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Search:
+class _PupilSearch:
     system: OpticalSystem
     points: ObjectPoints
     wavelength: Tensor

@@ -162,7 +162,7 @@ def direct_samples(wavefront: Wavefront, half_window: float, settings: Diffracti
     """
     if settings.samples is not None:
         return settings.samples
-    reach = (wavefront.landing.abs() + half_window) / _wave(wavefront)[:, None, None, None]
+    reach = (wavefront.intercept.abs() + half_window) / _wave(wavefront)[:, None, None, None]
     lit = wavefront.coverage > 0.0
     turns = 0.0
     for dim in (1, 2):
@@ -240,7 +240,7 @@ def _farthest(wavefront: Wavefront) -> Tensor:
     """
     share = wavefront.coverage
     lit = (share > 0.0) & (share >= 0.5 * share.amax((1, 2), keepdim=True))
-    return torch.where(lit[..., None], wavefront.landing.abs(), 0.0).amax((1, 2))
+    return torch.where(lit[..., None], wavefront.intercept.abs(), 0.0).amax((1, 2))
 
 
 def _enough(needed: float) -> int:

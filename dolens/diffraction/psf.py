@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.diffraction.differentiable_bounds import with_differentiable_bounds
 from dolens.diffraction.field import direct_field, fourier_field
-from dolens.diffraction.moving_bounds import with_moving_bounds
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.pixel_integration import PixelWindow, fine_grid, pixel_matrix
 from dolens.diffraction.propagation import (
@@ -158,7 +158,7 @@ def _prepare(
     if not isinstance(points, ObjectPoints):
         points = ObjectPoints.at(points)
     rays = pupil_wavefront(system, points, wavelength, centres, settings.rays)
-    fit = with_moving_bounds(_fitted(rays, settings))
+    fit = with_differentiable_bounds(_fitted(rays, settings))
     points = points.to(rays.opd.dtype, rays.opd.device)
     found = _Prepared(points, fit, fourier_samples(fit, window.half_width, settings))
     parts = found.pieces()

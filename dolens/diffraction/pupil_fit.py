@@ -33,7 +33,7 @@ class PupilFit:
         centre: (N, 2), of the box, no gradient.
         half_width: (N, 2).
         low: (N, 2), direction cosines that bound the light; no gradient, unless
-            `with_moving_bounds` gave them one.
+            `with_differentiable_bounds` gave them one.
         high: (N, 2).
         residual: (N,), waves: the largest error of the fitted OPD at a ray inside the pupil, no
             gradient.

@@ -91,7 +91,7 @@ def sphere_curvature(
 
 
 @torch.no_grad()
-def chief_ray_landings(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -> Tensor:
+def chief_ray_intercepts(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) -> Tensor:
     """Return the sensor intercepts of chief rays, whether apertures clip them or not.
 
     Args:

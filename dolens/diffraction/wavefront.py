@@ -10,7 +10,7 @@ from dolens.diffraction.entrance_beam import EntranceBeam, box_grid, find_beam, 
 from dolens.diffraction.object_flux import axial_flux, flux_density, path_before
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.pupil_edges import coverage
-from dolens.diffraction.reference_sphere import chief_ray_landings, sphere_curvature, to_sphere
+from dolens.diffraction.reference_sphere import chief_ray_intercepts, sphere_curvature, to_sphere
 from dolens.errors import InputError
 from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
@@ -39,7 +39,7 @@ class Wavefront:
             Positive where light arrives late; Welford's W has the other sign.
         direction: (N, S, S, 2), x and y of the unit vector from the ray's point of the sphere
             towards its centre.
-        landing: (N, S, S, 2), mm, where the rays meet the sensor, from the sphere's centre.
+        intercept: (N, S, S, 2), mm, where the rays meet the sensor, from the sphere's centre.
         area: (N, S, S), of the ray's cell, in direction cosines.
         amplitude: (N, S, S), root of the flux per area in direction cosines: amplitude²·area is the
             flux of a whole cell over that of the axial point of the same object plane through the
@@ -60,7 +60,7 @@ class Wavefront:
 
     opd: Tensor
     direction: Tensor
-    landing: Tensor
+    intercept: Tensor
     area: Tensor
     amplitude: Tensor
     coverage: Tensor
@@ -147,7 +147,7 @@ def pupil_wavefront(
     if beam is None:
         beam = find_beam(system, points, waves)
     if centres is None:
-        centre = chief_ray_landings(system, points, waves)
+        centre = chief_ray_intercepts(system, points, waves)
     else:
         centre = torch.as_tensor(centres, **options).detach()
         if centre.shape != (len(points), 2):
@@ -185,7 +185,7 @@ def pupil_wavefront(
     return Wavefront(
         opd=torch.where(valid, opd - piston[:, None, None], 0.0),
         direction=_inner(direction),
-        landing=_inner(away),
+        intercept=_inner(away),
         area=area,
         amplitude=torch.where(valid, amplitude, 0.0),
         coverage=share,

@@ -217,10 +217,10 @@ class _Writer:
         """Write a surface's clear aperture."""
         values, record = self.constants, row[Code.OFFSET]
         edge, hole = aperture.edge, aperture.obscuration
-        values[record + Slot.LIMIT] = FAR * edge.reach
-        values[record + Slot.SCALE] = edge.reach
+        values[record + Slot.LIMIT] = FAR * edge.semi_diameter
+        values[record + Slot.SCALE] = edge.semi_diameter
         # A full circle is tested on the way; where there is none it is out of reach.
-        values[record + Slot.EDGE] = (2.0 * FAR * edge.reach) ** 2
+        values[record + Slot.EDGE] = (2.0 * FAR * edge.semi_diameter) ** 2
         row[Code.EDGE], first, second = edge.packed()
         if row[Code.EDGE] == Outline.CIRCLE:
             values[record + Slot.EDGE] = first

@@ -77,7 +77,7 @@ def _cut(system: OpticalSystem, number: int, outline: Outline) -> Profile:
         return np.zeros(0), np.zeros(0)
     # The rims: the last point inside on either side.
     near = torch.zeros(2, dtype=torch.float64)
-    far = 1.5 * outline.reach * torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    far = 1.5 * outline.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
     for _ in range(_BISECTIONS):
         half = 0.5 * (near + far)
         kept = inside(half)

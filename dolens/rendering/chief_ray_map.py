@@ -16,7 +16,7 @@ from dolens.sensor.pixels import Sensor
 _ORDERS, _SMALL = (7, 13, 25), 1e-3
 
 
-class Distortion(NamedTuple):
+class ChiefRayMap(NamedTuple):
     """Polynomials of where a sensor's pixels look.
 
     Attributes:
@@ -28,7 +28,7 @@ class Distortion(NamedTuple):
     coefficients: Tensor
     sensor: Sensor
 
-    def seen_by(self, window: Sensor) -> tuple[Tensor, Tensor]:
+    def of_window(self, window: Sensor) -> tuple[Tensor, Tensor]:
         """Rows and columns that a window's pixels look at, each (D, C, height, width)."""
         order, device = self.coefficients.shape[-1], self.coefficients.device
         sides = []
@@ -41,7 +41,7 @@ class Distortion(NamedTuple):
         return (sides[0] @ self.coefficients @ sides[1].mT).unbind(0)
 
 
-def distortion(imaging: ImagingSystem) -> Distortion | None:
+def fit_chief_ray_map(imaging: ImagingSystem) -> ChiefRayMap | None:
     """Find where the chief rays of a sensor's pixels meet the planes of a scene, as polynomials.
 
     Rays are traced from Chebyshev points of the sensor: distortion is an analytic function of the
@@ -73,7 +73,7 @@ def distortion(imaging: ImagingSystem) -> Distortion | None:
             coefficients[..., -2:, :].abs().amax(), coefficients[..., -2:].abs().amax()
         )
         if float(last.detach()) <= _SMALL:
-            return Distortion(coefficients, sensor)
+            return ChiefRayMap(coefficients, sensor)
     return None
 
 
@@ -86,7 +86,7 @@ def chief_ray_maps(
     a ray for each of its pixels.
 
     Args:
-        imaging: as of `distortion`; its sensor is the whole one.
+        imaging: as of `fit_chief_ray_map`; its sensor is the whole one.
         windows: of the sensor; the sensor itself is one.
 
     Returns:
@@ -94,11 +94,11 @@ def chief_ray_maps(
         (D, C, height, width), double precision; differentiable in the lens.
 
     Raises:
-        InputError: as `distortion`.
+        InputError: as `fit_chief_ray_map`.
     """
-    found = distortion(imaging)
+    found = fit_chief_ray_map(imaging)
     if found is not None:
-        return [found.seen_by(window) for window in windows]
+        return [found.of_window(window) for window in windows]
     return [_by_itself(imaging, window) for window in windows]
 
 

@@ -17,7 +17,7 @@ class ImagingSystem:
         scene: D planes and C wavelengths.
         sensor: the pixels.
         pupil: the disc of the exit pupil that rays from the pixels are aimed at: numbers, or
-            tensors whose gradients follow the lens (`moving_exit_pupil`).
+            tensors whose gradients follow the lens (`differentiable_exit_pupil`).
     """
 
     system: OpticalSystem

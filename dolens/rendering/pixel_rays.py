@@ -14,13 +14,13 @@ from dolens.optics.backend import trace_components
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane
+from dolens.rendering.differentiable_geometry import DifferentiableGeometry, sample_weight
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.moving_view import MovingView, sample_share
-from dolens.rendering.pupil.aim import aim
 from dolens.rendering.pupil.edge_rays import EdgeRays
 from dolens.rendering.pupil.exit_pupil import ExitPupil
-from dolens.rendering.pupil.light_edges import EdgeMap
-from dolens.rendering.pupil.pixel_edges import of_channel, pixel_edge_rays
+from dolens.rendering.pupil.pixel_edges import pixel_edge_rays, select_wavelength
+from dolens.rendering.pupil.pupil_boundary import PupilBoundaryMap
+from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 from dolens.rendering.random_numbers import random_words, uniform
 from dolens.rendering.sampling import square_to_disc, stratified_square
 from dolens.scene.scene import Scene
@@ -42,7 +42,7 @@ class PixelRays:
     scene: Scene
     sensor: Sensor
     view: View
-    edges: EdgeMap | None = None
+    edges: PupilBoundaryMap | None = None
 
     def samples(
         self, system: OpticalSystem, pupil: ExitPupil, start: int, end: int
@@ -61,8 +61,8 @@ class PixelRays:
         x, y = self.sensor.positions(rows, columns)
         sensor_z = system.vertices[-1]
         radius = pupil.radius
-        ray = aim(x, y, sensor_z, disc_x * radius, disc_y * radius, pupil.z)
-        return ray, (ray.n * ray.n) ** 2 * sample_share(system, view, pupil)
+        ray = rays_to_exit_pupil(x, y, sensor_z, disc_x * radius, disc_y * radius, pupil.z)
+        return ray, (ray.n * ray.n) ** 2 * sample_weight(system, view, pupil)
 
     def rim(self, system: OpticalSystem, pupil: ExitPupil, start: int, end: int) -> EdgeRays | None:
         """Rays along the edges of apertures; None where no gradient asks for them."""
@@ -72,7 +72,7 @@ class PixelRays:
     def light(
         self,
         system: OpticalSystem,
-        moving: MovingView,
+        moving: DifferentiableGeometry,
         shown: tuple[Tensor, ...],
         start: int,
         end: int,
@@ -94,7 +94,7 @@ class PixelRays:
             arriving = torch.where(valid & (there.n < 0.0), weight, 0.0)
             if rim is not None:
                 # Rays along the edges stand beside the samples.
-                beside = of_channel(rim.ray, channel)
+                beside = select_wavelength(rim.ray, channel)
                 there = Components(
                     *(torch.cat(pair, -1) for pair in zip(there, beside, strict=True))
                 )
@@ -106,7 +106,7 @@ class PixelRays:
     def edge_light(
         self,
         system: OpticalSystem,
-        moving: MovingView,
+        moving: DifferentiableGeometry,
         shown: tuple[Tensor, ...],
         start: int,
         end: int,
@@ -126,7 +126,7 @@ class PixelRays:
             self.scene.gather(
                 shown,
                 channel,
-                self._texture_places(still, of_channel(rim.ray, channel)),
+                self._texture_places(still, select_wavelength(rim.ray, channel)),
                 rim.weight[channel],
             )
             for channel in range(len(wavelengths))

@@ -13,10 +13,10 @@ from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.pupil.aim import aim
+from dolens.rendering.pupil.differentiable_pupil import depends_on_parameters
 from dolens.rendering.pupil.edge_rays import EdgeRays, edge_rays
-from dolens.rendering.pupil.light_edges import AZIMUTHS, light_edges
-from dolens.rendering.pupil.moving_pupil import depends_on_parameters
+from dolens.rendering.pupil.pupil_boundary import AZIMUTHS, pupil_boundary
+from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 
 # Radii of sensor points closer than this share of the largest are one radius.
 _SAME_RADIUS = 1e-7
@@ -68,7 +68,9 @@ def plane_points(
         ray = Components(*(torch.cat(pair, -1) for pair in zip(ray, rim.ray, strict=True)))
         weight = torch.cat((weight, rim.weight), -1)
     rows, columns = [], []
-    for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
+    for depth, magnification in zip(
+        scene.depths, scene.differentiable_magnifications(system), strict=True
+    ):
         t, _ = distance_to_plane(ray, -depth, -1.0)
         scale = magnification / pitch
         columns.append(torch.addcmul(ray.x, t, ray.l) * scale)
@@ -102,7 +104,7 @@ def pupil_rays(
     sensor_z = system.vertices[-1]
     x, y = (p.to(sensor_z.dtype)[:, None] for p in points)
     disc_x, disc_y = (d[: len(x)] * pupil.radius for d in disc)
-    ray = aim(x, y, sensor_z, disc_x, disc_y, pupil.z)
+    ray = rays_to_exit_pupil(x, y, sensor_z, disc_x, disc_y, pupil.z)
     there, valid = _before_the_lens(system, ray, imaging.scene.wavelengths)
     share = (pupil.radius / pupil.axial_radius) ** 2
     share = share / (pupil.axial_mean(sensor_z) * disc_x.shape[-1])
@@ -119,7 +121,7 @@ def rim_rays(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> EdgeRays 
     if not depends_on_parameters(system):
         return None
     middle = wavelengths[len(wavelengths) // 2]
-    found = light_edges(system, middle, points, pupil.numbers())
+    found = pupil_boundary(system, middle, points, pupil.numbers())
     if found is None:
         return None
     angle = torch.arange(AZIMUTHS, dtype=system.dtype, device=system.device)
@@ -149,7 +151,7 @@ def chief_ray_points(
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     x, y = (p.to(system.dtype) for p in points)
     zero = torch.zeros_like(x)
-    ray = aim(x, y, system.vertices[-1], zero, zero, imaging.pupil.z)
+    ray = rays_to_exit_pupil(x, y, system.vertices[-1], zero, zero, imaging.pupil.z)
     wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64, device=system.device)
     rays = Rays.from_components(ray, wavelengths[:, None])
     hit = trace_rays(system, rays, -1.0)
@@ -160,7 +162,9 @@ def chief_ray_points(
         )
     there = hit.components()
     rows, columns = [], []
-    for depth, magnification in zip(scene.depths, scene.moving_magnifications(system), strict=True):
+    for depth, magnification in zip(
+        scene.depths, scene.differentiable_magnifications(system), strict=True
+    ):
         t, _ = distance_to_plane(there, -depth, -1.0)
         scale = magnification / pitch
         columns.append(torch.addcmul(there.x, t, there.l) * scale)

@@ -26,19 +26,19 @@ from dolens.rendering.sampling import square_to_disc, stratified_square
 _LIGHT_SAMPLES = 32
 
 
-class FieldFunctions(NamedTuple):
+class FieldPointSpreadFunctions(NamedTuple):
     """Point spread functions at N points of the sensor.
 
     Attributes:
         functions: (N, D, C, K, K), upright, of the points' light about the central pixel; their
             sums are relative illuminations, less what falls beyond the window.
         light: (N, C), relative illumination by the same rays.
-        lost: (), the largest share of a function's light that falls beyond its window.
+        truncated: (), the largest share of a function's light that falls beyond its window.
     """
 
     functions: Tensor
     light: Tensor
-    lost: Tensor
+    truncated: Tensor
 
 
 def field_point_spread_functions(
@@ -48,7 +48,7 @@ def field_point_spread_functions(
     pupil_samples: int,
     seed: int | None,
     distortion: bool,
-) -> FieldFunctions:
+) -> FieldPointSpreadFunctions:
     """Geometric point spread functions at points of the sensor.
 
     A function says how much of the light of the scene's point (row, column), counted from the
@@ -74,14 +74,14 @@ def field_point_spread_functions(
     seen = plane_points(imaging, points, disc)
     centre = (chief_ray_points if distortion else pinhole_points)(imaging, points)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
-    return splatted(
+    return splat_plane_points(
         PlanePoints(seen.rows - rows, seen.columns - columns, seen.weight),
         size,
         cpu_kernels_serve(system),
     )
 
 
-def splatted(seen: PlanePoints, size: int, fused: bool) -> FieldFunctions:
+def splat_plane_points(seen: PlanePoints, size: int, fused: bool) -> FieldPointSpreadFunctions:
     """Functions (N, D, C, size, size) of rays by where they meet the planes, from their centre."""
     middle = size // 2
     # A pixel sees the point at +e: seen from there, the pixel is at -e.
@@ -92,7 +92,7 @@ def splatted(seen: PlanePoints, size: int, fused: bool) -> FieldFunctions:
     with torch.no_grad():
         kept = functions.sum((-2, -1)) / total.clamp(min=torch.finfo(total.dtype).tiny)
         lost = torch.where(total > 0.0, 1.0 - kept, 0.0).max()
-    return FieldFunctions(functions, total[:, 0], lost)
+    return FieldPointSpreadFunctions(functions, total[:, 0], lost)
 
 
 def wave_point_spread_functions(
@@ -101,7 +101,7 @@ def wave_point_spread_functions(
     size: int,
     distortion: bool,
     settings: DiffractionSettings | None = None,
-) -> FieldFunctions:
+) -> FieldPointSpreadFunctions:
     """The same with diffraction: of the wavefronts of the points that functions are centred on.
 
     Each function keeps the share of light that rays give it; what diffraction spreads beyond the
@@ -119,7 +119,7 @@ def wave_point_spread_functions(
     total = kernels.sum((-2, -1))
     share = torch.where(total > 0.0, light / torch.where(total > 0.0, total, 1.0), 0.0)
     lost = torch.zeros((), dtype=kernels.dtype, device=kernels.device)
-    return FieldFunctions(kernels * share[..., None, None], light[:, 0], lost)
+    return FieldPointSpreadFunctions(kernels * share[..., None, None], light[:, 0], lost)
 
 
 def wave_cost(
@@ -148,7 +148,7 @@ def _object_points(
     rows, columns = (chief_ray_points if distortion else pinhole_points)(imaging, points)
     options = {"dtype": torch.float64, "device": system.device}
     depth = torch.tensor(scene.depths, **options)[:, None]
-    magnifications = scene.moving_magnifications(system)
+    magnifications = scene.differentiable_magnifications(system)
     scale = pitch / torch.stack([torch.as_tensor(m, **options) for m in magnifications])[:, None]
     shape = (len(points[0]), planes, channels)
     positions = torch.stack(

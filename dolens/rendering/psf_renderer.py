@@ -18,12 +18,12 @@ from dolens.rendering.patches import PatchLayout, node_positions, patches
 from dolens.rendering.plane_blur import PlaneBlur, places_in_texture
 from dolens.rendering.protocol import Renderer, SensorWindow
 from dolens.rendering.psf_grid import (
-    FieldFunctions,
+    FieldPointSpreadFunctions,
     field_point_spread_functions,
     wave_point_spread_functions,
 )
+from dolens.rendering.pupil.differentiable_pupil import differentiable_exit_pupil
 from dolens.rendering.pupil.exit_pupil import ExitPupil, sampled_exit_pupil, working_f_number
-from dolens.rendering.pupil.moving_pupil import moving_exit_pupil
 from dolens.rendering.relative_illumination import relative_illumination
 from dolens.scene.planar import PlanarScene, as_planes
 from dolens.scene.scene import Scene
@@ -163,7 +163,7 @@ class PsfRenderer(Renderer):
             pupil = self.pupil
             if pupil is None:
                 pupil = sampled_exit_pupil(system, scene.wavelengths, self.sensor)
-        pupil = moving_exit_pupil(system, scene.wavelengths, pupil)
+        pupil = differentiable_exit_pupil(system, scene.wavelengths, pupil)
         imaging = ImagingSystem(system, scene, self.sensor, pupil)
         parts = [self.on(window) for window in windows]
         x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
@@ -185,7 +185,7 @@ class PsfRenderer(Renderer):
         self,
         imaging: ImagingSystem,
         textures: Tensor,
-        found: FieldFunctions,
+        found: FieldPointSpreadFunctions,
         look: tuple[Tensor, Tensor] | None,
     ) -> Tensor:
         """The image by functions that are known; `look` is where chief rays meet the scene, None
@@ -205,11 +205,11 @@ class PsfRenderer(Renderer):
             blur = blur.illuminated(found.light, wanted)
         return scene.blend(scene.on_planes(textures), blur)
 
-    def _warn_of_loss(self, found: FieldFunctions) -> None:
-        if float(found.lost) > _NOTABLE_LOSS:
+    def _warn_of_loss(self, found: FieldPointSpreadFunctions) -> None:
+        if float(found.truncated) > _NOTABLE_LOSS:
             say_once(
-                f"renderer psf: {100 * float(found.lost):.0f} % of a function's light falls beyond "
-                f"its {self.size} pixels; a larger renderer.size keeps it"
+                f"renderer psf: {100 * float(found.truncated):.0f} % of a function's light falls "
+                f"beyond its {self.size} pixels; a larger renderer.size keeps it"
             )
 
     def point_spread_functions(
@@ -217,7 +217,7 @@ class PsfRenderer(Renderer):
         imaging: ImagingSystem,
         seed: int,
         points: tuple[Tensor, Tensor] | None = None,
-    ) -> FieldFunctions:
+    ) -> FieldPointSpreadFunctions:
         """The functions at the grid's points, row after row, or at others; differentiable.
 
         Args:

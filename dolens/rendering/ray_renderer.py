@@ -19,14 +19,14 @@ from dolens.optics.lens import Lens
 from dolens.optics.packing import pack
 from dolens.optics.replay import replay
 from dolens.optics.system import OpticalSystem
+from dolens.rendering.differentiable_geometry import DifferentiableGeometry, differentiable_geometry
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.moving_view import MovingView, moving_view
 from dolens.rendering.pixel_rays import PixelRays
 from dolens.rendering.protocol import Renderer, SensorWindow
+from dolens.rendering.pupil.differentiable_pupil import depends_on_parameters
 from dolens.rendering.pupil.exit_pupil import ExitPupil, axial_exit_pupil, sampled_exit_pupil
-from dolens.rendering.pupil.light_edges import edge_map
-from dolens.rendering.pupil.moving_pupil import depends_on_parameters
 from dolens.rendering.pupil.pixel_edges import edge_samples
+from dolens.rendering.pupil.pupil_boundary import pupil_boundary_map
 from dolens.scene.scene import Scene
 from dolens.scene.texture import texture_origin
 from dolens.sensor.pixels import Sensor
@@ -144,14 +144,18 @@ class RayRenderer(Renderer):
         scene.check(now)
         pupil = sampled_exit_pupil(now, scene.wavelengths, self.sensor, axial)
         view = self._view(now, scene, (textures.shape[-2], textures.shape[-1]), seed, pupil)
-        moving = moving_view(system, scene, view)
+        moving = differentiable_geometry(system, scene, view)
         edges = None
         if depends_on_parameters(system):
-            edges = edge_map(ImagingSystem(now, scene, self.sensor, moving.pupil.numbers()))
+            edges = pupil_boundary_map(
+                ImagingSystem(now, scene, self.sensor, moving.pupil.numbers())
+            )
         rays = PixelRays(scene, self.sensor, view, edges)
         names, planes = list(parameters), len(shown)
 
-        def moved(tensors: Sequence[Tensor]) -> tuple[OpticalSystem, MovingView, Sequence[Tensor]]:
+        def moved(
+            tensors: Sequence[Tensor],
+        ) -> tuple[OpticalSystem, DifferentiableGeometry, Sequence[Tensor]]:
             """The lens, the view and what planes show, from a piece's own tensors."""
             values = dict(zip(names, tensors[planes:-1], strict=True))
             return lens.system(values).traced_by(backend), moving.of(tensors[-1]), tensors[:planes]
@@ -235,7 +239,7 @@ class RayRenderer(Renderer):
         scene: Scene,
         textures: Tensor,
         view: View,
-        moving: MovingView,
+        moving: DifferentiableGeometry,
     ) -> Tensor:
         """The render in one kernel."""
         wavelengths = torch.tensor(scene.wavelengths, dtype=torch.float64)
@@ -250,7 +254,7 @@ class RayRenderer(Renderer):
             table.indices,
             textures,
             system.vertices[-1],
-            moving.seen_by_kernel(system, view),
+            moving.packed_for_kernel(system, view),
             table.codes,
             table.extras,
             view.integers(),

@@ -23,7 +23,7 @@ from dolens.sensor.pixels import Sensor
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 
-class LandedRays(NamedTuple):
+class SensorIntercepts(NamedTuple):
     """Intercepts of rays with the sensor plane, mm, and the light of each, steradians; (N,)."""
 
     x: Tensor
@@ -119,16 +119,16 @@ class SpotImager:
         self, system: OpticalSystem, source: Tensor, first: int, last: int
     ) -> tuple[Tensor, Tensor]:
         """Pixels, and Σ light·(1, x, y), of rays `first` to `last`."""
-        landed = self.landed(system, source, first, last)
+        landed = self.sensor_intercepts(system, source, first, last)
         sensor = self.sensor
         rows, columns = sensor.pixels(landed.x, landed.y)
         grid = bin_rays(rows, columns, landed.light, sensor.height, sensor.width, self.subpixels)
         light = landed.light
         return grid, torch.stack([light.sum(), (light * landed.x).sum(), (light * landed.y).sum()])
 
-    def landed(
+    def sensor_intercepts(
         self, system: OpticalSystem, source: Tensor, first: int = 0, last: int | None = None
-    ) -> LandedRays:
+    ) -> SensorIntercepts:
         """Rays `first` to `last` of a source on the sensor plane.
 
         Each carries the solid angle of its part of the disc that it aims at, cos θ·dA/r².
@@ -148,7 +148,7 @@ class SpotImager:
         trace = trace_surfaces(system, ray, self.wavelength, record=True)
         light = area * cosine / distance**2 * self._passed(system, trace, u * u + v * v)
         on_sensor = trace_to_plane(system, trace, system.vertices[-1], self.wavelength, 1.0)
-        return LandedRays(on_sensor.ray.x, on_sensor.ray.y, light)
+        return SensorIntercepts(on_sensor.ray.x, on_sensor.ray.y, light)
 
     def _passed(self, system: OpticalSystem, trace: Trace, aimed: Tensor) -> Tensor:
         """The share of each ray that the rims let through.

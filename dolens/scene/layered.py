@@ -9,10 +9,10 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.scene.occlusion import (
-    as_if_all_seen,
     composite,
-    continued_behind,
+    inpaint_hidden,
     layer_opacities,
+    normalise_by_visibility,
     stopped_share,
 )
 from dolens.scene.scene import Blur, Scene
@@ -31,9 +31,9 @@ class LayeredScene(Scene):
     (`layer_opacities`).  A backward ray meets the planes from near to far; each stops min(α_l, what
     the nearer ones have left), and the ray carries home the sum of what it was stopped by, which
     for opaque planes is Σ_l α_l L_l Π_{k<l} (1 - α_k).  What lies behind an occluder's edge a
-    pinhole never saw: planes go on there for `reach` texels (`continued_behind`), and rays that
-    meet nothing even so count like the mean of those of the same pixel that do: the sum over the
-    pupil is divided by its opacity.  So a white scene is white, whatever its depths.
+    pinhole never saw: planes go on there for `inpainting_radius` texels (`inpaint_hidden`), and
+    rays that meet nothing even so count like the mean of those of the same pixel that do: the sum
+    over the pupil is divided by its opacity.  So a white scene is white, whatever its depths.
 
     `RayRenderer` renders this model.  `PsfRenderer` composes blurred planes (`composite`) as if
     rays met distinct surfaces independently: exact where all but one at an edge are sharp.  Ikoma
@@ -59,11 +59,11 @@ class LayeredScene(Scene):
 
     Attributes:
         depths: of the planes, mm in front of the first vertex, near to far.
-        reach: texels by which a plane goes on behind what hides it; the widest blur's radius is
-            enough.
+        inpainting_radius: texels by which a plane goes on behind what hides it; the widest blur's
+            radius is enough.
     """
 
-    reach: int = 15
+    inpainting_radius: int = 15
 
     separate_planes: ClassVar[bool] = False
 
@@ -73,8 +73,10 @@ class LayeredScene(Scene):
             raise InputError(
                 f"scene: layers' depths must grow, near to far, not {list(self.depths)}"
             )
-        if self.reach < 0:
-            raise InputError(f"scene: reach must be 0 texels or more, not {self.reach}")
+        if self.inpainting_radius < 0:
+            raise InputError(
+                f"scene.inpainting_radius must be 0 texels or more, not {self.inpainting_radius}"
+            )
 
     @classmethod
     def evenly_spaced(
@@ -84,8 +86,8 @@ class LayeredScene(Scene):
         layers: int,
         wavelengths: Sequence[float],
         texture_centre: tuple[float, float] = (0.0, 0.0),
-        reach: int = 15,
-        follows: Literal["magnification", "world"] = "magnification",
+        inpainting_radius: int = 15,
+        texture_scale: Literal["magnification", "fixed"] = "magnification",
     ) -> "LayeredScene":
         """Planes evenly spaced in vergence, 1/depth: blur grows evenly from one to the next.
 
@@ -98,8 +100,8 @@ class LayeredScene(Scene):
             layers: how many planes, both ends' included; 1 is the middle in vergence.
             wavelengths: nm.
             texture_centre: of `Scene`.
-            reach: of `LayeredScene`.
-            follows: of `Scene`.
+            inpainting_radius: of `LayeredScene`.
+            texture_scale: of `Scene`.
         """
         if not 0.0 < nearest < farthest < float("inf"):
             raise InputError(
@@ -110,7 +112,13 @@ class LayeredScene(Scene):
             raise InputError(f"scene: layers must be at least 1, not {layers}")
         shares = [i / (layers - 1) for i in range(layers)] if layers > 1 else [0.5]
         depths = tuple(1.0 / ((1.0 - share) / nearest + share / farthest) for share in shares)
-        return cls(depths, tuple(wavelengths), texture_centre, reach, follows=follows)
+        return cls(
+            depths,
+            tuple(wavelengths),
+            texture_centre,
+            inpainting_radius,
+            texture_scale=texture_scale,
+        )
 
     def labels(self) -> list[str]:
         """The one image's: `0.5-8m`."""
@@ -145,7 +153,7 @@ class LayeredScene(Scene):
         opacity, hidden = layer_opacities(depth, self.depths)
         light = opacity[:, :, None] * self.colours(textures)[:, None]
         maps = torch.cat((opacity[:, :, None], light), dim=2)
-        maps = continued_behind(maps, hidden, self.reach)
+        maps = inpaint_hidden(maps, hidden, self.inpainting_radius)
         return maps[:, :, 1:], maps[:, :, :1]
 
     def gather(
@@ -166,7 +174,7 @@ class LayeredScene(Scene):
             seen = seen + (weight * share * glow).sum(dim=-1)
             covered = covered + (weight * stopped).sum(dim=-1)
             through = (through - stopped).clamp(min=0.0)
-        return as_if_all_seen(seen, covered, weight.sum(dim=-1))[:, None]
+        return normalise_by_visibility(seen, covered, weight.sum(dim=-1))[:, None]
 
     def blend(self, shown: tuple[Tensor, ...], blur: Blur) -> Tensor:
         """Blurred planes in front of one another, (B, 1, C, height, width); see `Scene.blend`."""
@@ -174,4 +182,4 @@ class LayeredScene(Scene):
         white = blur.white()
         lit = white > 0.0
         share = torch.where(lit, blur(opacity) / torch.where(lit, white, 1.0), 0.0)
-        return as_if_all_seen(*composite(blur(light), share))[:, None]
+        return normalise_by_visibility(*composite(blur(light), share))[:, None]

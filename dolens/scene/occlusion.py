@@ -47,7 +47,7 @@ def layer_opacities(depth: Tensor, depths: Sequence[float]) -> tuple[Tensor, Ten
     return opacity.to(depth.dtype), hidden
 
 
-def continued_behind(maps: Tensor, hidden: Tensor, reach: int) -> Tensor:
+def inpaint_hidden(maps: Tensor, hidden: Tensor, inpainting_radius: int) -> Tensor:
     """Continue planes behind what hides them, since a pinhole's image says nothing about it.
 
     A hidden texel takes the mean of its neighbours on the same plane, and these may have been
@@ -56,14 +56,14 @@ def continued_behind(maps: Tensor, hidden: Tensor, reach: int) -> Tensor:
     Args:
         maps: (..., C, H, W): opacity first, and light, which goes with it.
         hidden: (..., H, W), bool, where the plane is hidden.
-        reach: texels, in rows and columns, as far as which a plane goes on.
+        inpainting_radius: texels, in rows and columns, as far as which a plane goes on.
 
     Returns:
         (..., C, H, W); differentiable in the maps.
     """
     step, done = 1, 0
-    while done < reach:
-        step = min(step, reach - done)
+    while done < inpainting_radius:
+        step = min(step, inpainting_radius - done)
         there = maps[..., :1, :, :] > 0.0
         count = _sum_of_neighbours(there.to(maps.dtype), step)
         mean = _sum_of_neighbours(maps, step) / count.clamp(min=1.0)
@@ -128,7 +128,7 @@ def composite(light: Tensor, opacity: Tensor) -> tuple[Tensor, Tensor]:
     return seen, covered
 
 
-def as_if_all_seen(light: Tensor, opacity: Tensor, whole: Tensor | float = 1.0) -> Tensor:
+def normalise_by_visibility(light: Tensor, opacity: Tensor, whole: Tensor | float = 1.0) -> Tensor:
     """Light · whole / opacity: what is not known looks like the rest of what the pixel sees.
 
     Black where the opacity is less than a thousandth of the whole.

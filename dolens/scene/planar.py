@@ -78,7 +78,7 @@ def as_planes(
         scene.depths if depths is None else depths,
         scene.wavelengths if wavelengths is None else wavelengths,
         scene.texture_centre if texture_centre is None else texture_centre,
-        follows=scene.follows,
+        texture_scale=scene.texture_scale,
         fixed_scales=scene.fixed_scales,
     )
 

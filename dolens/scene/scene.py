@@ -34,11 +34,11 @@ class Scene(ABC):
     of a texture is the texture's central part.  Texel and pixel centres coincide.
 
     What happens to this scale when the lens changes is part of the model, and derivatives are those
-    of the model.  With `follows` "magnification" the texels change with the lens: the scene is as
-    large as the lens sees it, and the truth stays the texture's central part, whatever the focal
-    length.  Magnification then costs nothing, as for a camera whose pictures are compared at equal
-    framing.  With "world" the texels are fixed at the scale of one lens (`fixed_for`): a lens that
-    magnifies more sees less of the scene, and its image departs from the truth.
+    of the model.  With `texture_scale` "magnification" the texels change with the lens: the scene
+    is as large as the lens sees it, and the truth stays the texture's central part, whatever the
+    focal length.  Magnification then costs nothing, as for a camera whose pictures are compared at
+    equal framing.  With "fixed" the texels are fixed at the scale of one lens (`fixed_for`): a lens
+    that magnifies more sees less of the scene, and its image departs from the truth.
 
     Renderers know the light's way from a pixel to the planes; what is met there, and how the planes
     share a pixel, the scene knows: `on_planes` once an image, then `gather` for rays or `blend` for
@@ -49,7 +49,8 @@ class Scene(ABC):
         wavelengths: nm, one for each of the texture's colours.
         texture_centre: rows below and columns right of the axis, in the pinhole's image, where the
             texture's centre lies; (0, 0) but for windows of a larger sensor.
-        follows: what the texels' size follows when the lens changes, "magnification" or "world".
+        texture_scale: what the texels' size follows when the lens changes, "magnification" or
+            "fixed".
         fixed_scales: pairs of a depth and its magnification, where the scale is fixed; `fixed_for`
             fills it in.
         separate_planes: whether each plane makes an image of its own, as the fused kernels have it.
@@ -58,15 +59,16 @@ class Scene(ABC):
     depths: tuple[float, ...]
     wavelengths: tuple[float, ...]
     texture_centre: tuple[float, float] = (0.0, 0.0)
-    follows: Literal["magnification", "world"] = field(default="magnification", kw_only=True)
+    texture_scale: Literal["magnification", "fixed"] = field(default="magnification", kw_only=True)
     fixed_scales: tuple[tuple[float, float], ...] = field(default=(), kw_only=True)
 
     separate_planes: ClassVar[bool]
 
     def __post_init__(self) -> None:
-        if self.follows not in ("magnification", "world"):
+        if self.texture_scale not in ("magnification", "fixed"):
             raise InputError(
-                f"scene.follows: '{self.follows}' is unknown; allowed: magnification, world"
+                f"scene.texture_scale: '{self.texture_scale}' is unknown; "
+                "allowed: magnification, fixed"
             )
         for name in ("depths", "wavelengths", "texture_centre"):
             object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
@@ -156,10 +158,10 @@ class Scene(ABC):
         return [f"{depth / 1000.0:g}m" for depth in self.depths]
 
     def fixed_for(self, system: OpticalSystem) -> Self:
-        """The scene as it is used from now on: with `follows` "world" its texels keep the scale
-        that they have for this lens, with "magnification" the scene itself.
+        """The scene as it is used from now on: with `texture_scale` "fixed" its texels keep the
+        scale that they have for this lens, with "magnification" the scene itself.
         """
-        if self.follows == "magnification" or self.fixed_scales:
+        if self.texture_scale == "magnification" or self.fixed_scales:
             return self
         scales = _paraxial_magnifications(ParaxialNumbers.of(system), self.depths)
         return replace(self, fixed_scales=tuple(zip(self.depths, scales, strict=True)))
@@ -170,22 +172,22 @@ class Scene(ABC):
         |image height / object height| of the paraxial chief ray at each depth, of this lens or of
         the one that the scale is fixed for.
         """
-        if self.follows == "world":
+        if self.texture_scale == "fixed":
             fixed = dict(self.fixed_scales)
             if not set(self.depths) <= set(fixed):
                 raise InputError(
-                    "scene.follows: 'world' needs the lens that the scale is fixed for; call "
+                    "scene.texture_scale: 'fixed' needs the lens that the scale is fixed for; call "
                     "scene.fixed_for(lens.system()) once, with the lens as it begins"
                 )
             return [fixed[depth] for depth in self.depths]
         with torch.no_grad():
             return _paraxial_magnifications(ParaxialNumbers.of(system), self.depths)
 
-    def moving_magnifications(self, system: OpticalSystem) -> list[float | Tensor]:
+    def differentiable_magnifications(self, system: OpticalSystem) -> list[float | Tensor]:
         """The same, with gradients with respect to the lens's parameters where there are any."""
         numbers = self.magnifications(system)
         moving = None
-        if self.follows == "magnification" and torch.is_grad_enabled():
+        if self.texture_scale == "magnification" and torch.is_grad_enabled():
             moving = ParaxialNumbers.differentiable(system)
         if moving is None:
             return list(numbers)

@@ -79,7 +79,7 @@ class Camera(Experiment):
         batch: Tensor,
         stage: str,
         index: int,
-        judge: str | None = None,
+        reference: str | None = None,
     ) -> tuple[Views, Tensor | None]:
         """Image textures, and find point spread functions where the network asks for them.
 
@@ -90,10 +90,10 @@ class Camera(Experiment):
             batch: textures (B, 3, h, w), linear light.
             stage: `train`, `val` or `test`.
             index: of the batch; with the stage and the seed it decides all random numbers.
-            judge: the renderer that makes the images; None: the camera's own.
+            reference: the renderer that makes the images; None: the camera's own.
         """
         with torch.autocast(self.device.type, enabled=False):
-            taken = self.views.take(self.lens, values, batch, stage, index, judge)
+            taken = self.views.take(self.lens, values, batch, stage, index, reference)
             return taken, self.functions(values)
 
     def functions(self, values: Mapping[str, Tensor]) -> Tensor | None:

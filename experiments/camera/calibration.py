@@ -19,7 +19,7 @@ from dolens.tolerancing import tolerances_from
 from experiments.camera.views.base import Imaging
 
 
-class Calibration(Protocol):
+class Miscalibration(Protocol):
     """Makes point spread functions that a network is given instead of the exact ones."""
 
     def functions(
@@ -50,7 +50,7 @@ class OtherDepth:
 
     def __init__(self, depth: float) -> None:
         if not (math.isfinite(depth) and depth > 0.0):
-            raise InputError(f"calibrations: depth must be positive (mm), not {depth}")
+            raise InputError(f"miscalibrations: depth must be positive (mm), not {depth}")
         self.depth = float(depth)
 
     def functions(
@@ -110,7 +110,7 @@ class NoisyMeasurement:
     def __init__(self, electrons: float, read_noise: float = 0.0, seed: int = 0) -> None:
         if not electrons > 0.0 or not read_noise >= 0.0:
             raise InputError(
-                "calibrations: electrons must be positive and read_noise at least 0, not "
+                "miscalibrations: electrons must be positive and read_noise at least 0, not "
                 f"{electrons} and {read_noise}"
             )
         self.electrons, self.read_noise, self.seed = electrons, read_noise, seed
@@ -128,12 +128,12 @@ class NoisyMeasurement:
         return noisy_point_spread_functions(exact, self.electrons, self.read_noise, same)
 
 
-def check(calibrations: Mapping[str, Calibration], lens: Lens) -> None:
+def check(miscalibrations: Mapping[str, Miscalibration], lens: Lens) -> None:
     """Check that the tolerances of calibrations are parameters of the lens.
 
     Raises:
         InputError: one is not.
     """
-    for calibration in calibrations.values():
+    for calibration in miscalibrations.values():
         if isinstance(calibration, OtherSample):
             tolerances_from(lens, calibration.tolerances, calibration.factor)

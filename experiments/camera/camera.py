@@ -10,8 +10,8 @@ from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db
 from experiments.camera.adversary import Adversary
 from experiments.camera.base import Camera
-from experiments.camera.calibration import Calibration
-from experiments.camera.calibration import check as check_calibrations
+from experiments.camera.calibration import Miscalibration
+from experiments.camera.calibration import check as check_miscalibrations
 from experiments.camera.costs import StepCosts
 from experiments.camera.evaluation import Evaluation, means_of, without_loss
 from experiments.camera.figures import camera_figures
@@ -43,7 +43,8 @@ class CameraModule(Camera):
         operands: what the lens must be besides, as of a merit function: Σ (weight·deviation)² is
             added to the loss.  Objects are at the views' `object_distance`; see `CameraOperands`.
             A step of the lens after which a chief ray does not reach the stop is taken back.
-        calibrations: point spread functions that tests give the network besides; see `Evaluation`.
+        miscalibrations: point spread functions that tests give the network besides; see
+            `Evaluation`.
 
     Raises:
         InputError: a setting is out of range, or the network or the loss does not fit.
@@ -58,7 +59,7 @@ class CameraModule(Camera):
         training: Training,
         variables: Mapping[str, Mapping[str, Any] | None] | None,
         operands: Sequence[Mapping[str, Any]],
-        calibrations: Mapping[str, Calibration] | None,
+        miscalibrations: Mapping[str, Miscalibration] | None,
     ) -> None:
         super().__init__(
             lens,
@@ -74,7 +75,7 @@ class CameraModule(Camera):
         discriminator, rate = reconstruction.discriminator, rates.discriminator or rates.network
         self.adversary = Adversary(discriminator, rate) if discriminator else None
         self.costs = StepCosts()
-        self.evaluation = Evaluation(calibrations)
+        self.evaluation = Evaluation(miscalibrations)
         self.test_scores: dict[str, PhotographScores] = {}
         self._looked_in_epoch: int | None = None
         self._shown: dict[str, Tensor] = {}  # stage → its first crop, for figures
@@ -87,7 +88,7 @@ class CameraModule(Camera):
             getattr(self.optimizer, "lens_steps", None),
         )
         views.expose(self.lens)
-        check_calibrations(self.evaluation.calibrations, lens)
+        check_miscalibrations(self.evaluation.miscalibrations, lens)
 
     # ---------------------------------------------------------------- training
 

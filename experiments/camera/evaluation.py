@@ -11,7 +11,7 @@ from torch import Tensor
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
 from experiments.camera.base import Camera
-from experiments.camera.calibration import Calibration
+from experiments.camera.calibration import Miscalibration
 from experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
 from experiments.camera.views.base import Views, seed_of
 
@@ -20,15 +20,15 @@ class Evaluation:
     """Collects scores of crops and views, and averages them over photographs.
 
     A stage is `val` or `test`; it is done again by every judge of the views, whose numbers are
-    called `test_<judge>/…`, and a test with every wrong calibration besides,
+    called `test_<reference>/…`, and a test with every wrong calibration besides,
     `test/psnr_db_miscalibrated/<kind>`.  All see the same textures and the same noise.
 
     Args:
-        calibrations: name → the calibration whose functions replace the exact ones.
+        miscalibrations: name → the calibration whose functions replace the exact ones.
     """
 
-    def __init__(self, calibrations: Mapping[str, Calibration] | None = None) -> None:
-        self.calibrations = dict(calibrations or {})
+    def __init__(self, miscalibrations: Mapping[str, Miscalibration] | None = None) -> None:
+        self.miscalibrations = dict(miscalibrations or {})
         self._rows: dict[str, dict[str, list[Tensor]]] = {}
         self._seconds: dict[str, list[float]] = {}
 
@@ -36,14 +36,14 @@ class Evaluation:
     def measure(self, camera: Camera, batch: Tensor, stage: str, index: int) -> None:
         """Image, restore and compare textures (B, 3, h, w); see `Imaging.take` for the others."""
         values = camera.variables()
-        for judge in (None, *camera.views.judges()):
+        for reference in (None, *camera.views.reference_renderers()):
             started = time.perf_counter()
-            taken, functions = camera.take(values, batch, stage, index, judge)
-            if judge is not None:
-                self._seconds.setdefault(judge, []).append(time.perf_counter() - started)
-            name = stage if judge is None else f"{stage}_{judge}"
+            taken, functions = camera.take(values, batch, stage, index, reference)
+            if reference is not None:
+                self._seconds.setdefault(reference, []).append(time.perf_counter() - started)
+            name = stage if reference is None else f"{stage}_{reference}"
             self._add(name, _row(camera, taken, camera.restore(taken, functions)))
-            if judge is None and stage == "test" and functions is not None:
+            if reference is None and stage == "test" and functions is not None:
                 self._miscalibrated(camera, values, taken, functions, index)
 
     def _miscalibrated(
@@ -54,7 +54,7 @@ class Evaluation:
         exact: Tensor,
         index: int,
     ) -> None:
-        for kind, calibration in self.calibrations.items():
+        for kind, calibration in self.miscalibrations.items():
             generator = torch.Generator().manual_seed(seed_of(0, "test", index))
             wrong = calibration.functions(camera.views, camera.lens, values, exact, generator)
             restored = camera.restore(taken, wrong).clamp(0.0, 1.0)

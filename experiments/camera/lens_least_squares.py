@@ -135,8 +135,8 @@ class LensLeastSquares:
             share: of the trust radius, as a schedule has it.
 
         Returns:
-            Numbers to log: `reach`, the trust radius (pixels); `slope_kept` by the last step;
-            `moved` (RMS, pixels).
+            Numbers to log: `trust_radius`, the trust radius (pixels); `slope_kept` by the last
+            step; `moved` (RMS, pixels).
 
         Raises:
             UnreachableField: a chief ray that operands ask for does not reach the stop.

@@ -14,7 +14,9 @@ from experiments.tables import Row
 
 
 def table_name(stage: str = "test") -> str:
-    """Return the name of a stage's table in a run folder; a stage is `test` or `test_<judge>`."""
+    """Return the name of a stage's table in a run folder; a stage is `test` or
+    `test_<reference>`.
+    """
     return f"{stage}_photographs.csv"
 
 

@@ -14,7 +14,7 @@ from dolens.rendering.auto.agreement import (
     gradient,
     gradients_of_rays,
     image_measure,
-    judging_samples,
+    reference_strata,
 )
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.auto.probes import Reference, probe_image, reference
@@ -217,7 +217,7 @@ def gradient_agreements(subject: Subject, contenders: Sequence[Contender]) -> di
     stored = lens.variables(list(subject.variables))
     values = {n: p.detach().clone().requires_grad_() for n, p in stored.items()}
     measure = image_measure(values, truth)
-    side = judging_samples(sensor.height, sensor.width, len(scene.wavelengths))
+    side = reference_strata(sensor.height, sensor.width, len(scene.wavelengths))
 
     def rendered(renderer: Renderer) -> Render:
         def render(values: Mapping[str, Tensor], seed: int) -> Tensor:

@@ -100,7 +100,7 @@ def test_two_spheres_cut_the_same_rays(triplet):
         return -radius * torch.cat([alpha, z[:, None]], -1)
 
     far, near = sphere(found, radius), sphere(small, 0.5 * radius)
-    landing = torch.nn.functional.pad(found.landing[lit], (0, 1))
+    landing = torch.nn.functional.pad(found.intercept[lit], (0, 1))
     gone = (near - far).norm(dim=-1)
     to_sensor = (landing - far) / (landing - far).norm(dim=-1, keepdim=True)
     assert torch.allclose(near - far, gone[:, None] * to_sensor, atol=1e-10)
@@ -234,8 +234,8 @@ def test_a_moved_stop_moves_its_light():
     lens.elements["hole"] = Element(1, 1, pose).requires_grad_(False)
     found = pupil_wavefront(lens.system(), AXIS, 500.0, CENTRE, 48)
     share = found.weight / found.weight.sum()
-    assert float((share * found.landing[..., 0]).sum()) == pytest.approx(5.0, abs=1e-4)
-    assert float((share * found.landing[..., 1]).sum()) == pytest.approx(-3.0, abs=1e-4)
+    assert float((share * found.intercept[..., 0]).sum()) == pytest.approx(5.0, abs=1e-4)
+    assert float((share * found.intercept[..., 1]).sum()) == pytest.approx(-3.0, abs=1e-4)
     # A tilted hole is narrower by its cosine.
     assert float(found.flux) == pytest.approx(math.cos(0.3), rel=2e-4)
 
@@ -299,7 +299,7 @@ def test_rays_that_are_reflected_totally_end_the_pupil():
     found = pupil_wavefront(lens.system(), AXIS, 500.0, CENTRE, 48)
     assert bool(found.ended)
     assert not bool(found.valid.all())
-    for values in (found.opd, found.direction, found.amplitude, found.area, found.landing):
+    for values in (found.opd, found.direction, found.amplitude, found.area, found.intercept):
         assert bool(torch.isfinite(values).all())
     # The differences take rays to two cells around, and so lose the last of those that pass.
     expected = (10.0 / N / 9.0) ** 2

@@ -15,7 +15,7 @@ from experiments.running.run_settings import RunSettings
 from experiments.running.training import build_lens, run
 
 QUICK = ["trainer.max_epochs=1", "callbacks.pictures=null"]
-JUDGED = ["judges=wave", "calibrations=wrong"]
+JUDGED = ["reference_renderers=wave", "miscalibrations=wrong"]
 WAVEFRONT_CODING = ["experiment=wavefront_coding", *TINY, *TINY_NETWORK, *QUICK, *JUDGED]
 KINDS = ("depth", "tolerances", "noise")
 
@@ -53,10 +53,10 @@ def test_a_run_is_judged_by_waves_and_with_wrong_calibrations_too(composed, tmp_
 
 def test_a_judge_that_is_the_evaluation_renderer_says_the_same_to_the_bit(composed, tmp_path):
     same = (
-        "judges={again: {_target_: dolens.rendering.ray_renderer.RayRenderer, "
+        "reference_renderers={again: {_target_: dolens.rendering.ray_renderer.RayRenderer, "
         "sensor: '${renderer.sensor}', pupil_samples: 2}}"
     )
-    run(composed(*WAVEFRONT_CODING, "judges=none", f"++{same}"))
+    run(composed(*WAVEFRONT_CODING, "reference_renderers=none", f"++{same}"))
     metrics = metrics_of(tmp_path)
     for name in ("psnr_db", "ssim", "raw_psnr_db/worst"):
         assert metrics[f"test_again/{name}"] == metrics[f"test/{name}"]
@@ -102,7 +102,7 @@ def test_a_tolerance_that_the_lens_does_not_have_is_refused(refused):
     refused(
         "no parameter 'surfaces.9.curvature'",
         *WAVEFRONT_CODING,
-        "++calibrations.tolerances.tolerances={surfaces.9.curvature: 0.1}",
+        "++miscalibrations.tolerances.tolerances={surfaces.9.curvature: 0.1}",
     )
 
 

@@ -6,7 +6,7 @@ import yaml
 
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering import chief_ray_map as module
-from dolens.rendering.chief_ray_map import chief_ray_maps, distortion
+from dolens.rendering.chief_ray_map import chief_ray_maps, fit_chief_ray_map
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points
 from dolens.rendering.protocol import SensorWindow
@@ -52,9 +52,9 @@ def test_windows_of_a_sensor_look_where_the_sensor_does(root):
     system, sensor = lens_of(root, "large_fov_doublet").system(), SENSORS["large_fov_doublet"]
     scene = PlanarScene((5000.0,), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    whole = distortion(ImagingSystem(system, scene, sensor, pupil))
+    whole = fit_chief_ray_map(ImagingSystem(system, scene, sensor, pupil))
     window = sensor.window(11, 200, 40, 30)
-    for part, all_of_it in zip(whole.seen_by(window), whole.seen_by(sensor), strict=True):
+    for part, all_of_it in zip(whole.of_window(window), whole.of_window(sensor), strict=True):
         assert torch.allclose(part, all_of_it[..., 11:51, 200:230], rtol=0, atol=1e-9)
 
 
@@ -63,7 +63,7 @@ def test_where_polynomials_are_not_enough_every_pixel_has_its_ray(root, monkeypa
     system, sensor = lens_of(root, "cooke_triplet").system(), Sensor(12, 10, 1.0)
     scene = PlanarScene((5000.0,), LINES)
     pupil = axial_exit_pupil(system, LINES)
-    assert distortion(ImagingSystem(system, scene, sensor, pupil)) is None
+    assert fit_chief_ray_map(ImagingSystem(system, scene, sensor, pupil)) is None
     (found,) = chief_ray_maps(ImagingSystem(system, scene, sensor, pupil), [sensor])
     for one, other in zip(found, by_rays(system, scene, sensor, pupil), strict=True):
         assert torch.equal(one, other)

@@ -9,7 +9,7 @@ from dolens.errors import InputError
 from dolens.kernels import rendering
 from dolens.optics.rays import Rays, Status
 from dolens.prescriptions import lens_from_prescription
-from dolens.rendering.moving_view import moving_view
+from dolens.rendering.differentiable_geometry import differentiable_geometry
 from dolens.rendering.pixel_rays import PixelRays
 from dolens.rendering.pupil.exit_pupil import sampled_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
@@ -220,7 +220,7 @@ def test_traces_by_kernels_serve_where_no_renderer_is_fused(wavefront_coding):
     lens, scene = wavefront_coding(1e-5), PlanarScene([8000.0], LINES)
     renderer, system = RayRenderer(SMALL, 3), lens.system()
     view = renderer._view(system, scene, (40, 43), 0, sampled_exit_pupil(system, LINES, SMALL))
-    moving = moving_view(system, scene, view)
+    moving = differentiable_geometry(system, scene, view)
     rays, shown = PixelRays(scene, SMALL, view), scene.on_planes(texture(40))
     images = [
         rays.light(system.traced_by(backend), moving, shown, 0, 180)

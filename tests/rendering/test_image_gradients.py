@@ -31,10 +31,10 @@ def triplet(root):
     return load_lens(root / "conf/lens/cooke_triplet.yaml", dtype=torch.float64)
 
 
-def squared_error(lens, renderer, depth, follows="magnification"):
+def squared_error(lens, renderer, depth, texture_scale="magnification"):
     """To what a pinhole of the lens as it begins sees."""
     sensor = renderer.sensor
-    scene = PlanarScene((depth,), LINES, follows=follows).fixed_for(lens.system())
+    scene = PlanarScene((depth,), LINES, texture_scale=texture_scale).fixed_for(lens.system())
     textures = probe_texture(sensor, 3, 0)[:1]
     truth = pinhole_image(textures, sensor)[:, None]
 
@@ -177,17 +177,17 @@ def test_a_scene_fixed_in_the_world_punishes_another_magnification(root):
     """What follows the lens's magnification is free to grow; what is fixed is not."""
     lens, name = triplet(root), "thicknesses.2"
     found = {
-        follows: rows_of(lens, RayRenderer(whole_field(12, 0.5), 8), 1000.0, [name],
-                         follows=follows)[name]
-        for follows in ("magnification", "world")
+        texture_scale: rows_of(lens, RayRenderer(whole_field(12, 0.5), 8), 1000.0, [name],
+                         texture_scale=texture_scale)[name]
+        for texture_scale in ("magnification", "fixed")
     }  # fmt: skip
     for row in found.values():
         assert row.error < 5e-3, row
-    assert found["world"].autograd != pytest.approx(found["magnification"].autograd, rel=0.1)
+    assert found["fixed"].autograd != pytest.approx(found["magnification"].autograd, rel=0.1)
 
 
 def test_a_world_must_be_fixed_for_a_lens(root):
     with pytest.raises(InputError, match="fixed_for"):
-        PlanarScene((1000.0,), LINES, follows="world").magnifications(triplet(root).system())
-    with pytest.raises(InputError, match=r"scene\.follows: 'sky' is unknown"):
-        PlanarScene((1000.0,), LINES, follows="sky")
+        PlanarScene((1000.0,), LINES, texture_scale="fixed").magnifications(triplet(root).system())
+    with pytest.raises(InputError, match=r"scene\.texture_scale: 'sky' is unknown"):
+        PlanarScene((1000.0,), LINES, texture_scale="sky")

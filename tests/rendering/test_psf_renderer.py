@@ -17,8 +17,8 @@ from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.psf_grid import field_point_spread_functions
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.rendering.pupil.aim import aim
 from dolens.rendering.pupil.exit_pupil import sampled_exit_pupil
+from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.rendering.relative_illumination import relative_illumination
 from dolens.scene.planar import PlanarScene
@@ -227,7 +227,7 @@ def test_light_from_beyond_the_axial_pupil_is_not_lost(root):
     )
     for row, column in ((0, 0), (1, 0)):
         x, y = sensor.positions(torch.tensor(row).double(), torch.tensor(column).double())
-        ray = aim(x, y, system.vertices[-1], across, down, pupil.z)
+        ray = rays_to_exit_pupil(x, y, system.vertices[-1], across, down, pupil.z)
         traced = trace_surfaces(system, ray, LINES[1], sense=-1.0)
         light = torch.where(traced.valid, ray.n**4, 0.0).sum() * (3.0 * pupil.radius / 700) ** 2
         squared = (float(system.vertices[-1]) - pupil.z) ** 2
@@ -246,8 +246,8 @@ def test_light_beyond_the_window_is_counted(root):
     imaging = ImagingSystem.of(lens.system(), scene, sensor)
     found = renderer.point_spread_functions(imaging, 0)
     kept = found.functions.sum((-2, -1)).min()
-    assert 0.05 < float(found.lost) < 0.95
-    assert float(found.lost) == pytest.approx(
+    assert 0.05 < float(found.truncated) < 0.95
+    assert float(found.truncated) == pytest.approx(
         1.0 - float(kept) / float(found.light[0, 0]), abs=0.02
     )
 

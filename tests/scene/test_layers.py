@@ -149,7 +149,7 @@ def test_white_is_white_at_any_depths(triplet, renderer, reach):
     depths[..., 20:] = blocks[..., 20:]
     white = torch.ones(1, 1, 60, 60, dtype=torch.float64)
     focus = focused(triplet, FAR)
-    scene = LayeredScene.evenly_spaced(NEAR, FAR, 5, GREEN, reach=reach)
+    scene = LayeredScene.evenly_spaced(NEAR, FAR, 5, GREEN, inpainting_radius=reach)
     image = renderer.render(triplet, scene, torch.cat((white, depths), 1), 2, focus)
     plane = renderer.render(triplet, PlanarScene((2000.0,), GREEN), white, 2, focus)
     assert float((image - plane).abs().max()) < 1e-4

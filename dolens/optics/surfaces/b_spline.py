@@ -54,8 +54,8 @@ def spline_sag(p: Parameters, x: Tensor, y: Tensor, second: bool = False) -> Spl
     sx, sy = (row_x * by.value).sum(0), (row * by.slope).sum(0)
     if not second:
         return SplineSag(s, sx, sy)
-    sxx = ((c * bx.bend).sum(1) * by.value).sum(0)
-    return SplineSag(s, sx, sy, sxx, (row_x * by.slope).sum(0), (row * by.bend).sum(0))
+    sxx = ((c * bx.second_derivative).sum(1) * by.value).sum(0)
+    return SplineSag(s, sx, sy, sxx, (row_x * by.slope).sum(0), (row * by.second_derivative).sum(0))
 
 
 class BSpline(Surface):

@@ -179,7 +179,7 @@ class Surface(nn.Module):
     @property
     def semi_diameter(self) -> float:
         """Distance of the clear aperture's farthest point from the vertex, mm."""
-        return self.aperture.edge.reach
+        return self.aperture.edge.semi_diameter
 
     def check_aperture(self) -> None:
         """Raise `InputError` where the clear aperture reaches beyond the surface's sag branch."""
@@ -368,7 +368,7 @@ class SurfaceState:
     @property
     def semi_diameter(self) -> float:
         """Distance of the clear aperture's farthest point from the vertex, mm."""
-        return self.aperture.edge.reach
+        return self.aperture.edge.semi_diameter
 
     @property
     def edge_radius(self) -> float | Tensor:

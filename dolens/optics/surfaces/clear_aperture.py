@@ -28,11 +28,6 @@ class Circle:
         return self.semi_diameter - square.clamp(min=torch.finfo(square.dtype).tiny).sqrt()
 
     @property
-    def reach(self) -> float:
-        """Distance of its farthest point from the vertex, mm."""
-        return self.semi_diameter
-
-    @property
     def extent(self) -> tuple[float, float]:
         """How far it reaches along x and along y, mm."""
         return self.semi_diameter, self.semi_diameter
@@ -59,7 +54,7 @@ class Rectangle:
         return self.margin(x, y)
 
     @property
-    def reach(self) -> float:
+    def semi_diameter(self) -> float:
         """Distance of its corners from the vertex, mm."""
         return math.hypot(self.half_width_x, self.half_width_y)
 
@@ -78,11 +73,12 @@ class Unlimited:
     """No edge at all: light passes wherever the surface is, as a search for a better lens needs it.
 
     Attributes:
-        reach: mm, how far from the vertex light is expected; it sets the scale of tolerances.
+        semi_diameter: mm, how far from the vertex light is expected; it sets the scale of
+            tolerances.
     """
 
     rotational: ClassVar[bool] = True
-    reach: float
+    semi_diameter: float
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Positive everywhere."""
@@ -90,12 +86,12 @@ class Unlimited:
 
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
         """Without an edge, its reach."""
-        return self.reach * self.margin(x, y)
+        return self.semi_diameter * self.margin(x, y)
 
     @property
     def extent(self) -> tuple[float, float]:
         """How far light is expected along x and along y, mm."""
-        return self.reach, self.reach
+        return self.semi_diameter, self.semi_diameter
 
     def packed(self) -> tuple[OutlineKind, float, float]:
         """What the kernels know of it: nothing."""
@@ -122,10 +118,13 @@ class ClearAperture:
             for name, value in vars(outline).items() if outline else ():
                 if not 0.0 < value < math.inf:
                     raise InputError(f"{name} must be positive and finite, not {value}")
-        if self.obscuration is not None and self.obscuration.reach >= self.edge.reach:
+        if (
+            self.obscuration is not None
+            and self.obscuration.semi_diameter >= self.edge.semi_diameter
+        ):
             raise InputError(
-                f"the obscuration reaches {self.obscuration.reach:g} mm from the vertex, the "
-                f"aperture only {self.edge.reach:g}"
+                f"the obscuration reaches {self.obscuration.semi_diameter:g} mm from the vertex, "
+                f"the aperture only {self.edge.semi_diameter:g}"
             )
 
     @property
@@ -135,7 +134,7 @@ class ClearAperture:
 
     def opened(self) -> "ClearAperture":
         """The same size with no edge and no obscuration: it clips nothing."""
-        return ClearAperture(Unlimited(self.edge.reach))
+        return ClearAperture(Unlimited(self.edge.semi_diameter))
 
     def resized(self, semi_diameter: float) -> "ClearAperture":
         """The same with another radius of its circular edge.

@@ -26,13 +26,13 @@ class CubicBasis(NamedTuple):
         first: index of the first of the four, span - 3 (int64, shape of u).
         value: (4, ...), N.
         slope: (4, ...), dN/du, 1/mm.
-        bend: (4, ...), d²N/du², 1/mm²; None when it was not asked for.
+        second_derivative: (4, ...), d²N/du², 1/mm²; None when it was not asked for.
     """
 
     first: Tensor
     value: Tensor
     slope: Tensor
-    bend: Tensor | None
+    second_derivative: Tensor | None
 
 
 def clamped_knots(half_width: float, count: int) -> list[float]:
@@ -129,9 +129,11 @@ def cubic_basis(knots: Tensor, u: Tensor, second: bool = False) -> CubicBasis:
         )
     )
     slope = 3.0 * torch.stack((-q0, q0 - q1, q1 - q2, q2))
-    bend = None
+    second_derivative = None
     if second:
         r0, r1, r2 = -p0 / (d - a), (p0 - p1) / (e - b), p1 / (f - c)
-        bend = 6.0 * torch.stack((-r0, r0 - r1, r1 - r2, r2))
-        bend = torch.where(beyond == 0.0, bend, torch.zeros_like(bend))
-    return CubicBasis(first, torch.addcmul(value, beyond, slope), slope, bend)
+        second_derivative = 6.0 * torch.stack((-r0, r0 - r1, r1 - r2, r2))
+        second_derivative = torch.where(
+            beyond == 0.0, second_derivative, torch.zeros_like(second_derivative)
+        )
+    return CubicBasis(first, torch.addcmul(value, beyond, slope), slope, second_derivative)

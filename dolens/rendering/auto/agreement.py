@@ -69,7 +69,7 @@ def from_plain(values: Sequence[float] | None) -> Agreement | None:
     return None if values is None else Agreement(*values)
 
 
-def judging_samples(height: int, width: int, wavelengths: int) -> int:
+def reference_strata(height: int, width: int, wavelengths: int) -> int:
     """Strata along each side of the pupil of the renders that gradients are judged by."""
     side = math.sqrt(_RAYS / (height * width * wavelengths))
     return int(min(max(side, _FEWEST), _MOST))

@@ -174,7 +174,7 @@ class AutoRenderer(Renderer):
             renewed = before.renderer.with_pupil(lens, scene, values)
             # The whole sensor is measured with the pupil that it was rendered with until now.
             renderer = renewed if self.windows else before.renderer
-            now = measured(renderer, before.dtype, before.findings, trial)
+            now = measured(renderer, before.dtype, before.decisions, trial)
             now = replace(now, seconds=before.seconds + time.perf_counter() - started)
             if now.error <= max(self.tolerance, before.error) and self.tolerances.serves_still(
                 before.agreement, now.agreement

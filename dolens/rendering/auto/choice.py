@@ -9,7 +9,7 @@ import torch
 
 from dolens.errors import InputError
 from dolens.rendering.auto.agreement import Agreement, from_plain, plain
-from dolens.rendering.auto.field_grid import Finding
+from dolens.rendering.auto.field_grid import Decision
 from dolens.rendering.auto.trial import Trial
 from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer
@@ -72,7 +72,7 @@ class Choice:
     Attributes:
         renderer: the one that renders; its sensor is the whole one.
         dtype: of rays and image.
-        findings: the decisions, with what each costs in grey levels.
+        decisions: the decisions, with what each costs in grey levels.
         errors: RMS on the worst probe image against rays, both without diffraction, grey levels, by
             the windows' names, or of the whole sensor by ""; 0 is below what the reference can
             tell.
@@ -84,7 +84,7 @@ class Choice:
 
     renderer: Renderer
     dtype: torch.dtype
-    findings: tuple[Finding, ...]
+    decisions: tuple[Decision, ...]
     errors: Mapping[str, float]
     uncertainty: float
     tolerance: float
@@ -104,7 +104,7 @@ class Choice:
             f"grey levels (±{self.uncertainty:.2g}) on the probe images, planned in "
             f"{self.seconds:.1f} s",
             *([f"  errors in grey levels: {by_window}"] if by_window else []),
-            *(f"  {finding}" for finding in self.findings),
+            *(f"  {decision}" for decision in self.decisions),
             *([f"  {self.agreement}"] if self.agreement else []),
         ]
 
@@ -172,14 +172,14 @@ class Choice:
 def measured(
     renderer: Renderer,
     dtype: torch.dtype,
-    findings: Sequence[Finding],
+    decisions: Sequence[Decision],
     trial: Trial,
 ) -> Choice:
     """A renderer with its errors and the agreement of its gradients in a trial."""
     return Choice(
         renderer,
         dtype,
-        tuple(findings),
+        tuple(decisions),
         trial.errors(renderer, dtype),
         trial.uncertainty,
         trial.requirements.tolerance,
@@ -196,7 +196,7 @@ def choose(trial: Trial, tolerances: Tolerances) -> Choice:
 
     def attempt(tolerance: float) -> tuple[float, tuple[Choice, float]]:
         found = trial.plan(tolerance)
-        choice = measured(found.renderer, found.dtype, found.findings, trial)
+        choice = measured(found.renderer, found.dtype, found.decisions, trial)
         worst = max(choice.error, tolerances.error * tolerances.excess(choice.agreement))
         return worst, (choice, found.without_diffraction)
 
@@ -216,17 +216,17 @@ def choose(trial: Trial, tolerances: Tolerances) -> Choice:
     if of_rays <= tolerances.error and wanted:
         agreed = f", {choice.agreement}" if choice.agreement else ""
         because = f"functions err by {choice.error:.2g}{agreed}; {verdict}"
-        findings = [
-            Finding("model", RayRenderer.model, of_rays, because),
-            *(f for f in choice.findings if f.what == "diffraction"),
+        decisions = [
+            Decision("model", RayRenderer.model, of_rays, because),
+            *(f for f in choice.decisions if f.topic == "diffraction"),
         ]
         rays = RayRenderer(trial.probes.sensor, samples)
-        return measured(rays, torch.float32, findings, trial)
-    findings = [Finding("model", PsfRenderer.model, choice.error, verdict), *choice.findings]
+        return measured(rays, torch.float32, decisions, trial)
+    decisions = [Decision("model", PsfRenderer.model, choice.error, verdict), *choice.decisions]
     if not trial.separate_planes:
         because = "not measured: the probe's planes make images of their own"
-        findings.append(Finding("occlusion", "blurred planes", 0.0, because))
-    return replace(choice, findings=tuple(findings))
+        decisions.append(Decision("occlusion", "blurred planes", 0.0, because))
+    return replace(choice, decisions=tuple(decisions))
 
 
 def _tightened(

@@ -24,23 +24,23 @@ _LARGEST = 511  # window, pixels
 
 
 @dataclass(frozen=True)
-class Finding:
+class Decision:
     """One decision of a plan.
 
     Attributes:
-        what: the setting that was decided on.
-        chosen: its value.
+        topic: the setting that was decided on.
+        selected: its value.
         error: the error that it leaves, grey levels on the probe.
-        because: the reason.
+        reason: the reason.
     """
 
-    what: str
-    chosen: str
+    topic: str
+    selected: str
     error: float
-    because: str
+    reason: str
 
     def __str__(self) -> str:
-        return f"{self.what}: {self.chosen} ({self.error:.2g} grey levels; {self.because})"
+        return f"{self.topic}: {self.selected} ({self.error:.2g} grey levels; {self.reason})"
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Layout:
     """A renderer with its fields, registration, illumination and window, and why these."""
 
     renderer: PsfRenderer
-    finding: Finding
+    decision: Decision
 
 
 def choose_fields(
@@ -93,7 +93,7 @@ def choose_fields(
         f"illumination in {'a map' if renderer.illumination == 'map' else 'the functions'}, "
         f"{renderer.size} pixels"
     )
-    return Layout(renderer, Finding("fields", chosen, error, why))
+    return Layout(renderer, Decision("fields", chosen, error, why))
 
 
 def _candidates(
@@ -149,10 +149,10 @@ def _window(truth: Survey, distortion: bool, tolerance: float) -> int | None:
     return 2 * high + 1
 
 
-def window_finding(truth: Survey, size: int, distortion: bool) -> Finding:
+def window_decision(truth: Survey, size: int, distortion: bool) -> Decision:
     """Return the error of leaving out the light beyond a window of `size` pixels."""
     error = 255.0 * MEAN * _lost(truth, distortion, size)
-    return Finding("window", f"{size} pixels", error, "light beyond it is lost")
+    return Decision("window", f"{size} pixels", error, "light beyond it is lost")
 
 
 def _node_survey(imaging: ImagingSystem, renderer: PsfRenderer) -> Survey:

@@ -12,9 +12,9 @@ from dolens.rendering.auto.field_grid import (
     REGISTRATIONS,
     SAMPLES,
     WINDOW_SHARE,
-    Finding,
+    Decision,
     choose_fields,
-    window_finding,
+    window_decision,
 )
 from dolens.rendering.auto.probes import blurred_grey_levels, grey_levels
 from dolens.rendering.auto.survey import Pixels, Survey, spread_pixels, survey
@@ -49,19 +49,19 @@ class Plan:
     Attributes:
         renderer: the settings.
         dtype: precision of rays and image.
-        findings: the decisions.
+        decisions: the decisions.
         without_diffraction: grey levels that leaving diffraction out costs, or would cost.
     """
 
     renderer: PsfRenderer
     dtype: torch.dtype
-    findings: tuple[Finding, ...]
+    decisions: tuple[Decision, ...]
     without_diffraction: float
 
     @property
     def expected_error(self) -> float:
         """Grey levels, as if the decisions' errors were independent."""
-        return math.sqrt(sum(finding.error**2 for finding in self.findings))
+        return math.sqrt(sum(decision.error**2 for decision in self.decisions))
 
 
 @dataclass(frozen=True)
@@ -98,35 +98,35 @@ def plan(single: ImagingSystem, double: ImagingSystem, requirements: Requirement
     layout = choose_fields(truth, tolerance, requirements.registrations)
     renderer, distortion = layout.renderer, layout.renderer.registration == "chief_rays"
     functions = truth.functions(renderer.size, distortion)
-    findings = [layout.finding, window_finding(truth, renderer.size, distortion)]
+    decisions = [layout.decision, window_decision(truth, renderer.size, distortion)]
     shared = (_SHARING_OF_GRADIENTS if requirements.gradients else _SHARING) * tolerance
-    for name, finding in (
+    for name, decision in (
         ("depths", _shared_depths(functions, scene, shared)),
         ("colours", _shared_colours(functions, scene, shared)),
     ):
-        renderer = replace(renderer, **{name: finding.chosen})
-        findings.append(finding)
-    finding, without = _diffraction(functions, truth, renderer, tolerance)
+        renderer = replace(renderer, **{name: decision.selected})
+        decisions.append(decision)
+    decision, without = _diffraction(functions, truth, renderer, tolerance)
     if not requirements.diffraction:
-        finding = Finding(
+        decision = Decision(
             "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
         )
-    renderer = replace(renderer, diffraction=finding.chosen)
-    findings.append(finding)
-    if finding.chosen != "none":
-        finding = _wider_window(truth, renderer, tolerance)
-        renderer = replace(renderer, size=int(finding.chosen))
-        findings.append(finding)
+    renderer = replace(renderer, diffraction=decision.selected)
+    decisions.append(decision)
+    if decision.selected != "none":
+        decision = _wider_window(truth, renderer, tolerance)
+        renderer = replace(renderer, size=int(decision.selected))
+        decisions.append(decision)
         functions = truth.functions(renderer.size, distortion)
     few = slice(0, 8)
     part = tuple(place[few] for place in truth.pixels)
-    finding = _sampling(double, part, functions[few], renderer, tolerance)
-    renderer = replace(renderer, pupil_samples=int(finding.chosen))
-    findings.append(finding)
-    finding = _precision((single, double), part, renderer, tolerance)
-    findings.append(finding)
-    dtype = torch.float32 if finding.chosen == "single" else torch.float64
-    return Plan(renderer, dtype, tuple(findings), without)
+    decision = _sampling(double, part, functions[few], renderer, tolerance)
+    renderer = replace(renderer, pupil_samples=int(decision.selected))
+    decisions.append(decision)
+    decision = _precision((single, double), part, renderer, tolerance)
+    decisions.append(decision)
+    dtype = torch.float32 if decision.selected == "single" else torch.float64
+    return Plan(renderer, dtype, tuple(decisions), without)
 
 
 def union(plans: Mapping[str, Plan], sensor: Sensor) -> Plan:
@@ -151,38 +151,38 @@ def union(plans: Mapping[str, Plan], sensor: Sensor) -> Plan:
         f"{renderer.size} pixels, colours {renderer.colours}, diffraction {renderer.diffraction}"
     )
     error = max(found.expected_error for found in plans.values())
-    finding = Finding("windows", chosen, error, f"the most demanding of {', '.join(plans)}")
+    decision = Decision("windows", chosen, error, f"the most demanding of {', '.join(plans)}")
     double = any(found.dtype == torch.float64 for found in plans.values())
     return Plan(
         renderer,
         torch.float64 if double else torch.float32,
-        (finding,),
+        (decision,),
         max(found.without_diffraction for found in plans.values()),
     )
 
 
-def _shared_depths(functions: Tensor, scene: PlanarScene, tolerance: float) -> Finding:
+def _shared_depths(functions: Tensor, scene: PlanarScene, tolerance: float) -> Decision:
     middle = functions[:, scene.depths.index(scene.middle_depth)][:, None]
     return _sharing("depths", functions - middle, len(scene.depths), tolerance)
 
 
-def _shared_colours(functions: Tensor, scene: PlanarScene, tolerance: float) -> Finding:
+def _shared_colours(functions: Tensor, scene: PlanarScene, tolerance: float) -> Decision:
     middle = functions[:, :, scene.wavelengths.index(scene.middle_wavelength)][:, :, None]
     return _sharing("colours", functions - middle, len(scene.wavelengths), tolerance)
 
 
-def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Finding:
+def _sharing(what: str, difference: Tensor, count: int, tolerance: float) -> Decision:
     error = float(grey_levels(difference).square().mean().sqrt())
     if count == 1:
-        return Finding(what, "each", 0.0, "there is one")
+        return Decision(what, "each", 0.0, "there is one")
     if error <= tolerance:
-        return Finding(what, "one", error, "they hardly differ")
-    return Finding(what, "each", 0.0, f"one for all would cost {error:.2g}")
+        return Decision(what, "one", error, "they hardly differ")
+    return Decision(what, "each", 0.0, f"one for all would cost {error:.2g}")
 
 
 def _diffraction(
     functions: Tensor, truth: Survey, renderer: PsfRenderer, tolerance: float
-) -> tuple[Finding, float]:
+) -> tuple[Decision, float]:
     """Choose the model of diffraction, and return the error of leaving diffraction out.
 
     A perfect pupil's says whether it can matter at all; where it can, wavefronts are asked.
@@ -200,7 +200,7 @@ def _diffraction(
     ]
     error = float(torch.stack(errors).square().mean().sqrt())
     if error <= _DIFFRACTION * tolerance:
-        return Finding("diffraction", "none", error, seen), error
+        return Decision("diffraction", "none", error, seen), error
     sensor, distortion = renderer.sensor, renderer.registration == "chief_rays"
     # From the middle to a corner: what diffracts there may be beyond Fourier transforms.
     share = torch.linspace(0.5, 1.0, _WAVES, dtype=torch.float64)
@@ -215,7 +215,7 @@ def _diffraction(
     if against is not None:
         # A perfect pupil's effect is then all that is known of it, and its size.
         because = f"{seen}; not by waves: {against}"
-        return Finding("diffraction", "limit", error, because), error
+        return Decision("diffraction", "limit", error, because), error
     waves = found.waves(size, distortion)
     pair = [s.functions(size, distortion).double() for s in (found, again)]
     rays, noise = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
@@ -227,15 +227,15 @@ def _diffraction(
         for f in (rays, limited)
     )
     if without <= _DIFFRACTION * tolerance:
-        return Finding("diffraction", "none", without, f"{seen}; measured by waves"), without
+        return Decision("diffraction", "none", without, f"{seen}; measured by waves"), without
     if with_limit <= _DIFFRACTION * tolerance:
         because = f"{seen}; measured by waves; without it {without:.2g}"
-        return Finding("diffraction", "limit", with_limit, because), without
+        return Decision("diffraction", "limit", with_limit, because), without
     because = f"{seen}; without it {without:.2g}, with a perfect pupil's {with_limit:.2g}"
-    return Finding("diffraction", "wave", 0.0, because), without
+    return Decision("diffraction", "wave", 0.0, because), without
 
 
-def _wider_window(truth: Survey, renderer: PsfRenderer, tolerance: float) -> Finding:
+def _wider_window(truth: Survey, renderer: PsfRenderer, tolerance: float) -> Decision:
     """A window that holds what diffraction spreads."""
     scene = truth.imaging.scene
     pitch, distortion = renderer.sensor.pixel_pitch, renderer.registration == "chief_rays"
@@ -253,7 +253,7 @@ def _wider_window(truth: Survey, renderer: PsfRenderer, tolerance: float) -> Fin
         error = float(grey_levels(difference).square().mean().sqrt())
         if error <= WINDOW_SHARE * tolerance:
             break
-    return Finding("window with diffraction", str(size), error, "the Airy disc is wide")
+    return Decision("window with diffraction", str(size), error, "the Airy disc is wide")
 
 
 def _sampling(
@@ -262,7 +262,7 @@ def _sampling(
     functions: Tensor,
     renderer: PsfRenderer,
     tolerance: float,
-) -> Finding:
+) -> Decision:
     """The fewest rays whose functions are those of many."""
     distortion = renderer.registration == "chief_rays"
     error, samples = math.inf, _PUPIL_SAMPLES[-1]
@@ -273,7 +273,7 @@ def _sampling(
         if error <= _SAMPLING * tolerance:
             break
     because = "the fewest whose noise is small" if error <= _SAMPLING * tolerance else "the most"
-    return Finding("pupil samples", str(samples), error, because)
+    return Decision("pupil samples", str(samples), error, because)
 
 
 def _precision(
@@ -281,10 +281,10 @@ def _precision(
     places: Pixels,
     renderer: PsfRenderer,
     tolerance: float,
-) -> Finding:
+) -> Decision:
     distortion = renderer.registration == "chief_rays"
     found = [survey(each, places, 16).functions(renderer.size, distortion) for each in imaging]
     error = float(grey_levels(found[0].double() - found[1]).square().mean().sqrt())
     if error <= _PRECISION * tolerance:
-        return Finding("precision", "single", error, "rounding does not show")
-    return Finding("precision", "double", 0.0, f"single would cost {error:.2g}")
+        return Decision("precision", "single", error, "rounding does not show")
+    return Decision("precision", "double", 0.0, f"single would cost {error:.2g}")

@@ -17,7 +17,7 @@ from dolens.rendering.plane_points import (
 )
 from dolens.rendering.psf_grid import (
     sampled_disc,
-    splatted,
+    splat_plane_points,
     wave_cost,
     wave_point_spread_functions,
 )
@@ -70,7 +70,7 @@ class Survey:
     def functions(self, size: int, distortion: bool) -> Tensor:
         """(N, D, C, size, size)."""
         fused = cpu_kernels_serve(self.imaging.system)
-        return splatted(self.offsets(distortion), size, fused).functions
+        return splat_plane_points(self.offsets(distortion), size, fused).functions
 
     def waves(self, size: int, distortion: bool) -> Tensor:
         """Functions (N, D, C, size, size) with diffraction, of the same points."""

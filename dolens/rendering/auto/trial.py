@@ -15,7 +15,7 @@ from dolens.rendering.auto.agreement import (
     gradient,
     gradients_of_rays,
     image_measure,
-    judging_samples,
+    reference_strata,
 )
 from dolens.rendering.auto.costs import psf_cost, rays_cost
 from dolens.rendering.auto.plan import Plan, Requirements, plan, union
@@ -139,7 +139,7 @@ class Trial:
         textures = torch.cat(self._textures)
         if self._of_rays is None:
             window = self._each[0].sensor
-            side = judging_samples(
+            side = reference_strata(
                 window.height, window.width * len(self._each), len(self.scene.wavelengths)
             )
             rays = self._rendered(RayRenderer(self.probes.sensor, side), torch.float32)

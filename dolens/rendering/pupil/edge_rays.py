@@ -20,9 +20,9 @@ from torch import Tensor
 from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
-from dolens.rendering.pupil.aim import aim
-from dolens.rendering.pupil.axial_limit import edge_distances
 from dolens.rendering.pupil.exit_pupil import ExitPupil
+from dolens.rendering.pupil.limiting_aperture import edge_distances
+from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 
 # The share of the radius that differences are taken over, and for each precision the steps towards
 # the edge by one slope.
@@ -61,9 +61,9 @@ def edge_rays(
         system: the lens, differentiable.
         wavelengths: nm, C of them.
         points: x and y on the sensor, mm, each (P,).
-        pupil: the disc, of `moving_exit_pupil`.
+        pupil: the disc, of `differentiable_exit_pupil`.
         edge: middles (P, 1, 2), arms (P, J, 2), radii (P, J) and surfaces (P, J) in units of the
-            disc's radius, as `EdgeMap.at` gives them; J azimuths that are spread evenly.
+            disc's radius, as `PupilBoundaryMap.at` gives them; J azimuths that are spread evenly.
 
     Returns:
         None where no edge cuts the disc.
@@ -145,7 +145,7 @@ class _Beam:
         across, up = (self.middle + radius[..., None] * self.arms).unbind(-1)
         x, y = self.points
         sensor_z = self.system.vertices[-1]
-        return aim(x, y, sensor_z, across * pupil.radius, up * pupil.radius, pupil.z)
+        return rays_to_exit_pupil(x, y, sensor_z, across * pupil.radius, up * pupil.radius, pupil.z)
 
     def distance(self, radius: Tensor, pupil: ExitPupil) -> Tensor:
         """Return the distance inside the edge, mm."""

@@ -12,8 +12,8 @@ from dolens.optics.backend import trace_components
 from dolens.optics.paraxial_numbers import ParaxialNumbers
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
-from dolens.rendering.pupil.aim import aim
-from dolens.rendering.pupil.axial_limit import axial_limit, limiting_radius
+from dolens.rendering.pupil.limiting_aperture import limiting_aperture, limiting_pupil_radius
+from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 from dolens.sensor.pixels import Sensor
 
 _AZIMUTHS = 16
@@ -31,7 +31,8 @@ _ROOM, _STEPS = 1.01, 32
 class ExitPupil(NamedTuple):
     """A disc through which light reaches the sensor: z from the first vertex and radii, mm.
 
-    Numbers, or tensors whose gradients follow the lens (`moving_pupil.moving_exit_pupil`).
+    Numbers, or tensors whose gradients follow the lens
+    (`differentiable_pupil.differentiable_exit_pupil`).
 
     Attributes:
         z: of the paraxial exit pupil.
@@ -97,7 +98,7 @@ def sampled_exit_pupil(
     angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
     share = (torch.arange(_FINE_RADII, **options)[:, None] + 0.5) * (_LARGEST / _FINE_RADII)
     radii = share * axial.radius
-    ray = aim(
+    ray = rays_to_exit_pupil(
         x, y, system.vertices[-1], radii * torch.cos(angle), radii * torch.sin(angle), axial.z
     )
     passes = _get_through(system, ray, wavelengths[len(wavelengths) // 2 :][:1])
@@ -139,7 +140,9 @@ def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> Exi
     low, high = 0.0, min(2.0 * paraxial, 100.0 * distance)
     for _ in range(3):
         radii = torch.linspace(low, high, _RADII, **options)[:, None]
-        ray = aim(origin, origin, sensor_z, radii * torch.cos(angle), radii * torch.sin(angle), z)
+        ray = rays_to_exit_pupil(
+            origin, origin, sensor_z, radii * torch.cos(angle), radii * torch.sin(angle), z
+        )
         passes = _get_through(system, ray, wavelengths)
         failing = torch.nonzero(~passes.all(dim=1)).flatten()
         if len(failing) == 0:
@@ -150,9 +153,9 @@ def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> Exi
                 "no light reaches the centre of the sensor: every axial ray is stopped"
             )
         low, high = float(radii[first - 1]), float(radii[first])
-    limit = axial_limit(system, wavelengths, z, low)
+    limit = limiting_aperture(system, wavelengths, z, low)
     if limit is not None:
-        low = limiting_radius(system, limit, z, low, high)
+        low = limiting_pupil_radius(system, limit, z, low, high)
     return ExitPupil(z, low, low)
 
 

@@ -7,9 +7,9 @@ import torch
 from dolens.kernels.view import View
 from dolens.optics.rays import Components
 from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.pupil.differentiable_pupil import depends_on_parameters
 from dolens.rendering.pupil.edge_rays import EdgeRays, edge_rays
-from dolens.rendering.pupil.light_edges import EdgeMap
-from dolens.rendering.pupil.moving_pupil import depends_on_parameters
+from dolens.rendering.pupil.pupil_boundary import PupilBoundaryMap
 from dolens.rendering.random_numbers import random_words, uniform
 
 # Rays a pixel and wavelength, where edges cut light: as many as half the strata along a side of the
@@ -23,7 +23,7 @@ def edge_samples(pupil_samples: int) -> int:
 
 
 def pixel_edge_rays(
-    imaging: ImagingSystem, view: View, edges: EdgeMap | None, start: int, end: int
+    imaging: ImagingSystem, view: View, edges: PupilBoundaryMap | None, start: int, end: int
 ) -> EdgeRays | None:
     """Rays (C, pixels, samples) of pixels `start` to `end`; None where no gradient asks for them.
 
@@ -55,6 +55,6 @@ def pixel_edge_rays(
     return edge_rays(system, imaging.scene.wavelengths, points, imaging.pupil, edge)
 
 
-def of_channel(ray: Components, channel: int) -> Components:
+def select_wavelength(ray: Components, channel: int) -> Components:
     """Rays of one wavelength."""
     return Components(*(component[channel] for component in ray))

@@ -104,11 +104,11 @@ class Imaging(ABC):
         textures: Tensor,
         stage: str,
         index: int,
-        judge: str | None = None,
+        reference: str | None = None,
     ) -> Views:
         """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`.
 
-        With a judge, one of `judges`, it makes the images; the noise is the same.
+        With a judge, one of `reference_renderers`, it makes the images; the noise is the same.
         """
 
     @abstractmethod
@@ -125,7 +125,7 @@ class Imaging(ABC):
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Rays of spots that stand for what the views see, one entry for each object distance."""
 
-    def judges(self) -> Sequence[str]:
+    def reference_renderers(self) -> Sequence[str]:
         """Names of renderers that make the test images besides."""
         return []
 

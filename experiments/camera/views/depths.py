@@ -18,7 +18,7 @@ from dolens.scene.scene import Scene
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
 from experiments.camera.views.base import Comparison, Imaging, Views, seed_of
-from experiments.camera.views.truth import check_truth, chief_ray_looks, looked_up
+from experiments.camera.views.truth import check_truth, reference_chief_ray_map, sample_texture
 
 
 class DepthViews(Imaging):
@@ -38,7 +38,7 @@ class DepthViews(Imaging):
         psf_pupil_samples: their strata along each side of the pupil.
         truth: `pinhole` or `chief_rays`.
         seed: of rendering and noise.
-        judges: make the test images besides, of the same sensor, by name.
+        reference_renderers: make the test images besides, of the same sensor, by name.
         psf_diffraction: of the functions that networks ask for: `none`, or `limit`, blurred by a
             perfect pupil's diffraction, as a measurement would find them.
 
@@ -56,7 +56,7 @@ class DepthViews(Imaging):
         psf_pupil_samples: int = 48,
         truth: str = "pinhole",
         seed: int = 0,
-        judges: Mapping[str, Renderer] | None = None,
+        reference_renderers: Mapping[str, Renderer] | None = None,
         psf_diffraction: str = "none",
     ) -> None:
         super().__init__(scene, renderer, readout, seed)
@@ -69,14 +69,17 @@ class DepthViews(Imaging):
         self.evaluation_renderer = evaluation_renderer or renderer
         self.psf_size = psf_size
         self.psf_pupil_samples = psf_pupil_samples
-        self._judges = dict(judges or {})
+        self._reference_renderers = dict(reference_renderers or {})
         if psf_diffraction not in ("none", "limit"):
             raise InputError(
                 f"views.psf_diffraction '{psf_diffraction}' is unknown; allowed: none, limit"
             )
         self.psf_diffraction = psf_diffraction
         self._f_number: float | None = None
-        others = {f"judges.{name}": judge for name, judge in self._judges.items()}
+        others = {
+            f"reference_renderers.{name}": reference
+            for name, reference in self._reference_renderers.items()
+        }
         for name, other in {"evaluation_renderer": self.evaluation_renderer, **others}.items():
             if other.sensor != renderer.sensor:
                 raise InputError(
@@ -118,11 +121,11 @@ class DepthViews(Imaging):
         textures: Tensor,
         stage: str,
         index: int,
-        judge: str | None = None,
+        reference: str | None = None,
     ) -> Views:
         """Image textures at every depth."""
         renderer = self._training if stage == "train" else self.evaluation_renderer
-        renderer = renderer if judge is None else self._judges[judge]
+        renderer = renderer if reference is None else self._reference_renderers[reference]
         seed = seed_of(self.seed, stage, index)
         image = renderer.render(lens, self.scene, textures, seed, values)
         raw = self._raw(image, seed)
@@ -133,14 +136,16 @@ class DepthViews(Imaging):
         colours = self.scene.colours(textures)
         if self.truth == "pinhole":
             return linear_to_srgb(pinhole_image(colours, self.sensor))[:, None]
-        ((rows, columns),) = chief_ray_looks(lens, values, self.scene, self.sensor, [self.sensor])
+        ((rows, columns),) = reference_chief_ray_map(
+            lens, values, self.scene, self.sensor, [self.sensor]
+        )
         centre = self.scene.texture_centre
-        planes = [looked_up(colours, r, c, centre) for r, c in zip(rows, columns, strict=True)]
+        planes = [sample_texture(colours, r, c, centre) for r, c in zip(rows, columns, strict=True)]
         return linear_to_srgb(torch.stack(planes, 1))
 
-    def judges(self) -> list[str]:
+    def reference_renderers(self) -> list[str]:
         """Those that were given."""
-        return list(self._judges)
+        return list(self._reference_renderers)
 
     def point_spread_functions(
         self,

@@ -19,7 +19,12 @@ from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 from experiments.camera.views.base import Comparison, Imaging, Views, seed_of
 from experiments.camera.views.field_windows import FieldWindows
-from experiments.camera.views.truth import check_truth, chief_ray_looks, looked_up, nearest_texel
+from experiments.camera.views.truth import (
+    check_truth,
+    nearest_texel,
+    reference_chief_ray_map,
+    sample_texture,
+)
 
 EVERYWHERE = "field"
 # Pixels along each side of point spread functions, where the training renderer has none.
@@ -128,7 +133,7 @@ class FieldViews(Imaging):
         textures: Tensor,
         stage: str,
         index: int,
-        judge: str | None = None,
+        reference: str | None = None,
     ) -> Views:
         """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
         seed, count = seed_of(self.seed, stage, index), len(textures)
@@ -163,7 +168,7 @@ class FieldViews(Imaging):
         if self.truth == "pinhole":
             centres = [(float(round(w.centre_row)), float(round(w.centre_column))) for w in windows]
             return None, centres
-        looks = chief_ray_looks(lens, values, self.scene, self.whole, windows)
+        looks = reference_chief_ray_map(lens, values, self.scene, self.whole, windows)
         return looks, [nearest_texel(rows, columns) for rows, columns in looks]
 
     def point_spread_functions(
@@ -208,7 +213,7 @@ def _seen(
         ]
         return linear_to_srgb(torch.stack(found))
     found = [
-        looked_up(texture, rows[0], columns[0], window.texture_centre)
+        sample_texture(texture, rows[0], columns[0], window.texture_centre)
         for texture, (rows, columns), window in zip(textures, looks, windows, strict=True)
     ]
     return linear_to_srgb(torch.stack(found))

@@ -42,7 +42,7 @@ class LayerViews(DepthViews):
         textures: Tensor,
         stage: str,
         index: int,
-        judge: str | None = None,
+        reference: str | None = None,
     ) -> Views:
         """One image of each texture."""
         if textures.shape[1] == len(self.scene.wavelengths):
@@ -50,4 +50,4 @@ class LayerViews(DepthViews):
             generator = torch.Generator().manual_seed(seed)
             near, far = self.scene.depths[0], self.scene.depths[-1]
             textures = with_occluders(textures, near, far, self.occluders, generator)
-        return super().take(lens, values, textures, stage, index, judge)
+        return super().take(lens, values, textures, stage, index, reference)

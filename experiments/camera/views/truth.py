@@ -9,8 +9,8 @@ from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.imaging_system import ImagingSystem
+from dolens.rendering.pupil.differentiable_pupil import differentiable_chief_pupil
 from dolens.rendering.pupil.exit_pupil import paraxial_exit_pupil
-from dolens.rendering.pupil.moving_pupil import moving_chief_pupil
 from dolens.scene.planar import as_planes
 from dolens.scene.scene import Scene
 from dolens.scene.texture import bilinear, texture_origin
@@ -26,7 +26,7 @@ def check_truth(name: str) -> str:
     return name
 
 
-def chief_ray_looks(
+def reference_chief_ray_map(
     lens: Lens,
     values: Mapping[str, Tensor],
     scene: Scene,
@@ -45,12 +45,14 @@ def chief_ray_looks(
     system = lens.system(values)
     wavelengths = (lens.primary_wavelength,)
     planes = as_planes(scene, wavelengths=wavelengths)
-    pupil = moving_chief_pupil(system, wavelengths, paraxial_exit_pupil(system, wavelengths))
+    pupil = differentiable_chief_pupil(
+        system, wavelengths, paraxial_exit_pupil(system, wavelengths)
+    )
     looks = chief_ray_maps(ImagingSystem(system, planes, whole, pupil), windows)
     return [(rows[:, 0], columns[:, 0]) for rows, columns in looks]
 
 
-def looked_up(
+def sample_texture(
     textures: Tensor, rows: Tensor, columns: Tensor, centre: tuple[float, float]
 ) -> Tensor:
     """Textures (..., h, w) at rows and columns (H, W) from the axis: (..., H, W).

@@ -7,8 +7,12 @@ from torch import Tensor
 
 from dolens.optics.paraxial_numbers import ParaxialNumbers
 from dolens.optics.system import OpticalSystem
-from dolens.rendering.pupil.axial_limit import AxialLimit, axial_limit, limit_distance
 from dolens.rendering.pupil.exit_pupil import ExitPupil
+from dolens.rendering.pupil.limiting_aperture import (
+    LimitingAperture,
+    limiting_aperture,
+    limiting_edge_distance,
+)
 
 
 def depends_on_parameters(system: OpticalSystem) -> bool:
@@ -25,7 +29,7 @@ def depends_on_parameters(system: OpticalSystem) -> bool:
     return any(tensor.requires_grad for tensor in tensors)
 
 
-def moving_exit_pupil(
+def differentiable_exit_pupil(
     system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil
 ) -> ExitPupil:
     """The pupil's numbers, with gradients with respect to the lens's parameters.
@@ -49,7 +53,7 @@ def moving_exit_pupil(
     options = {"dtype": system.dtype, "device": system.device}
     z, ratio = _pupil_plane(system, wavelengths, pupil)
     axial = torch.tensor(pupil.axial_radius, **options)
-    limit = axial_limit(system, wavelengths, pupil.z, pupil.axial_radius)
+    limit = limiting_aperture(system, wavelengths, pupil.z, pupil.axial_radius)
     if limit is not None:
         axial = _radius(system, limit, axial, z)
     elif ratio is not None:
@@ -58,7 +62,7 @@ def moving_exit_pupil(
     return ExitPupil(z, axial * (pupil.radius / pupil.axial_radius), axial)
 
 
-def moving_chief_pupil(
+def differentiable_chief_pupil(
     system: OpticalSystem, wavelengths: Sequence[float], pupil: ExitPupil
 ) -> ExitPupil:
     """The pupil with the gradient of its z alone: enough for chief rays, and no ray is traced."""
@@ -85,10 +89,10 @@ def _pupil_plane(
     return z, ratio
 
 
-def _radius(system: OpticalSystem, limit: AxialLimit, radius: Tensor, z: Tensor) -> Tensor:
+def _radius(system: OpticalSystem, limit: LimitingAperture, radius: Tensor, z: Tensor) -> Tensor:
     """The axial radius as a function of the lens, by the implicit function theorem."""
     reach = radius.detach().requires_grad_()
-    distance = limit_distance(system, limit, reach, z)
+    distance = limiting_edge_distance(system, limit, reach, z)
     (slope,) = torch.autograd.grad(distance, reach, retain_graph=True)
     if not bool(slope != 0.0):
         return radius

@@ -10,8 +10,8 @@ from dolens.optics.backend import trace_rays
 from dolens.optics.rays import Rays, Status
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.pupil.aim import aim
 from dolens.rendering.pupil.exit_pupil import ExitPupil
+from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 
 # Azimuths of the edge, points along each side of the disc in the search for its middle, and
 # halvings of the interval that the edge lies in: Newton's iteration does the rest.
@@ -23,7 +23,7 @@ UNCUT = 0.999
 
 
 @dataclass(frozen=True)
-class LightEdges:
+class PupilBoundary:
     """The edge of the light of F points of the sensor, in polar coordinates about its middle.
 
     Coordinates are those of the disc, in units of its radius.
@@ -41,12 +41,12 @@ class LightEdges:
 
 
 @torch.no_grad()
-def light_edges(
+def pupil_boundary(
     system: OpticalSystem,
     wavelength: float,
     points: tuple[Tensor, Tensor],
     pupil: ExitPupil,
-) -> LightEdges | None:
+) -> PupilBoundary | None:
     """Search for the edges of the light of points of the sensor, at one wavelength.
 
     One trace tells where nothing cuts the disc; the answer is then None.
@@ -82,7 +82,7 @@ def light_edges(
     surface = torch.where(cut, surface, 0)
     if not bool((surface > 0).any()):
         return None
-    return LightEdges(middle, 0.5 * (low + high), surface)
+    return PupilBoundary(middle, 0.5 * (low + high), surface)
 
 
 class _Probe:
@@ -101,7 +101,7 @@ class _Probe:
     def passes(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return which rays pass, and the surface whose edge stops a ray; 0 where none does."""
         across, up = (self.pupil.radius * places).unbind(-1)
-        ray = aim(self.x, self.y, self.system.vertices[-1], across, up, self.pupil.z)
+        ray = rays_to_exit_pupil(self.x, self.y, self.system.vertices[-1], across, up, self.pupil.z)
         rays = Rays.from_components(ray, self.wavelength)
         hit = trace_rays(self.system, rays, -1.0)
         clipped = hit.status == Status.VIGNETTED
@@ -122,7 +122,7 @@ class _Probe:
 
 
 @dataclass(frozen=True)
-class EdgeMap:
+class PupilBoundaryMap:
     """Edges found at a few points of a sensor, for all of its pixels.
 
     Attributes:
@@ -132,7 +132,7 @@ class EdgeMap:
         step: mm between neighbouring points.
     """
 
-    edges: LightEdges
+    edges: PupilBoundary
     symmetric: bool
     low: tuple[float, float]
     step: tuple[float, float]
@@ -200,7 +200,7 @@ def _neighbours(place: Tensor) -> list[tuple[Tensor, Tensor]]:
 
 
 @torch.no_grad()
-def edge_map(imaging: ImagingSystem) -> EdgeMap | None:
+def pupil_boundary_map(imaging: ImagingSystem) -> PupilBoundaryMap | None:
     """Find the edges of the light all over a sensor; None where nothing cuts the disc.
 
     Args:
@@ -230,8 +230,8 @@ def edge_map(imaging: ImagingSystem) -> EdgeMap | None:
             corner[1] + grid * step[1], corner[0] + grid * step[0], indexing="ij"
         )
         points = (across.reshape(-1), up.reshape(-1))
-    edges = light_edges(system, wavelength, points, imaging.pupil)
-    return None if edges is None else EdgeMap(edges, symmetric, corner, step)
+    edges = pupil_boundary(system, wavelength, points, imaging.pupil)
+    return None if edges is None else PupilBoundaryMap(edges, symmetric, corner, step)
 
 
 def _distances(x: Tensor, y: Tensor) -> tuple[float, float]:

@@ -21,7 +21,7 @@ _STEP, _NEAR = 1e-4, 0.1
 _TINY = 1e-30
 
 
-def with_moving_bounds(fit: PupilFit) -> PupilFit:
+def with_differentiable_bounds(fit: PupilFit) -> PupilFit:
     """A fit whose bounds have the gradients of the edges that end the light.
 
     With d(α; θ) the distance inside an edge, and α the cosine along one axis of the light's last

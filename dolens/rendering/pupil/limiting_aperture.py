@@ -12,7 +12,7 @@ from dolens.optics.elements import from_lens_axes
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces
-from dolens.rendering.pupil.aim import aim
+from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
 
 _AZIMUTHS = 16
 # An axial ray that passes every edge at this share of its semi-diameter is limited by none.
@@ -20,7 +20,7 @@ _LIMITED = 1e-2
 _ITERATIONS = 4
 
 
-class AxialLimit(NamedTuple):
+class LimitingAperture(NamedTuple):
     """The limit of the axial beam: a surface's number, the ray's azimuth, and its wavelength."""
 
     surface: int
@@ -29,9 +29,9 @@ class AxialLimit(NamedTuple):
 
 
 @torch.no_grad()
-def axial_limit(
+def limiting_aperture(
     system: OpticalSystem, wavelengths: Sequence[float], z: float, radius: float
-) -> AxialLimit | None:
+) -> LimitingAperture | None:
     """The edge that the rim of a disc of the exit pupil is nearest to; None where none is near.
 
     Args:
@@ -47,7 +47,7 @@ def axial_limit(
     across, up = radius * torch.cos(angle), radius * torch.sin(angle)
     every = torch.tensor(wavelengths, **options)[:, None]
     one = torch.ones_like(every)
-    ray = aim(origin, origin, sensor_z, across * one, up * one, z)
+    ray = rays_to_exit_pupil(origin, origin, sensor_z, across * one, up * one, z)
     trace = trace_surfaces(system, ray, every, sense=-1.0, record=True)
     nearest, limit = _LIMITED, None
     for margins, point in zip(trace.margins, trace.points, strict=True):
@@ -56,13 +56,13 @@ def axial_limit(
         if float(share) < nearest:
             nearest = float(share)
             colour, azimuth = divmod(int(place), count)
-            limit = AxialLimit(margins.number, float(angle[azimuth]), wavelengths[colour])
+            limit = LimitingAperture(margins.number, float(angle[azimuth]), wavelengths[colour])
     return limit
 
 
-def limit_distance(
+def limiting_edge_distance(
     system: OpticalSystem,
-    limit: AxialLimit,
+    limit: LimitingAperture,
     radius: Tensor,
     z: float | Tensor,
 ) -> Tensor:
@@ -72,14 +72,14 @@ def limit_distance(
     """
     zero = torch.zeros_like(radius)[None]
     across, up = math.cos(limit.azimuth) * radius[None], math.sin(limit.azimuth) * radius[None]
-    ray = aim(zero, zero, system.vertices[-1], across, up, z)
+    ray = rays_to_exit_pupil(zero, zero, system.vertices[-1], across, up, z)
     return edge_distances(system, ray, limit.surface, limit.wavelength)[0]
 
 
 @torch.no_grad()
-def limiting_radius(
+def limiting_pupil_radius(
     system: OpticalSystem,
-    limit: AxialLimit,
+    limit: LimitingAperture,
     z: float,
     low: float,
     high: float,
@@ -91,7 +91,7 @@ def limiting_radius(
 
     def distance(radius: float) -> float:
         reach = torch.tensor(radius, dtype=system.dtype, device=system.device)
-        return float(limit_distance(system, limit, reach, z))
+        return float(limiting_edge_distance(system, limit, reach, z))
 
     start, inside, outside = low, distance(low), distance(high)
     if not inside >= 0.0 > outside:

@@ -6,7 +6,7 @@ from torch import Tensor
 from dolens.optics.rays import Components
 
 
-def aim(
+def rays_to_exit_pupil(
     x: Tensor,
     y: Tensor,
     sensor_z: Tensor,
