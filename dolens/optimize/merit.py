@@ -162,10 +162,11 @@ class MeritValue:
 
 def _operands(merit: MeritFunction, sensor_distance: Tensor | None = None) -> OperandValues | None:
     """Return the operands' values; None where one cannot be evaluated."""
-    parameters = merit.variables()
+    if not merit.operands:
+        return OperandValues((), (), ())
+    lens, parameters = merit.lens, merit.variables()
     if sensor_distance is not None:
         parameters["sensor_distance"] = sensor_distance
-    lens = merit.lens
     try:
         return evaluate_operands(
             merit.operands, lens, parameters, lens.object_distance, merit.crossings
