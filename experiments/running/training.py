@@ -18,6 +18,7 @@ from dolens.errors import InputError
 from dolens.prescriptions import lens_from_prescription, save_lens
 from experiments.callbacks.interruption import InterruptionNotice
 from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
+from experiments.running.extensions import import_extensions
 from experiments.running.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
 from experiments.running.unread_settings import refuse_unread
 
@@ -35,7 +36,7 @@ OmegaConf.register_new_resolver("count", len, replace=True)
 # The top-level keys that `run` itself takes; all others must be read by one of these.
 TAKEN = (
     *("lens", "module", "data", "callbacks", "logger", "trainer"),
-    *("seed", "backend", "lens_dtype", "threads", "matmul_precision"),
+    *("extensions", "seed", "backend", "lens_dtype", "threads", "matmul_precision"),
     *("train", "test", "ckpt_path", "objective"),
 )
 
@@ -48,6 +49,7 @@ def run(cfg: DictConfig) -> float:
     folder = Path(HydraConfig.get().runtime.output_dir)
     refuse_subprocess_ddp_in_sweep(cfg)
     refuse_unread(cfg, TAKEN)
+    import_extensions(cfg.extensions)
     settings = settings_of(cfg)  # before Hydra resolves in place what it instantiates
     if str(cfg.objective).startswith("test/") and not cfg.test:
         raise InputError(f"objective: '{cfg.objective}' needs test=true, or name another metric")
