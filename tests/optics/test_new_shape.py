@@ -112,7 +112,7 @@ def test_it_has_gradients_a_prescription_and_statuses(with_wedge):
 
 
 def test_a_surface_is_known_by_its_kind_once_it_is_registered(registered):
-    with pytest.raises(InputError, match="type .wedge. is unknown"):
+    with pytest.raises(InputError, match=r"type .wedge. is unknown"):
         prism({"type": "wedge"})
     assert registered(Wedge) is Wedge, "usable as a decorator"
     assert SURFACES["wedge"] is Wedge
