@@ -15,17 +15,18 @@ from torch import Tensor
 
 
 class Kind(IntEnum):
-    """What a step is.  The shape's numbers follow the header, in the order given here."""
+    """Steps that the kernels' own sources tell apart, and after them surfaces given by their sag.
 
-    PLANE = 0  # none
-    SPHERE = 1  # c
-    CONIC = 2  # c, k
-    EVEN_ASPHERE = 3  # c, k, a4, a6, ...: as many as Code.COUNT says
-    XY_POLYNOMIAL = 4  # b, then coefficients; powers (i, j) in `extras`, two for each
-    B_SPLINE = 5  # knots_x, knots_y, then coefficients, rows of Code.COLUMNS
-    CHANGE_AXES = 6  # the ray is carried to the plane of the next vertex, then turned
-    LENS_AXES = 7  # position ← turn·position + step, direction ← turn·direction
-    SENSOR = 8  # carried along the line to z = 0, after the shift
+    The numbers of a surface's shape follow the header of its record, in the order of its `packed`.
+    """
+
+    CHANGE_AXES = 0  # the ray is carried to the plane of the next vertex, then turned
+    LENS_AXES = 1  # position ← turn·position + step, direction ← turn·direction
+    SENSOR = 2  # carried along the line to z = 0, after the shift
+    PLANE = 3  # no numbers
+    SPHERE = 4  # c
+    CONIC = 5  # c, k
+    BY_SAG = 6  # the first code of a `SurfaceKernel` of its own
 
 
 class Slot:

@@ -26,9 +26,13 @@ Wavelength = float | Sequence[float] | Tensor
 
 def unsupported(system: OpticalSystem) -> str | None:
     """Why the kernels cannot trace a lens, in words that name the surface; None where they can."""
+    device = system.device.type
     for number, surface in enumerate(system.surfaces, 1):
-        if surface.shape.kernel is None:
+        kernel = surface.shape.kernel
+        if kernel is None:
             return f"surface {number} ({surface.shape.kind}) has no kernel"
+        if not kernel.serves(device):
+            return f"surface {number} ({surface.shape.kind}) has no kernel for {device}"
     return None
 
 
@@ -95,7 +99,7 @@ def _lay_out(
             sizes.append(None if value is None else value.shape)
             if value is not None:
                 (arrays if value.ndim else scalars).append(value)
-        forms.append(Form(shape.kernel, count, columns, degree, extras, tuple(sizes)))
+        forms.append(Form(shape.kernel.code, count, columns, degree, extras, tuple(sizes)))
         apertures.append(surface.aperture)
     scalars += (*system.thicknesses, system.sensor_distance)
     layout = records(

@@ -24,7 +24,7 @@ class Form(NamedTuple):
     """A shape without its numbers; see `PackedShape`.
 
     Attributes:
-        kind: which kernel.
+        kind: the code of its kernel.
         count: as in `PackedShape`, and the three that follow.
         columns: of a spline; 1 for a polynomial with a b·z² term.
         degree: highest power of x or y.
@@ -32,7 +32,7 @@ class Form(NamedTuple):
         sizes: the shape of each number's tensor; None: the number is zero.
     """
 
-    kind: Kind
+    kind: int
     count: int
     columns: int
     degree: int
@@ -164,7 +164,7 @@ class _Writer:
             turns=tuple(self.turns),
         )
 
-    def step(self, kind: Kind, before: int, after: int, number: int) -> list[int]:
+    def step(self, kind: int, before: int, after: int, number: int) -> list[int]:
         """Begin a record; its row of codes, to be filled in further."""
         row = [0] * Code.ROW
         row[Code.KIND], row[Code.OFFSET] = int(kind), len(self.constants)

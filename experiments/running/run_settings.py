@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from dolens.errors import InputError, check_choice
 
@@ -26,6 +26,7 @@ class RunSettings:
         trainer: makes the trainer.
         callbacks: name → what makes a callback, or None.
         logger: name → what makes a logger, or None.
+        extensions: names of Python modules that are imported first, as they register surfaces.
         seed: the seed of all random numbers.
         backend: what traces rays; see `dolens.load_lens`.
         lens_dtype: `float32` or `float64`.
@@ -46,6 +47,7 @@ class RunSettings:
     trainer: DictConfig
     callbacks: DictConfig | None
     logger: DictConfig | None
+    extensions: ListConfig | None
     seed: int
     backend: str
     lens_dtype: str

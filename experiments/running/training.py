@@ -21,6 +21,7 @@ from experiments.callbacks.interruption import InterruptionNotice
 from experiments.experiment import Experiment, check_experiment
 from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
 from experiments.running.configuration import checked
+from experiments.running.extensions import import_extensions
 from experiments.running.resolvers import register_resolvers
 from experiments.running.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
 from experiments.running.run_settings import RunSettings
@@ -44,6 +45,7 @@ def run(cfg: DictConfig) -> float:
     cfg = checked(cfg)
     settings = RunSettings.of(cfg)
     refuse_subprocess_ddp_in_sweep(settings)
+    import_extensions(settings.extensions)
     written = settings_of(cfg)  # before Hydra resolves in place what it instantiates
     if settings.threads:
         torch.set_num_threads(settings.threads)

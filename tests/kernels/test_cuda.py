@@ -9,7 +9,10 @@ import pytest
 import torch
 
 from dolens import InputError, Rays, load_lens
+from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Kind
+from dolens.optics.surfaces import EvenAsphere, XYPolynomial
+from tests.kernels.own_surface.paraboloid import Paraboloid
 
 pytest.importorskip("triton")
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -62,11 +65,13 @@ def test_rays_on_the_cpu_are_refused(root):
         lens.trace(rays)
 
 
-def compile_for(kernel, real, kinds, block, absent):
+def compile_for(kernel, real, kinds, surfaces, block, absent):
     """PTX of a kernel for an H100 or H200, which need not be here."""
     import triton
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
+
+    from dolens.kernels.cuda.functions import shape_of
 
     numbers = "*fp64" if real == torch.float64 else "*fp32"
     types = dict.fromkeys(("codes", "extras", "which"), "*i32") | {
@@ -76,7 +81,12 @@ def compile_for(kernel, real, kinds, block, absent):
                 "out_path", "of_position", "of_direction", "of_path", "position_gradient",
                 "direction_gradient", "scratch")  # fmt: skip
     types |= dict.fromkeys(pointers, numbers)
-    fixed = {"KINDS": kinds, "BLOCK": block, "INDICES": False} | dict.fromkeys(absent)
+    forms = tuple(
+        shape_of(surface.kernel.code, kernels_of(surface.kernel.code, "cuda"))
+        for surface in surfaces
+    )
+    fixed = {"KINDS": kinds, "FORMS": forms, "BLOCK": block, "INDICES": False}
+    fixed |= dict.fromkeys(absent)
     fixed = {name: value for name, value in fixed.items() if name in kernel.arg_names}
     signature = {
         name: "constexpr" if name in fixed else types.get(name, "i32") for name in kernel.arg_names
@@ -88,9 +98,10 @@ def compile_for(kernel, real, kinds, block, absent):
 
 SPHERES = 1 << Kind.PLANE | 1 << Kind.SPHERE | 1 << Kind.SENSOR
 LENSES = {
-    "spheres": SPHERES,
-    "aspheres": SPHERES | 1 << Kind.EVEN_ASPHERE,
-    "posed plates": SPHERES | 1 << Kind.XY_POLYNOMIAL | 1 << Kind.CHANGE_AXES | 1 << Kind.LENS_AXES,
+    "spheres": (SPHERES, ()),
+    "aspheres": (SPHERES, (EvenAsphere,)),
+    "posed plates": (SPHERES | 1 << Kind.CHANGE_AXES | 1 << Kind.LENS_AXES, (XYPolynomial,)),
+    "a surface of a user's own": (SPHERES, (Paraboloid,)),
 }
 
 
@@ -102,6 +113,7 @@ LENSES = {
         ("spheres", torch.float64),
         ("posed plates", torch.float32),
         ("aspheres", torch.float64),
+        ("a surface of a user's own", torch.float32),
     ],
 )
 def test_the_kernels_compile_and_keep_their_precision(name, real):
@@ -113,9 +125,9 @@ def test_the_kernels_compile_and_keep_their_precision(name, real):
     from dolens.kernels.cuda.backend import ADJOINT_BLOCK, FORWARD_BLOCK
     from dolens.kernels.cuda.forward import forward_kernel
 
-    forward = compile_for(forward_kernel, real, LENSES[name], FORWARD_BLOCK, ("which",))
+    forward = compile_for(forward_kernel, real, *LENSES[name], FORWARD_BLOCK, ("which",))
     absent = ("which", "of_direction", "of_path")
-    adjoint = compile_for(adjoint_kernel, real, LENSES[name], ADJOINT_BLOCK[real], absent)
+    adjoint = compile_for(adjoint_kernel, real, *LENSES[name], ADJOINT_BLOCK[real], absent)
     bits = 64 if real == torch.float64 else 32
     for ptx in (forward, adjoint):
         assert f"div.rn.f{bits}" in ptx and f"sqrt.rn.f{bits}" in ptx

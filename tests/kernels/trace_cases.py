@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from dolens import Rays, load_lens
+from dolens.optics.surfaces import register_surface, unregister_surface
 from dolens.optics.surfaces.spline_basis import clamped_knots
 from dolens.prescriptions import lens_from_prescription
+from tests.kernels.own_surface.paraboloid import Paraboloid
 
 F64 = torch.float64
 _GLASS = "1.5168/64.17"
@@ -48,6 +50,16 @@ def _aspheres():
     front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "a6": -1e-7,
              "a8": 3e-9, "a10": 1e-11, "a12": -1e-13}  # fmt: skip
     return _singlet(front, {"type": "even_asphere", "radius": -60.0, "conic": 0.4, "a4": 1e-5})
+
+
+def _own_surface():
+    """A surface of a user's own behind a sphere; it is registered while the lens is made."""
+    back = {"type": "paraboloid", "curvature_x": -0.02, "curvature_y": -0.015, "twist": 0.002}
+    register_surface(Paraboloid)
+    try:
+        return _singlet({"type": "sphere", "radius": 40.0}, back)
+    finally:
+        unregister_surface("paraboloid")
 
 
 def _posed(root):
@@ -95,6 +107,7 @@ LENSES = {
     "polynomial": lambda root: _polynomial(),
     "even_aspheres": lambda root: _aspheres(),
     "clipped": lambda root: _clipped(),
+    "own_surface": lambda root: _own_surface(),
 }
 
 

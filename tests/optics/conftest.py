@@ -3,7 +3,9 @@ import math
 import pytest
 import torch
 
+import dolens
 from dolens import Rays, load_lens
+from dolens.optics.surfaces import unregister_surface
 from dolens.prescriptions import lens_from_prescription
 
 # A singlet whose back is an XY polynomial with b, in every kind of monomial.
@@ -52,3 +54,18 @@ def bundle():
         return Rays(source.expand(count, 3), direction, wavelength)
 
     return make
+
+
+@pytest.fixture
+def registered():
+    """Register surface classes for one test."""
+    kinds = []
+
+    def register(shape):
+        dolens.register_surface(shape)
+        kinds.append(shape.kind)
+        return shape
+
+    yield register
+    for kind in kinds:
+        unregister_surface(kind)

@@ -8,7 +8,6 @@ import yaml
 
 from dolens import InputError, Rays
 from dolens.optics.jacobian import ray_jacobian
-from dolens.optics.surfaces import SURFACES
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 from dolens.prescriptions import lens_from_prescription
@@ -79,8 +78,8 @@ class Leaning(XYPolynomial):
         return sag + 0.05 * x, sx + 0.05, sy, exists
 
 
-def test_a_kernel_is_not_inherited_by_another_sag(monkeypatch):
-    monkeypatch.setitem(SURFACES, "leaning", Leaning)
+def test_a_kernel_is_not_inherited_by_another_sag(registered):
+    registered(Leaning)
     surface = {"type": "leaning", "x2": 0.01, "semi_diameter": 8.0, "material": "1.5"}
     lens = lens_from_prescription({"surfaces": {"1": surface}, "sensor": {"distance": 20.0}})
     rays = dataclasses.replace(bundle(), direction=torch.tensor([[0.0, 0.0, 1.0]]).double())

@@ -39,7 +39,6 @@ from dolens.kernels.cpu.layout import (
 )
 from dolens.kernels.cpu.records import (
     ADJOINT,
-    B_SPLINE,
     BEFORE,
     CHANGE_AXES,
     CODE_ROW,
@@ -51,6 +50,7 @@ from dolens.kernels.cpu.records import (
     OFFSET,
     POSE,
     SHAPE,
+    STENCIL,
 )
 
 
@@ -145,7 +145,7 @@ def sweeps(real: types.Type) -> Sweeps:
         moved = POSE if kind in (CHANGE_AXES, LENS_AXES) else 1
         for j in range(moved):
             add_row(cotangents, OF_RECORD + BLOCK * j, sums, offset + j)
-        if kind == B_SPLINE:
+        if codes[STENCIL] != 0:
             first = offset + length - codes[COUNT] * codes[COLUMNS]
             place = carray(shifted(cotangents, STENCIL_PLACE), BLOCK)
             for j in range(4):

@@ -6,13 +6,14 @@ Each ray needs six knots of either axis and 16 coefficients.  They are copied to
 ray's span changes, which between Newton's steps is seldom; the arithmetic then runs over rows.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
 from numba import carray, njit, types
 
 from dolens.kernels.cpu.compiler import OPTIONS, shifted
+from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
     FURTHER,
@@ -187,7 +188,7 @@ def b_spline_sag(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
-def b_spline_bend(real: types.Type) -> Callable[..., None]:
+def b_spline_hessian(real: types.Type) -> Callable[..., None]:
     """Slopes and second derivatives."""
     fetch, basis, bend = _spline(real)
     zero = real(0.0)
@@ -233,7 +234,7 @@ def b_spline_bend(real: types.Type) -> Callable[..., None]:
 def b_spline_parameters(real: types.Type) -> Callable[..., None]:
     """Cotangents of the 16 coefficients at hand and where they lie.
 
-    The place counts from the record's first coefficient.  `b_spline_bend` has fetched the knots.
+    The place counts from the record's first coefficient.  `b_spline_hessian` has fetched the knots.
     """
     _, basis, _ = _spline(real)
 
@@ -263,3 +264,13 @@ def b_spline_parameters(real: types.Type) -> Callable[..., None]:
             cot[STENCIL_PLACE + i] = w[FIRST_ROW + i] * width + w[FIRST_COLUMN + i]
 
     return kernel
+
+
+def _rows_of_stencil(row: Sequence[int]) -> int:
+    """Rows for each ray's knots and coefficients."""
+    return STENCIL_ROWS
+
+
+KERNELS = given_by_sag(
+    b_spline_sag, b_spline_hessian, b_spline_parameters, stencil=True, scratch=_rows_of_stencil
+)

@@ -5,6 +5,7 @@ kernel as a Python function.  Each is compiled when a lens first needs it, and k
 """
 
 import hashlib
+import inspect
 import logging
 import pickle
 import threading
@@ -129,7 +130,10 @@ def compile_team(factory: Factory) -> Any:
 
 @cache
 def stamp() -> str:
-    """A digest of the kernels' sources: a change in any of them makes every cached one stale."""
+    """Return a digest of the kernels' sources: a change in any of them makes all on disk stale.
+
+    Layouts and tables are among these sources: Numba freezes their integers in the kernels.
+    """
     here = Path(__file__).parent
     digest = hashlib.sha256()
     for path in (*sorted(here.rglob("*.py")), here.parent / "table.py"):
@@ -137,16 +141,32 @@ def stamp() -> str:
     return digest.hexdigest()
 
 
+def source_of(factory: Factory) -> tuple[str, ...]:
+    """Return what tells a kernel on disk from others: its name, and a digest of its own file.
+
+    A kernel that inlines a user's functions, which its factory wraps, goes by these.
+
+    Raises:
+        RuntimeError: they stand in no file, as in a notebook.
+    """
+    function = inspect.unwrap(factory)
+    path = Path(inspect.getsourcefile(function) or "")
+    if not path.is_file():
+        raise RuntimeError(f"the source of {function.__qualname__} is in no file")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return function.__module__, function.__qualname__, factory.__name__, digest
+
+
 class _StampedCache(FunctionCache):
     """Numba's on-disk cache; a directory that cannot be written costs the cache, not the run."""
 
-    def __init__(self, function: Callable[..., None], real: str) -> None:
+    def __init__(self, function: Callable[..., None], factory: Factory, real: str) -> None:
         super().__init__(function)
-        self._real = real
+        self._source = (*source_of(factory), real)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         # Not what the kernel closes over, as Numba has it: its helpers differ in every process.
-        return sig, self._real, codegen.magic_tuple(), stamp()
+        return sig, self._source, codegen.magic_tuple(), stamp()
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         # Numba's own prepares to compile first, which imports SciPy and half of Numba (0.6 s);
@@ -179,8 +199,8 @@ def _compiled(factory: Factory, real: str, signature: Any) -> CFunc:
                 form = normalize_signature(signature)
                 kernel = CFunc(function, form, locals={}, options=dict(OPTIONS))
                 try:
-                    kernel._cache = _StampedCache(function, real)
-                except RuntimeError as error:  # neither beside the source nor in the user's own
+                    kernel._cache = _StampedCache(function, factory, real)
+                except RuntimeError as error:  # no source, or no directory that can be written
                     logger.warning("compiled kernels cannot be kept for the next start: %s", error)
                 kernel.compile()
             _kernels[factory, real] = kernel

@@ -12,6 +12,7 @@ from numba import carray, njit, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import OPTIONS
+from dolens.kernels.cpu.functions import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
     INDEX,
@@ -158,3 +159,6 @@ def conic_adjoint(real: types.Type) -> Callable[..., None]:
             cot[OF_SECOND + i] = c * z * (half * along * z - vz)
 
     return kernel
+
+
+KERNELS = StepFunctions(conic_forward, conic_adjoint)

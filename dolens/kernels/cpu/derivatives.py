@@ -13,8 +13,8 @@ from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.jacobian import jacobian_driver
 from dolens.kernels.cpu.layout import BLOCK, COTANGENT_HEADER
 from dolens.kernels.cpu.normal_equations import normal_equations_driver
-from dolens.kernels.cpu.program import Program
-from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
+from dolens.kernels.cpu.program import Program, functions_of
+from dolens.kernels.table import Code, Slot, SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 
 # Where an output lies among a state's rows, and so where its cotangent is one.
@@ -180,7 +180,10 @@ def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
     steps = np.searchsorted(codes[:, Code.OFFSET], places, side="right") - 1
     rows = places - codes[steps, Code.OFFSET] + COTANGENT_HEADER
     first_step = int(steps.min(initial=codes.shape[0]))
-    local = (codes[steps, Code.KIND] == Kind.B_SPLINE) & (rows >= COTANGENT_HEADER + Slot.HEADER)
+    stencils = np.array(
+        [functions_of(int(code)).stencil for code in codes[:, Code.KIND]], dtype=bool
+    )
+    local = stencils[steps] & (rows >= COTANGENT_HEADER + Slot.HEADER)
     spline = None
     if local.any():
         spline = np.full(values, -1, dtype=np.int64)

@@ -11,6 +11,7 @@ from numba import carray, njit, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import OPTIONS, shifted
+from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
     MARGIN,
@@ -105,7 +106,7 @@ def even_asphere_sag(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
-def even_asphere_bend(real: types.Type) -> Callable[..., None]:
+def even_asphere_hessian(real: types.Type) -> Callable[..., None]:
     """Slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy = 4xyf''."""
     _, safe_sqrt, *_ = arithmetic(real)
     _, horner = _horner(real)
@@ -167,3 +168,8 @@ def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
                 w[LOWER + i] = upper
 
     return kernel
+
+
+KERNELS = given_by_sag(
+    even_asphere_sag, even_asphere_hessian, even_asphere_parameters, starts_on_conic=True
+)

@@ -1,18 +1,20 @@
 """Surfaces that are given by their sag: Newton's iteration, refraction, and the adjoint.
 
 A shape gives three block functions, by address in its codes: `sag` (sag, slopes, and the margin of
-its branch at the points in two work rows), `bend` (slopes and second derivatives there), and
+its branch at the points in two work rows), `sag_hessian` (slopes and second derivatives there), and
 `parameters` (cotangents of its numbers from those of sag and slopes).
 """
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 from numba import carray, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
-from dolens.kernels.cpu.compiler import call_block
+from dolens.kernels.cpu.compiler import Factory, call_block
 from dolens.kernels.cpu.conic import conic_distance
+from dolens.kernels.cpu.functions import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
     DISTANCE,
@@ -51,8 +53,6 @@ from dolens.kernels.cpu.layout import (
 from dolens.kernels.cpu.records import (
     CODE_ROW,
     EDGE,
-    EVEN_ASPHERE,
-    KIND,
     LIMIT,
     PARAMETERS,
     REFRACTS,
@@ -63,6 +63,7 @@ from dolens.kernels.cpu.records import (
     SHAPE,
     SHIFT,
     SHORT_RECORD,
+    STARTS_ON_CONIC,
     TAG,
 )
 from dolens.kernels.table import NEWTON_STEPS
@@ -96,7 +97,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             dst[X + i], dst[Y + i], dst[Z + i], dst[TRAVELLED + i] = x, y, met, t
             w[DISTANCE + i] = zero
         w[STENCIL_IS_HERE] = zero
-        if q[KIND] == EVEN_ASPHERE:
+        if q[STARTS_ON_CONIC] != 0:
             c, k = p[SHAPE], p[SHAPE + 1]
             for i in range(BLOCK):
                 n = src[N + i]
@@ -224,3 +225,19 @@ def explicit_adjoint(real: types.Type) -> Callable[..., None]:
         call_block(q[PARAMETERS], before, after, cotangents, record, work, codes)
 
     return kernel
+
+
+def given_by_sag(
+    sag: Factory, sag_hessian: Factory, parameters: Factory, **options: Any
+) -> StepFunctions:
+    """Return the functions of a surface that is given by its sag.
+
+    Args:
+        sag: factory of the block function that fills the rows of sag, slopes and margin.
+        sag_hessian: of the one that fills those of slopes and second derivatives.
+        parameters: of the one that fills the cotangents of the shape's numbers.
+        options: further fields of `StepFunctions`.
+    """
+    return StepFunctions(
+        explicit_forward, explicit_adjoint, sag, sag_hessian, parameters, **options
+    )

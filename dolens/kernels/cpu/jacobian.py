@@ -37,14 +37,13 @@ from dolens.kernels.cpu.layout import (
 )
 from dolens.kernels.cpu.records import (
     ADJOINT,
-    B_SPLINE,
     CODE_ROW,
     COLUMNS,
     COUNT,
-    EVEN_ASPHERE,
-    KIND,
     LENGTH,
     OFFSET,
+    SAG_AND_SLOPES,
+    STENCIL,
 )
 
 # Rays of a block that must pass for it to be swept as it is: tracing some rays again costs about as
@@ -87,8 +86,8 @@ def columns(real: types.Type) -> Columns:
         stack, work = at(job[jobs.STACK]), at(job[jobs.WORK])
         for k in range(job[jobs.STEPS]):
             now, then = shifted(stack, STATE * k), shifted(stack, STATE * (k + 1))
-            kind = carray(shifted(int64_at(job[jobs.CODES]), CODE_ROW * k), CODE_ROW)[KIND]
-            if kind >= EVEN_ASPHERE and kind <= B_SPLINE:
+            codes = carray(shifted(int64_at(job[jobs.CODES]), CODE_ROW * k), CODE_ROW)
+            if codes[SAG_AND_SLOPES] != 0:
                 end_vignetted(now)
             step(job, k, lanes, now, then, then, work)
         end_vignetted(shifted(stack, STATE * job[jobs.STEPS]))
@@ -191,7 +190,7 @@ def columns(real: types.Type) -> Columns:
                 target = shifted(columns, span * output)
                 call_block(codes[ADJOINT], now, then, cotangents, record, work, place)
                 put_entries(job, k, cotangents, target, stride)
-                if codes[KIND] == B_SPLINE and job[jobs.SPLINE_COLUMNS] != 0:
+                if codes[STENCIL] != 0 and job[jobs.SPLINE_COLUMNS] != 0:
                     add_stencil(job, codes, cotangents, target, stride)
 
     @njit(**OPTIONS)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from numba import carray, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
+from dolens.kernels.cpu.functions import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
     INDEX,
@@ -130,3 +131,6 @@ def clip(real: types.Type) -> Callable[..., None]:
                 dst[VIGNETTED + i] = tag + stopped
 
     return kernel
+
+
+KERNELS = StepFunctions(plane_forward, plane_adjoint)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.kernels.cpu import compiler, jobs
 from dolens.kernels.cpu.axes import (
     change_axes_adjoint,
@@ -16,19 +17,7 @@ from dolens.kernels.cpu.axes import (
     lens_axes_forward,
     sensor_forward,
 )
-from dolens.kernels.cpu.b_spline import (
-    STENCIL_ROWS,
-    b_spline_bend,
-    b_spline_parameters,
-    b_spline_sag,
-)
-from dolens.kernels.cpu.conic import conic_adjoint, conic_forward
-from dolens.kernels.cpu.even_asphere import (
-    even_asphere_bend,
-    even_asphere_parameters,
-    even_asphere_sag,
-)
-from dolens.kernels.cpu.explicit import explicit_adjoint, explicit_forward
+from dolens.kernels.cpu.functions import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
     COTANGENT_HEADER,
@@ -36,7 +25,7 @@ from dolens.kernels.cpu.layout import (
     STENCIL_NUMBERS,
     WORK_ROWS,
 )
-from dolens.kernels.cpu.plane import clip, plane_adjoint, plane_forward
+from dolens.kernels.cpu.plane import clip, plane_adjoint
 from dolens.kernels.cpu.records import (
     ADJOINT,
     CODE_ROW,
@@ -45,51 +34,28 @@ from dolens.kernels.cpu.records import (
     PARAMETERS,
     SAG_AND_SLOPES,
     SAG_HESSIAN,
+    STARTS_ON_CONIC,
+    STENCIL,
 )
-from dolens.kernels.cpu.sphere import sphere_adjoint, sphere_forward
 from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
-from dolens.kernels.cpu.xy_polynomial import (
-    xy_polynomial_bend,
-    xy_polynomial_parameters,
-    xy_polynomial_sag,
-)
+from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
 
 REAL = {torch.float32: "float32", torch.float64: "float64"}
 _ALIGNMENT = 64  # bytes: a line of the cache
 
-_FORWARD = {
-    Kind.PLANE: plane_forward,
-    Kind.SPHERE: sphere_forward,
-    Kind.CONIC: conic_forward,
-    Kind.EVEN_ASPHERE: explicit_forward,
-    Kind.XY_POLYNOMIAL: explicit_forward,
-    Kind.B_SPLINE: explicit_forward,
-    Kind.CHANGE_AXES: change_axes_forward,
-    Kind.LENS_AXES: lens_axes_forward,
-    Kind.SENSOR: sensor_forward,
+# Steps that are no surfaces; the sensor's adjoint is a plane's between equal media.
+_STEPS = {
+    Kind.CHANGE_AXES: StepFunctions(change_axes_forward, change_axes_adjoint),
+    Kind.LENS_AXES: StepFunctions(lens_axes_forward, lens_axes_adjoint),
+    Kind.SENSOR: StepFunctions(sensor_forward, plane_adjoint),
 }
-_ADJOINT = {
-    Kind.PLANE: plane_adjoint,
-    Kind.SPHERE: sphere_adjoint,
-    Kind.CONIC: conic_adjoint,
-    Kind.EVEN_ASPHERE: explicit_adjoint,
-    Kind.XY_POLYNOMIAL: explicit_adjoint,
-    Kind.B_SPLINE: explicit_adjoint,
-    Kind.CHANGE_AXES: change_axes_adjoint,
-    Kind.LENS_AXES: lens_axes_adjoint,
-    Kind.SENSOR: plane_adjoint,
-}
-_SAG = {
-    Kind.EVEN_ASPHERE: even_asphere_sag,
-    Kind.XY_POLYNOMIAL: xy_polynomial_sag,
-    Kind.B_SPLINE: b_spline_sag,
-}
-_DERIVATIVES = {
-    Kind.EVEN_ASPHERE: (even_asphere_bend, even_asphere_parameters),
-    Kind.XY_POLYNOMIAL: (xy_polynomial_bend, xy_polynomial_parameters),
-    Kind.B_SPLINE: (b_spline_bend, b_spline_parameters),
-}
+
+
+def functions_of(code: int) -> StepFunctions:
+    """Return the functions of a step with this code; a surface's module is imported for them."""
+    step = _STEPS.get(code)
+    return kernels_of(code, "cpu") if step is None else step
 
 
 class Steps(NamedTuple):
@@ -116,23 +82,28 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     rows[: len(table), : Code.ROW] = table
     longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
-        kind = Kind(row[Code.KIND])
-        row[FORWARD] = compiler.compile_block(_FORWARD[kind], real)
-        if kind in _SAG:
-            row[SAG_AND_SLOPES] = compiler.compile_block(_SAG[kind], real)
+        functions = functions_of(int(row[Code.KIND]))
+        numbers = int(row[Code.LENGTH]) - Slot.HEADER
+        if functions.numbers not in (None, numbers):
+            raise InputError(
+                f"the CPU kernels '{functions.sag.__qualname__}' take {functions.numbers} numbers "
+                f"of a surface; its `packed` gives {numbers}"
+            )
+        row[FORWARD] = compiler.compile_block(functions.forward, real)
+        if functions.sag is not None:
+            row[SAG_AND_SLOPES] = compiler.compile_block(functions.sag, real)
+            row[STARTS_ON_CONIC], row[STENCIL] = functions.starts_on_conic, functions.stencil
         if derivatives:
-            row[ADJOINT] = compiler.compile_block(_ADJOINT[kind], real)
-            if kind in _DERIVATIVES:
-                bend, parameters = _DERIVATIVES[kind]
-                row[SAG_HESSIAN] = compiler.compile_block(bend, real)
-                row[PARAMETERS] = compiler.compile_block(parameters, real)
-        length = int(row[Code.LENGTH])
-        if kind == Kind.B_SPLINE:
-            # Its stencil takes 17 rows of cotangents, whatever the number of its coefficients.
-            length, scratch = Slot.HEADER + STENCIL_NUMBERS, max(scratch, STENCIL_ROWS)
-        elif kind == Kind.XY_POLYNOMIAL:
-            scratch = max(scratch, 2 * (int(row[Code.DEGREE]) + 1))
+            row[ADJOINT] = compiler.compile_block(functions.adjoint, real)
+            for place, function in (
+                (SAG_HESSIAN, functions.sag_hessian),
+                (PARAMETERS, functions.parameters),
+            ):
+                if function is not None:
+                    row[place] = compiler.compile_block(function, real)
+        length = Slot.HEADER + STENCIL_NUMBERS if functions.stencil else int(row[Code.LENGTH])
         longest = max(longest, length)
+        scratch = max(scratch, functions.scratch(row))
     clips = (rows[:, Code.EDGE] == Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
     address = compiler.compile_block(clip, real) if clips.any() else 0
     return Steps(rows, longest, scratch, address)

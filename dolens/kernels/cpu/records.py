@@ -25,11 +25,10 @@ COUNT, COLUMNS, DEGREE = Code.COUNT, Code.COLUMNS, Code.DEGREE
 FORWARD, ADJOINT, SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS, EXTRAS_ADDRESS = range(
     Code.ROW, Code.ROW + 6
 )
-CODE_ROW = 24
+# Whether a surface given by its sag is met from its conic, and whether it has a stencil.
+STARTS_ON_CONIC, STENCIL = Code.ROW + 6, Code.ROW + 7
+CODE_ROW = Code.ROW + 8
 
-EVEN_ASPHERE, XY_POLYNOMIAL, B_SPLINE = (
-    int(kind) for kind in (Kind.EVEN_ASPHERE, Kind.XY_POLYNOMIAL, Kind.B_SPLINE)
-)
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
 CIRCLE, RECTANGLE = int(Outline.CIRCLE), int(Outline.RECTANGLE)
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from numba import carray, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
+from dolens.kernels.cpu.functions import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
     ENDED,
@@ -125,3 +126,6 @@ def sphere_adjoint(real: types.Type) -> Callable[..., None]:
             cot[OF_SHAPE + i] = of_c
 
     return kernel
+
+
+KERNELS = StepFunctions(sphere_forward, sphere_adjoint)

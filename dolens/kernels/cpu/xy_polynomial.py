@@ -6,7 +6,7 @@ Up to the third degree, a phase plate's, P is a dense polynomial by Horner's rul
 over the terms that there are.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -14,6 +14,7 @@ from numba import carray, njit, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
 from dolens.kernels.cpu.compiler import OPTIONS, int64_at, shifted
+from dolens.kernels.cpu.explicit import given_by_sag
 from dolens.kernels.cpu.layout import (
     BLOCK,
     CUBIC,
@@ -163,7 +164,7 @@ def xy_polynomial_sag(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
-def xy_polynomial_bend(real: types.Type) -> Callable[..., None]:
+def xy_polynomial_hessian(real: types.Type) -> Callable[..., None]:
     """Slopes and second derivatives: s_xy = P_xy/W + 2b·P_x·P_y/W³.
 
     Rows 20, 21 and 22 keep W, P_x and P_y for the cotangents of the coefficients.
@@ -242,3 +243,13 @@ def xy_polynomial_parameters(real: types.Type) -> Callable[..., None]:
                     out[k] += power * of_sy[k] * u[k] * lower[k]
 
     return kernel
+
+
+def _rows_of_powers(row: Sequence[int]) -> int:
+    """Rows for the powers of x and y."""
+    return 2 * (int(row[DEGREE]) + 1)
+
+
+KERNELS = given_by_sag(
+    xy_polynomial_sag, xy_polynomial_hessian, xy_polynomial_parameters, scratch=_rows_of_powers
+)

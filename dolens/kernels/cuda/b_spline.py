@@ -7,6 +7,7 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import divide
+from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COLUMNS, COUNT, SHAPE
 from dolens.kernels.cuda.sums import add_sum, first_of
 
@@ -89,7 +90,7 @@ def _stencil(record, codes, x, y):
 
 
 @triton.jit
-def b_spline_sag(record, codes, x, y):
+def b_spline_sag(record, codes, extras, x, y):
     """Sag, slopes, and the distance to the nearest edge of the knot rectangle."""
     columns, near_x, near_y, place, coefficients, x_low, x_high, y_low, y_high = _stencil(
         record, codes, x, y
@@ -113,7 +114,7 @@ def b_spline_sag(record, codes, x, y):
 
 
 @triton.jit
-def b_spline_bend(record, codes, x, y):
+def b_spline_hessian(record, codes, extras, x, y):
     """Slopes and second derivatives."""
     columns, near_x, near_y, place, coefficients, x_low, x_high, y_low, y_high = _stencil(
         record, codes, x, y
@@ -142,7 +143,7 @@ def b_spline_bend(record, codes, x, y):
 
 
 @triton.jit
-def b_spline_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive):
+def b_spline_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive):
     """Add the cotangents of the coefficients, from those of the sag and its slopes.
 
     One stencil of 16 at a time, for all rays of the block that share it: the order of the additions
@@ -165,3 +166,6 @@ def b_spline_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive):
             add_sum(row + 2, along * bx2 + across * dx2, here)
             add_sum(row + 3, along * bx3 + across * dx3, here)
         left = left & (place != stencil)
+
+
+KERNELS = SagFunctions(b_spline_sag, b_spline_hessian, b_spline_sums)

@@ -14,8 +14,10 @@ from triton.runtime.interpreter import InterpretedFunction
 from dolens.errors import InputError
 from dolens.kernels.cuda.adjoint import adjoint_kernel
 from dolens.kernels.cuda.forward import forward_kernel
+from dolens.kernels.cuda.functions import SagFunctions, Shape, shape_of
 from dolens.kernels.cuda.layout import STATE
-from dolens.kernels.table import Code, Kind, Slot, SurfaceTable
+from dolens.kernels.surface_kernel import kernels_of
+from dolens.kernels.table import Code, Kind, SurfaceTable
 
 logger = logging.getLogger("dolens.kernels")
 
@@ -37,10 +39,11 @@ class DeviceCodes(NamedTuple):
 
     Attributes:
         codes: (steps, Code.ROW), int32.
-        extras: int32; where the coefficients of polynomials lie, see `xy_polynomial`.
+        extras: int32; the table's, and behind them what shapes have made of them.
         before: (steps,), int64, rows of the indices; and after.
         after: and behind.
         kinds: bit k is set where there is a step of kind k.
+        forms: of the surfaces given by their sag; see `functions.shape_of`.
     """
 
     codes: Tensor
@@ -48,43 +51,34 @@ class DeviceCodes(NamedTuple):
     before: Tensor
     after: Tensor
     kinds: int
-
-
-def _monomials(row: list[int], extras: list[int]) -> tuple[int, list[int]]:
-    """Degree (the highest i + j) of a polynomial, and its coefficients' places in Horner's order.
-
-    A place counts from the record's beginning; -1: no such monomial.
-    """
-    first = row[Code.EXTRAS]
-    powers = extras[first : first + 2 * row[Code.COUNT]]
-    place = {
-        (i, j): Slot.HEADER + 1 + t
-        for t, (i, j) in enumerate(zip(powers[::2], powers[1::2], strict=True))
-    }
-    degree = max((i + j for i, j in place), default=0)
-    order = [(i, j) for j in range(degree, -1, -1) for i in range(degree - j, -1, -1)]
-    return degree, [place.get(power, -1) for power in order]
+    forms: tuple[Shape, ...]
 
 
 @lru_cache(maxsize=128)
 def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCodes:
     """Copied once for a lens, from int64: an optimization changes its numbers, not its codes."""
     rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()
-    powers = np.frombuffer(extras, dtype=np.int64).tolist()
-    places, kinds = [0], 0
+    own = np.frombuffer(extras, dtype=np.int64).tolist()
+    device_extras, kinds, forms = list(own), 0, set()
     for row in rows:
-        kinds |= 1 << row[Code.KIND]
-        if row[Code.KIND] == Kind.XY_POLYNOMIAL:
-            row[Code.DEGREE], order = _monomials(row, powers)
-            row[Code.EXTRAS] = len(places)
-            places += order
+        kind = row[Code.KIND]
+        if kind < Kind.BY_SAG:
+            kinds |= 1 << kind
+            continue
+        functions: SagFunctions = kernels_of(kind, "cuda")
+        forms.add(shape_of(kind, functions))
+        further = functions.extras(row, own)
+        if further is not None:
+            row[Code.EXTRAS] = len(device_extras)
+            device_extras += further
     table = torch.tensor(rows, dtype=torch.int32).reshape(-1, Code.ROW)
     return DeviceCodes(
         table.to(device),
-        torch.tensor(places, dtype=torch.int32).to(device),
+        torch.tensor(device_extras, dtype=torch.int32).to(device),
         table[:, Code.BEFORE].long().to(device),
         table[:, Code.AFTER].long().to(device),
         kinds,
+        tuple(sorted(forms, key=lambda form: form[0])),
     )
 
 
@@ -150,7 +144,7 @@ def trace(
             table.values, table.values.numel() - 1, media, table.indices.shape[1],
             codes.codes, codes.extras, codes.codes.shape[0], count,
             position, *position.stride(), direction, *direction.stride(), which,
-            *out, KINDS=codes.kinds, BLOCK=FORWARD_BLOCK, **_OPTIONS,
+            *out, KINDS=codes.kinds, FORMS=codes.forms, BLOCK=FORWARD_BLOCK, **_OPTIONS,
         )  # fmt: skip
     return out
 
@@ -225,7 +219,7 @@ def trace_adjoint(
                 of_position, *_strides(of_position, 2), of_direction, *_strides(of_direction, 2),
                 of_path, *_strides(of_path, 1), *gradients, sums, length,
                 values.new_empty(programs * kept),
-                KINDS=codes.kinds, INDICES=wanted[2], BLOCK=block, **_OPTIONS,
+                KINDS=codes.kinds, FORMS=codes.forms, INDICES=wanted[2], BLOCK=block, **_OPTIONS,
             )  # fmt: skip
     total, cut = sums.sum(0), values.numel()
     return (

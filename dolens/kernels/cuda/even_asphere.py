@@ -4,12 +4,13 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
+from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COUNT, SHAPE
 from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit
-def even_asphere_sag(record, codes, x, y):
+def even_asphere_sag(record, codes, extras, x, y):
     """Sag, slopes, and the margin of the conic's branch."""
     c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
     count = tl.load(codes + COUNT)
@@ -25,7 +26,7 @@ def even_asphere_sag(record, codes, x, y):
 
 
 @triton.jit
-def even_asphere_bend(record, codes, x, y):
+def even_asphere_hessian(record, codes, extras, x, y):
     """Slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy = 4xyf''."""
     c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
     count = tl.load(codes + COUNT)
@@ -50,7 +51,7 @@ def even_asphere_bend(record, codes, x, y):
 
 
 @triton.jit
-def even_asphere_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive):
+def even_asphere_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive):
     """Add the cotangents of c, k and the coefficients, from those of the sag and its slopes.
 
     With R = √(1 - (1+k)c²q): s_c = (q + (1+k)s²)/2R and s_k = c·s²/2R of the conic's sag s, and of
@@ -72,3 +73,8 @@ def even_asphere_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive):
         upper = lower * q
         add_sum(sums + SHAPE + 2 + i, of_sag * upper + (i + 2.0) * of_slope * lower, alive)
         lower = upper
+
+
+KERNELS = SagFunctions(
+    even_asphere_sag, even_asphere_hessian, even_asphere_sums, starts_on_conic=True
+)

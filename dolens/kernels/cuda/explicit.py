@@ -1,57 +1,12 @@
-"""Surfaces that are given by their sag: Newton's iteration to them, and the three they are for."""
+"""Surfaces that are given by their sag: Newton's iteration to them."""
 
 import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import away_from_zero, clamp, divide, safe_sqrt
-from dolens.kernels.cuda.b_spline import b_spline_bend, b_spline_sag, b_spline_sums
 from dolens.kernels.cuda.conic import conic_distance
-from dolens.kernels.cuda.even_asphere import (
-    even_asphere_bend,
-    even_asphere_sag,
-    even_asphere_sums,
-)
-from dolens.kernels.cuda.layout import EVEN_ASPHERE, MAX_STEPS, SHAPE, XY_POLYNOMIAL
-from dolens.kernels.cuda.xy_polynomial import (
-    xy_polynomial_bend,
-    xy_polynomial_sag,
-    xy_polynomial_sums,
-)
-
-
-@triton.jit
-def sag_and_slopes(record, codes, extras, x, y, FORM: tl.constexpr):
-    """Sag, slopes, and a margin that is positive on the sag's branch."""
-    if FORM == EVEN_ASPHERE:
-        return even_asphere_sag(record, codes, x, y)
-    elif FORM == XY_POLYNOMIAL:
-        return xy_polynomial_sag(record, codes, extras, x, y)
-    else:
-        return b_spline_sag(record, codes, x, y)
-
-
-@triton.jit
-def slopes_and_bends(record, codes, extras, x, y, FORM: tl.constexpr):
-    """s_x, s_y, s_xx, s_xy, s_yy."""
-    if FORM == EVEN_ASPHERE:
-        return even_asphere_bend(record, codes, x, y)
-    elif FORM == XY_POLYNOMIAL:
-        return xy_polynomial_bend(record, codes, extras, x, y)
-    else:
-        return b_spline_bend(record, codes, x, y)
-
-
-@triton.jit
-def explicit_sums(
-    record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive, FORM: tl.constexpr
-):
-    """Add the cotangents of the shape's numbers, from those of the sag and its slopes."""
-    if FORM == EVEN_ASPHERE:
-        even_asphere_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive)
-    elif FORM == XY_POLYNOMIAL:
-        xy_polynomial_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive)
-    else:
-        b_spline_sums(record, codes, sums, x, y, of_sag, of_sx, of_sy, alive)
+from dolens.kernels.cuda.functions import ON_CONIC, SAG
+from dolens.kernels.cuda.layout import MAX_STEPS, SHAPE
 
 
 @triton.jit
@@ -67,21 +22,21 @@ def explicit_intersect(
     close = 2.0**-26 if x.dtype == tl.float64 else 2.0**-11.5
     rounding = 2.0**-46 if x.dtype == tl.float64 else 2.0**-17
     t = tl.zeros_like(x)
-    if FORM == EVEN_ASPHERE:
+    if FORM[ON_CONIC]:
         c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
         start, squared = conic_distance(c, c + (c * k) * (n * n), x, y, l, m, n, sense)
         t = tl.where(squared > 0.0, clamp(start, limit), 0.0)
     moving = tl.full((), 1, tl.int32)
     steps = tl.full((), 0, tl.int32)
     while (moving > 0) & (steps < MAX_STEPS):
-        sag, sx, sy, _ = sag_and_slopes(record, codes, extras, x + l * t, y + m * t, FORM)
+        sag, sx, sy, _ = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
         change = divide(sag - n * t, away_from_zero(l * sx + m * sy - n))
         change = clamp(change, scale)
         t = t - change
         moves = tl.abs(change) > close * (tl.abs(t) + scale)
         moving = tl.max(moves.to(tl.int32), 0)
         steps += 1
-    sag, sx, sy, margin = sag_and_slopes(record, codes, extras, x + l * t, y + m * t, FORM)
+    sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
     residual = sag - n * t
     slope = l * sx + m * sy - n
     steep = tl.where(tl.abs(slope) > 1.0, tl.abs(slope), 1.0)

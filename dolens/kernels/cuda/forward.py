@@ -28,7 +28,7 @@ def forward_kernel(
     values, exit_place, media, wavelengths, codes, extras, steps, count,
     position, position_row, position_column, direction, direction_row, direction_column, which,
     out_position, out_direction, out_path, out_status, out_surface,
-    KINDS: tl.constexpr, BLOCK: tl.constexpr,
+    KINDS: tl.constexpr, FORMS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Trace `count` rays; see `dolens.kernels.cuda.backend.trace`.
 
@@ -44,7 +44,7 @@ def forward_kernel(
         position: (count, 3), with its strides; and so on for the direction.
         which: (count,), int32, or None.
         out_position: and the other results, contiguous.
-        KINDS: see `step`.
+        KINDS: see `step`, and FORMS.
         BLOCK: rays a program.
     """
     rays = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -60,7 +60,22 @@ def forward_kernel(
         record = values + tl.load(row + OFFSET)
         index, ratio = load_media(media, k, wavelengths, columns)
         x, y, z, l, m, n, path, ended, vignetted, _ = step(
-            row, record, extras, index, ratio, x, y, z, l, m, n, path, ended, vignetted, KINDS
+            row,
+            record,
+            extras,
+            index,
+            ratio,
+            x,
+            y,
+            z,
+            l,
+            m,
+            n,
+            path,
+            ended,
+            vignetted,
+            KINDS,
+            FORMS,
         )
     z = z + tl.load(values + exit_place)
     # Rays that are not valid may overflow.

@@ -7,23 +7,19 @@ from dolens.kernels.cuda.arithmetic import clamp, distance_to_plane, refract
 from dolens.kernels.cuda.axes import change_axes, lens_axes
 from dolens.kernels.cuda.conic import conic_intersect, sphere_intersect
 from dolens.kernels.cuda.explicit import explicit_intersect
+from dolens.kernels.cuda.functions import CODE
 from dolens.kernels.cuda.layout import (
-    B_SPLINE,
     CHANGE_AXES,
     CIRCLE,
     CONIC,
     EDGE,
-    EVEN_ASPHERE,
     HALF_X,
     HALF_Y,
-    HAS_B_SPLINE,
     HAS_CHANGE_AXES,
     HAS_CONIC,
-    HAS_EVEN_ASPHERE,
     HAS_LENS_AXES,
     HAS_SENSOR,
     HAS_SPHERE,
-    HAS_XY_POLYNOMIAL,
     HOLE,
     HOLE_X,
     HOLE_Y,
@@ -32,6 +28,7 @@ from dolens.kernels.cuda.layout import (
     LIMIT,
     MISSED,
     OUTLINE,
+    PLANE,
     RECTANGLE,
     REFRACTS,
     SCALE,
@@ -42,12 +39,13 @@ from dolens.kernels.cuda.layout import (
     TAG,
     TOTALLY_REFLECTED,
     VIGNETTED,
-    XY_POLYNOMIAL,
 )
 
 
 @triton.jit
-def intersect(record, codes, extras, kind, x, y, l, m, n, sense, KINDS: tl.constexpr):
+def intersect(
+    record, codes, extras, kind, x, y, l, m, n, sense, KINDS: tl.constexpr, FORMS: tl.constexpr
+):
     """Distance from the vertex plane to a surface, unit normal there, and whether it is met."""
     limit = tl.load(record + LIMIT)
     t, nx, ny = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
@@ -60,20 +58,10 @@ def intersect(record, codes, extras, kind, x, y, l, m, n, sense, KINDS: tl.const
         if kind == CONIC:
             t, nx, ny, nz, met = conic_intersect(record, x, y, l, m, n, sense, limit)
     scale = tl.load(record + SCALE)
-    if HAS_EVEN_ASPHERE & KINDS:
-        if kind == EVEN_ASPHERE:
+    for k in tl.static_range(len(FORMS)):
+        if kind == FORMS[k][CODE]:
             t, nx, ny, nz, met = explicit_intersect(
-                record, codes, extras, x, y, l, m, n, sense, limit, scale, EVEN_ASPHERE
-            )
-    if HAS_XY_POLYNOMIAL & KINDS:
-        if kind == XY_POLYNOMIAL:
-            t, nx, ny, nz, met = explicit_intersect(
-                record, codes, extras, x, y, l, m, n, sense, limit, scale, XY_POLYNOMIAL
-            )
-    if HAS_B_SPLINE & KINDS:
-        if kind == B_SPLINE:
-            t, nx, ny, nz, met = explicit_intersect(
-                record, codes, extras, x, y, l, m, n, sense, limit, scale, B_SPLINE
+                record, codes, extras, x, y, l, m, n, sense, limit, scale, FORMS[k]
             )
     return t, nx, ny, nz, met
 
@@ -97,7 +85,7 @@ def passes(record, codes, x, y):
 @triton.jit
 def step(
     codes, record, extras, index, ratio,
-    x, y, z, l, m, n, path, ended, vignetted, KINDS: tl.constexpr,
+    x, y, z, l, m, n, path, ended, vignetted, KINDS: tl.constexpr, FORMS: tl.constexpr,
 ):  # fmt: skip
     """Carry a block through one step.
 
@@ -112,6 +100,7 @@ def step(
         ended: tag and status of a miss or a total reflection, else 0; int32.
         vignetted: of the first aperture that stopped the ray, else 0.
         KINDS: bit k is set where the lens has steps of kind k; code for no others is made.
+        FORMS: of the surfaces given by their sag that the lens has; see `functions.shape_of`.
 
     Returns:
         x to vignetted behind the step, and the distance travelled to it.
@@ -120,12 +109,14 @@ def step(
     sense = tl.load(record + SENSE)
     tag = tl.load(record + TAG).to(tl.int32)
     travelled = tl.zeros_like(x)
-    if kind <= B_SPLINE:
+    if kind >= PLANE:
         t0, towards = distance_to_plane(z + tl.load(record + SHIFT), n, sense)
         limit = tl.load(record + LIMIT)
         x, y = clamp(x + t0 * l, limit), clamp(y + t0 * m, limit)
         towards &= (tl.abs(x) < limit) & (tl.abs(y) < limit)
-        t, nx, ny, nz, met = intersect(record, codes, extras, kind, x, y, l, m, n, sense, KINDS)
+        t, nx, ny, nz, met = intersect(
+            record, codes, extras, kind, x, y, l, m, n, sense, KINDS, FORMS
+        )
         towards &= tl.abs(t) < limit
         x, y, z = x + t * l, y + t * m, t * n
         travelled = t0 + t

@@ -12,27 +12,22 @@ import triton.language as tl
 from dolens.kernels.cuda.arithmetic import divide, refract_adjoint, safe_sqrt
 from dolens.kernels.cuda.axes import change_axes_adjoint, lens_axes_adjoint
 from dolens.kernels.cuda.conic import conic_curvature_cotangent, conic_gradient, conic_sums
-from dolens.kernels.cuda.explicit import explicit_sums, slopes_and_bends
+from dolens.kernels.cuda.functions import CODE, HESSIAN, SUMS
 from dolens.kernels.cuda.layout import (
-    B_SPLINE,
     CHANGE_AXES,
     CONIC,
-    EVEN_ASPHERE,
-    HAS_B_SPLINE,
     HAS_CHANGE_AXES,
     HAS_CONIC,
-    HAS_EVEN_ASPHERE,
     HAS_LENS_AXES,
     HAS_SPHERE,
-    HAS_XY_POLYNOMIAL,
     KIND,
     LENS_AXES,
+    PLANE,
     REFRACTS,
     SENSOR,
     SHAPE,
     SHIFT,
     SPHERE,
-    XY_POLYNOMIAL,
 )
 from dolens.kernels.cuda.sums import add_sum
 
@@ -40,14 +35,16 @@ from dolens.kernels.cuda.sums import add_sum
 @triton.jit
 def _explicit_gradient(record, codes, extras, x, y, FORM: tl.constexpr):
     """g = (-s_x, -s_y, 1), 1/|g|, and F's second derivatives xx, xy, yy and zz."""
-    sx, sy, sxx, sxy, syy = slopes_and_bends(record, codes, extras, x, y, FORM)
+    sx, sy, sxx, sxy, syy = FORM[HESSIAN](record, codes, extras, x, y)
     gz = 1.0 + tl.zeros_like(x)
     inverse = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
     return -sx, -sy, gz, inverse, -sxx, -sxy, -syy, tl.zeros_like(x)
 
 
 @triton.jit
-def surface_gradient(record, codes, extras, kind, x, y, z, KINDS: tl.constexpr):
+def surface_gradient(
+    record, codes, extras, kind, x, y, z, KINDS: tl.constexpr, FORMS: tl.constexpr
+):
     """g, 1/|g|, and F's second derivatives xx, xy, yy and zz, at a point of any surface."""
     gx, gy, gz = tl.zeros_like(x), tl.zeros_like(x), 1.0 + tl.zeros_like(x)
     inverse = 1.0 + tl.zeros_like(x)
@@ -61,28 +58,19 @@ def surface_gradient(record, codes, extras, kind, x, y, z, KINDS: tl.constexpr):
             c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
             gx, gy, gz, inverse, xx, zz = conic_gradient(c, k, x, y, z)
             yy = xx
-    if HAS_EVEN_ASPHERE & KINDS:
-        if kind == EVEN_ASPHERE:
+    for k in tl.static_range(len(FORMS)):
+        if kind == FORMS[k][CODE]:
             gx, gy, gz, inverse, xx, xy, yy, zz = _explicit_gradient(
-                record, codes, extras, x, y, EVEN_ASPHERE
-            )
-    if HAS_XY_POLYNOMIAL & KINDS:
-        if kind == XY_POLYNOMIAL:
-            gx, gy, gz, inverse, xx, xy, yy, zz = _explicit_gradient(
-                record, codes, extras, x, y, XY_POLYNOMIAL
-            )
-    if HAS_B_SPLINE & KINDS:
-        if kind == B_SPLINE:
-            gx, gy, gz, inverse, xx, xy, yy, zz = _explicit_gradient(
-                record, codes, extras, x, y, B_SPLINE
+                record, codes, extras, x, y, FORMS[k]
             )
     return gx, gy, gz, inverse, xx, xy, yy, zz
 
 
 @triton.jit
 def shape_sums(
-    record, codes, extras, sums, kind, x, y, z, along, ux, uy, uz, alive, KINDS: tl.constexpr
-):
+    record, codes, extras, sums, kind, x, y, z, along, ux, uy, uz, alive,
+    KINDS: tl.constexpr, FORMS: tl.constexpr,
+):  # fmt: skip
     """Add the cotangents of a shape's numbers, from τ and (ux, uy, uz), the cotangent of g."""
     if HAS_SPHERE & KINDS:
         if kind == SPHERE:
@@ -91,21 +79,15 @@ def shape_sums(
     if HAS_CONIC & KINDS:
         if kind == CONIC:
             conic_sums(record, sums, x, y, z, along, ux, uy, uz, alive)
-    if HAS_EVEN_ASPHERE & KINDS:
-        if kind == EVEN_ASPHERE:
-            explicit_sums(record, codes, extras, sums, x, y, along, -ux, -uy, alive, EVEN_ASPHERE)
-    if HAS_XY_POLYNOMIAL & KINDS:
-        if kind == XY_POLYNOMIAL:
-            explicit_sums(record, codes, extras, sums, x, y, along, -ux, -uy, alive, XY_POLYNOMIAL)
-    if HAS_B_SPLINE & KINDS:
-        if kind == B_SPLINE:
-            explicit_sums(record, codes, extras, sums, x, y, along, -ux, -uy, alive, B_SPLINE)
+    for k in tl.static_range(len(FORMS)):
+        if kind == FORMS[k][CODE]:
+            FORMS[k][SUMS](record, codes, extras, sums, x, y, along, -ux, -uy, alive)
 
 
 @triton.jit
 def step_adjoint(
     codes, record, extras, sums, index, ratio,
-    before, after, px, py, pz, a, b, c, path, alive, KINDS: tl.constexpr,
+    before, after, px, py, pz, a, b, c, path, alive, KINDS: tl.constexpr, FORMS: tl.constexpr,
 ):  # fmt: skip
     """Cotangents in front of a step from those behind it; its own are added to `sums`.
 
@@ -117,7 +99,7 @@ def step_adjoint(
         a: to c: of the direction behind.
         path: of the optical path.
         alive: which rays count.
-        KINDS: see `step`.
+        KINDS: see `step`, and FORMS.
 
     Returns:
         Cotangents of position and direction in front, and of the indices in front and behind.
@@ -126,9 +108,9 @@ def step_adjoint(
     x0, y0, z0, l, m, n, _ = before
     x, y, z, out_l, out_m, out_n, t = after
     of_front, of_behind = tl.zeros_like(x), tl.zeros_like(x)
-    if (kind <= B_SPLINE) | (kind == SENSOR):
+    if (kind >= PLANE) | (kind == SENSOR):
         gx, gy, gz, inverse, xx, xy, yy, zz = surface_gradient(
-            record, codes, extras, kind, x, y, z, KINDS
+            record, codes, extras, kind, x, y, z, KINDS, FORMS
         )
         ux, uy, uz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
         if tl.load(codes + REFRACTS) != 0:
@@ -143,7 +125,9 @@ def step_adjoint(
             uz = (vz - across * nz) * inverse
         px, py, pz = px + xx * ux + xy * uy, py + xy * ux + yy * uy, pz + zz * uz
         along = divide(px * l + py * m + pz * n + index * path, gx * l + gy * m + gz * n)
-        shape_sums(record, codes, extras, sums, kind, x, y, z, along, ux, uy, uz, alive, KINDS)
+        shape_sums(
+            record, codes, extras, sums, kind, x, y, z, along, ux, uy, uz, alive, KINDS, FORMS
+        )
         px, py, pz = px - along * gx, py - along * gy, pz - along * gz
         a, b, c = a + t * px, b + t * py, c + t * pz
         of_front += path * t

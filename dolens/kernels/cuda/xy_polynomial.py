@@ -6,12 +6,16 @@ within it i, falling; i + j up to the degree), which number of the record is its
 none.
 """
 
+from collections.abc import Sequence
+
 import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
+from dolens.kernels.cuda.functions import SagFunctions
 from dolens.kernels.cuda.layout import COLUMNS, DEGREE, EXTRAS, SHAPE
 from dolens.kernels.cuda.sums import add_sum
+from dolens.kernels.table import Code, Slot
 
 
 @triton.jit
@@ -74,7 +78,7 @@ def xy_polynomial_sag(record, codes, extras, x, y):
 
 
 @triton.jit
-def xy_polynomial_bend(record, codes, extras, x, y):
+def xy_polynomial_hessian(record, codes, extras, x, y):
     """Slopes and second derivatives: s_xy = P_xy/W + 2b·P_x·P_y/W³."""
     places = extras + tl.load(codes + EXTRAS)
     p, sx, sy, sxx, sxy, syy = _bends(record, places, tl.load(codes + DEGREE), x, y)
@@ -122,3 +126,26 @@ def xy_polynomial_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, 
             term -= 1
         v_lower = v
         v = v * y
+
+
+def horner_order(row: list[int], extras: Sequence[int]) -> list[int]:
+    """Where the coefficients lie, in Horner's order, from the powers of the monomials in `extras`.
+
+    A place counts from the record's beginning; -1: no such monomial.  The row's degree becomes the
+    highest i + j.
+    """
+    first = row[Code.EXTRAS]
+    powers = extras[first : first + 2 * row[Code.COUNT]]
+    place = {
+        (i, j): Slot.HEADER + 1 + t
+        for t, (i, j) in enumerate(zip(powers[::2], powers[1::2], strict=True))
+    }
+    degree = max((i + j for i, j in place), default=0)
+    row[Code.DEGREE] = degree
+    order = [(i, j) for j in range(degree, -1, -1) for i in range(degree - j, -1, -1)]
+    return [place.get(power, -1) for power in order]
+
+
+KERNELS = SagFunctions(
+    xy_polynomial_sag, xy_polynomial_hessian, xy_polynomial_sums, extras=horner_order
+)

@@ -1,16 +1,13 @@
-"""Surface shapes.  A new one is a file here and a line in `SURFACES`."""
+"""Surface shapes, one a file; each registers itself under the `type` of a prescription."""
 
+from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.b_spline import BSpline
-from dolens.optics.surfaces.base import Surface, SurfaceState
+from dolens.optics.surfaces.base import PackedShape, Surface, SurfaceState
 from dolens.optics.surfaces.conic import Conic, Sphere
 from dolens.optics.surfaces.even_asphere import EvenAsphere
 from dolens.optics.surfaces.plane import Aperture, Plane
+from dolens.optics.surfaces.registry import SURFACES, register_surface, unregister_surface
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
-
-SURFACES: dict[str, type[Surface]] = {
-    shape.kind: shape
-    for shape in (Plane, Aperture, Sphere, Conic, EvenAsphere, XYPolynomial, BSpline)
-}
 
 __all__ = [
     "SURFACES",
@@ -18,9 +15,13 @@ __all__ = [
     "BSpline",
     "Conic",
     "EvenAsphere",
+    "PackedShape",
     "Plane",
     "Sphere",
     "Surface",
+    "SurfaceKernel",
     "SurfaceState",
     "XYPolynomial",
+    "register_surface",
+    "unregister_surface",
 ]

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_keys
-from dolens.kernels.table import Kind
+from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, tensor_of
 from dolens.optics.surfaces.clear_aperture import ClearAperture
+from dolens.optics.surfaces.registry import register_surface
 from dolens.optics.surfaces.spline_basis import check_knots, clamped_knots, cubic_basis
 
 
@@ -58,6 +59,7 @@ def spline_sag(p: Parameters, x: Tensor, y: Tensor, second: bool = False) -> Spl
     return SplineSag(s, sx, sy, sxx, (row_x * by.slope).sum(0), (row * by.second_derivative).sum(0))
 
 
+@register_surface
 class BSpline(Surface):
     """z = Σ c_ji·N_j(y)·N_i(x) with cubic B-splines N on a rectangle of knots (S7).
 
@@ -73,7 +75,7 @@ class BSpline(Surface):
     """
 
     kind = "b_spline"
-    kernel = Kind.B_SPLINE
+    kernel = SurfaceKernel("dolens.kernels.cpu.b_spline", "dolens.kernels.cuda.b_spline")
     constants = ("knots_x", "knots_y")
     arrays = ("coefficients", "knots_x", "knots_y")
     optional = ("coefficients", "knots_x", "knots_y", "half_width", "half_width_x", "half_width_y")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.kernels.table import Kind
+from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 
@@ -138,14 +138,14 @@ class Surface(nn.Module):
         constants: names among the parameters that no optimizer varies (knots); they are buffers.
         arrays: names that a prescription gives as lists; every other is one number.
         optional: names that a prescription may leave out; every other is then zero.
-        kernel: what the fast kernels call it; None: they have none, and the reference traces.
+        kernel: where its fast kernels are; None: it has none, and the reference traces.
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
             These three are not inherited, since a subclass may have another sag.
     """
 
     kind: ClassVar[str] = ""
-    kernel: ClassVar[Kind | None] = None
+    kernel: ClassVar[SurfaceKernel | None] = None
     constants: ClassVar[tuple[str, ...]] = ()
     arrays: ClassVar[tuple[str, ...]] = ()
     optional: ClassVar[tuple[str, ...]] = ()
@@ -208,8 +208,11 @@ class Surface(nn.Module):
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """The numbers that `kernel` takes; a shape without one is never asked."""
-        raise NotImplementedError
+        """Return the numbers that `kernel` takes, in its order.
+
+        Here: all parameters in the order of `parameter_names`, and then the constants.
+        """
+        return PackedShape(tuple(p.values()))
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
 from dolens.optics.surfaces.base import (
     GRAZING,
@@ -16,6 +17,7 @@ from dolens.optics.surfaces.base import (
     Surface,
     safe_sqrt,
 )
+from dolens.optics.surfaces.registry import register_surface
 
 _FLAT = 1e-15  # 1/mm
 
@@ -67,11 +69,12 @@ def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[T
     return (t if sense > 0.0 else -t), discriminant.detach()
 
 
+@register_surface
 class Conic(Surface):
     """A conic of revolution with curvature c (1/mm) and conic constant k (S1 without a_2i)."""
 
     kind = "conic"
-    kernel = Kind.CONIC
+    kernel = SurfaceKernel("dolens.kernels.cpu.conic", "dolens.kernels.cuda.conic", Kind.CONIC)
     rotational = True
     closed_form = True
 
@@ -143,11 +146,12 @@ class Conic(Surface):
         return cls.conic_constant(p) * p["curvature"] ** 3 / 8.0
 
 
+@register_surface
 class Sphere(Conic):
     """A sphere of curvature c = 1/R (1/mm); c = 0 is a plane whose curvature can move."""
 
     kind = "sphere"
-    kernel = Kind.SPHERE
+    kernel = SurfaceKernel("dolens.kernels.cpu.sphere", "dolens.kernels.cuda.conic", Kind.SPHERE)
     rotational = True
     closed_form = True
 

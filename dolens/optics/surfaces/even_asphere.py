@@ -7,18 +7,20 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.table import Kind
+from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, PlaneRay, Surface
 from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
+from dolens.optics.surfaces.registry import register_surface
 
 _POWER = re.compile(r"a([1-9]\d*)")
 
 
+@register_surface
 class EvenAsphere(Conic):
     """s(r) = conic + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power)."""
 
     kind = "even_asphere"
-    kernel = Kind.EVEN_ASPHERE
+    kernel = SurfaceKernel("dolens.kernels.cpu.even_asphere", "dolens.kernels.cuda.even_asphere")
     rotational = True
 
     @classmethod

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
 from dolens.optics.surfaces.base import (
     PackedShape,
@@ -14,13 +15,15 @@ from dolens.optics.surfaces.base import (
     Surface,
     safe_sqrt,
 )
+from dolens.optics.surfaces.registry import register_surface
 
 
+@register_surface
 class Plane(Surface):
     """A flat refracting surface; it has no parameters."""
 
     kind = "plane"
-    kernel = Kind.PLANE
+    kernel = SurfaceKernel("dolens.kernels.cpu.plane", "dolens.kernels.cuda.step", Kind.PLANE)
     rotational = True
     closed_form = True
 
@@ -74,10 +77,11 @@ class Plane(Surface):
         return 0.0
 
 
+@register_surface
 class Aperture(Plane):
     """A plane stop: it clips, and does not refract (except behind an `occluder` medium)."""
 
     kind = "aperture"
-    kernel = Kind.PLANE
+    kernel = Plane.kernel
     rotational = True
     closed_form = True

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from dolens.kernels.table import Kind
+from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, safe_sqrt
+from dolens.optics.surfaces.registry import register_surface
 
 
 def monomial_powers(name: str) -> tuple[int, int] | None:
@@ -22,6 +23,7 @@ def monomial_powers(name: str) -> tuple[int, int] | None:
     return (int(i or 1) if x else 0), (int(j or 1) if y else 0)
 
 
+@register_surface
 class XYPolynomial(Surface):
     """Σ a_ij·x^i·y^j + b·z² - z = 0; coefficients named by their monomials, mm^(1 - i - j).
 
@@ -30,7 +32,7 @@ class XYPolynomial(Surface):
     """
 
     kind = "xy_polynomial"
-    kernel = Kind.XY_POLYNOMIAL
+    kernel = SurfaceKernel("dolens.kernels.cpu.xy_polynomial", "dolens.kernels.cuda.xy_polynomial")
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:

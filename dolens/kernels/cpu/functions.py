@@ -1,0 +1,40 @@
+"""What the CPU's kernels know of a step: block functions, by the factories that compile them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from dolens.kernels.cpu.compiler import Factory
+
+
+def _none(row: Sequence[int]) -> int:
+    """No work rows."""
+    return 0
+
+
+@dataclass(frozen=True)
+class StepFunctions:
+    """A step's block functions.
+
+    Attributes:
+        forward: carries a block of rays through the step.
+        adjoint: takes cotangents from behind the step to its front.
+        sag: of a surface given by its sag: sag, slopes and margin; see `explicit`.
+        sag_hessian: slopes and second derivatives of the sag.
+        parameters: cotangents of the shape's numbers from those of sag and slopes.
+        starts_on_conic: the shape's first two numbers are a conic's, from which the iteration
+            starts; else it starts on the vertex plane.
+        stencil: a ray depends on 4×4 neighbours among the shape's last COUNT·COLUMNS numbers only,
+            and has cotangents for these alone.
+        scratch: work rows of the shape's own, by its row of codes.
+        numbers: how many a shape must have; None: any.
+    """
+
+    forward: Factory
+    adjoint: Factory
+    sag: Factory | None = None
+    sag_hessian: Factory | None = None
+    parameters: Factory | None = None
+    starts_on_conic: bool = False
+    stencil: bool = False
+    scratch: Callable[[Sequence[int]], int] = _none
+    numbers: int | None = None

@@ -1,0 +1,53 @@
+"""What the GPU's kernels know of a surface that is given by its sag: three functions of Triton."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import triton.language as tl
+
+Row = list[int]
+
+
+def _as_they_are(row: Row, extras: Sequence[int]) -> list[int] | None:
+    """The table's own extras serve."""
+    return None
+
+
+class SagFunctions(NamedTuple):
+    """Functions compiled by `triton.jit`, which a module offers as `KERNELS`.
+
+    Each takes a pointer to the surface's record, whose shape begins at `layout.SHAPE`, its row of
+    codes, its extras, and points x, y (mm) of the block's rays; numbers take the rays' precision.
+
+    Attributes:
+        sag: `(record, codes, extras, x, y)` gives sag (mm), ∂s/∂x, ∂s/∂y, and a margin that is
+            positive where the sag exists; where it does not, the numbers must be finite.
+        sag_hessian: the same arguments; ∂s/∂x, ∂s/∂y, ∂²s/∂x², ∂²s/∂x∂y and ∂²s/∂y².
+        add_sums: `(record, codes, extras, sums, x, y, of_sag, of_x, of_y, alive)` adds with
+            `sums.add_sum` the cotangent of each number of the record to the same place of `sums`:
+            of_sag·∂s/∂p + of_x·∂²s/∂x∂p + of_y·∂²s/∂y∂p; it returns nothing.
+        starts_on_conic: the shape's first two numbers are a conic's, from which the iteration
+            starts; else it starts on the vertex plane.
+        extras: a function of the row of codes, which it may change, and of the table's extras; it
+            gives the integers that the device has in their place, or None for the table's own.
+    """
+
+    sag: Any
+    sag_hessian: Any
+    add_sums: Any
+    starts_on_conic: bool = False
+    extras: Callable[[Row, Sequence[int]], list[int] | None] = _as_they_are
+
+
+# A shape as the kernels take it, a tuple of constants: its code and its functions, and at last a
+# digest of these, since Triton's cache on disk goes by the names of functions in a tuple.
+CODE, SAG, HESSIAN, SUMS, ON_CONIC = (tl.constexpr(place) for place in range(5))
+Shape = tuple[int, Any, Any, Any, bool, str]
+
+
+def shape_of(code: int, functions: SagFunctions) -> Shape:
+    """A surface's code and functions as the kernels take them."""
+    three = functions[:3]
+    # Triton's interpreter has no digests.
+    digest = "".join(getattr(function, "cache_key", "") for function in three)
+    return (code, *three, functions.starts_on_conic, digest)

@@ -1,0 +1,73 @@
+"""Where a surface's kernels are: modules by name, imported when a lens first needs them.
+
+A surface class carries a `SurfaceKernel`.  Its `code` marks the surface's steps in a table, so that
+the kernels know no list of surfaces: a new one is its own modules.
+"""
+
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from itertools import count
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.kernels.table import Kind
+
+_codes = count(Kind.BY_SAG)
+_by_code: dict[int, "SurfaceKernel"] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceKernel:
+    """The kernels of a surface, for the CPU, for GPUs, or for both.
+
+    Each module offers `KERNELS`: on the CPU what `given_by_scalars` or `given_by_sag` returns, on
+    GPUs a `SagFunctions`.  Where there is none for a device, the reference in PyTorch traces there.
+
+    Args:
+        cpu: the name of an importable module with Numba functions, or None.
+        cuda: the name of one with Triton functions, or None.
+
+    Rarely needed:
+        kind: a surface in closed form that the kernels' own sources name.
+
+    Attributes:
+        code: what marks this surface's steps in a table; it is given anew in each process.
+    """
+
+    cpu: str | None = None
+    cuda: str | None = None
+    kind: Kind | None = None
+    code: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "code", next(_codes) if self.kind is None else int(self.kind))
+        _by_code[self.code] = self
+
+    def serves(self, device: str) -> bool:
+        """Whether there are kernels for `cpu` or `cuda`."""
+        return {"cpu": self.cpu, "cuda": self.cuda}.get(device) is not None
+
+
+@cache
+def kernels_of(code: int, device: str) -> Any:
+    """Return `KERNELS` of the module for a device, imported when first needed.
+
+    Args:
+        code: of a `SurfaceKernel`.
+        device: `cpu` or `cuda`.
+
+    Raises:
+        InputError: the module is not there, or offers no `KERNELS`.
+    """
+    kernel = _by_code[code]
+    name = {"cpu": kernel.cpu, "cuda": kernel.cuda}[device]
+    try:
+        module = import_module(str(name))
+    except ModuleNotFoundError as error:
+        if error.name is None or not str(name).startswith(error.name):
+            raise
+        raise InputError(f"a surface's {device} kernels: no module named '{name}'") from None
+    if not hasattr(module, "KERNELS"):
+        raise InputError(f"a surface's {device} kernels: module '{name}' offers no KERNELS")
+    return module.KERNELS
