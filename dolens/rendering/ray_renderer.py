@@ -160,11 +160,13 @@ class RayRenderer(Renderer):
             values = dict(zip(names, tensors[planes:-1], strict=True))
             return lens.system(values).traced_by(backend), moving.of(tensors[-1]), tensors[:planes]
 
-        leaves = [*parameters.values(), moving.joined(system)]
-        if backend == "cpu" and scene.separate_planes:
+        fused = backend == "cpu" and scene.separate_planes
+        if fused:
             image = self._fused(system, scene, textures, view, moving)
             if edges is None:
                 return image
+        leaves = [*parameters.values(), moving.joined(system)]
+        if fused:
             pieces = self._pieces(self.chunk_rays // edge_samples(self.pupil_samples))
 
             def edge_light(i: int, *tensors: Tensor) -> Tensor:
