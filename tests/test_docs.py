@@ -83,6 +83,24 @@ def test_every_path_of_the_repository_exists(document):
         assert (ROOT / path).exists(), path
 
 
+def test_the_glossary_s_present_names_are_in_the_code():
+    """The second column of every table: each name, and each key or value, stands somewhere."""
+    files = [
+        path
+        for top in ("dolens", "experiments", "conf")
+        for path in (ROOT / top).rglob("*")
+        if path.suffix in (".py", ".yaml")
+    ]
+    words = {path.stem for path in files}
+    for path in files:
+        words.update(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+    for line in (ROOT / "docs/glossary.md").read_text(encoding="utf-8").splitlines():
+        if line.startswith("| ") and not line.startswith("| Was"):
+            for name in re.findall(r"`([^`]+)`", line.split("|")[2]):
+                missing = set(re.findall(r"[A-Za-z_]\w+", name)) - words
+                assert not missing, f"{line.split('|')[1].strip()}: {missing}"
+
+
 def anchors(document):
     """The anchors of a document's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ (.+)$", document.read_text(encoding="utf-8"), re.MULTILINE)
