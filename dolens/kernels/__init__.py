@@ -1,1 +1,1 @@
-"""The trace, fast: packed surface tables and the kernels that run them, one backend a folder."""
+"""The kernels trace a packed surface table fast; each backend has a folder."""

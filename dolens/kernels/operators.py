@@ -1,4 +1,4 @@
-"""The kernels as PyTorch operators: differentiable, and opaque to torch.compile.
+"""The kernels are PyTorch operators: differentiable, and opaque to torch.compile.
 
 `dolens::trace` and `dolens::trace_adjoint` take a packed table as tensors, so that graphs and saved
 programs hold no Python objects of ours.  First derivatives only: a second one says so.
@@ -20,7 +20,7 @@ from dolens.kernels.table import SurfaceTable
 
 
 def _backend(position: Tensor) -> Any:
-    """The module that runs kernels where the rays are; imported when it is first needed."""
+    """Return the module that runs kernels where the rays are; it is imported when first needed."""
     if position.device.type == "cpu":
         from dolens.kernels.cpu import backend
     elif position.device.type == "cuda":
@@ -84,7 +84,7 @@ def trace_adjoint(
     of_path: Tensor | None,
     wanted: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cotangents of values, indices, position and direction.
+    """Return the cotangents of values, indices, position and direction.
 
     `wanted`: of position, direction and indices; what is not comes back empty, or zero.
     """

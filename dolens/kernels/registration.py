@@ -1,4 +1,4 @@
-"""Making functions operators of PyTorch's dispatcher, with shapes and derivatives."""
+"""Functions become operators of PyTorch's dispatcher, with shapes and derivatives."""
 
 from collections.abc import Callable
 from typing import Any
@@ -31,7 +31,7 @@ def register_shapes(name: str, shapes: Callable[..., Any]) -> None:
 def register_derivative(
     name: str, backward: Callable[..., Any], setup: Callable[..., None]
 ) -> None:
-    """Give an operator its backward pass, and what it saves for that."""
+    """Give an operator its backward pass, and the function that saves tensors for it."""
     torch.library.register_autograd(f"dolens::{name}", backward, setup_context=setup, lib=_library)
 
 

@@ -1,4 +1,4 @@
-"""The fused renderer as PyTorch operators: `dolens::render` and `dolens::render_adjoint`.
+"""The fused renderer is two PyTorch operators: `dolens::render` and `dolens::render_adjoint`.
 
 As the trace's, they take the packed table as tensors and know first derivatives only.  What no
 gradient concerns, the view, comes as lists of integers and of numbers.
@@ -21,7 +21,7 @@ from dolens.kernels.view import View
 
 
 def _backend(textures: Tensor) -> Any:
-    """The module that renders where the textures are; imported when it is first needed."""
+    """Return the module that renders where the textures are; it is imported when first needed."""
     if textures.device.type != "cpu":
         raise InputError(f"no fused renderer on {textures.device}; use backend 'reference'")
     from dolens.kernels.cpu.rendering import backend
@@ -91,7 +91,8 @@ def render_adjoint(
     of_image: Tensor,
     wanted: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Cotangents of values, indices, textures, sensor_z and moving from that of the image.
+    """Return the cotangents of values, indices, textures, sensor_z and moving from that of the
+    image.
 
     Args beyond those of `render`:
         of_image: (B, depths, C, height, width).

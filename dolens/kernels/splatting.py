@@ -1,4 +1,4 @@
-"""The splat as PyTorch operators: `dolens::splat` and `dolens::splat_adjoint`."""
+"""The splat is two PyTorch operators: `dolens::splat` and `dolens::splat_adjoint`."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from dolens.kernels.registration import (
 
 
 def _backend(points: Tensor) -> Any:
-    """The module that splats where the points are; imported when it is first needed."""
+    """Return the module that splats where the points are; it is imported when first needed."""
     if points.device.type != "cpu":
         raise InputError(f"no fused splat on {points.device}; use backend 'reference'")
     from dolens.kernels.cpu.rendering import splat_backend
@@ -48,7 +48,7 @@ def _splat_shapes(rows, columns, weight, size):  # noqa: ANN001, ANN202
 def splat_adjoint(
     rows: Tensor, columns: Tensor, weight: Tensor, of_grid: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cotangents of rows, columns and weight, (G, N), from that of the grids."""
+    """Return the cotangents of rows, columns and weight, (G, N), from that of the grids."""
     tensors = (t.contiguous() for t in (rows, columns, weight, of_grid))
     return _backend(rows).splat_adjoint(*tensors)
 

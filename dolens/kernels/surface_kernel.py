@@ -1,4 +1,4 @@
-"""Where a surface's kernels are: modules by name, imported when a lens first needs them.
+"""A surface names the modules of its kernels, which are imported when a lens first needs them.
 
 A surface class carries a `SurfaceKernel`.  Its `code` marks the surface's steps in a table, so that
 the kernels know no list of surfaces: a new one is its own modules.
@@ -19,7 +19,7 @@ _by_code: dict[int, "SurfaceKernel"] = {}
 
 @dataclass(frozen=True, eq=False)
 class SurfaceKernel:
-    """The kernels of a surface, for the CPU, for GPUs, or for both.
+    """A surface has kernels for the CPU, for GPUs, or for both.
 
     Each module offers `KERNELS`: on the CPU what `given_by_scalars` or `given_by_sag` returns, on
     GPUs a `SagFunctions`.  Where there is none for a device, the reference in PyTorch traces there.
@@ -45,7 +45,7 @@ class SurfaceKernel:
         _by_code[self.code] = self
 
     def serves(self, device: str) -> bool:
-        """Whether there are kernels for `cpu` or `cuda`."""
+        """Return whether there are kernels for `cpu` or `cuda`."""
         return {"cpu": self.cpu, "cuda": self.cuda}.get(device) is not None
 
 

@@ -1,4 +1,4 @@
-"""A lens as a kernel sees it: flat numbers and codes, one record for every step of a ray.
+"""Kernels see a lens as a table of numbers and codes, with one record for every step of a ray.
 
 A step is a surface, or a change of axes between elements of different poses, or the sensor plane.
 Steps come in the order that light meets them, so that backward mode is another table, not another
@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 class Kind(IntEnum):
-    """Steps that the kernels' own sources tell apart, and after them surfaces given by their sag.
+    """The kernels' own sources tell these steps apart; after them come surfaces given by their sag.
 
     The numbers of a surface's shape follow the header of its record, in the order of its `packed`.
     """
@@ -30,7 +30,7 @@ class Kind(IntEnum):
 
 
 class Slot:
-    """Where a number lies in the header of a record."""
+    """A record's header holds its numbers in these slots."""
 
     # Of a surface and the sensor: added to z on arrival, minus the gap.
     SHIFT = 0
@@ -51,7 +51,7 @@ class Slot:
 
 
 class Code:
-    """Where a code lies in a step's row."""
+    """A step's row holds its codes at these places."""
 
     KIND = 0
     OFFSET = 1  # of the record in `values`
@@ -69,7 +69,7 @@ class Code:
 
 
 class Outline(IntEnum):
-    """The shape of an aperture's edge or of its obscuration."""
+    """An aperture's edge and its obscuration have one of these shapes."""
 
     NONE = 0
     CIRCLE = 1
@@ -77,7 +77,7 @@ class Outline(IntEnum):
 
 
 class Failure:
-    """Statuses that are added to a surface's tag; see `dolens.optics.rays.Status`."""
+    """One of these statuses is added to a surface's tag; see `dolens.optics.rays.Status`."""
 
     VIGNETTED = 1
     TOTALLY_REFLECTED = 2
@@ -92,7 +92,7 @@ NEWTON_STEPS = 40
 
 @dataclass(frozen=True)
 class SurfaceTable:
-    """A lens, or some of its surfaces, packed for rays of one sense.
+    """A lens, or some of its surfaces, is packed for rays of one sense.
 
     Attributes:
         values: (V,), the records one after the other, and last of all what is added to z of the

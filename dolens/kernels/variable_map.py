@@ -1,4 +1,4 @@
-"""How the numbers of a packed table follow from a lens's variables."""
+"""The map relates the numbers of a packed table to a lens's variables."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class VariableMap:
-    """d(values)/d(variables), a sparse matrix in lists of its entries.
+    """The map is d(values)/d(variables), a sparse matrix in lists of its entries.
 
     A number that follows from several variables, or a variable that several numbers follow from,
     has as many entries.  Coefficients of a spline are variables themselves, so their weights are 1.

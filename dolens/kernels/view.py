@@ -1,11 +1,11 @@
-"""What a renderer renders: a sensor's pixels, their samples of the pupil, and planes of a scene."""
+"""A view is a sensor's pixels, their samples of the pupil, and planes of a scene."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class View:
-    """A sensor that looks through a lens at textured planes.
+    """A sensor looks through a lens at textured planes.
 
     Attributes:
         height: pixels.
@@ -42,7 +42,8 @@ class View:
     magnifications: tuple[float, ...]
 
     def weight(self, sensor_z: float) -> float:
-        """Weight of a sample over cos⁴ of its ray's angle, so that they sum to one on the axis.
+        """Return the weight of a sample over cos⁴ of its ray's angle, so that they sum to one on
+        the axis.
 
         The mean of cos⁴ over a disc of radius a at distance L, seen from the axis, is L²/(L² + a²).
         """
@@ -52,7 +53,7 @@ class View:
         return larger / (axial * self.pupil_samples**2)
 
     def integers(self) -> list[int]:
-        """The integers, as an operator takes them; `from_lists` is the inverse."""
+        """Return the integers, as an operator takes them; `from_lists` is the inverse."""
         return [
             self.height,
             self.width,
@@ -63,7 +64,7 @@ class View:
         ]
 
     def numbers(self) -> list[float]:
-        """The lengths and magnifications, as an operator takes them."""
+        """Return the lengths and magnifications, as an operator takes them."""
         own = (
             self.pixel_pitch,
             self.middle_row,
@@ -78,7 +79,7 @@ class View:
 
     @staticmethod
     def from_lists(integers: list[int], numbers: list[float]) -> "View":
-        """The view of `integers` and `numbers`."""
+        """Return the view of `integers` and `numbers`."""
         height, width, pupil_samples, pixel_area, low, high = integers
         pixel_pitch, *places, pupil_z, pupil_radius, axial_radius = numbers[:8]
         planes = numbers[8:]

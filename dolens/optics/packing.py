@@ -1,4 +1,4 @@
-"""Packing a lens for the kernels: an `OpticalSystem` becomes a `SurfaceTable`.
+"""Packing turns an `OpticalSystem` into the `SurfaceTable` that the kernels take.
 
 Every number of the table is a sum of parameters with signs, or comes from the poses, so that
 gradients flow back through ordinary tensor operations, and derivatives by parameters are known.
@@ -25,7 +25,7 @@ Wavelength = float | Sequence[float] | Tensor
 
 
 def unsupported(system: OpticalSystem) -> str | None:
-    """Why the kernels cannot trace a lens, in words that name the surface; None where they can."""
+    """Say why the kernels cannot trace a lens, naming the surface; None where they can."""
     device = system.device.type
     for number, surface in enumerate(system.surfaces, 1):
         kernel = surface.shape.kernel
@@ -64,7 +64,7 @@ def pack(
 def pack_with_variables(
     system: OpticalSystem, wavelengths: Sequence[float], variables: Sequence[Tensor]
 ) -> tuple[SurfaceTable, VariableMap]:
-    """Pack a whole lens up to its sensor, and how the table follows from variables.
+    """Pack a whole lens up to its sensor, with the map from its variables to the table.
 
     Args:
         system: the lens.
@@ -85,7 +85,7 @@ def pack_with_variables(
 def _lay_out(
     system: OpticalSystem, sense: float, first: int, last: int, to_sensor: bool
 ) -> tuple[Records, list[Tensor], list[Tensor]]:
-    """The layout of the records, and the lens's numbers in its order: scalars, then arrays."""
+    """Return the layout of the records, and the lens's numbers: scalars, then arrays."""
     scalars: list[Tensor] = []
     arrays: list[Tensor] = []
     forms, apertures = [], []
@@ -125,7 +125,7 @@ def _lay_out(
 
 
 def _values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
-    """The records as one tensor."""
+    """Return the records as one tensor."""
     numbers = torch.stack(tuple(scalars))
     options = {"dtype": numbers.dtype, "device": numbers.device}
     if arrays:
@@ -145,7 +145,7 @@ def _table(
 def _variable_map(
     layout: Records, numbers: Sequence[Tensor], variables: Sequence[Tensor]
 ) -> VariableMap:
-    """How the records follow from variables: the very tensors that were packed.
+    """Return the map of the records from variables: the very tensors that were packed.
 
     What was computed from variables, as the poses are, is differentiated by autograd.
     """
@@ -177,7 +177,9 @@ def _variable_map(
 def _map_of_numbers(
     layout: Records, sizes: tuple[int, ...], columns: tuple[int, ...], count: int
 ) -> VariableMap:
-    """The map of those of the lens's numbers that are variables, from the first column of each."""
+    """Return the map of those of the lens's numbers that are variables, from the first column of
+    each.
+    """
     column = np.concatenate(
         [
             np.full(size, -1) if first < 0 else first + np.arange(size)
@@ -193,7 +195,9 @@ def _map_of_numbers(
 def _derivatives(
     functions: Sequence[tuple[int, Tensor]], variables: Sequence[Tensor]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of numbers that autograd can follow to the variables: source, column and derivative."""
+    """Return source, column and derivative of the numbers that autograd can follow to the
+    variables.
+    """
     flat = torch.cat([value.reshape(-1) for _, value in functions])
     source = torch.cat([torch.arange(b, b + value.numel()) for b, value in functions])
     jacobian = jacobian_of(flat, variables)
@@ -207,7 +211,7 @@ def _indices(
     media: tuple[int, ...],
     device: torch.device,
 ) -> Tensor:
-    """(media, wavelengths), in double precision whatever the lens's."""
+    """Return the indices (media, wavelengths), in double precision whatever the lens's."""
     used = tuple(materials[k] for k in media)
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)

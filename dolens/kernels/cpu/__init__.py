@@ -1,1 +1,1 @@
-"""Kernels for the CPU, compiled by Numba: blocks of rays carried through all surfaces in cache."""
+"""Numba compiles the CPU kernels, which carry blocks of rays through all surfaces in cache."""

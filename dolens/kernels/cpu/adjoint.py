@@ -1,4 +1,4 @@
-"""Driver of the backward pass: each block is traced again, keeping its states, and swept back.
+"""The backward driver traces each block again, keeps its states, and sweeps cotangents back.
 
 Only valid rays take part: a block is filled with the next of them, so that rays which fail cost
 nothing and cannot spoil a sum.  Sums are kept for every chunk of rays, in double precision, and the
@@ -55,7 +55,7 @@ from dolens.kernels.cpu.records import (
 
 
 class Sweeps(NamedTuple):
-    """Compiled functions that the drivers of derivatives share."""
+    """These compiled functions are shared by the drivers of derivatives."""
 
     load_lanes: Any
     gather: Any
@@ -66,7 +66,9 @@ class Sweeps(NamedTuple):
 
 @cache
 def sweeps(real: types.Type) -> Sweeps:
-    """Functions that fill a block with valid rays, trace it, and sweep back, for one real type."""
+    """Compile functions that fill a block with valid rays, trace it, and sweep back, for one real
+    type.
+    """
     at = real_at(real)
     zero = real(0.0)
     find_wavelength, load, set_indices, step = streams(real)
@@ -92,7 +94,7 @@ def sweeps(real: types.Type) -> Sweeps:
 
     @njit(**OPTIONS)
     def gather(job, ray, end, lanes):  # noqa: ANN001, ANN202
-        """Load the next valid rays from `ray` on; their number, and where to go on."""
+        """Load the next valid rays from `ray` on; return their number, and the ray behind them."""
         status = carray(int8_at(job[jobs.OUT_STATUS]), UNBOUNDED)
         count = 0
         while ray < end and count < BLOCK:
@@ -176,7 +178,9 @@ def sweeps(real: types.Type) -> Sweeps:
 
 
 def adjoint_driver(real: types.Type) -> Callable[..., None]:
-    """Sweep chunks `first` to `last` back: gradients of the rays, and sums for each chunk."""
+    """Compile the sweep of chunks `first` to `last`: gradients of the rays, and sums for each
+    chunk.
+    """
     at = real_at(real)
     _, gather, forward, back, add_sums = sweeps(real)
     zero = real(0.0)

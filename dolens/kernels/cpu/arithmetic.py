@@ -1,4 +1,4 @@
-"""The steps that all surfaces share, for one ray: clamps, transfer, Snell's law, and its adjoint.
+"""All surfaces share these functions of one ray: clamps, transfer, Snell's law, and its adjoint.
 
 They mirror `dolens.optics.trace` and `dolens.optics.surfaces.base`.
 """
@@ -15,7 +15,7 @@ from dolens.kernels.cpu.records import MISSED, STOPPED, TOTALLY_REFLECTED
 
 
 class Arithmetic(NamedTuple):
-    """Compiled scalar functions for one real type, to be inlined in a block's loop."""
+    """These compiled scalar functions of one real type are inlined in a block's loop."""
 
     clamp: Any
     safe_sqrt: Any
@@ -27,7 +27,9 @@ class Arithmetic(NamedTuple):
 
 @cache
 def arithmetic(real: types.Type) -> Arithmetic:
-    """The functions for a real type; every constant in them has it, so that none is promoted."""
+    """Compile the functions for a real type; every constant in them has it, so that none is
+    promoted.
+    """
     grazing, tiny = real(1e-9), real(1e-18)
     zero, one, two = real(0.0), real(1.0), real(2.0)
     stopped, totally_reflected = real(STOPPED), real(TOTALLY_REFLECTED)
@@ -35,20 +37,20 @@ def arithmetic(real: types.Type) -> Arithmetic:
 
     @njit(**OPTIONS)
     def clamp(value, limit):  # noqa: ANN001, ANN202
-        """The value, held within ± limit; NaN stays."""
+        """Return the value, held within ± limit; NaN stays."""
         low = -limit
         value = low if value < low else value
         return limit if value > limit else value
 
     @njit(**OPTIONS)
     def safe_sqrt(squared):  # noqa: ANN001, ANN202
-        """Square root; what is not positive counts as 1e-18."""
+        """Return the square root; an argument that is not positive counts as 1e-18."""
         return math.sqrt(squared if squared > tiny else tiny)
 
     @njit(**OPTIONS)
     def arrive(x, y, z, l, m, n, sense, limit):  # noqa: ANN001, ANN202, E741
-        """x, y on the vertex plane, the distance there, and the cosine in the sense of travel, zero
-        where x or y is held at the limit.
+        """Return x and y on the vertex plane, the distance there, and the cosine in the sense of
+        travel, which is zero where x or y is held at the limit.
         """
         towards = sense * n
         t = -sense * z / (towards if towards > grazing else grazing)
@@ -58,7 +60,7 @@ def arithmetic(real: types.Type) -> Arithmetic:
 
     @njit(**OPTIONS)
     def set_status(src, dst, i, tag, edge, x, y, met, least, transmitted):  # noqa: ANN001, ANN202
-        """Note in ray i's state behind a surface how it fails there; the first failure stays.
+        """Set the status of ray i behind a surface; the first failure of each kind stays.
 
         Args: the states in front and behind; i; the surface's tag, and its circular edge's radius
         squared; where the ray meets it; a number that exceeds `least` if it does; and cos² behind,
@@ -72,7 +74,7 @@ def arithmetic(real: types.Type) -> Arithmetic:
 
     @njit(**OPTIONS)
     def refract(l, m, n, nx, ny, nz, ratio, sense):  # noqa: ANN001, ANN202, E741
-        """Directions behind a surface, and cos² of the angle there: positive without TIR."""
+        """Return direction and cos² of the angle behind a surface; it is positive without TIR."""
         cosine = clamp(l * nx + m * ny + n * nz, two)
         squared = (one - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
         along = sense * safe_sqrt(squared) - ratio * cosine
@@ -85,7 +87,8 @@ def arithmetic(real: types.Type) -> Arithmetic:
 
     @njit(**OPTIONS)
     def refract_adjoint(a, b, c, l, m, n, nx, ny, nz, out_l, out_m, out_n, ratio, per_index):  # noqa: ANN001, ANN202, E741
-        """Cotangents of direction, normal and both indices from (a, b, c), that of d'; 1/cos i.
+        """Return the cotangents of direction, normal and both indices from (a, b, c), that of d',
+        and 1/cos i.
 
         d' = μ·d + Γ·N with Γ = s·cos t - μ·cos i, and s·cos t = d'·N.  `per_index` is one over the
         index in front.  One division serves both cosines.
@@ -95,9 +98,11 @@ def arithmetic(real: types.Type) -> Arithmetic:
         both = one / (cosine * inside)
         along = inside - ratio * cosine
         of_along = a * nx + b * ny + c * nz
-        bend = ratio * both * cosine
-        of_cosine = of_along * (ratio * bend * cosine - ratio)
-        of_ratio = (a * l + b * m + c * n) - of_along * (bend * (one - cosine * cosine) + cosine)
+        refracted = ratio * both * cosine
+        of_cosine = of_along * (ratio * refracted * cosine - ratio)
+        of_ratio = (a * l + b * m + c * n) - of_along * (
+            refracted * (one - cosine * cosine) + cosine
+        )
         of_before = of_ratio * ratio * per_index
         return (
             ratio * a + of_cosine * nx,

@@ -1,4 +1,4 @@
-"""Steps between surfaces of different poses, and to the sensor, and their adjoints.
+"""Rays change their axes between surfaces of different poses, and are carried to the sensor.
 
 They mirror `change_axes` and `to_lens_axes` of `dolens.optics.elements`, and `trace_to_plane`.
 """
@@ -65,7 +65,7 @@ from dolens.kernels.cpu.records import (
 
 @cache
 def _turns(real: types.Type) -> tuple[Any, Any]:
-    """Compiled: R·v and Rᵀ·v, with R by rows in a record."""
+    """Compile R·v and Rᵀ·v, where a record holds R by rows."""
 
     @njit(**OPTIONS)
     def turn(p, x, y, z):  # noqa: ANN001, ANN202
@@ -117,7 +117,7 @@ def change_axes_forward(real: types.Type) -> Callable[..., None]:
 
 
 def change_axes_adjoint(real: types.Type) -> Callable[..., None]:
-    """Adjoint of `change_axes_forward`."""
+    """Sweep cotangents back through `change_axes_forward`."""
     _, turn_back = _turns(real)
     zero, one, grazing = real(0.0), real(1.0), real(1e-9)
 
@@ -159,7 +159,7 @@ def change_axes_adjoint(real: types.Type) -> Callable[..., None]:
 
 
 def lens_axes_forward(real: types.Type) -> Callable[..., None]:
-    """See rays from the lens's axes."""
+    """Transform rays to the lens's axes."""
     turn, _ = _turns(real)
     zero = real(0.0)
 
@@ -177,7 +177,7 @@ def lens_axes_forward(real: types.Type) -> Callable[..., None]:
 
 
 def lens_axes_adjoint(real: types.Type) -> Callable[..., None]:
-    """Adjoint of `lens_axes_forward`."""
+    """Sweep cotangents back through `lens_axes_forward`."""
     _, turn_back = _turns(real)
     zero = real(0.0)
 

@@ -1,4 +1,5 @@
-"""Cubic B-spline surfaces by their local stencil; see `dolens.optics.surfaces.b_spline`.
+"""A cubic B-spline surface is evaluated by its local stencil; see
+`dolens.optics.surfaces.b_spline`.
 
 The record holds the knots in x, the knots in y, and the coefficients, rows along y.
 
@@ -49,11 +50,11 @@ FIRST_COLUMN, FIRST_ROW = C0 + 4 * FOUR, C0 + 4 * FOUR + BLOCK
 
 
 class Spline(NamedTuple):
-    """Compiled functions of one real type."""
+    """These compiled functions belong to one real type."""
 
     fetch: Any
     basis: Any
-    bend: Any
+    second_derivatives: Any
 
 
 @cache
@@ -62,7 +63,7 @@ def _spline(real: types.Type) -> Spline:
 
     @njit(**OPTIONS)
     def span(knots, count, u):  # noqa: ANN001, ANN202
-        """First of the four coefficients that matter at u, from 0 to count - 4."""
+        """Return the first of the four coefficients that matter at u, from 0 to count - 4."""
         last = count - 4
         low, high = knots[3], knots[count]
         if not u > low:
@@ -111,7 +112,9 @@ def _spline(real: types.Type) -> Spline:
 
     @njit(**OPTIONS)
     def basis(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
-        """Values and slopes of the four basis functions of the span [c, d]; see `cubic_basis`."""
+        """Return values and slopes of the four basis functions of the span [c, d]; see
+        `cubic_basis`.
+        """
         inside = low if u < low else u
         inside = high if inside > high else inside
         beyond = u - inside
@@ -135,19 +138,19 @@ def _spline(real: types.Type) -> Spline:
         )
 
     @njit(**OPTIONS)
-    def bend(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
-        """Second derivatives of the four; zero beyond the ends."""
+    def second_derivatives(a, b, c, d, e, f, u, low, high):  # noqa: ANN001, ANN202
+        """Return the second derivatives of the four; zero beyond the ends."""
         scale = zero if u < low or u > high else six
         width = one / (d - c)
         p0, p1 = (d - u) * width / (d - b), (u - c) * width / (e - c)
         r0, r1, r2 = -p0 / (d - a), (p0 - p1) / (e - b), p1 / (f - c)
         return -scale * r0, scale * (r0 - r1), scale * (r1 - r2), scale * r2
 
-    return Spline(fetch, basis, bend)
+    return Spline(fetch, basis, second_derivatives)
 
 
 def b_spline_sag(real: types.Type) -> Callable[..., None]:
-    """Sag, slopes, and the distance to the nearest edge of the knot rectangle."""
+    """Fill the rows of sag, slopes, and the distance to the nearest edge of the knot rectangle."""
     fetch, basis, _ = _spline(real)
     zero = real(0.0)
 
@@ -189,8 +192,8 @@ def b_spline_sag(real: types.Type) -> Callable[..., None]:
 
 
 def b_spline_hessian(real: types.Type) -> Callable[..., None]:
-    """Slopes and second derivatives."""
-    fetch, basis, bend = _spline(real)
+    """Fill the rows of slopes and second derivatives."""
+    fetch, basis, second_derivatives = _spline(real)
     zero = real(0.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
@@ -210,8 +213,8 @@ def b_spline_hessian(real: types.Type) -> Callable[..., None]:
             yd, ye, yf = w[YD + i], w[YE + i], w[YF + i]
             bx = basis(xa, xb, xc, xd, xe, xf, x, x_low, x_high)
             by = basis(ya, yb, yc, yd, ye, yf, y, y_low, y_high)
-            ex = bend(xa, xb, xc, xd, xe, xf, x, x_low, x_high)
-            ey = bend(ya, yb, yc, yd, ye, yf, y, y_low, y_high)
+            ex = second_derivatives(xa, xb, xc, xd, xe, xf, x, x_low, x_high)
+            ey = second_derivatives(ya, yb, yc, yd, ye, yf, y, y_low, y_high)
             level = w[LEVEL + i]
             sx = sy = sxx = sxy = syy = zero
             for j in range(4):
@@ -232,7 +235,7 @@ def b_spline_hessian(real: types.Type) -> Callable[..., None]:
 
 
 def b_spline_parameters(real: types.Type) -> Callable[..., None]:
-    """Cotangents of the 16 coefficients at hand and where they lie.
+    """Fill the cotangents of each ray's 16 coefficients, and where these lie.
 
     The place counts from the record's first coefficient.  `b_spline_hessian` has fetched the knots.
     """
@@ -267,7 +270,7 @@ def b_spline_parameters(real: types.Type) -> Callable[..., None]:
 
 
 def _rows_of_stencil(row: Sequence[int]) -> int:
-    """Rows for each ray's knots and coefficients."""
+    """Return the number of rows for each ray's knots and coefficients."""
     return STENCIL_ROWS
 
 

@@ -1,4 +1,4 @@
-"""Running the CPU kernels on tensors."""
+"""These functions run the CPU kernels on tensors."""
 
 import torch
 from torch import Tensor
@@ -48,7 +48,7 @@ def trace(
 
 
 def chunk_size(count: int) -> int:
-    """Rays a chunk, a multiple of the block; it does not depend on the threads."""
+    """Return the rays of a chunk, a multiple of the block; it does not depend on the threads."""
     return max(4096, -(-count // (_CHUNKS * BLOCK)) * BLOCK)
 
 
@@ -61,7 +61,7 @@ def trace_adjoint(
     cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
     wanted: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor, Tensor]:
-    """Cotangents of rays and table from those of position, direction and path length.
+    """Return the cotangents of rays and table from those of position, direction and path length.
 
     Args:
         table: as in `trace`, and the rays.

@@ -1,4 +1,4 @@
-"""Compiling kernels: C callbacks with an on-disk cache, and the intrinsics that join them.
+"""Kernels are compiled to C functions that a cache on disk keeps; intrinsics join them.
 
 A kernel is a function of pointers, made by a factory: a function of a real type that returns the
 kernel as a Python function.  Each is compiled when a lens first needs it, and kept on disk.
@@ -39,18 +39,20 @@ _lock = threading.RLock()
 
 
 def pointer(real: types.Type) -> types.Type:
-    """The type of a pointer to numbers of this type."""
+    """Return the type of a pointer to numbers of this type."""
     return types.CPointer(real)
 
 
 def block_signature(real: types.Type) -> Any:
-    """Of a step's functions: before, after, cotangents, record, work rows, codes."""
+    """Return a block function's signature: before, after, cotangents, record, work rows, codes."""
     p = pointer(real)
     return types.void(p, p, p, p, p, INTEGERS)
 
 
 def _call_address(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Code that calls the function at the address in the first argument with the others."""
+    """Generate a call of the function at the address in the first argument with the other
+    arguments.
+    """
     kind = ir.FunctionType(ir.VoidType(), [a.type for a in arguments[1:]])
     builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
     return context.get_dummy_value()
@@ -71,7 +73,7 @@ def call_driver(context, address, job, first, end):  # noqa: ANN001, ANN201
 
 @intrinsic
 def fetch_add(context, base, place, amount):  # noqa: ANN001, ANN201
-    """Add to base[place], which other threads add to as well, and give what was there before."""
+    """Add to base[place], which other threads add to as well; return the number from before."""
 
     def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
         number = builder.gep(arguments[0], [arguments[1]])
@@ -82,7 +84,7 @@ def fetch_add(context, base, place, amount):  # noqa: ANN001, ANN201
 
 @intrinsic
 def shifted(context, base, count):  # noqa: ANN001, ANN201
-    """The pointer `count` numbers further on: its index then needs no sign test."""
+    """Return the pointer `count` numbers further on: its index then needs no sign test."""
 
     def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
         return builder.gep(arguments[0], [arguments[1]])
@@ -111,20 +113,20 @@ int8_at = _pointer_at(types.int8)
 
 @cache
 def compile_block(factory: Factory, real: str) -> int:
-    """Address of a block function for `float32` or `float64`."""
+    """Return the address of a block function for `float32` or `float64`."""
     return _compiled(factory, real, block_signature(REALS[real])).address
 
 
 @cache
 def compile_driver(factory: Factory, real: str) -> int:
-    """Address of a driver, a C function of (job, first, end)."""
+    """Return the address of a driver, a C function of (job, first, end)."""
     signature = types.void(INTEGERS, types.int64, types.int64)
     return _compiled(factory, real, signature).address
 
 
 @cache
 def compile_team(factory: Factory) -> Any:
-    """What a thread of a team runs: a C function of its task, called without Python's lock."""
+    """Return the C function of a task that each thread of a team runs, without Python's lock."""
     return _compiled(factory, "float64", types.void(INTEGERS)).ctypes
 
 
@@ -158,7 +160,7 @@ def source_of(factory: Factory) -> tuple[str, ...]:
 
 
 class _StampedCache(FunctionCache):
-    """Numba's on-disk cache; a directory that cannot be written costs the cache, not the run."""
+    """Numba's cache on disk serves; a directory that cannot be written costs only the cache."""
 
     def __init__(self, function: Callable[..., None], factory: Factory, real: str) -> None:
         super().__init__(function)
@@ -208,7 +210,7 @@ def _compiled(factory: Factory, real: str, signature: Any) -> CFunc:
 
 
 class _Announcement(event.Listener):
-    """Says once in a process that kernels are being compiled; reading the cache is silent."""
+    """The log says once a process that kernels are being compiled; reading the cache is silent."""
 
     said = False
 
@@ -218,7 +220,7 @@ class _Announcement(event.Listener):
             logger.info("compiling kernels (once for this machine; some seconds)")
 
     def on_end(self, event: Any) -> None:
-        """Nothing to say."""
+        """Say nothing."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Conics of revolution: the closed form of `dolens.optics.surfaces.conic`, and its adjoint.
+"""Rays meet a conic of revolution in the closed form of `dolens.optics.surfaces.conic`.
 
 F = z - c(x² + y² + (1+k)z²)/2 has the gradient g = (-cx, -cy, 1 - (1+k)cz); the normal is g/|g|.
 """
@@ -50,7 +50,7 @@ from dolens.kernels.cpu.records import (
 
 @cache
 def conic_distance(real: types.Type) -> Any:
-    """Compiled: distance from the vertex plane to a conic, and D; see `optics.surfaces.conic`."""
+    """Compile the distance from the vertex plane to a conic, and D; see `optics.surfaces.conic`."""
     _, safe_sqrt, *_ = arithmetic(real)
     zero, one, grazing, flat = real(0.0), real(1.0), real(1e-9), real(1e-15)
 
@@ -115,7 +115,7 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
 
 
 def conic_adjoint(real: types.Type) -> Callable[..., None]:
-    """Cotangents in front of a conic from those behind it, in place; see `explicit_adjoint`."""
+    """Sweep cotangents back through a conic, in place; see `explicit_adjoint`."""
     *_, refract_adjoint = arithmetic(real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
 

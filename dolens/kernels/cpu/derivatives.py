@@ -1,4 +1,4 @@
-"""Running the drivers of Jacobians and of least squares on tensors."""
+"""These functions run the drivers of Jacobians and of least squares on tensors."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ RayTensors = tuple[Tensor, Tensor, Tensor | None]
 def ray_jacobian(
     table: SurfaceTable, variables: VariableMap, outputs: Sequence[str], rays: RayTensors
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Outputs of every ray and their derivatives by every variable.
+    """Return the outputs of every ray and their derivatives with respect to every variable.
 
     Args:
         table: the lens, up to the sensor.
@@ -64,7 +64,7 @@ def normal_equations(
     group: Tensor | None,
     groups: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sums over valid rays for least squares with residuals r = output - target.
+    """Return sums over valid rays for least squares with residuals r = output - target.
 
     Args:
         table: and the three that follow, as in `ray_jacobian`.
@@ -115,13 +115,13 @@ def normal_equations(
 
 
 def _chunk(count: int, length: int) -> int:
-    """Rays a chunk, a multiple of the block; it does not depend on the threads."""
+    """Return the rays of a chunk, a multiple of the block; it does not depend on the threads."""
     chunks = max(1, min(_CHUNKS, _NUMBERS // length))
     return max(8 * BLOCK, -(-count // (chunks * BLOCK)) * BLOCK)
 
 
 class _Derivatives:
-    """A program, and the arrays that its job points to while it runs."""
+    """A program is held together with the arrays that its job points to while it runs."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class _Derivatives:
 
 
 class _Entries(NamedTuple):
-    """A map of variables as the drivers take it.
+    """The drivers take a map of variables in this form.
 
     Attributes:
         first_step: a sweep ends here, at the first step that any variable belongs to.
@@ -170,7 +170,7 @@ class _Entries(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
-    """The map by steps; coefficients of splines are looked up by their place instead."""
+    """Sort the map by steps; coefficients of splines are looked up by their place instead."""
     codes = np.frombuffer(codes_, dtype=np.int64).reshape(-1, Code.ROW)
     # The last number moves z of the rays only, which is no output.
     kept = variables.places.numpy() < values - 1

@@ -1,4 +1,4 @@
-"""Even aspheres, s = conic + q²·H(q) with q = r² and H = a4 + a6·q + ..., by Horner's rule.
+"""An even asphere has the sag s = conic + q²·H(q) with q = r² and H = a4 + a6·q + ....
 
 Coefficients come in groups of four, so that four steps are unrolled at a time.
 """
@@ -35,7 +35,7 @@ from dolens.kernels.cpu.layout import (
 from dolens.kernels.cpu.records import CODE_ROW, COUNT, SHAPE, SHORT_RECORD
 
 # Work rows: q, H, H' and H''/2; for the cotangents, powers of q and the weight of the slope.
-Q, H, H_SLOPE, H_BEND, *_ = OWN
+Q, H, H_SLOPE, H_SECOND, *_ = OWN
 LOWER, OF_SLOPE = H, H_SLOPE
 # The first coefficient in a record, and its cotangent.
 COEFFICIENTS, OF_COEFFICIENTS = SHAPE + 2, OF_SECOND + BLOCK
@@ -43,7 +43,7 @@ COEFFICIENTS, OF_COEFFICIENTS = SHAPE + 2, OF_SECOND + BLOCK
 
 @cache
 def _horner(real: types.Type) -> tuple[Any, Any]:
-    """Compiled: H and H' (and H''/2) of a block, and q, into their work rows."""
+    """Compile Horner's rule for H and H' (and H''/2) of a block; q, too, gets a work row."""
     zero = real(0.0)
 
     @njit(**OPTIONS)
@@ -67,22 +67,22 @@ def _horner(real: types.Type) -> tuple[Any, Any]:
         for i in range(BLOCK):
             x, y = w[POINT_X + i], w[POINT_Y + i]
             w[Q + i] = x * x + y * y
-            w[H + i], w[H_SLOPE + i], w[H_BEND + i] = zero, zero, zero
+            w[H + i], w[H_SLOPE + i], w[H_SECOND + i] = zero, zero, zero
         for group in range(count // 4 - 1, -1, -1):
             a = carray(shifted(record, COEFFICIENTS + 4 * group), 4)
             a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
             for i in range(BLOCK):
-                q, h, d, e = w[Q + i], w[H + i], w[H_SLOPE + i], w[H_BEND + i]
+                q, h, d, e = w[Q + i], w[H + i], w[H_SLOPE + i], w[H_SECOND + i]
                 e, d, h = e * q + d, d * q + h, h * q + a3
                 e, d, h = e * q + d, d * q + h, h * q + a2
                 e, d, h = e * q + d, d * q + h, h * q + a1
-                w[H_BEND + i], w[H_SLOPE + i], w[H + i] = e * q + d, d * q + h, h * q + a0
+                w[H_SECOND + i], w[H_SLOPE + i], w[H + i] = e * q + d, d * q + h, h * q + a0
 
     return first, second
 
 
 def even_asphere_sag(real: types.Type) -> Callable[..., None]:
-    """Sag, slopes, and the margin of the conic's branch."""
+    """Fill the rows of sag, slopes, and the margin of the conic's branch."""
     _, safe_sqrt, *_ = arithmetic(real)
     horner, _ = _horner(real)
     one, two = real(1.0), real(2.0)
@@ -107,7 +107,9 @@ def even_asphere_sag(real: types.Type) -> Callable[..., None]:
 
 
 def even_asphere_hessian(real: types.Type) -> Callable[..., None]:
-    """Slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy = 4xyf''."""
+    """Fill the rows of slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy =
+    4xyf''.
+    """
     _, safe_sqrt, *_ = arithmetic(real)
     _, horner = _horner(real)
     half, one, two, four = real(0.5), real(1.0), real(2.0), real(4.0)
@@ -120,21 +122,21 @@ def even_asphere_hessian(real: types.Type) -> Callable[..., None]:
         ec2 = (one + p[SHAPE + 1]) * c * c
         for i in range(BLOCK):
             x, y, q = w[POINT_X + i], w[POINT_Y + i], w[Q + i]
-            h, d, e = w[H + i], w[H_SLOPE + i], w[H_BEND + i]
+            h, d, e = w[H + i], w[H_SLOPE + i], w[H_SECOND + i]
             root = safe_sqrt(one - ec2 * q)
             conic = half * c / root
             slope = conic + q * (two * h + q * d)
-            bend = half * conic * ec2 / (root * root) + two * h + four * q * d + two * q * q * e
+            second = half * conic * ec2 / (root * root) + two * h + four * q * d + two * q * q * e
             w[SLOPE_X + i], w[SLOPE_Y + i] = two * x * slope, two * y * slope
-            w[SAG_XX + i] = two * slope + four * x * x * bend
-            w[SAG_XY + i] = four * x * y * bend
-            w[SAG_YY + i] = two * slope + four * y * y * bend
+            w[SAG_XX + i] = two * slope + four * x * x * second
+            w[SAG_XY + i] = four * x * y * second
+            w[SAG_YY + i] = two * slope + four * y * y * second
 
     return kernel
 
 
 def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
-    """Cotangents of c, k and the coefficients.
+    """Fill the cotangents of c, k and the coefficients.
 
     With R = √(1 - (1+k)c²q): s_c = (q + (1+k)s²)/2R and s_k = c·s²/2R of the conic's sag s, and of
     its derivative in q, c/2R: 1/2R³ and c³q/4R³.

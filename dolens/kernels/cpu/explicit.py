@@ -1,4 +1,4 @@
-"""Surfaces that are given by their sag: Newton's iteration, refraction, and the adjoint.
+"""Newton's iteration finds the ray intercept on a surface that is given by its sag.
 
 A shape gives three block functions, by address in its codes: `sag` (sag, slopes, and the margin of
 its branch at the points in two work rows), `sag_hessian` (slopes and second derivatives there), and
@@ -176,7 +176,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
 
 
 def explicit_adjoint(real: types.Type) -> Callable[..., None]:
-    """Cotangents in front of a surface from those behind it, in place.
+    """Sweep cotangents back through a surface, in place.
 
     With F = z - sag and g = ∇F, the ray meets the surface at P = Q + t·d, where
     dt = -(g·(dQ + t·dd) + F_θ·dθ)/(g·d).  With τ = (P̄·d + n̄·path)/(g·d), where n̄ is the index in

@@ -1,4 +1,4 @@
-"""Driver of the forward trace: blocks of rays through all steps, in cache."""
+"""The forward driver carries blocks of rays through all steps, in cache."""
 
 import math
 from collections.abc import Callable
@@ -52,7 +52,7 @@ from dolens.kernels.cpu.records import (
 
 
 class Streams(NamedTuple):
-    """Compiled functions that drivers share."""
+    """These compiled functions are shared by the drivers."""
 
     find_wavelength: Any
     load: Any
@@ -61,13 +61,13 @@ class Streams(NamedTuple):
 
 
 def real_at(real: types.Type) -> Any:
-    """The intrinsic that makes an address a pointer to this type."""
+    """Return the intrinsic that makes an address a pointer to this type."""
     return compiler.real32_at if real is types.float32 else compiler.real64_at
 
 
 @cache
 def streams(real: types.Type) -> Streams:
-    """Functions that load rays, fill in the indices, and run a step, for one real type."""
+    """Compile functions that load rays, fill in the indices, and run a step, for one real type."""
     at = real_at(real)
     zero = real(0.0)
 
@@ -85,7 +85,7 @@ def streams(real: types.Type) -> Streams:
 
     @njit(**OPTIONS)
     def load(job, start, count, state, lanes):  # noqa: ANN001, ANN202
-        """Rays `start` to `start + count` into a block; the lanes beyond repeat its first ray."""
+        """Load rays `start` to `start + count` into a block; lanes beyond repeat its first ray."""
         for i in range(BLOCK):
             lanes[i] = start + (i if i < count else 0)
         find_wavelength(job, lanes)
@@ -128,7 +128,9 @@ def streams(real: types.Type) -> Streams:
 
     @njit(**OPTIONS)
     def set_indices(job, codes, lanes, work):  # noqa: ANN001, ANN202
-        """The index in front and the ratio of a step; `lanes` are the rays' numbers."""
+        """Fill the rows of the index in front and of the ratio of a step; `lanes` are the rays'
+        numbers.
+        """
         w = carray(work, WORK_SIZE)
         count = job[jobs.WAVELENGTHS]
         before = carray(shifted(real64_at(job[jobs.INDICES]), codes[BEFORE] * count), UNBOUNDED)
@@ -164,7 +166,7 @@ def streams(real: types.Type) -> Streams:
 
 
 def forward_driver(real: types.Type) -> Callable[..., None]:
-    """Trace blocks `first` to `last` and write the rays behind the last step."""
+    """Compile the trace of blocks `first` to `last`, which writes the rays behind the last step."""
     at = real_at(real)
     _, load, _, step = streams(real)
     zero = real(0.0)
@@ -172,7 +174,7 @@ def forward_driver(real: types.Type) -> Callable[..., None]:
 
     @njit(**OPTIONS)
     def finite(value):  # noqa: ANN001, ANN202
-        """The number, or zero: rays that are not valid may overflow."""
+        """Return the number, or zero: rays that are not valid may overflow."""
         return value if math.fabs(value) <= largest else zero
 
     def kernel(job_, first, last):  # noqa: ANN001, ANN202

@@ -1,4 +1,4 @@
-"""What the CPU's kernels know of a step: block functions, by the factories that compile them."""
+"""A step's kernels are block functions, given by the factories that compile them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,13 +7,13 @@ from dolens.kernels.cpu.compiler import Factory
 
 
 def _none(row: Sequence[int]) -> int:
-    """No work rows."""
+    """Ask for no work rows."""
     return 0
 
 
 @dataclass(frozen=True)
 class StepFunctions:
-    """A step's block functions.
+    """A step has these block functions.
 
     Attributes:
         forward: carries a block of rays through the step.

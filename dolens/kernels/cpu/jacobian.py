@@ -1,4 +1,5 @@
-"""Driver of Jacobians: how every ray's outputs move with the lens's variables.
+"""The driver of Jacobians gives the derivatives of every ray's outputs with respect to the
+variables.
 
 A block is traced once and its states are kept.  Each output (x or y on the sensor, path length) is
 then swept back with a cotangent of one; since a ray depends on no other, the cotangents of a step's
@@ -52,7 +53,7 @@ ENOUGH = 72
 
 
 class Columns(NamedTuple):
-    """Compiled functions that the drivers of Jacobians share."""
+    """These compiled functions are shared by the drivers of Jacobians."""
 
     begin: Any
     trace: Any
@@ -63,7 +64,9 @@ class Columns(NamedTuple):
 
 @cache
 def columns(real: types.Type) -> Columns:
-    """Functions that trace a block and fill its columns with derivatives, for one real type."""
+    """Compile functions that trace a block and fill its columns with derivatives, for one real
+    type.
+    """
     at = real_at(real)
     _, load, set_indices, step = streams(real)
     load_lanes, *_ = sweeps(real)
@@ -78,7 +81,7 @@ def columns(real: types.Type) -> Columns:
 
     @njit(**OPTIONS)
     def trace(job, lanes):  # noqa: ANN001, ANN202
-        """Trace the loaded block, keeping all states; the number of rays that pass.
+        """Trace the loaded block, keeping all states; return the number of rays that pass.
 
         In the last state, row 7 is zero for those.  A vignetted ray need not go on: no Newton
         iteration waits for it.
@@ -99,7 +102,7 @@ def columns(real: types.Type) -> Columns:
 
     @njit(**OPTIONS)
     def begin(job, start, count, lanes):  # noqa: ANN001, ANN202
-        """Load and trace rays `start` to `start + count`; how many pass, of a whole block."""
+        """Load and trace rays `start` to `start + count`; return how many of a whole block pass."""
         load(job, start, count, at(job[jobs.STACK]), lanes)
         return trace(job, lanes)
 
@@ -119,7 +122,8 @@ def columns(real: types.Type) -> Columns:
 
     @njit(**OPTIONS)
     def put_entries(job, k, cotangents, columns, stride):  # noqa: ANN001, ANN202
-        """Put what step k gives into columns; what comes first to a column overwrites it.
+        """Put the derivatives of step k into columns; the first that comes to a column overwrites
+        it.
 
         Entries are taken last first.  After the last step's come columns that begin as zero.
         """
@@ -195,7 +199,7 @@ def columns(real: types.Type) -> Columns:
 
     @njit(**OPTIONS)
     def wait(job, lanes, count, waiting):  # noqa: ANN001, ANN202
-        """Put the block's rays that pass behind those that wait; the number that then do."""
+        """Put the block's rays that pass behind those that wait; return the number that then do."""
         last = carray(shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS]), STATE)
         pending = carray(int64_at(job[jobs.PENDING]), 2 * BLOCK)
         for i in range(count):
@@ -206,7 +210,7 @@ def columns(real: types.Type) -> Columns:
 
     @njit(**OPTIONS)
     def resume(job, lanes, waiting):  # noqa: ANN001, ANN202
-        """Trace rays that wait, a block at most; their number."""
+        """Trace rays that wait, a block at most; return their number."""
         pending = carray(int64_at(job[jobs.PENDING]), 2 * BLOCK)
         count = min(waiting, BLOCK)
         for i in range(BLOCK):
@@ -221,14 +225,16 @@ def columns(real: types.Type) -> Columns:
 
 
 def jacobian_driver(real: types.Type) -> Callable[..., None]:
-    """Write outputs, validity and derivatives of chunks `first` to `last`; zeros where invalid."""
+    """Compile the driver that writes outputs, validity and derivatives of chunks `first` to `last`;
+    zeros where invalid.
+    """
     at = real_at(real)
     begin, _, differentiate, wait, resume = columns(real)
     zero = real(0.0)
 
     @njit(**OPTIONS)
     def store_outputs(job, start, count):  # noqa: ANN001, ANN202
-        """Outputs and validity of rays that follow each other."""
+        """Store outputs and validity of rays that follow each other."""
         last = shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS])
         ended = carray(shifted(last, ENDED), BLOCK)
         valid = carray(shifted(int8_at(job[jobs.OUT_VALID]), start), BLOCK)

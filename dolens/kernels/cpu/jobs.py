@@ -1,4 +1,4 @@
-"""Where a driver finds things: places in its job, an array of integers.
+"""A job is an array of integers in which a driver finds its arrays and counts, at these places.
 
 Addresses of arrays (zero: not asked for), strides in numbers, and counts.
 """

@@ -1,4 +1,4 @@
-"""Where the numbers of a block of rays lie in memory: rows of 128, one number for each ray.
+"""A block of rays lies in memory by rows of 128, one number for each ray.
 
 A row's name is the place of its first number, so that ray i of row X is number `X + i`.  Numba
 freezes a module's integers when it compiles: LLVM sees constant distances between rows, without
@@ -13,7 +13,7 @@ UNBOUNDED = 1 << 40  # the length of an array that its user keeps track of
 
 
 def _rows(first: int, count: int) -> tuple[int, ...]:
-    """Places of `count` rows that follow each other, from row `first`."""
+    """Return the places of `count` rows that follow each other, from row `first`."""
     return tuple(BLOCK * row for row in range(first, first + count))
 
 

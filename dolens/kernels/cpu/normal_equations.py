@@ -1,4 +1,4 @@
-"""Driver of least squares: JᵀJ, Jᵀr and sums by groups of rays, without storing the Jacobian.
+"""The driver of least squares sums JᵀJ, Jᵀr and groups of rays without storing the Jacobian.
 
 Every chunk of rays has its own sums in double precision:
     0 the number of rays, 1 Σ w·r²; then Jᵀr (P); then JᵀJ, rows of P, of which the lower triangle
@@ -23,14 +23,14 @@ GROUP_WEIGHT, GROUP_RESIDUAL = range(1, 3)
 
 
 def normal_equations_driver(real: types.Type) -> Callable[..., None]:
-    """Add chunks `first` to `last` to their sums."""
+    """Compile the driver that adds chunks `first` to `last` to their sums."""
     at = real_at(real)
     begin, _, differentiate, wait, resume = columns(real)
     zero, one = real(0.0), real(1.0)
 
     @njit(**OPTIONS)
     def weigh(job, lanes, count, weights):  # noqa: ANN001, ANN202
-        """The rays' weights; zero of those that do not pass, and of lanes beyond `count`."""
+        """Set the rays' weights; zero for those that do not pass, and for lanes beyond `count`."""
         ended = carray(shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS] + ENDED), BLOCK)
         given = carray(at(job[jobs.WEIGHT]), UNBOUNDED)
         out = carray(weights, BLOCK)
@@ -50,7 +50,7 @@ def normal_equations_driver(real: types.Type) -> Callable[..., None]:
 
     @njit(**OPTIONS)
     def four_dots(a_, b_):  # noqa: ANN001, ANN202
-        """Products of a row with four rows that follow each other."""
+        """Return the products of a row with four rows that follow each other."""
         a, b = carray(a_, BLOCK), carray(b_, 4 * BLOCK)
         s0 = s1 = s2 = s3 = zero
         for i in range(BLOCK):
@@ -89,7 +89,7 @@ def normal_equations_driver(real: types.Type) -> Callable[..., None]:
 
     @njit(**OPTIONS)
     def add_groups(job, lanes, count, output, weights, residual, weighted, sums):  # noqa: ANN001, ANN202
-        """Neighbours of one group are added together."""
+        """Add neighbours of one group together."""
         group = carray(int64_at(job[jobs.GROUP]), UNBOUNDED)
         first = 0
         while first < count:

@@ -1,4 +1,4 @@
-"""Planes and aperture stops, and their adjoint."""
+"""Rays refract at planes and pass aperture stops."""
 
 import math
 from collections.abc import Callable
@@ -79,7 +79,7 @@ def plane_forward(real: types.Type) -> Callable[..., None]:
 
 
 def plane_adjoint(real: types.Type) -> Callable[..., None]:
-    """Cotangents in front of a plane from those behind it, in place.
+    """Sweep cotangents back through a plane, in place.
 
     l' = μl, m' = μm, n'² = 1 - μ²(1 - n²); on the plane z = 0 and the distance is -z/n.
     """

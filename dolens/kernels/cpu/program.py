@@ -1,4 +1,4 @@
-"""A surface table with its compiled steps, and how a driver runs over it."""
+"""A program is a surface table with its compiled steps; drivers run over it."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -59,7 +59,7 @@ def functions_of(code: int) -> StepFunctions:
 
 
 class Steps(NamedTuple):
-    """The steps of a lens, compiled.
+    """A lens's steps, compiled, are these.
 
     Attributes:
         codes: (steps, CODE_ROW), int64: the table's, and the addresses of the block functions.
@@ -110,7 +110,7 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
 
 
 class Program:
-    """A surface table with its compiled steps, and the memory of each worker.
+    """A program holds a surface table, its compiled steps, and the memory of each worker.
 
     Args:
         table: of contiguous tensors on the CPU.
@@ -151,7 +151,7 @@ class Program:
         }
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
-        """Point to rays (N, 3) of any strides, and their wavelengths' places (N,), int32."""
+        """Point to rays (N, 3) of any strides, and to their wavelengths' columns (N,), int32."""
         for place, tensor in ((jobs.POSITION, position), (jobs.DIRECTION, direction)):
             self.job[place] = tensor.data_ptr()
             self.job[place + 1 : place + 3] = tensor.stride()
@@ -176,7 +176,7 @@ class Program:
         spread(function, [self._job_of(memory, step) for memory in memories], pieces)
 
     def _job_of(self, memory: np.ndarray, step: int) -> np.ndarray:
-        """The job of a worker, which works in this memory; `step` is the bytes of a number."""
+        """Return the job of a worker with this memory; `step` is the bytes of a number."""
         job = self.job.copy()
         address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
         for place, length in self._sizes.items():

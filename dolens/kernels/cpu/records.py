@@ -1,4 +1,4 @@
-"""Places in a step's record and in its row of codes (`dolens.kernels.table`), as plain integers.
+"""These plain integers are places in a step's record and in its row of codes.
 
 Numba takes integers of a module, and no attributes of a class.
 """

@@ -1,4 +1,4 @@
-"""Kernels of a surface from three functions of one point: the simplest way to a fast surface.
+"""Three functions of one point make a surface's kernels: the simplest way to a fast surface.
 
 The functions are inlined in the loops over a block's rays, which LLVM then vectorises.
 """

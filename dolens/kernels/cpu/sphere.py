@@ -1,4 +1,4 @@
-"""Spheres: the closed form of `dolens.optics.surfaces.conic`, and its adjoint.
+"""Rays meet a sphere in the closed form of `dolens.optics.surfaces.conic`.
 
 F = z - c(x² + y² + z²)/2 has the gradient N = (-cx, -cy, 1 - cz), a unit vector on the sphere.
 """
@@ -91,7 +91,7 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
 
 
 def sphere_adjoint(real: types.Type) -> Callable[..., None]:
-    """Cotangents in front of a sphere from those behind it, in place; see `explicit_adjoint`."""
+    """Sweep cotangents back through a sphere, in place; see `explicit_adjoint`."""
     *_, refract_adjoint = arithmetic(real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
 

@@ -1,4 +1,4 @@
-"""What every thread of a team does: take the next share of the work until none is left."""
+"""Every thread of a team takes the next share of the work until none is left."""
 
 from collections.abc import Callable
 from functools import cache
@@ -18,7 +18,9 @@ TASK = 6  # length
 
 @cache
 def team(real: types.Type) -> Callable[..., None]:
-    """A thread's part of a task: cores are not equally fast, nor all ours, so none has its own."""
+    """Compile a thread's part of a task: cores are not equally fast, nor all ours, so none has its
+    own.
+    """
 
     def kernel(task):  # noqa: ANN001, ANN202
         bounds = carray(int64_at(task[BOUNDS]), UNBOUNDED)

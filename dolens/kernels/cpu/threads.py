@@ -1,4 +1,5 @@
-"""Spreading a driver over threads: as many as torch is set to use, and where possible torch's own.
+"""A driver is spread over as many threads as torch is set to use, and where possible over torch's
+own.
 
 Torch's threads belong to OpenMP.  After each of its operations they wait for the next one without
 sleeping, for some milliseconds; threads of ours would have to share the cores with them.  So ours
@@ -39,12 +40,13 @@ _own = threading.local()
 
 
 def thread_count(rays: int, small: int = SMALL) -> int:
-    """Threads for this many rays: torch's own setting, and one for fewer than `small`."""
+    """Return the threads for this many rays: torch's own setting, or one below `small`."""
     return 1 if rays < small else max(1, torch.get_num_threads())
 
 
 def scratch(size: int, worker: int) -> np.ndarray:
-    """Memory of at least this many bytes for a worker of the task that the calling thread runs.
+    """Return memory of at least this many bytes for a worker of the task that the calling thread
+    runs.
 
     Asking the system for fresh pages at every call would cost a tenth of a small trace.
     """
@@ -108,7 +110,8 @@ def run_in_pool(task: np.ndarray, threads: int) -> None:
 
 @cache
 def torchs_openmp() -> ctypes.CDLL | None:
-    """The OpenMP that torch runs on; None where it cannot be found, or has not gcc's interface.
+    """Return the OpenMP that torch runs on; None where it cannot be found, or has not gcc's
+    interface.
 
     Torch loads its libraries for all to see, and the OpenMP that obeys its setting is its own.
     """
@@ -134,7 +137,7 @@ def torchs_openmp() -> ctypes.CDLL | None:
 
 
 def is_forked() -> bool:
-    """Whether this process may be a fork of one that had OpenMP's threads."""
+    """Return whether this process may be a fork of one that had OpenMP's threads."""
     return os.getpid() != _home or multiprocessing.parent_process() is not None
 
 
@@ -143,7 +146,7 @@ def _integers(array: np.ndarray) -> "ctypes._Pointer":
 
 
 def _shares(pieces: int, threads: int) -> np.ndarray:
-    """First and end of neighbouring pieces, (S, 2): large shares first, to end together."""
+    """Return first and end of neighbouring pieces, (S, 2): large shares first, to end together."""
     shares, first = [], 0
     least = max(1, pieces // (16 * max(threads, 1)))
     while first < pieces:

@@ -1,4 +1,4 @@
-"""XY polynomials with the implicit b·z² term; see `dolens.optics.surfaces.xy_polynomial`.
+"""An XY polynomial may have the implicit b·z² term; see `dolens.optics.surfaces.xy_polynomial`.
 
 With P = Σ a·x^i·y^j and W = √(1 - 4bP): s = 2P/(1 + W), s_x = P_x/W.
 
@@ -47,7 +47,7 @@ COEFFICIENTS, OF_COEFFICIENTS = SHAPE + 1, OF_SECOND  # behind b
 
 @cache
 def _polynomial(real: types.Type) -> tuple[Any, Any, Any]:
-    """Compiled: powers of a block; P and its slopes; its second derivatives."""
+    """Compile the powers of a block, P with its slopes, and P's second derivatives."""
     zero, one, two, three = real(0.0), real(1.0), real(2.0), real(3.0)
 
     @njit(**OPTIONS)
@@ -84,7 +84,7 @@ def _polynomial(real: types.Type) -> tuple[Any, Any, Any]:
 
     @njit(**OPTIONS)
     def cubic_slopes(work, p, extras, count):  # noqa: ANN001, ANN202
-        """P and its slopes, with every coefficient in a register."""
+        """Fill the rows of P and its slopes, with every coefficient in a register."""
         w, a = carray(work, WORK_SIZE), carray(shifted(work, CUBIC), 16)
         for k in range(16):
             a[k] = zero
@@ -122,7 +122,7 @@ def _polynomial(real: types.Type) -> tuple[Any, Any, Any]:
                 accumulate(work, degree, SLOPE_Y, a * real(j), i, j - 1)
 
     @njit(**OPTIONS)
-    def bends(work, p, extras, count, degree):  # noqa: ANN001, ANN202
+    def second_derivatives(work, p, extras, count, degree):  # noqa: ANN001, ANN202
         w = carray(work, WORK_SIZE)
         for i in range(BLOCK):
             w[SAG_XX + i], w[SAG_XY + i], w[SAG_YY + i] = zero, zero, zero
@@ -135,11 +135,11 @@ def _polynomial(real: types.Type) -> tuple[Any, Any, Any]:
             if j > 1:
                 accumulate(work, degree, SAG_YY, a * real(j * (j - 1)), i, j - 2)
 
-    return powers, slopes, bends
+    return powers, slopes, second_derivatives
 
 
 def xy_polynomial_sag(real: types.Type) -> Callable[..., None]:
-    """Sag, slopes, and the margin 1 - 4bP of the branch through the vertex."""
+    """Fill the rows of sag, slopes, and the margin 1 - 4bP of the branch through the vertex."""
     _, safe_sqrt, *_ = arithmetic(real)
     _, slopes, _ = _polynomial(real)
     one, two, four = real(1.0), real(2.0), real(4.0)
@@ -165,12 +165,12 @@ def xy_polynomial_sag(real: types.Type) -> Callable[..., None]:
 
 
 def xy_polynomial_hessian(real: types.Type) -> Callable[..., None]:
-    """Slopes and second derivatives: s_xy = P_xy/W + 2b·P_x·P_y/W³.
+    """Fill the rows of slopes and second derivatives: s_xy = P_xy/W + 2b·P_x·P_y/W³.
 
     Rows 20, 21 and 22 keep W, P_x and P_y for the cotangents of the coefficients.
     """
     _, safe_sqrt, *_ = arithmetic(real)
-    powers, slopes, bends = _polynomial(real)
+    powers, slopes, second_derivatives = _polynomial(real)
     one, two, four = real(1.0), real(2.0), real(4.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
@@ -178,7 +178,7 @@ def xy_polynomial_hessian(real: types.Type) -> Callable[..., None]:
         extras = carray(int64_at(q[EXTRAS_ADDRESS]), UNBOUNDED)
         powers(work, q[DEGREE])
         slopes(work, p, extras, q[COUNT], q[DEGREE])
-        bends(work, p, extras, q[COUNT], q[DEGREE])
+        second_derivatives(work, p, extras, q[COUNT], q[DEGREE])
         if q[COLUMNS] == 0:
             return
         b = p[SHAPE]
@@ -186,18 +186,18 @@ def xy_polynomial_hessian(real: types.Type) -> Callable[..., None]:
             root = safe_sqrt(one - four * b * w[SAG + i])
             inverse = one / root
             px, py = w[SLOPE_X + i], w[SLOPE_Y + i]
-            bend = two * b * inverse * inverse * inverse
+            factor = two * b * inverse * inverse * inverse
             w[ROOT + i], w[P_X + i], w[P_Y + i] = root, px, py
             w[SLOPE_X + i], w[SLOPE_Y + i] = px * inverse, py * inverse
-            w[SAG_XX + i] = w[SAG_XX + i] * inverse + bend * px * px
-            w[SAG_XY + i] = w[SAG_XY + i] * inverse + bend * px * py
-            w[SAG_YY + i] = w[SAG_YY + i] * inverse + bend * py * py
+            w[SAG_XX + i] = w[SAG_XX + i] * inverse + factor * px * px
+            w[SAG_XY + i] = w[SAG_XY + i] * inverse + factor * px * py
+            w[SAG_YY + i] = w[SAG_YY + i] * inverse + factor * py * py
 
     return kernel
 
 
 def xy_polynomial_parameters(real: types.Type) -> Callable[..., None]:
-    """Cotangents of b and the coefficients.
+    """Fill the cotangents of b and the coefficients.
 
     Those of P, P_x and P_y first: s_P = 1/W, ∂s_x/∂P = 2b·P_x/W³; and with b, s_b = s²/W and
     ∂s_x/∂b = 2P·P_x/W³.
@@ -246,7 +246,7 @@ def xy_polynomial_parameters(real: types.Type) -> Callable[..., None]:
 
 
 def _rows_of_powers(row: Sequence[int]) -> int:
-    """Rows for the powers of x and y."""
+    """Return the number of rows for the powers of x and y."""
     return 2 * (int(row[DEGREE]) + 1)
 
 

@@ -1,1 +1,1 @@
-"""The trace on a GPU, in Triton: one program carries a block of rays through all steps."""
+"""Triton compiles the GPU kernels: one program carries a block of rays through all steps."""

@@ -1,4 +1,4 @@
-"""The backward pass: each block is traced again, keeping its states, and swept back.
+"""The backward pass traces each block again, keeps its states, and sweeps cotangents back.
 
 A fixed number of programs share all blocks.  Each has its own memory for the states of one block
 and its own row of sums, so that neither grows with the number of rays.

@@ -1,4 +1,4 @@
-"""What all surfaces share, for a block of rays: clamps, transfer, Snell's law, and its adjoint.
+"""All surfaces share these functions of a block: clamps, transfer, Snell's law, and its adjoint.
 
 It mirrors `dolens.optics.trace` and `dolens.optics.surfaces.base`.  Constants take the precision of
 the rays they meet.
@@ -14,7 +14,7 @@ TINY = tl.constexpr(1e-18)
 
 @triton.jit
 def divide(a, b):
-    """a/b, rounded to nearest; Triton's own division of float32 is not."""
+    """Return a/b, rounded to nearest; Triton's own division of float32 is not."""
     if b.dtype == tl.float64:
         return a / b
     else:
@@ -23,7 +23,7 @@ def divide(a, b):
 
 @triton.jit
 def safe_sqrt(squared):
-    """Square root, rounded to nearest; what is not positive counts as 1e-18."""
+    """Return the square root, rounded to nearest; no argument counts as less than 1e-18."""
     held = tl.where(squared > TINY, squared, TINY)
     if held.dtype == tl.float64:
         return tl.sqrt(held)
@@ -33,20 +33,20 @@ def safe_sqrt(squared):
 
 @triton.jit
 def clamp(value, limit):
-    """The value, held within ± limit; NaN stays."""
+    """Return the value, held within ± limit; NaN stays."""
     value = tl.where(value < -limit, -limit, value)
     return tl.where(value > limit, limit, value)
 
 
 @triton.jit
 def finite(value):
-    """The number, or zero where it has overflowed."""
+    """Return the number, or zero where it has overflowed."""
     return tl.where(tl.abs(value) < float("inf"), value, 0.0)
 
 
 @triton.jit
 def away_from_zero(value):
-    """The value, or ± 1e-9 of its sign where it is smaller."""
+    """Return the value, or ± 1e-9 of its sign where it is smaller."""
     size = tl.abs(value)
     size = tl.where(size > GRAZING, size, GRAZING)
     return tl.where(value < 0.0, -size, size)
@@ -54,14 +54,14 @@ def away_from_zero(value):
 
 @triton.jit
 def distance_to_plane(z, n, sense):
-    """Distance (mm) along rays to the plane z = 0, and whether they travel towards it."""
+    """Return the distance (mm) along rays to the plane z = 0, and whether they approach it."""
     towards = sense * n
     return divide(-sense * z, tl.where(towards > GRAZING, towards, GRAZING)), towards > GRAZING
 
 
 @triton.jit
 def refract(l, m, n, nx, ny, nz, ratio, sense):
-    """Directions behind a surface, and cos² of the angle there: positive without TIR."""
+    """Return the directions behind a surface, and cos² of the angle there: positive without TIR."""
     cosine = clamp(l * nx + m * ny + n * nz, 2.0)
     squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
     along = sense * safe_sqrt(squared) - ratio * cosine
@@ -75,7 +75,7 @@ def refract(l, m, n, nx, ny, nz, ratio, sense):
 
 @triton.jit
 def refract_adjoint(a, b, c, l, m, n, nx, ny, nz, out_l, out_m, out_n, ratio, front):
-    """Cotangents of direction, normal and both indices from (a, b, c), that of d'.
+    """Return the cotangents of direction, normal and both indices from (a, b, c), that of d'.
 
     d' = μ·d + Γ·N with Γ = s·cos t - μ·cos i, and s·cos t = d'·N.
     """

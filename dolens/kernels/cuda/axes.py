@@ -1,4 +1,4 @@
-"""Steps between surfaces of different poses, and their adjoints.
+"""Rays change their axes between surfaces of different poses.
 
 They mirror `change_axes` and `to_lens_axes` of `dolens.optics.elements`.
 """
@@ -26,7 +26,7 @@ from dolens.kernels.cuda.sums import add_sum
 
 @triton.jit
 def _rotation(record):
-    """R by rows."""
+    """Load R by rows."""
     return (
         tl.load(record + TURN_XX),
         tl.load(record + TURN_XY),
@@ -42,14 +42,14 @@ def _rotation(record):
 
 @triton.jit
 def _turn(record, x, y, z):
-    """R·v."""
+    """Return R·v."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(record)
     return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
 
 
 @triton.jit
 def _turn_back(record, x, y, z):
-    """Rᵀ·v."""
+    """Return Rᵀ·v."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = _rotation(record)
     return xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z
 
@@ -87,7 +87,7 @@ def change_axes(record, x, y, z, l, m, n):
 
 @triton.jit
 def change_axes_adjoint(record, sums, index, x, y, z, l, m, n, t, px, py, pz, a, b, c, path, alive):
-    """Cotangents in front of `change_axes`, and that of the index, from those behind it.
+    """Return the cotangents in front of `change_axes`, and that of the index, from those behind it.
 
     Args x to n are the ray in front, t the distance, px to c and path the cotangents behind.
     """
@@ -108,7 +108,7 @@ def change_axes_adjoint(record, sums, index, x, y, z, l, m, n, t, px, py, pz, a,
 
 @triton.jit
 def lens_axes(record, x, y, z, l, m, n):
-    """See rays from the lens's axes: position and direction."""
+    """Return position and direction in the lens's axes."""
     x, y, z = _turn(record, x, y, z)
     l, m, n = _turn(record, l, m, n)
     return (
@@ -123,7 +123,7 @@ def lens_axes(record, x, y, z, l, m, n):
 
 @triton.jit
 def lens_axes_adjoint(record, sums, x, y, z, l, m, n, px, py, pz, a, b, c, alive):
-    """Cotangents in front of `lens_axes` from those behind it."""
+    """Return the cotangents in front of `lens_axes` from those behind it."""
     add_sum(sums + STEP_X, px, alive)
     add_sum(sums + STEP_Y, py, alive)
     add_sum(sums + STEP_Z, pz, alive)

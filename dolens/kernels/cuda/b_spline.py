@@ -1,4 +1,5 @@
-"""Cubic B-spline surfaces by their local stencil; see `dolens.optics.surfaces.b_spline`.
+"""A cubic B-spline surface is evaluated by its local stencil; see
+`dolens.optics.surfaces.b_spline`.
 
 The record holds the knots in x, the knots in y, and the coefficients, rows along y.
 """
@@ -16,7 +17,9 @@ MORE_KNOTS = tl.constexpr(4)  # than coefficients
 
 @triton.jit
 def _span(knots, count, u):
-    """First of the four coefficients that matter at u, from 0 to count - 4, by bisection."""
+    """Return the first of the four coefficients that matter at u, from 0 to count - 4, by
+    bisection.
+    """
     low = tl.zeros(u.shape, tl.int32)
     high = low + (count - MORE_KNOTS)
     width = count - MORE_KNOTS
@@ -31,7 +34,9 @@ def _span(knots, count, u):
 
 @triton.jit
 def _basis(around, u, low, high):
-    """Values and slopes of four basis functions; `around` points to the knots about the span."""
+    """Return values and slopes of four basis functions; `around` points to the knots about the
+    span.
+    """
     a, b, c = tl.load(around + 1), tl.load(around + 2), tl.load(around + 3)
     d, e, f = tl.load(around + 4), tl.load(around + 5), tl.load(around + 6)
     inside = tl.where(u < low, low, u)
@@ -58,8 +63,8 @@ def _basis(around, u, low, high):
 
 
 @triton.jit
-def _bend(around, u, low, high):
-    """Second derivatives of the four; zero beyond the ends."""
+def _second_derivatives(around, u, low, high):
+    """Return the second derivatives of the four; zero beyond the ends."""
     a, b, c = tl.load(around + 1), tl.load(around + 2), tl.load(around + 3)
     d, e, f = tl.load(around + 4), tl.load(around + 5), tl.load(around + 6)
     scale = tl.where((u < low) | (u > high), 0.0, 6.0 + tl.zeros_like(u))
@@ -71,7 +76,9 @@ def _bend(around, u, low, high):
 
 @triton.jit
 def _stencil(record, codes, x, y):
-    """Where the knots and coefficients about each point lie, and the knot rectangle's edges."""
+    """Return the places of the knots and coefficients about each point, and the knot rectangle's
+    edges.
+    """
     rows, columns = tl.load(codes + COUNT), tl.load(codes + COLUMNS)
     knots_x = record + SHAPE
     knots_y = knots_x + columns + MORE_KNOTS
@@ -91,7 +98,7 @@ def _stencil(record, codes, x, y):
 
 @triton.jit
 def b_spline_sag(record, codes, extras, x, y):
-    """Sag, slopes, and the distance to the nearest edge of the knot rectangle."""
+    """Return sag, slopes, and the distance to the nearest edge of the knot rectangle."""
     columns, near_x, near_y, place, coefficients, x_low, x_high, y_low, y_high = _stencil(
         record, codes, x, y
     )
@@ -115,14 +122,14 @@ def b_spline_sag(record, codes, extras, x, y):
 
 @triton.jit
 def b_spline_hessian(record, codes, extras, x, y):
-    """Slopes and second derivatives."""
+    """Return slopes and second derivatives."""
     columns, near_x, near_y, place, coefficients, x_low, x_high, y_low, y_high = _stencil(
         record, codes, x, y
     )
     bx0, bx1, bx2, bx3, dx0, dx1, dx2, dx3 = _basis(near_x, x, x_low, x_high)
     by0, by1, by2, by3, dy0, dy1, dy2, dy3 = _basis(near_y, y, y_low, y_high)
-    ex0, ex1, ex2, ex3 = _bend(near_x, x, x_low, x_high)
-    ey0, ey1, ey2, ey3 = _bend(near_y, y, y_low, y_high)
+    ex0, ex1, ex2, ex3 = _second_derivatives(near_x, x, x_low, x_high)
+    ey0, ey1, ey2, ey3 = _second_derivatives(near_y, y, y_low, y_high)
     first = coefficients + place
     level = tl.load(first + columns + 1)
     sx, sy = tl.zeros_like(x), tl.zeros_like(x)

@@ -1,4 +1,4 @@
-"""Running the Triton kernels on tensors."""
+"""These functions run the Triton kernels on tensors."""
 
 import logging
 from contextlib import AbstractContextManager, nullcontext
@@ -35,7 +35,7 @@ _KEPT_BYTES = 1 << 24
 
 
 class DeviceCodes(NamedTuple):
-    """What a kernel reads of a table's integers, on the rays' device.
+    """A kernel reads these integers of a table, on the rays' device.
 
     Attributes:
         codes: (steps, Code.ROW), int32.
@@ -56,7 +56,7 @@ class DeviceCodes(NamedTuple):
 
 @lru_cache(maxsize=128)
 def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCodes:
-    """Copied once for a lens, from int64: an optimization changes its numbers, not its codes."""
+    """Copy a lens's codes once, from int64: an optimization changes its numbers, not its codes."""
     rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()
     own = np.frombuffer(extras, dtype=np.int64).tolist()
     device_extras, kinds, forms = list(own), 0, set()
@@ -83,7 +83,9 @@ def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCo
 
 
 def _prepared(table: SurfaceTable, like: Tensor) -> tuple[DeviceCodes, Tensor]:
-    """The codes, and (steps, 2, wavelengths): index in front and ratio, in the rays' precision."""
+    """Return the codes, and (steps, 2, wavelengths): index in front and ratio, in the rays'
+    precision.
+    """
     if like.device.type != "cuda" and not isinstance(forward_kernel, InterpretedFunction):
         raise InputError(
             f"Triton's kernels run on a GPU, not on {like.device} (or set TRITON_INTERPRET=1, "
@@ -150,7 +152,7 @@ def trace(
 
 
 def program_count(count: int, blocks: int, kept: int, processors: int) -> int:
-    """Programs of the adjoint: as many as fill the GPU, and as memory allows.
+    """Return the programs of the adjoint: as many as fill the GPU, and as memory allows.
 
     Args:
         count: rays.
@@ -163,7 +165,7 @@ def program_count(count: int, blocks: int, kept: int, processors: int) -> int:
 
 
 def _processors(device: torch.device) -> int:
-    """Multiprocessors; Triton's interpreter has one."""
+    """Return the number of multiprocessors; Triton's interpreter has one."""
     if device.type != "cuda":
         return 1
     return torch.cuda.get_device_properties(device).multi_processor_count
@@ -178,7 +180,7 @@ def trace_adjoint(
     cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
     wanted: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor, Tensor]:
-    """Cotangents of rays and table from those of position, direction and path length.
+    """Return the cotangents of rays and table from those of position, direction and path length.
 
     A repeated call on the same GPU gives the same bits.
 

@@ -1,4 +1,4 @@
-"""Spheres and conics of revolution: `dolens.optics.surfaces.conic`'s closed form, and its adjoint.
+"""Rays meet spheres and conics in the closed form of `dolens.optics.surfaces.conic`.
 
 F = z - c(x² + y² + (1+k)z²)/2 has the gradient g = (-cx, -cy, 1 - (1+k)cz), a unit vector on a
 sphere, where k = 0.
@@ -14,7 +14,7 @@ from dolens.kernels.cuda.sums import add_sum
 
 @triton.jit
 def conic_distance(c, a, x, y, l, m, n, sense):
-    """Distance from the vertex plane to a conic, and D; see `dolens.optics.surfaces.conic`."""
+    """Return the distance from the vertex plane to a conic, and D; see `optics.surfaces.conic`."""
     f = c * (x * x + y * y)
     g = n - c * (l * x + m * y)
     squared = g * g - a * f
@@ -28,7 +28,7 @@ def conic_distance(c, a, x, y, l, m, n, sense):
 
 @triton.jit
 def sphere_intersect(record, x, y, l, m, n, sense, limit):
-    """Distance from the vertex plane, unit normal there, and whether it is met."""
+    """Return the distance from the vertex plane, the unit normal there, and whether it is met."""
     c = tl.load(record + SHAPE)
     f = c * (x * x + y * y)
     g = n - c * (l * x + m * y)
@@ -41,7 +41,7 @@ def sphere_intersect(record, x, y, l, m, n, sense, limit):
 
 @triton.jit
 def conic_intersect(record, x, y, l, m, n, sense, limit):
-    """Distance from the vertex plane, unit normal there, and whether it is met."""
+    """Return the distance from the vertex plane, the unit normal there, and whether it is met."""
     c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
     t, squared = conic_distance(c, c + (c * k) * (n * n), x, y, l, m, n, sense)
     t = clamp(t, limit)
@@ -52,7 +52,7 @@ def conic_intersect(record, x, y, l, m, n, sense, limit):
 
 @triton.jit
 def conic_gradient(c, k, x, y, z):
-    """g, 1/|g|, and the diagonal of the second derivatives of F."""
+    """Return g, 1/|g|, and the diagonal of the second derivatives of F."""
     e = 1.0 + k
     gx, gy, gz = -c * x, -c * y, 1.0 - e * c * z
     inverse = divide(1.0, safe_sqrt(gx * gx + gy * gy + gz * gz))
@@ -61,7 +61,7 @@ def conic_gradient(c, k, x, y, z):
 
 @triton.jit
 def conic_curvature_cotangent(k, x, y, z, along, ux, uy, uz):
-    """Each ray's cotangent of c, from -`along`, that of F, and (ux, uy, uz), that of g."""
+    """Return each ray's cotangent of c, from -`along`, that of F, and (ux, uy, uz), that of g."""
     e = 1.0 + k
     return 0.5 * along * (x * x + y * y + e * z * z) - (ux * x + uy * y + e * uz * z)
 

@@ -1,4 +1,4 @@
-"""Even aspheres, s = conic + q²·H(q) with q = r² and H = a4 + a6·q + ..., by Horner's rule."""
+"""An even asphere has the sag s = conic + q²·H(q) with q = r² and H = a4 + a6·q + ...."""
 
 import triton
 import triton.language as tl
@@ -11,7 +11,7 @@ from dolens.kernels.cuda.sums import add_sum
 
 @triton.jit
 def even_asphere_sag(record, codes, extras, x, y):
-    """Sag, slopes, and the margin of the conic's branch."""
+    """Return sag, slopes, and the margin of the conic's branch."""
     c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
     count = tl.load(codes + COUNT)
     q = x * x + y * y
@@ -27,7 +27,7 @@ def even_asphere_sag(record, codes, extras, x, y):
 
 @triton.jit
 def even_asphere_hessian(record, codes, extras, x, y):
-    """Slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy = 4xyf''."""
+    """Return slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy = 4xyf''."""
     c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
     count = tl.load(codes + COUNT)
     q = x * x + y * y
@@ -40,13 +40,13 @@ def even_asphere_hessian(record, codes, extras, x, y):
     root = safe_sqrt(1.0 - ec2 * q)
     conic = divide(0.5 * c, root)
     slope = conic + q * (2.0 * h + q * d)
-    bend = divide(0.5 * conic * ec2, root * root) + 2.0 * h + 4.0 * q * d + 2.0 * q * q * e
+    second = divide(0.5 * conic * ec2, root * root) + 2.0 * h + 4.0 * q * d + 2.0 * q * q * e
     return (
         2.0 * x * slope,
         2.0 * y * slope,
-        2.0 * slope + 4.0 * x * x * bend,
-        4.0 * x * y * bend,
-        2.0 * slope + 4.0 * y * y * bend,
+        2.0 * slope + 4.0 * x * x * second,
+        4.0 * x * y * second,
+        2.0 * slope + 4.0 * y * y * second,
     )
 
 

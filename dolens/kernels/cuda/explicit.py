@@ -1,4 +1,4 @@
-"""Surfaces that are given by their sag: Newton's iteration to them."""
+"""Newton's iteration finds the ray intercept on a surface that is given by its sag."""
 
 import triton
 import triton.language as tl
@@ -13,7 +13,7 @@ from dolens.kernels.cuda.layout import MAX_STEPS, SHAPE
 def explicit_intersect(
     record, codes, extras, x, y, l, m, n, sense, limit, scale, FORM: tl.constexpr
 ):
-    """Distance from the vertex plane, unit normal there, and whether it is met.
+    """Return the distance from the vertex plane, the unit normal there, and whether it is met.
 
     As `Surface.intersect`: the iteration ends when no ray of the block moves any more, or after
     `MAX_STEPS`; whether a ray has converged is read off its residual at the end.

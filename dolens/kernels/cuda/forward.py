@@ -1,4 +1,4 @@
-"""The forward trace: each program carries a block of rays through all steps, in registers."""
+"""In the forward trace each program carries a block of rays through all steps, in registers."""
 
 import triton
 import triton.language as tl

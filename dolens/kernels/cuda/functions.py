@@ -1,4 +1,4 @@
-"""What the GPU's kernels know of a surface that is given by its sag: three functions of Triton."""
+"""A surface that is given by its sag has three Triton functions."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -9,12 +9,12 @@ Row = list[int]
 
 
 def _as_they_are(row: Row, extras: Sequence[int]) -> list[int] | None:
-    """The table's own extras serve."""
+    """Keep the table's own extras."""
     return None
 
 
 class SagFunctions(NamedTuple):
-    """Functions compiled by `triton.jit`, which a module offers as `KERNELS`.
+    """A module offers these functions, compiled by `triton.jit`, as `KERNELS`.
 
     Each takes a pointer to the surface's record, whose shape begins at `layout.SHAPE`, its row of
     codes, its extras, and points x, y (mm) of the block's rays; numbers take the rays' precision.
@@ -46,7 +46,7 @@ Shape = tuple[int, Any, Any, Any, bool, str]
 
 
 def shape_of(code: int, functions: SagFunctions) -> Shape:
-    """A surface's code and functions as the kernels take them."""
+    """Return a surface's code and functions as the kernels take them."""
     three = functions[:3]
     # Triton's interpreter has no digests.
     digest = "".join(getattr(function, "cache_key", "") for function in three)

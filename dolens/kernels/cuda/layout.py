@@ -1,4 +1,4 @@
-"""Places in records and rows of codes (`dolens.kernels.table`), as constants for Triton."""
+"""These constants of Triton are places in records and rows of codes (`dolens.kernels.table`)."""
 
 import triton.language as tl
 

@@ -1,4 +1,4 @@
-"""Reading and writing a block of rays, and the indices that each of them meets."""
+"""These functions read and write a block of rays, and the indices that each of them meets."""
 
 import triton
 import triton.language as tl
@@ -8,7 +8,7 @@ from dolens.kernels.cuda.layout import SENSE
 
 @triton.jit
 def load_vectors(pointer, row, column, rays, mask, third):
-    """x, y, z of each ray's vector; (0, 0, third) where the mask is off."""
+    """Load x, y, z of each ray's vector; (0, 0, third) where the mask is off."""
     place = pointer + rays * row
     return (
         tl.load(place, mask=mask, other=0.0),
@@ -28,13 +28,13 @@ def store_vectors(pointer, rays, mask, x, y, z):
 
 @triton.jit
 def first_sense(values, steps):
-    """+1 or -1, from the first record: the direction of the axial rays that fill a block up."""
+    """Return +1 or -1 from the first record: the sense of the axial rays that fill a block up."""
     return tl.load(values + SENSE, mask=steps > 0, other=1.0)
 
 
 @triton.jit
 def load_columns(which, rays, mask):
-    """Each ray's column of the indices; one for all where none is given."""
+    """Load each ray's column of the indices; one for all where none is given."""
     if which is None:
         return 0
     else:
@@ -43,6 +43,6 @@ def load_columns(which, rays, mask):
 
 @triton.jit
 def load_media(media, k, wavelengths, columns):
-    """Of step k: the index in front, and its ratio μ to the one behind."""
+    """Load the index in front of step k, and its ratio μ to the one behind."""
     front = media + 2 * k * wavelengths + columns
     return tl.load(front), tl.load(front + wavelengths)

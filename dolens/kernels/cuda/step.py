@@ -1,4 +1,4 @@
-"""One step of a block of rays: to a surface and through it, to other axes, or to the sensor."""
+"""A step carries a block of rays through a surface, to other axes, or to the sensor."""
 
 import triton
 import triton.language as tl
@@ -46,7 +46,9 @@ from dolens.kernels.cuda.layout import (
 def intersect(
     record, codes, extras, kind, x, y, l, m, n, sense, KINDS: tl.constexpr, FORMS: tl.constexpr
 ):
-    """Distance from the vertex plane to a surface, unit normal there, and whether it is met."""
+    """Return the distance from the vertex plane to a surface, the unit normal there, and whether it
+    is met.
+    """
     limit = tl.load(record + LIMIT)
     t, nx, ny = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     nz = 1.0 + tl.zeros_like(x)
@@ -68,7 +70,7 @@ def intersect(
 
 @triton.jit
 def passes(record, codes, x, y):
-    """Whether a point is strictly inside the clear aperture."""
+    """Return whether a point is strictly inside the clear aperture."""
     inside = tl.load(record + EDGE) - (x * x + y * y) > 0.0
     if tl.load(codes + OUTLINE) == RECTANGLE:
         inside &= tl.abs(x) < tl.load(record + HALF_X)

@@ -1,4 +1,4 @@
-"""The adjoint of one step of a block of rays.
+"""A step's adjoint takes a block's cotangents from behind the step to its front.
 
 With F = z - sag (or a conic's implicit form) and g = ∇F, the ray meets the surface at P = Q + t·d,
 where dt = -(g·(dQ + t·dd) + F_θ·dθ)/(g·d).  With τ = (P̄·d + n̄·path)/(g·d), where n̄ is the index
@@ -34,7 +34,7 @@ from dolens.kernels.cuda.sums import add_sum
 
 @triton.jit
 def _explicit_gradient(record, codes, extras, x, y, FORM: tl.constexpr):
-    """g = (-s_x, -s_y, 1), 1/|g|, and F's second derivatives xx, xy, yy and zz."""
+    """Return g = (-s_x, -s_y, 1), 1/|g|, and F's second derivatives xx, xy, yy and zz."""
     sx, sy, sxx, sxy, syy = FORM[HESSIAN](record, codes, extras, x, y)
     gz = 1.0 + tl.zeros_like(x)
     inverse = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
@@ -45,7 +45,7 @@ def _explicit_gradient(record, codes, extras, x, y, FORM: tl.constexpr):
 def surface_gradient(
     record, codes, extras, kind, x, y, z, KINDS: tl.constexpr, FORMS: tl.constexpr
 ):
-    """g, 1/|g|, and F's second derivatives xx, xy, yy and zz, at a point of any surface."""
+    """Return g, 1/|g|, and F's second derivatives xx, xy, yy and zz, at a point of any surface."""
     gx, gy, gz = tl.zeros_like(x), tl.zeros_like(x), 1.0 + tl.zeros_like(x)
     inverse = 1.0 + tl.zeros_like(x)
     xx, xy, yy, zz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
@@ -89,7 +89,7 @@ def step_adjoint(
     codes, record, extras, sums, index, ratio,
     before, after, px, py, pz, a, b, c, path, alive, KINDS: tl.constexpr, FORMS: tl.constexpr,
 ):  # fmt: skip
-    """Cotangents in front of a step from those behind it; its own are added to `sums`.
+    """Return the cotangents in front of a step from those behind it; its own are added to `sums`.
 
     Args:
         codes: to `ratio`: as in `step`; `sums` lie as the record does.

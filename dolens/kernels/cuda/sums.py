@@ -1,4 +1,4 @@
-"""Sums over a block's rays, kept in double precision in a row that belongs to one program.
+"""Sums over a block's rays are kept in double precision in a row that belongs to one program.
 
 A program adds in the order of its blocks, with no atomic operations, so that a repeated call gives
 the same bits.  Rays that are not `alive` may hold anything, NaN too, and do not count.
@@ -17,7 +17,7 @@ def add_sum(place, numbers, alive):
 
 @triton.jit
 def first_of(keys, left):
-    """The smallest key among the rays that are left, and which of them have it."""
+    """Return the smallest key among the rays that are left, and which of them have it."""
     key = tl.min(tl.where(left, keys, 2147483647), 0)
     return key, left & (keys == key)
 

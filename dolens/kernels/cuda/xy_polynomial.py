@@ -1,4 +1,4 @@
-"""XY polynomials with the implicit b·z² term; see `dolens.optics.surfaces.xy_polynomial`.
+"""An XY polynomial may have the implicit b·z² term; see `dolens.optics.surfaces.xy_polynomial`.
 
 With P = Σ a·x^i·y^j and W = √(1 - 4bP): s = 2P/(1 + W), s_x = P_x/W.  P and its derivatives come
 from Horner's rule in x within one in y.  `extras` say for every monomial, in that order (j, and
@@ -26,7 +26,7 @@ def _coefficient(record, places, term):
 
 @triton.jit
 def _slopes(record, places, degree, x, y):
-    """P, P_x and P_y."""
+    """Return P, P_x and P_y."""
     p, px, py = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     term = 0
     for j in range(degree + 1):
@@ -42,8 +42,8 @@ def _slopes(record, places, degree, x, y):
 
 
 @triton.jit
-def _bends(record, places, degree, x, y):
-    """P, P_x, P_y, P_xx, P_xy and P_yy."""
+def _second_derivatives(record, places, degree, x, y):
+    """Return P, P_x, P_y, P_xx, P_xy and P_yy."""
     p, px, py = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     pxx, pxy, half_pyy = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     term = 0
@@ -65,7 +65,7 @@ def _bends(record, places, degree, x, y):
 
 @triton.jit
 def xy_polynomial_sag(record, codes, extras, x, y):
-    """Sag, slopes, and the margin 1 - 4bP of the branch through the vertex."""
+    """Return sag, slopes, and the margin 1 - 4bP of the branch through the vertex."""
     places = extras + tl.load(codes + EXTRAS)
     sag, sx, sy = _slopes(record, places, tl.load(codes + DEGREE), x, y)
     margin = 1.0 + tl.zeros_like(x)
@@ -79,17 +79,17 @@ def xy_polynomial_sag(record, codes, extras, x, y):
 
 @triton.jit
 def xy_polynomial_hessian(record, codes, extras, x, y):
-    """Slopes and second derivatives: s_xy = P_xy/W + 2b·P_x·P_y/W³."""
+    """Return slopes and second derivatives: s_xy = P_xy/W + 2b·P_x·P_y/W³."""
     places = extras + tl.load(codes + EXTRAS)
-    p, sx, sy, sxx, sxy, syy = _bends(record, places, tl.load(codes + DEGREE), x, y)
+    p, sx, sy, sxx, sxy, syy = _second_derivatives(record, places, tl.load(codes + DEGREE), x, y)
     if tl.load(codes + COLUMNS) != 0:
         b = tl.load(record + SHAPE)
         inverse = divide(1.0, safe_sqrt(1.0 - 4.0 * b * p))
-        bend = 2.0 * b * inverse
+        factor = 2.0 * b * inverse
         sx, sy = sx * inverse, sy * inverse
-        sxx = sxx * inverse + bend * sx * sx
-        sxy = sxy * inverse + bend * sx * sy
-        syy = syy * inverse + bend * sy * sy
+        sxx = sxx * inverse + factor * sx * sx
+        sxy = sxy * inverse + factor * sx * sy
+        syy = syy * inverse + factor * sy * sy
     return sx, sy, sxx, sxy, syy
 
 
@@ -129,7 +129,8 @@ def xy_polynomial_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, 
 
 
 def horner_order(row: list[int], extras: Sequence[int]) -> list[int]:
-    """Where the coefficients lie, in Horner's order, from the powers of the monomials in `extras`.
+    """Return the places of the coefficients in Horner's order, from the powers of the monomials in
+    `extras`.
 
     A place counts from the record's beginning; -1: no such monomial.  The row's degree becomes the
     highest i + j.

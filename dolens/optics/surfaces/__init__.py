@@ -1,4 +1,4 @@
-"""Surface shapes, one a file; each registers itself under the `type` of a prescription."""
+"""A surface shape has a file here, and registers itself under the `type` of a prescription."""
 
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.b_spline import BSpline

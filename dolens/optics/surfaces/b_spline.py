@@ -1,4 +1,4 @@
-"""Cubic B-spline freeform surfaces (S7, S8)."""
+"""A freeform surface may be a cubic B-spline (S7, S8)."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from dolens.optics.surfaces.spline_basis import check_knots, clamped_knots, cubi
 
 
 class SplineSag(NamedTuple):
-    """Sag (mm), slopes, and second derivatives (1/mm; None when they were not asked for)."""
+    """A spline gives sag (mm), slopes, and second derivatives (1/mm; None if not asked for)."""
 
     s: Tensor
     sx: Tensor
@@ -26,7 +26,8 @@ class SplineSag(NamedTuple):
 
 
 def spline_sag(p: Parameters, x: Tensor, y: Tensor, second: bool = False) -> SplineSag:
-    """s = Σ c_ji·N_j(y)·N_i(x) and its derivatives in one pass, from the 4×4 coefficients at hand.
+    """Return s = Σ c_ji·N_j(y)·N_i(x) and its derivatives in one pass, from the 4×4 coefficients of
+    each point.
 
     Beyond the knot rectangle the surface goes on straight: along its tangent past an edge, and
     past a corner as s + Δx·s_x + Δy·s_y + Δx·Δy·s_xy.  Value and slopes stay continuous.
@@ -61,7 +62,7 @@ def spline_sag(p: Parameters, x: Tensor, y: Tensor, second: bool = False) -> Spl
 
 @register_surface
 class BSpline(Surface):
-    """z = Σ c_ji·N_j(y)·N_i(x) with cubic B-splines N on a rectangle of knots (S7).
+    """The sag is z = Σ c_ji·N_j(y)·N_i(x) with cubic B-splines N on a rectangle of knots (S7).
 
     A prescription gives `coefficients`, rows along y and columns along x, and either `knots_x`
     and `knots_y` or `half_width` (or `half_width_x` and `half_width_y`) for equally spaced knots
@@ -89,7 +90,7 @@ class BSpline(Surface):
         super().__init__(aperture, with_knots(parameters), dtype)
 
     def check_aperture(self) -> None:
-        """The knots must fit the coefficients, and their rectangle must hold the aperture."""
+        """Check that the knots fit the coefficients and that their rectangle holds the aperture."""
         rows, columns = self.coefficients.shape
         extents = self.aperture.edge.extent
         for axis, count, extent in zip("xy", (columns, rows), extents, strict=True):
@@ -104,34 +105,35 @@ class BSpline(Surface):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Coefficients and knots, or the half widths that the knots are made from."""
+        """Return coefficients and knots, or the half widths that the knots are made from."""
         return list(cls.optional)
 
     @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Sag (S7), slopes (S8), and the distance to the nearest edge of the knot rectangle."""
+        """Return sag (S7), slopes (S8), and the distance to the knot rectangle's nearest edge."""
         sag, sx, sy, *_ = spline_sag(p, x, y)
         return sag, sx, sy, torch.minimum(_inside(p["knots_x"], x), _inside(p["knots_y"], y))
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """Knots in x, knots in y, coefficients."""
+        """Return knots in x, knots in y, coefficients."""
         rows, columns = p["coefficients"].shape
         numbers = (p["knots_x"], p["knots_y"], p["coefficients"])
         return PackedShape(numbers, count=rows, columns=columns)
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
-        """(s_xx + s_yy)/2 at x = y = 0: the mean over azimuth."""
+        """Return (s_xx + s_yy)/2 at x = y = 0: the mean over azimuth."""
         zero = p["knots_x"].new_zeros(())
         bent = spline_sag(p, zero, zero, second=True)
         return 0.5 * (bent.sxx + bent.syy)
 
 
 def with_knots(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Coefficients and knots, the knots made from the half widths where those are given instead.
+    """Return coefficients and knots; the knots are made from the half widths where those are given
+    instead.
 
     Raises:
         InputError: coefficients that are no matrix of at least 4×4, knots that are missing or
@@ -163,6 +165,6 @@ def with_knots(parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _inside(knots: Tensor, u: Tensor) -> Tensor:
-    """Distance (mm) to the nearer end of the spline, negative beyond it."""
+    """Return the distance (mm) to the nearer end of the spline, negative beyond it."""
     u = u.detach()
     return torch.minimum(u - knots[3], knots[-4] - u)

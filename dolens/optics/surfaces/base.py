@@ -1,4 +1,4 @@
-"""What a surface is: parameters, and a few pure functions of them.
+"""A surface is a set of parameters and a few pure functions of them.
 
 Whether a ray is valid is carried as margins: numbers that are positive where a condition holds.
 The minimum of all margins decides at the end.  Comparing and selecting by masks costs five times
@@ -30,7 +30,7 @@ _UNCERTAIN = 1e-2
 
 
 class PlaneRay(NamedTuple):
-    """Rays where they cross the vertex plane z = 0: x, y in mm and direction cosines."""
+    """Rays cross the vertex plane z = 0 at x, y (mm) with these direction cosines."""
 
     x: Tensor
     y: Tensor
@@ -40,7 +40,9 @@ class PlaneRay(NamedTuple):
 
 
 class Refraction(NamedTuple):
-    """Direction cosines behind a surface, and a margin that is positive without TIR."""
+    """Refraction gives direction cosines behind a surface, and a margin that is positive without
+    TIR.
+    """
 
     l: Tensor  # noqa: E741
     m: Tensor
@@ -49,7 +51,7 @@ class Refraction(NamedTuple):
 
 
 class PackedShape(NamedTuple):
-    """The numbers of a shape as its kernel takes them.
+    """A shape gives its kernel these numbers.
 
     Attributes:
         numbers: scalars and arrays, the latter by rows; None: zero.
@@ -67,7 +69,9 @@ class PackedShape(NamedTuple):
 
 
 def safe_sqrt(squared: Tensor) -> Tensor:
-    """Square root with a finite derivative everywhere; exact where its argument is positive."""
+    """Return the square root, with a finite derivative everywhere; exact where its argument is
+    positive.
+    """
     return torch.sqrt(squared.clamp(min=GRAZING * GRAZING))
 
 
@@ -77,7 +81,7 @@ def snell(
     ratio: float | Tensor,
     sense: float,
 ) -> Refraction:
-    """Snell's law in vector form.
+    """Refract directions by Snell's law in vector form.
 
     Args:
         direction: cosines of unit vectors.
@@ -105,7 +109,7 @@ def snell(
 
 
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
-    """A new tensor of a number, nested lists of numbers, or an array.
+    """Return a new tensor of a number, nested lists of numbers, or an array.
 
     Raises:
         InputError: entries that are no numbers, or rows of unequal length.
@@ -118,15 +122,15 @@ def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
 
 
 class Surface(nn.Module):
-    """A refracting surface about its own vertex: state here, mathematics in its static methods.
+    """A surface refracts rays; it holds its parameters, and its class the mathematics.
 
-    A surface holds parameters, most of them scalars (`curvature`, `a4`, `x2y`, ...).  Its methods
-    for light take them as a mapping, so that a trace can be given other values than the stored
-    ones (scaled variables of an optimizer, a batch of perturbed lenses) without touching any state.
+    Most parameters are scalars (`curvature`, `a4`, `x2y`, ...).  The methods for light take them as
+    a mapping, so that a trace can be given other values than the stored ones (scaled variables of
+    an optimizer, a batch of perturbed lenses) without touching any state.
 
     A new shape is a subclass with `kind`, `parameter_names`, `sag_and_gradient`, and a better
     `start` where there is one; Newton's iteration does the rest.  A shape with a closed form
-    overrides `intersect` and `normal`.
+    overrides `intersect` and `normal`.  `register_surface` makes it known to prescriptions.
 
     Args:
         aperture: the clear aperture; a number is the semi-diameter of a circle, mm.
@@ -178,7 +182,7 @@ class Surface(nn.Module):
 
     @property
     def semi_diameter(self) -> float:
-        """Distance of the clear aperture's farthest point from the vertex, mm."""
+        """Return the distance of the clear aperture's farthest point from the vertex, mm."""
         return self.aperture.edge.semi_diameter
 
     def check_aperture(self) -> None:
@@ -186,14 +190,14 @@ class Surface(nn.Module):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Which parameters a surface with these keys in its prescription has."""
+        """Return the parameters of a surface with these keys in its prescription."""
         raise NotImplementedError
 
     @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Sag and its slopes.
+        """Return the sag and its slopes.
 
         Args:
             p: parameters.
@@ -216,7 +220,7 @@ class Surface(nn.Module):
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
-        """Curvature at the vertex (1/mm), the mean over azimuth.
+        """Return the curvature at the vertex (1/mm), the mean over azimuth.
 
         Here: from the derivative of the slopes at the vertex, for any sag.
         """
@@ -225,7 +229,8 @@ class Surface(nn.Module):
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
-        """Coefficient G (1/mm³) of r⁴ in the sag beyond the osculating sphere, c·r²/2 + c³·r⁴/8.
+        """Return the coefficient G (1/mm³) of r⁴ in the sag beyond the osculating sphere, c·r²/2 +
+        c³·r⁴/8.
 
         Here: from derivatives of the slopes at the vertex, for any sag.  Along an azimuth the
         fourth derivative is 24 times the r⁴ coefficient.  Of a surface without rotational symmetry
@@ -238,7 +243,7 @@ class Surface(nn.Module):
 
     @classmethod
     def _slope_by_azimuth(cls, p: Parameters) -> tuple[Callable[[Tensor], Tensor], Tensor]:
-        """The slope along three azimuths 60° apart at distances r (3,), and r at the vertex."""
+        """Return the slope along three azimuths 60° apart at distances r (3,), and zero r."""
         like = next(iter(p.values()))
         azimuth = torch.arange(3, dtype=like.dtype, device=like.device) * (math.pi / 3.0)
         cosine, sine = torch.cos(azimuth), torch.sin(azimuth)
@@ -251,14 +256,14 @@ class Surface(nn.Module):
 
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
-        """First guess of the distance (mm) from the vertex plane along the ray; finite."""
+        """Return a first guess of the distance (mm) from the vertex plane along the ray; finite."""
         return torch.zeros_like(ray.x)
 
     @classmethod
     def intersect(
         cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
     ) -> tuple[Tensor, Tensor | None]:
-        """Meet the surface.
+        """Find where rays meet the surface.
 
         Here: Newton's iteration for F = sag(x + l·t, y + m·t) - n·t = 0, outside any graph.  Each
         further step, inside the graph, doubles the order of the derivatives that are those of the
@@ -316,7 +321,9 @@ class Surface(nn.Module):
     def normal(
         cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Unit normal towards +z at a point of the surface: (-s_x, -s_y, 1)/√(1 + s_x² + s_y²)."""
+        """Return the unit normal towards +z at a point of the surface: (-s_x, -s_y, 1)/√(1 + s_x² +
+        s_y²).
+        """
         _, sx, sy, _ = cls.sag_and_gradient(p, x, y)
         nz = torch.rsqrt(torch.addcmul(torch.addcmul(torch.ones_like(sx), sx, sx), sy, sy))
         return -sx * nz, -sy * nz, nz
@@ -330,12 +337,12 @@ class Surface(nn.Module):
         ratio: float | Tensor,
         sense: float,
     ) -> Refraction:
-        """Bend rays at points (mm) of the surface; see `snell`."""
+        """Refract rays at points (mm) of the surface; see `snell`."""
         return snell(direction, cls.normal(p, *point), ratio, sense)
 
 
 def _derivative(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """Derivative of an elementwise function, in reverse mode: it may be nested."""
+    """Return the derivative of an elementwise function, in reverse mode: it may be nested."""
     return lambda r: torch.func.vjp(function, r)[1](torch.ones_like(r))[0]
 
 
@@ -349,7 +356,7 @@ def _newton_step(shape: type[Surface], p: Parameters, ray: PlaneRay, t: Tensor) 
 
 @dataclass(frozen=True)
 class SurfaceState:
-    """A surface as the pure functions see it.
+    """The pure functions see a surface in this form.
 
     Attributes:
         shape: the `Surface` subclass, used as a namespace of pure functions.
@@ -364,23 +371,23 @@ class SurfaceState:
     edge: Tensor | None = None
 
     def rim_sag(self, like: Tensor) -> Tensor:
-        """Sag (mm) at the aperture's reach along x, in the precision of another tensor."""
+        """Return the sag (mm) at the aperture's reach along x, in another tensor's precision."""
         reach = torch.full_like(like, self.semi_diameter)
         return self.shape.sag_and_gradient(self.parameters, reach, torch.zeros_like(like))[0]
 
     @property
     def semi_diameter(self) -> float:
-        """Distance of the clear aperture's farthest point from the vertex, mm."""
+        """Return the distance of the clear aperture's farthest point from the vertex, mm."""
         return self.aperture.edge.semi_diameter
 
     @property
     def edge_radius(self) -> float | Tensor:
-        """The semi-diameter, mm, with its gradient where there is one."""
+        """Return the semi-diameter, mm, with its gradient where there is one."""
         return self.semi_diameter if self.edge is None else self.edge
 
     def edge_distance(self, x: Tensor, y: Tensor) -> Tensor:
-        """How far points (mm, in the surface's axes) lie inside the aperture's edge; negative
-        outside.  Differentiable in the points and in `edge`.
+        """Return how far points (mm, in the surface's axes) lie inside the aperture's edge;
+        negative outside.  It is differentiable in the points and in `edge`.
         """
         depth = self.aperture.depth(x, y)
         if self.edge is None:

@@ -1,4 +1,4 @@
-"""What of a surface light passes: circles and rectangles, with obscurations."""
+"""A clear aperture passes light: circles and rectangles, with obscurations."""
 
 import math
 from dataclasses import dataclass
@@ -13,64 +13,69 @@ from dolens.kernels.table import Outline as OutlineKind
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle about the vertex; lengths in mm."""
+    """The outline is a circle about the vertex; lengths in mm."""
 
     rotational: ClassVar[bool] = True  # it looks the same from every azimuth
     semi_diameter: float
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
-        """Positive strictly inside: ρ² - r², mm²."""
+        """Return ρ² - r², mm²: positive strictly inside."""
         return self.semi_diameter**2 - torch.addcmul(x * x, y, y)
 
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
-        """How far inside the edge, mm; negative outside.  Differentiable but at the vertex."""
+        """Return how far inside the edge a point is, mm; negative outside.  It is differentiable
+        but at the vertex.
+        """
         square = torch.addcmul(x * x, y, y)
         return self.semi_diameter - square.clamp(min=torch.finfo(square.dtype).tiny).sqrt()
 
     @property
     def extent(self) -> tuple[float, float]:
-        """How far it reaches along x and along y, mm."""
+        """Return how far it reaches along x and along y, mm."""
         return self.semi_diameter, self.semi_diameter
 
     def packed(self) -> tuple[OutlineKind, float, float]:
-        """What the kernels know of it: kind, and two numbers; here r² (mm²) and nothing."""
+        """Return its kind and two numbers for the kernels; here r² (mm²) and nothing."""
         return OutlineKind.CIRCLE, self.semi_diameter**2, 0.0
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangle about the vertex, its sides along the surface's x and y; lengths in mm."""
+    """The outline is a rectangle about the vertex, its sides along the surface's x and y; lengths
+    in mm.
+    """
 
     rotational: ClassVar[bool] = False
     half_width_x: float
     half_width_y: float
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
-        """Positive strictly inside: the distance to the nearest side, mm."""
+        """Return the distance to the nearest side, mm: positive strictly inside."""
         return torch.minimum(self.half_width_x - x.abs(), self.half_width_y - y.abs())
 
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
-        """How far inside the nearest side, mm; negative outside."""
+        """Return how far inside the nearest side a point is, mm; negative outside."""
         return self.margin(x, y)
 
     @property
     def semi_diameter(self) -> float:
-        """Distance of its corners from the vertex, mm."""
+        """Return the distance of its corners from the vertex, mm."""
         return math.hypot(self.half_width_x, self.half_width_y)
 
     @property
     def extent(self) -> tuple[float, float]:
-        """How far it reaches along x and along y, mm."""
+        """Return how far it reaches along x and along y, mm."""
         return self.half_width_x, self.half_width_y
 
     def packed(self) -> tuple[OutlineKind, float, float]:
-        """What the kernels know of it: kind, and its half widths in mm."""
+        """Return its kind and its half widths (mm) for the kernels."""
         return OutlineKind.RECTANGLE, self.half_width_x, self.half_width_y
 
 
 @dataclass(frozen=True)
 class Unlimited:
-    """No edge at all: light passes wherever the surface is, as a search for a better lens needs it.
+    """The outline has no edge: light passes wherever the surface is, as a search for a better lens
+    needs it.
 
     Attributes:
         semi_diameter: mm, how far from the vertex light is expected; it sets the scale of
@@ -81,20 +86,20 @@ class Unlimited:
     semi_diameter: float
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
-        """Positive everywhere."""
+        """Return a positive number everywhere."""
         return torch.ones_like(x * y)
 
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
-        """Without an edge, its reach."""
+        """Return the reach everywhere, since there is no edge."""
         return self.semi_diameter * self.margin(x, y)
 
     @property
     def extent(self) -> tuple[float, float]:
-        """How far light is expected along x and along y, mm."""
+        """Return how far light is expected along x and along y, mm."""
         return self.semi_diameter, self.semi_diameter
 
     def packed(self) -> tuple[OutlineKind, float, float]:
-        """What the kernels know of it: nothing."""
+        """Return its kind for the kernels, and no numbers."""
         return OutlineKind.NONE, 0.0, 0.0
 
 
@@ -129,15 +134,15 @@ class ClearAperture:
 
     @property
     def rotational(self) -> bool:
-        """Whether it looks the same from every azimuth."""
+        """Return whether it looks the same from every azimuth."""
         return self.edge.rotational and (self.obscuration is None or self.obscuration.rotational)
 
     def opened(self) -> "ClearAperture":
-        """The same size with no edge and no obscuration: it clips nothing."""
+        """Return the same size with no edge and no obscuration: it clips nothing."""
         return ClearAperture(Unlimited(self.edge.semi_diameter))
 
     def resized(self, semi_diameter: float) -> "ClearAperture":
-        """The same with another radius of its circular edge.
+        """Return the same aperture with another radius of its circular edge.
 
         Raises:
             InputError: the edge is no circle.
@@ -147,14 +152,16 @@ class ClearAperture:
         return ClearAperture(Circle(semi_diameter), self.obscuration)
 
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
-        """How far a point is from what stops light, mm, negative where it does; differentiable."""
+        """Return how far a point is from the edge that stops light, mm, negative where it does;
+        differentiable.
+        """
         inside = self.edge.depth(x, y)
         if self.obscuration is None:
             return inside
         return torch.minimum(inside, -self.obscuration.depth(x, y))
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
-        """A number that is positive where light passes; no gradient."""
+        """Return a number that is positive where light passes; no gradient."""
         x, y = x.detach(), y.detach()
         inside = self.edge.margin(x, y)
         if self.obscuration is None:

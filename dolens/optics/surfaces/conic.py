@@ -1,4 +1,4 @@
-"""Spheres and conics, met in closed form."""
+"""Rays meet spheres and conics in closed form."""
 
 import math
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ _FLAT = 1e-15  # 1/mm
 
 
 def conic_sag(c: Tensor, k: Tensor | float, r2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Sag of a conic, s = c·r²/(1 + √(1 - (1+k)c²r²)).
+    """Return the sag of a conic, s = c·r²/(1 + √(1 - (1+k)c²r²)).
 
     Args:
         c: curvature, 1/mm.
@@ -40,7 +40,8 @@ def conic_sag(c: Tensor, k: Tensor | float, r2: Tensor) -> tuple[Tensor, Tensor,
 
 
 def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[Tensor, Tensor]:
-    """Distance from the vertex plane to a conic, on the crossing in the direction of `sense`.
+    """Return the distance from the vertex plane to a conic, on the crossing in the direction of
+    `sense`.
 
     Along the ray, A·t² - 2G·t + F = 0 with F = c(x² + y²), G = n - c(lx + my) and
     A = c(1 + k·n²).  At a root, direction · gradient = G - A·t = ±√D with D = G² - AF, so the
@@ -71,7 +72,9 @@ def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[T
 
 @register_surface
 class Conic(Surface):
-    """A conic of revolution with curvature c (1/mm) and conic constant k (S1 without a_2i)."""
+    """The surface is a conic of revolution with curvature c (1/mm) and conic constant k (S1 without
+    a_2i).
+    """
 
     kind = "conic"
     kernel = SurfaceKernel("dolens.kernels.cpu.conic", "dolens.kernels.cuda.conic", Kind.CONIC)
@@ -80,11 +83,11 @@ class Conic(Surface):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Curvature and conic constant."""
+        """Return curvature and conic constant."""
         return ["curvature", "conic"]
 
     def check_aperture(self) -> None:
-        """The clear aperture ends where the sag does: (1+k)·c²·r² ≤ 1."""
+        """Check that the clear aperture ends where the sag does: (1+k)·c²·r² ≤ 1."""
         stored = {name: float(value.detach()) for name, value in self.named_parameters()}
         c = stored["curvature"]
         alpha = (1.0 + stored.get("conic", 0.0)) * c * c
@@ -98,14 +101,14 @@ class Conic(Surface):
 
     @classmethod
     def conic_constant(cls, p: Parameters) -> Tensor | float:
-        """The conic constant k."""
+        """Return the conic constant k."""
         return p["conic"]
 
     @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Sag (S1) and slopes (S4): ∂s/∂x = 2x·ds/d(r²)."""
+        """Return sag (S1) and slopes (S4): ∂s/∂x = 2x·ds/d(r²)."""
         sag, slope, exists = conic_sag(p["curvature"], cls.conic_constant(p), x * x + y * y)
         return sag, 2.0 * x * slope, 2.0 * y * slope, exists
 
@@ -113,7 +116,7 @@ class Conic(Surface):
     def intersect(
         cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
     ) -> tuple[Tensor, Tensor | None]:
-        """Closed form; on the sag branch where 1 - (1+k)·c·z > 0."""
+        """Find the ray intercept in closed form, on the sag branch where 1 - (1+k)·c·z > 0."""
         c, k = p["curvature"], p["conic"]
         t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
         branch = 1.0 - ((1.0 + k) * c).detach() * (ray.n * t).detach()
@@ -123,7 +126,7 @@ class Conic(Surface):
     def normal(
         cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(-cx, -cy, 1 - (1+k)cz) over its length."""
+        """Return (-cx, -cy, 1 - (1+k)cz) over its length."""
         c, k = p["curvature"], p["conic"]
         nx, ny, nz = -c * x, -c * y, 1.0 - ((1.0 + k) * c) * z
         squared = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
@@ -132,23 +135,25 @@ class Conic(Surface):
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """c, k."""
+        """Return c, k."""
         return PackedShape((p["curvature"], p["conic"]))
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
-        """The curvature c."""
+        """Return the curvature c."""
         return p["curvature"]
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
-        """k·c³/8."""
+        """Return k·c³/8."""
         return cls.conic_constant(p) * p["curvature"] ** 3 / 8.0
 
 
 @register_surface
 class Sphere(Conic):
-    """A sphere of curvature c = 1/R (1/mm); c = 0 is a plane whose curvature can move."""
+    """The surface is a sphere of curvature c = 1/R (1/mm); c = 0 is a plane whose curvature can
+    move.
+    """
 
     kind = "sphere"
     kernel = SurfaceKernel("dolens.kernels.cpu.sphere", "dolens.kernels.cuda.conic", Kind.SPHERE)
@@ -157,19 +162,19 @@ class Sphere(Conic):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """The curvature."""
+        """Return the curvature."""
         return ["curvature"]
 
     @classmethod
     def conic_constant(cls, p: Parameters) -> Tensor | float:
-        """Zero."""
+        """Return zero."""
         return 0.0
 
     @classmethod
     def intersect(
         cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
     ) -> tuple[Tensor, Tensor | None]:
-        """Closed form; on the near half of the sphere where 1 - c·z > 0."""
+        """Find the ray intercept in closed form, on the near half where 1 - c·z > 0."""
         c = p["curvature"]
         t, met = conic_distance(c, c, ray, sense)
         return t, torch.minimum(met, 1.0 - c.detach() * (ray.n * t).detach())
@@ -178,11 +183,11 @@ class Sphere(Conic):
     def normal(
         cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """(-cx, -cy, 1 - cz): a unit vector on the sphere as it stands."""
+        """Return (-cx, -cy, 1 - cz), a unit vector on the sphere."""
         c = p["curvature"]
         return -c * x, -c * y, 1.0 - c * z
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """c."""
+        """Return c."""
         return PackedShape((p["curvature"],))

@@ -1,4 +1,4 @@
-"""Even aspheres: a conic plus powers of r² (S1, S2)."""
+"""An even asphere is a conic plus powers of r² (S1, S2)."""
 
 import re
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ _POWER = re.compile(r"a([1-9]\d*)")
 
 @register_surface
 class EvenAsphere(Conic):
-    """s(r) = conic + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power)."""
+    """The sag is s(r) = conic + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power)."""
 
     kind = "even_asphere"
     kernel = SurfaceKernel("dolens.kernels.cpu.even_asphere", "dolens.kernels.cuda.even_asphere")
@@ -25,7 +25,7 @@ class EvenAsphere(Conic):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Curvature, conic constant and the coefficients that the prescription names."""
+        """Return curvature, conic constant and the coefficients that the prescription names."""
         powers = []
         for key in keys:
             match = _POWER.fullmatch(str(key))
@@ -41,7 +41,7 @@ class EvenAsphere(Conic):
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Sag (S1) and slopes (S4), the polynomial by Horner's rule in r²."""
+        """Return sag (S1) and slopes (S4), the polynomial by Horner's rule in r²."""
         r2 = torch.addcmul(x * x, y, y)
         sag, slope, exists = conic_sag(p["curvature"], p["conic"], r2)
         powers = sorted(int(name[1:]) // 2 for name in p if _POWER.fullmatch(name))
@@ -57,7 +57,7 @@ class EvenAsphere(Conic):
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """c, k, a4, a6, ...: all powers up to the highest, in groups of four."""
+        """Return c, k, a4, a6, ...: all powers up to the highest, in groups of four."""
         powers = [int(name[1:]) for name in p if _POWER.fullmatch(name)]
         count = -(-(max(powers, default=2) // 2 - 1) // 4) * 4
         coefficients = [p.get(f"a{2 * i + 4}") for i in range(count)]
@@ -66,12 +66,12 @@ class EvenAsphere(Conic):
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
-        """k·c³/8 + a4."""
+        """Return k·c³/8 + a4."""
         return Conic.fourth_order_departure.__func__(cls, p) + p.get("a4", 0.0)
 
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
-        """The conic's own intersection, or the vertex plane where that is out of reach."""
+        """Return the conic's own intersection, or the vertex plane where that is out of reach."""
         c, k = p["curvature"], p["conic"]
         t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
         return torch.where(met > 0.0, t, torch.zeros_like(t))
@@ -80,12 +80,12 @@ class EvenAsphere(Conic):
     def intersect(
         cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
     ) -> tuple[Tensor, Tensor | None]:
-        """Newton's iteration from the conic."""
+        """Find the ray intercept by Newton's iteration from the conic."""
         return Surface.intersect.__func__(cls, p, ray, sense, scale)
 
     @classmethod
     def normal(
         cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """From the slopes."""
+        """Return the unit normal from the slopes."""
         return Surface.normal.__func__(cls, p, x, y, z)

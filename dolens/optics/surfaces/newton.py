@@ -1,4 +1,4 @@
-"""Newton's iteration to a surface, outside any graph and under every torch.func transform."""
+"""Newton's iteration runs outside any graph and under every torch.func transform."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ Step = Callable[[Mapping[str, Tensor], tuple[Tensor, ...], Tensor], Tensor]
 
 
 class _Root(torch.autograd.Function):
-    """The iteration as one operation.
+    """The iteration is one operation.
 
     Its loop ends when all rays have converged, a decision that `vmap` cannot trace; here a batch
     becomes one more leading dimension, and one loop serves it all.  The result has no derivative:

@@ -1,4 +1,4 @@
-"""Planes: refracting, and the aperture that only stops light."""
+"""A plane refracts, and an aperture only stops light."""
 
 from collections.abc import Mapping
 
@@ -20,7 +20,7 @@ from dolens.optics.surfaces.registry import register_surface
 
 @register_surface
 class Plane(Surface):
-    """A flat refracting surface; it has no parameters."""
+    """The surface is flat, refracts, and has no parameters."""
 
     kind = "plane"
     kernel = SurfaceKernel("dolens.kernels.cpu.plane", "dolens.kernels.cuda.step", Kind.PLANE)
@@ -29,14 +29,14 @@ class Plane(Surface):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """A plane has no parameters."""
+        """Return no names: a plane has no parameters."""
         return []
 
     @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Zero sag and slopes, everywhere."""
+        """Return zero sag and slopes, everywhere."""
         zero = torch.zeros_like(x + y)
         return zero, zero, zero, None
 
@@ -44,7 +44,7 @@ class Plane(Surface):
     def intersect(
         cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
     ) -> tuple[Tensor, Tensor | None]:
-        """The ray is there already."""
+        """Return zero distance: the ray is there already."""
         return torch.zeros_like(ray.n), None
 
     @classmethod
@@ -56,30 +56,32 @@ class Plane(Surface):
         ratio: float | Tensor,
         sense: float,
     ) -> Refraction:
-        """Snell's law about the axis: l' = μl, m' = μm, n' = s·√(1 - μ²(1 - n²))."""
+        """Refract by Snell's law about the axis: l' = μl, m' = μm, n' = s·√(1 - μ²(1 - n²))."""
         l, m, n = direction  # noqa: E741
         squared = (1.0 - ratio * ratio) + (ratio * ratio) * (n * n)
         return Refraction(ratio * l, ratio * m, sense * safe_sqrt(squared), squared.detach())
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """No numbers."""
+        """Return no numbers."""
         return PackedShape(())
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
-        """Zero."""
+        """Return zero."""
         return 0.0
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
-        """Zero."""
+        """Return zero."""
         return 0.0
 
 
 @register_surface
 class Aperture(Plane):
-    """A plane stop: it clips, and does not refract (except behind an `occluder` medium)."""
+    """The surface is a plane stop: it clips, and does not refract (except behind an `occluder`
+    medium).
+    """
 
     kind = "aperture"
     kernel = Plane.kernel

@@ -1,4 +1,4 @@
-"""Surfaces by the `type` that a prescription gives: those of this library and a user's own.
+"""The registry knows surfaces by the `type` of a prescription: this library's and a user's own.
 
 A prescription names a type, and no code.  What is not registered cannot be named.
 """
@@ -64,7 +64,7 @@ def unregister_surface(kind: str) -> None:
 
 
 def _wrong(shape: type[Surface]) -> list[str]:
-    """What keeps a class from being a surface of a prescription."""
+    """List what keeps a class from being a surface of a prescription."""
     wrong = []
     if not (isinstance(shape.kind, str) and shape.kind):
         wrong.append("`kind` must be the type's name in prescriptions, a word")

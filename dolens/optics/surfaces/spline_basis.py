@@ -1,4 +1,5 @@
-"""Cubic B-splines of one variable: knots, and the four basis functions that are not zero.
+"""A cubic spline of one variable has knots, and at each point four basis functions that are not
+zero.
 
 n coefficients need n + 4 knots t_0 ≤ ... ≤ t_(n+3); the spline lives on [t_3, t_n].  A knot of
 multiplicity m leaves 3 - m continuous derivatives there: two at a simple knot, a crease at a
@@ -20,7 +21,7 @@ RESOLUTION = 1e-6
 
 
 class CubicBasis(NamedTuple):
-    """The basis functions N_(span-3), ..., N_span at points u, and their derivatives.
+    """At points u these are the basis functions N_(span-3), ..., N_span and their derivatives.
 
     Attributes:
         first: index of the first of the four, span - 3 (int64, shape of u).
@@ -36,7 +37,7 @@ class CubicBasis(NamedTuple):
 
 
 def clamped_knots(half_width: float, count: int) -> list[float]:
-    """Knots for `count` coefficients on [-half_width, half_width] (mm), equally spaced.
+    """Return knots for `count` coefficients on [-half_width, half_width] (mm), equally spaced.
 
     The first and the last are quadruple, so that the spline ends on its outermost coefficients.
 

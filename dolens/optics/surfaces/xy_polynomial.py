@@ -1,4 +1,4 @@
-"""XY polynomials with the implicit b·z² term (S5, S6)."""
+"""An XY polynomial may have the implicit b·z² term (S5, S6)."""
 
 import re
 from collections.abc import Mapping
@@ -12,7 +12,8 @@ from dolens.optics.surfaces.registry import register_surface
 
 
 def monomial_powers(name: str) -> tuple[int, int] | None:
-    """Powers (i, j) of a coefficient named by its monomial x^i·y^j, or None for another name.
+    """Return the powers (i, j) of a coefficient named by its monomial x^i·y^j, or None for another
+    name.
 
     `x3` is (3, 0), `x2y` (2, 1), `xy` (1, 1), `y3` (0, 3); a power of one is not written.
     """
@@ -25,7 +26,8 @@ def monomial_powers(name: str) -> tuple[int, int] | None:
 
 @register_surface
 class XYPolynomial(Surface):
-    """Σ a_ij·x^i·y^j + b·z² - z = 0; coefficients named by their monomials, mm^(1 - i - j).
+    """The surface is Σ a_ij·x^i·y^j + b·z² - z = 0; coefficients are named by their monomials,
+    mm^(1 - i - j).
 
     The branch through the vertex is explicit: z = 2P/(1 + √(1 - 4bP)) with P = Σ a_ij·x^i·y^j,
     and there 1 - 2bz = √(1 - 4bP), so its slopes are P_x and P_y over that root.
@@ -36,14 +38,14 @@ class XYPolynomial(Surface):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """The monomials that the prescription names, and b where it is named."""
+        """Return the monomials that the prescription names, and b where it is named."""
         return [str(key) for key in keys if key == "b" or monomial_powers(str(key)) is not None]
 
     @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Sag and slopes of the branch through the vertex."""
+        """Return sag and slopes of the branch through the vertex."""
         polynomial, px, py = _evaluate(p, x, y)
         if "b" not in p:
             return polynomial, px, py, None
@@ -53,7 +55,7 @@ class XYPolynomial(Surface):
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """b, then the coefficients, and their powers as extras."""
+        """Return b, then the coefficients, and their powers as extras."""
         terms = [(powers, a) for n, a in p.items() if (powers := monomial_powers(n)) is not None]
         flat = [power for powers, _ in terms for power in powers]
         return PackedShape(
@@ -66,12 +68,12 @@ class XYPolynomial(Surface):
 
     @classmethod
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
-        """x2 + y2: the mean over azimuth of the curvature at the vertex."""
+        """Return x2 + y2: the mean over azimuth of the curvature at the vertex."""
         return p.get("x2", 0.0) + p.get("y2", 0.0)
 
 
 def _evaluate(p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """P, ∂P/∂x and ∂P/∂y; every power and product of powers is computed once."""
+    """Return P, ∂P/∂x and ∂P/∂y; every power and product of powers is computed once."""
     cache: dict[tuple[int, int], Tensor] = {(1, 0): x, (0, 1): y}
 
     def monomial(i: int, j: int) -> Tensor:

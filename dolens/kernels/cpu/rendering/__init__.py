@@ -1,1 +1,1 @@
-"""The renderer and the splat on the CPU: sampling, lookup, and the drivers around the trace."""
+"""The renderer and the splat run on the CPU: sampling, lookup, and the drivers around the trace."""

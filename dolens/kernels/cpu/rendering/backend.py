@@ -1,4 +1,4 @@
-"""Running the renderer and the splat on tensors."""
+"""These functions run the renderer on tensors."""
 
 from collections.abc import Sequence
 
@@ -54,7 +54,8 @@ def render_adjoint(
     scale: float,
     wanted: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Cotangents of the table, the textures, the sensor's z and the view from those of the image.
+    """Return the cotangents of the table, the textures, the sensor's z and the view from those of
+    the image.
 
     Args:
         table: as in `render`, and the textures, the sensor's z and the view.
@@ -109,7 +110,7 @@ def render_adjoint(
 
 
 class _RenderJob:
-    """A program with the arrays of a renderer's driver, which it keeps alive."""
+    """A program is held together with the arrays of a renderer's driver."""
 
     def __init__(
         self,
@@ -166,7 +167,7 @@ class _RenderJob:
 
 
 def _blocks(pieces: Tensor) -> np.ndarray:
-    """First pixel and number of pixels of every block of the pieces, (blocks, 2)."""
+    """Return first pixel and number of pixels of every block of the pieces, (blocks, 2)."""
     blocks = [
         (start, min(BLOCK, end - start))
         for first, end in pieces.tolist()
@@ -176,7 +177,7 @@ def _blocks(pieces: Tensor) -> np.ndarray:
 
 
 def _pad(textures: Tensor) -> Tensor:
-    """At least two texels each way: a texture's edge goes on."""
+    """Pad to at least two texels each way: a texture's edge goes on."""
     below, right = (int(size == 1) for size in textures.shape[-2:])
     if not (below or right):
         return textures
@@ -184,5 +185,5 @@ def _pad(textures: Tensor) -> Tensor:
 
 
 def _unpad(sums: Tensor, textures: Tensor) -> Tensor:
-    """The adjoint of `_pad`: added texels are never read with a weight."""
+    """Take the padding off: the adjoint of `_pad`, whose added texels have no weight."""
     return sums[..., : textures.shape[-2], : textures.shape[-1]].contiguous()

@@ -1,4 +1,4 @@
-"""The first surface that rays meet: at the same points, whatever their wavelength.
+"""Rays of all wavelengths meet the first surface at the same points.
 
 Only refraction differs.  With d' = μ·d + Γ·N a known refraction gives the normal, N ∥ d' - μ·d;
 another wavelength's differs by (Δμ)·d + (ΔΓ)·N: no second search for the intersection.
@@ -46,7 +46,7 @@ COSINE, NORMAL_X, NORMAL_Y, NORMAL_Z = (STATE + BLOCK * row for row in range(4))
 
 
 class FirstSurface(NamedTuple):
-    """Compiled functions that reuse the first step of a block's rays."""
+    """These compiled functions reuse the first step of a block's rays."""
 
     reusable: Any
     refract_again: Any
@@ -54,7 +54,7 @@ class FirstSurface(NamedTuple):
 
 @cache
 def first_surface(real: types.Type) -> FirstSurface:
-    """The functions for one real type."""
+    """Compile the functions for one real type."""
     at = real_at(real)
     zero, one, tiny = real(0.0), real(1.0), real(1e-18)
     totally_reflected = real(TOTALLY_REFLECTED)
@@ -63,7 +63,7 @@ def first_surface(real: types.Type) -> FirstSurface:
 
     @njit(**OPTIONS)
     def ratio(job, codes, wavelength):  # noqa: ANN001, ANN202
-        """Index in front of the step over that behind it."""
+        """Return the index in front of the step over that behind it."""
         count = job[jobs.WAVELENGTHS]
         indices = carray(real64_at(job[jobs.INDICES]), UNBOUNDED)
         return real(
@@ -72,7 +72,7 @@ def first_surface(real: types.Type) -> FirstSurface:
 
     @njit(**OPTIONS)
     def reusable(job, before, kept):  # noqa: ANN001, ANN202
-        """Whether the first wavelength's step serves the others: no ray of the block ended.
+        """Return whether the first wavelength's step serves the others: no ray of the block ended.
 
         N is taken along d' - μ·d, so that Γ is positive.
         """
@@ -94,7 +94,7 @@ def first_surface(real: types.Type) -> FirstSurface:
 
     @njit(**OPTIONS)
     def refract_again(job, wavelength, before, kept, after):  # noqa: ANN001, ANN202
-        """The state behind the first step at another wavelength, but for its path."""
+        """Set the state behind the first step at another wavelength, but for its path."""
         src, old, dst = carray(before, STATE), carray(kept, UNBOUNDED), carray(after, STATE)
         codes = carray(int64_at(job[jobs.CODES]), CODE_ROW)
         record = carray(shifted(at(job[jobs.VALUES]), codes[OFFSET]), SHORT_RECORD)

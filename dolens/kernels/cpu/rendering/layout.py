@@ -1,4 +1,4 @@
-"""Where a renderer's driver finds its numbers, and the rows of its scratch memory."""
+"""A renderer's driver finds its numbers at these places, and its scratch memory in these rows."""
 
 from dolens.kernels.cpu.layout import BLOCK
 

@@ -1,4 +1,4 @@
-"""Where rays meet a textured plane, what they see there, and the adjoint of both.
+"""Rays meet a textured plane and look its radiance up; the adjoint gives both back.
 
 It mirrors `distance_to_plane`, `texture_coordinates` and `bilinear` of the reference.
 """
@@ -33,7 +33,7 @@ from dolens.kernels.cpu.rendering.layout import (
 
 
 class Lookup(NamedTuple):
-    """Compiled functions between a block's rays and the texels of a plane."""
+    """These compiled functions stand between a block's rays and the texels of a plane."""
 
     arrive: Any
     meet: Any
@@ -44,7 +44,7 @@ class Lookup(NamedTuple):
 
 @intrinsic
 def between_rows(context, above, below, column, down):  # noqa: ANN001, ANN201
-    """Two neighbouring columns of texels between two rows, and how they grow downwards.
+    """Return two neighbouring columns of texels between two rows, and their growth downwards.
 
     Neighbours are loaded and blended as a vector of two, which halves the work of a lookup.
     """
@@ -76,7 +76,7 @@ def between_rows(context, above, below, column, down):  # noqa: ANN001, ANN201
 
 @cache
 def lookup(real: types.Type) -> Lookup:
-    """The functions for one real type.
+    """Compile the functions for one real type.
 
     Textures have at least two texels each way, so that a texel always has neighbours.
     """
@@ -84,7 +84,7 @@ def lookup(real: types.Type) -> Lookup:
 
     @njit(**OPTIONS)
     def arrive(state, scratch):  # noqa: ANN001, ANN202
-        """Mark the rays that got through the lens; their number."""
+        """Mark the rays that got through the lens; return their number."""
         src, rows = carray(state, STATE), carray(scratch, UNBOUNDED)
         total = zero
         for i in range(BLOCK):
@@ -98,7 +98,7 @@ def lookup(real: types.Type) -> Lookup:
 
     @njit(**OPTIONS)
     def meet(lengths, depth, per_mm, width, state, scratch, texels):  # noqa: ANN001, ANN202
-        """Carry rays to a plane: the texel above and to the left, and the fractions beyond it."""
+        """Carry rays to a plane; set the texel above and to the left, and fractions beyond it."""
         src, rows = carray(state, STATE), carray(scratch, UNBOUNDED)
         first = carray(int32_at(texels), BLOCK)
         middle_row, middle_column = lengths[TEXTURE_ROW], lengths[TEXTURE_COLUMN]
@@ -186,7 +186,7 @@ def lookup(real: types.Type) -> Lookup:
 
 @cache
 def texel_sums(real: types.Type) -> Any:
-    """Compiled: add what a block's pixels ask of the texels to a texture's sums."""
+    """Compile the function that adds the cotangents of a block's pixels to a texture's sums."""
     one = real(1.0)
 
     @njit(**OPTIONS)

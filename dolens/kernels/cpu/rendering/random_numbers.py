@@ -1,4 +1,4 @@
-"""Counter-based random numbers, the same bits as `dolens.rendering.random_numbers`."""
+"""Counters give random numbers, the same bits as `dolens.rendering.random_numbers`."""
 
 from numba import njit, types
 
@@ -10,7 +10,9 @@ _FACTOR, _SUMMAND, _HALF, _UNUSED = _word(1664525), _word(1013904223), _word(16)
 
 @njit(**OPTIONS)
 def random_words(x, y, z, w):  # noqa: ANN001, ANN201
-    """Four random words of four counters, all of 32 bits: pcg4d of Jarzynski and Olano (2020)."""
+    """Return four random words of four counters, all of 32 bits: pcg4d of Jarzynski and Olano
+    (2020).
+    """
     x, y = _word(x * _FACTOR + _SUMMAND), _word(y * _FACTOR + _SUMMAND)
     z, w = _word(z * _FACTOR + _SUMMAND), _word(w * _FACTOR + _SUMMAND)
     x = _word(x + y * w)
@@ -28,5 +30,5 @@ def random_words(x, y, z, w):  # noqa: ANN001, ANN201
 
 @njit(**OPTIONS)
 def upper_bits(word):  # noqa: ANN001, ANN201
-    """The 24 upper bits of a word, as a signed integer: exact in either precision."""
+    """Return the 24 upper bits of a word, as a signed integer: exact in either precision."""
     return types.int32(word >> _UNUSED)

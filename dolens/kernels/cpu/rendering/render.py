@@ -1,4 +1,4 @@
-"""Driver of the renderer: for every sample of a block of pixels, a ray of each wavelength.
+"""The renderer's driver traces a ray of each wavelength for every sample of a block of pixels.
 
 A block is pixels, and takes their samples in turn: a lane is a pixel, so that sums
 over samples need no scatter, and neighbours read neighbouring texels.  All wavelengths share the
@@ -35,7 +35,7 @@ from dolens.kernels.cpu.rendering.samples import sampler
 
 
 def render_driver(real: types.Type) -> Callable[..., None]:
-    """Render blocks of pixels `first` to `last`."""
+    """Compile the driver that renders blocks of pixels `first` to `last`."""
     at = real_at(real)
     step = streams(real).step
     place_pixels, sample, _ = sampler(real)

@@ -1,4 +1,4 @@
-"""Driver of the renderer's backward pass: samples are made again, traced, and swept back.
+"""The renderer's backward driver makes the samples again, traces them, and sweeps back.
 
 Sums are kept for every group of blocks.  Groups do not depend on the number of threads, and each is
 one worker's: neither does the result.
@@ -49,13 +49,13 @@ from dolens.kernels.cpu.rendering.samples import sampler
 
 @cache
 def _preparation(real: types.Type) -> tuple[Any, Any, Any, Any]:
-    """Compiled: load the pixels' cotangents, replace rays that fail, clear cotangents, copy."""
+    """Compile functions that load the pixels' cotangents, replace failed rays, clear, and copy."""
     at = real_at(real)
     zero = real(0.0)
 
     @njit(**OPTIONS)
     def load(view, lengths, start, count, scratch):  # noqa: ANN001, ANN202
-        """The pixels' cotangents, scaled; zero in the lanes beyond `count`."""
+        """Load the pixels' cotangents, scaled; zero in the lanes beyond `count`."""
         scale = lengths[SCALE]
         for j in range(view[IMAGES] * view[DEPTHS] * view[CHANNELS]):
             source = carray(shifted(at(view[IMAGE]), j * view[PIXELS] + start), BLOCK)
@@ -99,7 +99,9 @@ def _preparation(real: types.Type) -> tuple[Any, Any, Any, Any]:
 
 
 def render_adjoint_driver(real: types.Type) -> Callable[..., None]:
-    """Sweep groups `first` to `last` of blocks back, from pixels to the lens and the textures."""
+    """Compile the driver that sweeps groups `first` to `last` of blocks back, from pixels to the
+    lens and the textures.
+    """
     at = real_at(real)
     step = streams(real).step
     sweep = sweeps(real)

@@ -1,4 +1,4 @@
-"""Rays from the sensor, made in place: jittered points of pixels towards strata of the exit pupil.
+"""Samples are rays from jittered points of the sensor's pixels to strata of the exit pupil.
 
 It mirrors `RayRenderer._samples`, `sampling.square_to_disc` and `pupil.aim` of `dolens.rendering`.
 """
@@ -36,7 +36,7 @@ from dolens.kernels.cpu.rendering.random_numbers import random_words, upper_bits
 
 
 class Sampler(NamedTuple):
-    """Compiled functions that make a block's rays."""
+    """These compiled functions make a block's rays."""
 
     place_pixels: Any
     sample: Any
@@ -44,7 +44,7 @@ class Sampler(NamedTuple):
 
 
 def _disc(real: types.Type) -> Callable[..., Any]:
-    """Compiled: the concentric map of the unit square onto the unit disc."""
+    """Compile the concentric map of the unit square onto the unit disc."""
     zero, one, two, quarter = real(0.0), real(1.0), real(2.0), real(0.25 * math.pi)
     # Taylor's series, to the last bit of double precision up to 45 degrees.
     s0, s1, s2, s3, s4, s5, s6, s7 = (
@@ -73,14 +73,14 @@ def _disc(real: types.Type) -> Callable[..., Any]:
 
 @cache
 def sampler(real: types.Type) -> Sampler:
-    """Functions that place a block's pixels and make their rays, for one real type."""
+    """Compile functions that place a block's pixels and make their rays, for one real type."""
     disc = _disc(real)
     zero, half, one, four = real(0.0), real(0.5), real(1.0), real(4.0)
     unit = real(2.0**-24)
 
     @njit(**OPTIONS)
     def place_pixels(view, start, count, scratch):  # noqa: ANN001, ANN202
-        """Rows and columns of pixels from `start` on; lanes beyond `count` repeat the last."""
+        """Set rows and columns of pixels from `start` on; lanes beyond `count` repeat the last."""
         out = carray(scratch, UNBOUNDED)
         width = view[WIDTH]
         for i in range(BLOCK):
@@ -90,7 +90,7 @@ def sampler(real: types.Type) -> Sampler:
 
     @njit(**OPTIONS)
     def sample(view, lengths, number, start, count, state, scratch):  # noqa: ANN001, ANN202
-        """Rays of sample `number` into a state, and their weights."""
+        """Make the rays of sample `number` and their weights."""
         out, rows = carray(state, STATE), carray(scratch, UNBOUNDED)
         side = view[SIDE]
         seed_low, seed_high = types.uint32(view[SEED_LOW]), types.uint32(view[SEED_HIGH])
@@ -123,8 +123,8 @@ def sampler(real: types.Type) -> Sampler:
 
     @njit(**OPTIONS)
     def of_aim(lengths, state, cotangents, scratch):  # noqa: ANN001, ANN202
-        """Cotangents of the sensor's z, the pupil's z, its radius and the weight along the axis
-        from those of a block's rays and weights, summed.
+        """Return the cotangents of the sensor's z, the pupil's z, its radius and the weight along
+        the axis from those of a block's rays and weights, summed.
 
         Rays start at P, aim at the pupil's point A, and with A - P = Q·d
         of_A = (of_d - (of_d·d) d)/Q, of_P = of_position - of_A, and of_radius = of_A·A/radius.

@@ -1,4 +1,4 @@
-"""Splatting points onto pixels as quadratic B-splines, and its adjoint; see `dolens.rendering.psf`.
+"""Points are splatted onto pixels as quadratic B-splines; see `dolens.rendering.psf`.
 
 Chunks of a grid's points have a grid each, which are then added in their order: the result depends
 neither on the number of threads nor on their timing.
@@ -24,13 +24,15 @@ SPLAT_JOB = 64  # its length
 
 @cache
 def _taps(real: types.Type) -> tuple[Any, Any]:
-    """Compiled: the central pixel of a point, with the offset; the spline's values and slopes."""
+    """Compile the central pixel of a point, with the offset, and the spline's values and slopes."""
     half, one = real(0.5), real(1.0)
     three_quarters, two = real(0.75), real(2.0)
 
     @njit(**OPTIONS)
     def centre(position, size):  # noqa: ANN001, ANN202
-        """-2 where none of the three pixels is on the grid, or the position is no number."""
+        """Return the nearest pixel and the offset from it; -2 where none of the three pixels is on
+        the grid, or the position is no number.
+        """
         if not (position > -two and position < real(size) + one):
             return types.int64(-2), half
         nearest = math.floor(position + half)
@@ -45,7 +47,9 @@ def _taps(real: types.Type) -> tuple[Any, Any]:
 
 
 def splat_driver(real: types.Type) -> Callable[..., None]:
-    """Add the points of chunks `first` to `last`, of all grids, to the chunks' grids."""
+    """Compile the driver that adds the points of chunks `first` to `last`, of all grids, to the
+    chunks' grids.
+    """
     at = real_at(real)
     centre, spline = _taps(real)
 
@@ -76,7 +80,9 @@ def splat_driver(real: types.Type) -> Callable[..., None]:
 
 
 def splat_adjoint_driver(real: types.Type) -> Callable[..., None]:
-    """Cotangents of the points of chunks `first` to `last` from that of the grid."""
+    """Compile the driver of the cotangents of the points of chunks `first` to `last` from that of
+    the grid.
+    """
     at = real_at(real)
     centre, spline = _taps(real)
     zero = real(0.0)

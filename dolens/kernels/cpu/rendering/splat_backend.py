@@ -1,4 +1,4 @@
-"""Running the splat on tensors."""
+"""These functions run the splat on tensors."""
 
 import numpy as np
 import torch
@@ -27,7 +27,9 @@ def splat(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> Tensor:
 def splat_adjoint(
     rows: Tensor, columns: Tensor, weight: Tensor, of_grid: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cotangents (G, N) of rows, columns and weight from that of the grids (G, size, size)."""
+    """Return the cotangents (G, N) of rows, columns and weight from that of the grids (G, size,
+    size).
+    """
     job, chunks = _job(rows, columns, weight, of_grid.shape[-1])
     job[layout.GRIDS] = of_grid.data_ptr()
     gradients = torch.empty_like(rows), torch.empty_like(rows), torch.empty_like(rows)
@@ -37,7 +39,7 @@ def splat_adjoint(
 
 
 def _job(rows: Tensor, columns: Tensor, weight: Tensor, size: int) -> tuple[np.ndarray, int]:
-    """The job, and the chunks of a grid, at least one."""
+    """Return the job, and the number of chunks of a grid, at least one."""
     points = rows.shape[1]
     chunk = max(_SMALLEST, -(-points // _CHUNKS))
     chunks = max(1, -(-points // chunk))
