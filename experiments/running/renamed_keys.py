@@ -9,7 +9,8 @@ class Key:
     """A key that has another name now, or is gone.
 
     Attributes:
-        old: its dotted path; one `*` stands for anything, as in `variables.*.most`.
+        old: its dotted path, of a value or of a mapping with all that is in it; one `*` stands for
+            anything, as in `variables.*.most`.
         new: its path now, with the same `*`; None: it is gone.
         values: old value → value now, where these have changed too.
         instead: what to do where the key is gone; a clause.

@@ -127,15 +127,15 @@ def _translated(override: Override, renamed: Renamed) -> tuple[list[str], list[s
     if option is not None:
         note = f"{group}={value} is called {group}={option} now"
         return [f"{override.get_key_element()}={option}"], [note]
-    changes = [
+    own = _change(path, value, renamed) or _moved_with(path, value, renamed)
+    inner = [
         change
         for where, part, _ in _settings(path, value, {})
-        if (change := _change(where, part, renamed)) is not None
+        if where != path and (change := _change(where, part, renamed)) is not None
     ]
+    changes = [change for change in (own, *inner) if change is not None]
     if not changes:
         return [override.input_line], []
-    own = changes[0] if changes[0].old == path else None
-    inner = [change for change in changes if change is not own]
     outside = [c for c in inner if c.new is not None and not c.new.startswith(f"{path}.")]
     found = [f"++{change.new}={_text(change.after)}" for change in outside]
     if own is None or own.new is not None:
@@ -194,6 +194,17 @@ def _change(path: str, value: Any, renamed: Renamed) -> Change | None:
     if isinstance(value, str) and value in renamed.values.get(path, {}):
         return Change(path, path, value, renamed.values[path][value])
     return None
+
+
+def _moved_with(path: str, value: Any, renamed: Renamed) -> Change | None:
+    """What has become of a setting by what has become of the mapping that holds it."""
+    parent, dot, name = path.rpartition(".")
+    if not dot:
+        return None
+    change = _change(parent, None, renamed) or _moved_with(parent, None, renamed)
+    if change is None:
+        return None
+    return Change(path, change.new and f"{change.new}.{name}", value, value, change.instead)
 
 
 def _new_path(key: Key, path: str) -> str | None:
