@@ -58,7 +58,7 @@ def test_a_camera_hands_its_scenes_distance_to_its_operands(composed, monkeypatc
     cfg = composed(*asked)
     module = instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
     order = module.lens.first_order()
-    _, values = module.penalty(module.variables())
+    _, values = module.lens_steps.penalty(module.variables())
     expected = -float(order.efl / (700.0 + order.ffd))
     assert float(values["magnification"]) == pytest.approx(expected, rel=1e-4)
     seen, properties = [], operand_values.LensProperties
