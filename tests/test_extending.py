@@ -1,0 +1,172 @@
+"""The examples of docs/extending.md do what the document says when they are run as printed."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENT = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
+FENCE = re.compile(r"^```(\w*)[ ]?(\S*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+class Block(NamedTuple):
+    section: str
+    language: str
+    path: str
+    text: str
+
+
+def blocks_of(document):
+    """The fenced blocks in order; a name of a section stands before those of its heading."""
+    found = []
+    for part in re.split(r"^## ", document, flags=re.MULTILINE):
+        section = part.partition("\n")[0]
+        found += [Block(section, *match) for match in FENCE.findall(part)]
+    return found
+
+
+BLOCKS = blocks_of(DOCUMENT)
+FILES = {block.path: block.text for block in BLOCKS if block.path}
+COMMANDS = [block for block in BLOCKS if block.language == "sh"]
+SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block.path]
+EXPERIMENTS = [re.search(r"experiment=(\w+)", block.text)[1] for block in COMMANDS]
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A folder with the repository's files, those of the document, and a `python`."""
+    for name in ("train.py", "conf", "dolens", "experiments"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    for path, text in FILES.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text, encoding="utf-8")
+    python = tmp_path / "bin/python"
+    python.parent.mkdir()
+    python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n', encoding="utf-8")
+    python.chmod(0o755)
+    return tmp_path
+
+
+def run(checkout, command, **environment):
+    path = (checkout / "bin", Path(sys.executable).parent, os.environ["PATH"])
+    done = subprocess.run(
+        command,
+        cwd=checkout,
+        env={
+            **{key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
+            "PATH": os.pathsep.join(map(str, path)),
+            "OMP_NUM_THREADS": "1",
+            **environment,
+        },
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+
+
+def table(path):
+    """The rows of a CSV file."""
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def a_camera_of_nearer_objects(folder, metrics):
+    assert {"test/psnr_db/worst", "test/psnr_db/6m", "test/psnr_db/5m"} <= set(metrics)
+    plate = yaml.safe_load((folder / "lens/final.yaml").read_text())["surfaces"]["5"]
+    assert float(plate["x3"]) > 1.9e-5  # the child's start, not the parent's of 1.5e-5
+    assert float(plate.get("x2y", 0.0)) == 0.0  # dropped
+
+
+def a_design_with_less_astigmatism(folder, metrics):
+    assert metrics["rms_spot_um/final"] < 0.5 * metrics["rms_spot_um/initial"]
+    front = yaml.safe_load((folder / "lens/final.yaml").read_text())["surfaces"]["1"]
+    assert front["type"] == "paraboloid"
+    assert abs(float(front["twist"])) < 1e-6
+
+
+def another_network_and_loss(folder, metrics):
+    assert "test/psnr_db/worst" in metrics
+    assert metrics["network/pretrained"] == 0.0
+    assert "loss/perceptual_available" not in metrics  # of the repository's own loss alone
+    assert any(b"train/l1" in file.read_bytes() for file in folder.rglob("events.out.tfevents.*"))
+
+
+def an_operand_in_the_history(folder, metrics):
+    columns = {f"{kind}/telephoto_ratio" for kind in ("operand", "operand_slope", "merit")}
+    assert columns <= set(table(folder / "history.csv")[0])
+    assert "telephoto_ratio" in (folder / "operands.csv").read_text()
+
+
+def a_camera_trained_with_another_renderer(folder, metrics):
+    assert "test/psnr_db/worst" in metrics
+    assert metrics["cost/rays"] == 0.0
+
+
+def a_number_a_table_and_a_figure(folder, metrics):
+    rows = table(folder / "chromatic_focus.csv")
+    distances = [float(row["bfd_mm"]) for row in rows]
+    spread = max(distances) - min(distances)
+    assert metrics["chromatic_focus/range_mm"] == pytest.approx(spread, abs=2e-4)
+    assert (folder / "figures/chromatic_focus.png").stat().st_size > 5000
+
+
+# Section and experiment of a command → what the text promises of its run folder.
+PROMISES = {
+    ("A surface", "astigmatic"): a_design_with_less_astigmatism,
+    ("An experiment", "near_field"): a_camera_of_nearer_objects,
+    ("A loss", "wavefront_coding"): another_network_and_loss,
+    ("A merit", "short_triplet"): an_operand_in_the_history,
+    ("A renderer", "wavefront_coding"): a_camera_trained_with_another_renderer,
+    ("An analysis", "chromatic_focus"): a_number_a_table_and_a_figure,
+}
+
+
+@pytest.mark.parametrize(
+    ("block", "experiment"), list(zip(COMMANDS, EXPERIMENTS, strict=True)), ids=EXPERIMENTS
+)
+def test_a_command_leaves_what_the_text_promises(checkout, block, experiment):
+    run(checkout, ["sh", "-e", "-c", block.text])
+    (folder,) = (checkout / "outputs" / experiment).iterdir()
+    metrics = json.loads((folder / "metrics.json").read_text())
+    PROMISES[block.section, experiment](folder, metrics)
+
+
+@pytest.mark.parametrize("block", SCRIPTS, ids=lambda block: block.section)
+def test_a_script_runs(checkout, block):
+    script = checkout / "script.py"
+    script.write_text(block.text, encoding="utf-8")
+    run(checkout, ["python", str(script)], PYTHONPATH="mine")
+
+
+def test_every_command_has_a_promise():
+    assert {
+        (block.section, name) for block, name in zip(COMMANDS, EXPERIMENTS, strict=True)
+    } == set(PROMISES)
+
+
+def test_every_block_is_a_file_or_is_run():
+    """A block that is neither would be an example that nobody has tried."""
+    assert len(FILES) == sum(bool(block.path) for block in BLOCKS)  # no file is printed twice
+    for block in BLOCKS:
+        assert block.path.startswith("mine/") or block.language in ("sh", "python"), block
+
+
+def test_the_table_names_the_files_of_the_document_and_counts_them():
+    rows = [
+        line.split("|")[1:-1] for line in DOCUMENT.split("## ")[0].splitlines() if "`mine/" in line
+    ]
+    named = [
+        (re.findall(r"`(mine/[\w./]+)`", row[1]), int(row[2])) for row in rows if len(row) == 3
+    ]
+    assert len(named) >= 7
+    for paths, count in named:
+        assert len(paths) == count
+        assert set(paths) <= set(FILES)
