@@ -11,7 +11,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dolens.errors import InputError, check_keys
 
-_HYDRAS = ("_target_", "_partial_", "_convert_", "_recursive_", "_args_")
+_HYDRAS = frozenset(("_target_", "_partial_", "_convert_", "_recursive_", "_args_"))
 # A value that is another part of the configuration as a whole, as `network: ${network}`.
 _REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
@@ -59,11 +59,11 @@ def refuse_targets_in_lenses(cfg: DictConfig) -> None:
         if name != "lens":
             continue
         lens = _at(plain, package or name)
-        if any(key in _HYDRAS for mapping in _mappings(lens) for key in mapping):
-            raise InputError(
-                f"{package or name}: a prescription is data and makes nothing; '_target_' and its "
-                "like are not allowed"
-            )
+        for path, mapping in _mappings(package or name, lens):
+            for key in sorted(_HYDRAS.intersection(mapping)):
+                raise InputError(
+                    f"{path}: unknown key '{key}'; a prescription is data and makes nothing"
+                )
 
 
 def refuse_missing(cfg: DictConfig, parts: Sequence[str]) -> None:
@@ -159,8 +159,10 @@ def _at(plain: Any, path: str) -> Any:
     return plain
 
 
-def _mappings(node: Any) -> Iterator[Mapping[str, Any]]:
+def _mappings(path: str, node: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """All mappings within a node, with their dotted paths."""
+    inner = node if isinstance(node, dict) else dict(enumerate(node)) if type(node) is list else {}
     if isinstance(node, dict):
-        yield node
-    for value in node.values() if isinstance(node, dict) else node if type(node) is list else ():
-        yield from _mappings(value)
+        yield path, node
+    for key, value in inner.items():
+        yield from _mappings(f"{path}.{key}", value)

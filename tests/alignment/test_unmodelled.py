@@ -216,7 +216,7 @@ def test_waves_and_rays_agree_on_centroid_and_width(prescription):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"radii": 0.1}, "unmodelled: unknown key 'radii' \\(allowed: radius, index"),
+        ({"radii": 0.1}, "unmodelled: unknown key 'radii'; did you mean 'radius'"),
         ({"radius": -0.1}, "unmodelled.radius: -0.1; allowed: from 0 to 0.5"),
         ({"index": 1.0}, "unmodelled.index: 1.0; allowed: from 0 to 0.2"),
         ({"background": -1.0}, "unmodelled.background: -1.0; allowed: 0 or more"),

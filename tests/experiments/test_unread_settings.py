@@ -78,7 +78,7 @@ UNKNOWN = {
     ),
     "a class that makes itself from a lens file": (
         "+lens.elements.front._target_=os.system",
-        "lens: a prescription is data and makes nothing",
+        "lens.elements.front: unknown key '_target_'; a prescription is data and makes nothing",
     ),
 }
 
@@ -92,7 +92,9 @@ def test_a_key_that_no_class_takes_is_one_line_with_the_nearest(composed, case):
 
 
 def test_the_published_lens_is_data_too(composed):
-    with pytest.raises(InputError, match=r"^published: a prescription is data and makes nothing"):
+    with pytest.raises(
+        InputError, match=r"^published: unknown key .*; a prescription is data and makes nothing"
+    ):
         checked(composed("experiment=asphere", "+published._target_=os.system"))
 
 
