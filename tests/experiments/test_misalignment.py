@@ -69,15 +69,15 @@ def test_poses_are_found_and_what_was_found_first_is_held(composed, tmp_path):
 
 def test_a_resumed_run_ends_with_the_same_poses_to_the_bit(composed, tmp_path):
     """Within a stage of Adam, within least squares of either kind, and within the second fit."""
-    settings = [*TINY, *SHORT, "callbacks.last.every_n_train_steps=1"]
-    untested = ["test=false", "objective=train/loss"]
-    run(composed(*settings, *untested, folder="whole"))
-    whole = state(tmp_path / "whole")
+    settings = [*TINY, *SHORT, "test=false", "objective=train/loss"]
+    each = ["callbacks.last.every_n_train_steps=1", "+callbacks.last.save_top_k=-1"]
+    run(composed(*settings, *each, "callbacks.last.filename='{step}'", folder="whole"))
+    run(composed(*settings, folder="plain"))
+    whole = state(tmp_path / "plain")
     for stop in (1, 3, 5, 8):
-        part, resumed = f"part_{stop}", f"resumed_{stop}"
-        run(composed(*settings, *untested, f"+trainer.max_steps={stop}", folder=part))
-        last = f"ckpt_path={tmp_path / part / 'checkpoints/last.ckpt'}"
-        run(composed(*settings, *untested, last, folder=resumed))
+        resumed = f"resumed_{stop}"
+        last = f"ckpt_path='{tmp_path / 'whole/checkpoints' / f'step={stop}.ckpt'}'"
+        run(composed(*settings, last, folder=resumed))
         again = state(tmp_path / resumed)
         assert whole.keys() == again.keys()
         for name, value in whole.items():
