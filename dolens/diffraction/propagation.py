@@ -88,7 +88,7 @@ def choose_propagation(
     half_window: float,
     settings: DiffractionSettings | None = None,
 ) -> Propagation:
-    """Whether pupils may be propagated by a Fourier transform.
+    """Return whether pupils may be propagated by a Fourier transform.
 
     They may where the fitted path difference, and the distance from the reference sphere taken as
     linear in the direction cosines, are right to `settings.phase_error`, and the image is displaced

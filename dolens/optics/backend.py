@@ -93,7 +93,7 @@ def with_chosen_backend(system: OpticalSystem, others: Iterable[Tensor] = ()) ->
 
 
 def cpu_kernels_serve(system: OpticalSystem, others: Iterable[Tensor] = ()) -> bool:
-    """Whether what is done with a lens's rays is done by the CPU's fused kernels too.
+    """Return whether what is done with a lens's rays is done by the CPU's fused kernels too.
 
     These render, splat and look up images; on other devices PyTorch's operations do.
     """
@@ -268,7 +268,7 @@ def _tensors(system: OpticalSystem, rays: Rays | None) -> Iterator[Tensor]:
 
 
 def _transformed(tensors: Iterable[Tensor]) -> bool:
-    """Whether any tensor is seen through torch.func, or carries a tangent."""
+    """Return whether any tensor is seen through torch.func, or carries a tangent."""
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     forward = forward_ad._current_level >= 0
     return any(

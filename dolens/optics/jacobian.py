@@ -268,7 +268,7 @@ def _with_leaves(
 
 
 def _has_kernel(system: OpticalSystem, rays: Rays) -> bool:
-    """Whether the CPU's kernels differentiate; on a GPU the reference does, and says so."""
+    """Return whether the CPU's kernels differentiate; on a GPU the reference does, and says so."""
     chosen = choose_backend(system, rays)
     if chosen == "cuda":
         if system.backend == "cuda":

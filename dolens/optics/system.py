@@ -74,7 +74,7 @@ class OpticalSystem:
 
     @cached_property
     def rotationally_symmetric(self) -> bool:
-        """Whether nothing in the lens singles out a direction across the axis."""
+        """Return whether nothing in the lens singles out a direction across the axis."""
         surfaces = all(s.shape.rotational and s.aperture.rotational for s in self.surfaces)
         return surfaces and not self.elements
 

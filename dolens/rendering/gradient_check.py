@@ -47,7 +47,7 @@ class GradientRow:
         return abs(self.autograd - self.difference) / size if size > 0.0 else 0.0
 
     def agrees(self, share: float, sigmas: float = 3.0) -> bool:
-        """Whether the two agree within a share of the derivative or some standard errors."""
+        """Return whether the two agree within a share of the derivative or some standard errors."""
         size = max(abs(self.autograd), abs(self.difference))
         allowed = max(share * size, sigmas * self.noise)
         return abs(self.autograd - self.difference) <= allowed

@@ -57,7 +57,7 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class Training:
-    """How the parameters of a camera move.
+    """Settings of how the parameters of a camera move.
 
     Attributes:
         optimizer: parameter groups → optimizer; a `CameraOptimizer` may move the lens apart.

@@ -1,4 +1,4 @@
-"""What a checkpoint says of the run that wrote it, and what a run that takes it up may change."""
+"""Checkpoints name the run that wrote them, and limit what a run that resumes may change."""
 
 import logging
 from collections.abc import Iterator, Mapping

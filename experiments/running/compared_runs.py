@@ -114,7 +114,7 @@ def grouped(runs: Sequence[Run]) -> dict[str, dict[int, Run]]:
 
 
 def _differences(runs: Sequence[Run]) -> list[str]:
-    """What tells each run apart from the others, first by Hydra's choices, then key by key."""
+    """Return what tells each run from the others: first Hydra's choices, then key by key."""
     choices = _differing([run.choices for run in runs])
     prefixes = tuple(f"{_package(choice)}." for choice in choices)
     keys = _differing([run.config for run in runs])
@@ -144,7 +144,7 @@ def _differing(mappings: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def _package(choice: str) -> str:
-    """Where a group of Hydra's ends up in the configuration: `sensor@views.sensor`, `a/b`."""
+    """Return where a Hydra group ends up in the configuration: `sensor@views.sensor`, `a/b`."""
     group, _, package = choice.partition("@")
     return package or group.replace("/", ".")
 

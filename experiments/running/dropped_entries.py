@@ -86,7 +86,7 @@ def _files() -> list[Mapping[str, Any]] | None:
 
 
 def _gives(content: Any, place: Place) -> bool:
-    """Whether a file has an entry, and does not drop it."""
+    """Return whether a file has an entry, and does not drop it."""
     for key in place:
         if not isinstance(content, dict) or key not in content:
             return False

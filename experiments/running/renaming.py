@@ -182,7 +182,7 @@ def _text(value: Any) -> str:
 
 
 def _change(path: str, value: Any, renamed: Renamed) -> Change | None:
-    """What has become of a setting; None where it is as it was."""
+    """Return what has become of a setting; None where it is as it was."""
     if path.rpartition(".")[2] == "_target_" and value in renamed.targets:
         return Change(path, path, value, renamed.targets[value])
     for key in renamed.keys:
@@ -197,7 +197,7 @@ def _change(path: str, value: Any, renamed: Renamed) -> Change | None:
 
 
 def _moved_with(path: str, value: Any, renamed: Renamed) -> Change | None:
-    """What has become of a setting by what has become of the mapping that holds it."""
+    """Return what has become of a setting whose mapping has another name."""
     parent, dot, name = path.rpartition(".")
     if not dot:
         return None
@@ -229,7 +229,7 @@ def _settings(
 
 
 def _is_taken(path: str, holder: Mapping[str, Any]) -> bool:
-    """Whether a class that stands beside a key takes it."""
+    """Return whether a class that stands beside a key takes it."""
     name, target = path.rpartition(".")[2], holder.get("_target_")
     if name == "_target_" or not isinstance(target, str):
         return False

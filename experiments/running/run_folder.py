@@ -1,4 +1,4 @@
-"""What a run leaves behind besides what Hydra and Lightning write: run.json and metrics.json."""
+"""The files run.json and metrics.json of a run folder."""
 
 import json
 import math
@@ -33,7 +33,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def describe_run(seed: int, device: str, dtype: str, command: list[str]) -> dict[str, Any]:
-    """What one needs to know to repeat a run: code, versions, machine, seed."""
+    """Return what one needs to know to repeat a run: code, versions, machine, seed."""
     return {
         "command": command,
         "device": device,

@@ -1,4 +1,4 @@
-"""What Hydra is to make: keys that no class takes, and settings that are missing, are errors."""
+"""Keys that no class takes, and settings that are missing, are errors."""
 
 import inspect
 import pkgutil
@@ -153,7 +153,7 @@ def arguments_of(make: Callable[..., Any]) -> list[str] | None:
 
 
 def _at(plain: Any, path: str) -> Any:
-    """What lies at a path; None where there is nothing."""
+    """Return the value at a path; None where there is nothing."""
     for key in path.split("."):
         plain = plain.get(key) if isinstance(plain, dict) else None
     return plain

@@ -135,7 +135,7 @@ def refuse_idle_checkpoint(settings: RunSettings, module: Experiment) -> None:
 
 
 def summary_of(module: Experiment) -> dict[str, float]:
-    """What a module says of the whole run; nothing where it fails, which is logged.
+    """Return the numbers of the whole run; none where the module fails, which is logged.
 
     The run is finished: what was measured before must not be lost with this.
     """

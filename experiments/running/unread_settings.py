@@ -84,7 +84,7 @@ def _set_by_command_line() -> Iterator[str]:
 
 
 def _path_of(override: Override) -> str | None:
-    """Where an override puts its value; None where it deletes."""
+    """Return the path of an override's value; None where it deletes."""
     if override.is_delete():
         return None
     path = override.package if override.package is not None else override.key_or_group
@@ -109,7 +109,7 @@ def _without_experiment(name: str, sources: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _has_content(cfg: DictConfig, path: str) -> bool:
-    """Whether there is something at a path that could be read."""
+    """Return whether there is something at a path that could be read."""
     try:
         node = OmegaConf.select(cfg, path, throw_on_missing=False)
     except OmegaConfBaseException:

@@ -154,7 +154,7 @@ def render_rows(
 
 
 def _is_slow(subject: Subject, contender: Contender) -> bool:
-    """Whether it traces many rays for each pixel and wavelength."""
+    """Return whether it traces many rays for each pixel and wavelength."""
     renderer, sensor = contender.renderer, subject.sensor
     values = sensor.height * sensor.width * len(subject.scene.wavelengths)
     return renderer.monte_carlo and renderer.rays_per_image(subject.scene) > _MANY * values

@@ -46,7 +46,7 @@ class Tolerances:
         return agreement.excess(self.cosine, self.norm) if agreement else 0.0
 
     def serves_still(self, before: Agreement | None, now: Agreement | None) -> bool:
-        """Whether gradients are within their tolerance, or hardly worse than they were."""
+        """Return whether gradients are within their tolerance, or hardly worse than they were."""
         return self.excess(now) <= max(1.0, 1.5 * self.excess(before))
 
     def misses(self, choice: "Choice") -> list[str]:

@@ -16,7 +16,7 @@ from dolens.rendering.pupil.limiting_aperture import (
 
 
 def depends_on_parameters(system: OpticalSystem) -> bool:
-    """Whether gradients with respect to any of a lens's parameters are wanted."""
+    """Return whether gradients with respect to any of a lens's parameters are wanted."""
     if not torch.is_grad_enabled():
         return False
     tensors = [system.sensor_distance, *system.thicknesses]
