@@ -118,10 +118,10 @@ def diffracted_light(
     fit = fit_pupil(front, _DEGREE)
     wave = MM_PER_NM * float(front.wavelength) / float(front.index)
     width = (fit.high - fit.low)[0]
-    landing = front.intercept[0][front.coverage[0] > 0.0]
-    if not len(landing):
+    intercepts = front.intercept[0][front.coverage[0] > 0.0]
+    if not len(intercepts):
         raise InputError("unmodelled.diffraction: no light from the source reaches the sensor")
-    low, high = landing.amin(0), landing.amax(0)
+    low, high = intercepts.amin(0), intercepts.amax(0)
     # An edge's first fringe is as wide as √(λ·d), d the way to the focus: the spot over its cone;
     # in the focus as λ over the cone.
     fringe = torch.maximum((wave * (high - low) / width).sqrt(), wave / width).amax()

@@ -14,7 +14,7 @@ from dolens.errors import InputError
 METHODS = ("auto", "fourier", "direct")
 # Fewest samples across a pupil, so that its edge is where it belongs, and most.
 _FEWEST, _MOST = 96, 2048
-# Airy radii around the rays' landing points within which phases must be right.
+# Airy radii around the ray intercepts within which phases must be right.
 _AIRY_RADII = 10.0
 # Largest difference of the flux through the fitted pupil and of that of the rays, relative.
 _FLUX = 0.01

@@ -17,7 +17,7 @@ _ORDERS, _SMALL = (7, 13, 25), 1e-3
 
 
 class ChiefRayMap(NamedTuple):
-    """Polynomials of where a sensor's pixels look.
+    """Polynomials of the object points of a sensor's pixels.
 
     Attributes:
         coefficients: (2, D, C, n, n), of Chebyshev's polynomials along rows and columns: rows and
@@ -29,7 +29,7 @@ class ChiefRayMap(NamedTuple):
     sensor: Sensor
 
     def of_window(self, window: Sensor) -> tuple[Tensor, Tensor]:
-        """Rows and columns that a window's pixels look at, each (D, C, height, width)."""
+        """Return rows and columns of a window's object points, each (D, C, height, width)."""
         order, device = self.coefficients.shape[-1], self.coefficients.device
         sides = []
         for whole, centre, part, own in (
@@ -66,7 +66,7 @@ def fit_chief_ray_map(imaging: ImagingSystem) -> ChiefRayMap | None:
             for side in (sensor.height, sensor.width)
         )
         row, column = torch.meshgrid(down, across, indexing="ij")
-        found = _seen(imaging, row, column)
+        found = _object_points(imaging, row, column)
         transform = _to_coefficients(order).to(device)
         coefficients = transform @ found @ transform.mT
         last = torch.maximum(
@@ -112,10 +112,10 @@ def _by_itself(imaging: ImagingSystem, window: Sensor) -> tuple[Tensor, Tensor]:
         torch.arange(window.width, **options),
         indexing="ij",
     )
-    return _seen(imaging, row, column).unbind(0)
+    return _object_points(imaging, row, column).unbind(0)
 
 
-def _seen(imaging: ImagingSystem, row: Tensor, column: Tensor) -> Tensor:
+def _object_points(imaging: ImagingSystem, row: Tensor, column: Tensor) -> Tensor:
     """(2, D, C, ...) of pixels (...)."""
     points = imaging.sensor.positions(row.reshape(-1), column.reshape(-1))
     found = torch.stack([c.double().permute(1, 2, 0) for c in chief_ray_points(imaging, points)])

@@ -28,7 +28,7 @@ def convolve_patches(textures: Tensor, kernels: Tensor, layout: PatchLayout) -> 
     Args:
         textures: (B, D or 1, C or 1, H, W).
         kernels: (N, D or 1, C or 1, K, K), K odd, sums of quadratic B-splines.
-        layout: N patches, and where their pixels look.
+        layout: N patches, and the object points of their pixels.
 
     Returns:
         (B, D, C, height, width).
@@ -63,12 +63,12 @@ class _Convolution(torch.autograd.Function):
     ):
         ctx.settings = settings
         patches = settings.layout.patches
-        looks = None if rows is None else Coordinates(rows, columns)
+        object_points = None if rows is None else Coordinates(rows, columns)
         shape = (settings.depths, settings.channels, *settings.layout.image_size)
         image = textures.new_zeros((textures.shape[0], *shape))
-        seen_by = _Tiles(textures, kernels.shape[-1], settings, looks)
+        tiles = _Tiles(textures, kernels.shape[-1], settings, object_points)
         for node, patch in enumerate(patches):
-            tile = seen_by(patch)
+            tile = tiles(patch)
             seen = tile.see(tile.texture_spectrum() * tile.kernel_spectrum(kernels[node]))
             image[..., patch.top : patch.bottom, patch.left : patch.right] += patch.weight * seen
         # Where all patches see the same texels, their spectrum is kept for the way back.
@@ -80,16 +80,16 @@ class _Convolution(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         textures, kernels, rows, columns, spectrum = ctx.saved_tensors
-        looks = None if rows is None else Coordinates(rows, columns)
+        object_points = None if rows is None else Coordinates(rows, columns)
         of_textures, of_kernels, of_rows, of_columns = (
             torch.zeros_like(t) if needed else None
             for t, needed in zip(
                 (textures, kernels, rows, columns), ctx.needs_input_grad[:4], strict=True
             )
         )
-        seen_by = _Tiles(textures, kernels.shape[-1], ctx.settings, looks, spectrum)
+        tiles = _Tiles(textures, kernels.shape[-1], ctx.settings, object_points, spectrum)
         for node, patch in enumerate(ctx.settings.layout.patches):
-            tile = seen_by(patch)
+            tile = tiles(patch)
             area = (..., slice(patch.top, patch.bottom), slice(patch.left, patch.right))
             part = patch.weight * gradient[area]
             if of_kernels is not None or of_textures is not None:

@@ -27,7 +27,7 @@ class Patch(NamedTuple):
 
 
 class Coordinates(NamedTuple):
-    """Fractional rows and columns of the texture that each pixel of the image looks at.
+    """Fractional rows and columns, in the texture, of the object point of each pixel.
 
     Attributes:
         rows: (D, C, height, width).
@@ -40,14 +40,14 @@ class Coordinates(NamedTuple):
 
 @dataclass(frozen=True)
 class PatchLayout:
-    """The patches of an image, and where its pixels look in the texture.
+    """The patches of an image, and the object points of its pixels in the texture.
 
     Attributes:
         patches: N of them.
         image_size: height and width.
-        origin: row and column of the texture that pixel (0, 0) looks at, where there are no
+        origin: row and column of the object point of pixel (0, 0), where there are no
             `coordinates`.
-        coordinates: where the pixels look, if that is not simply every pixel a texel further.
+        coordinates: object points of the pixels, if they are not simply a texel apart.
         fused: whether the CPU's kernels look up and splat, else PyTorch's operations.
     """
 

@@ -17,7 +17,7 @@ class PlaneBlur:
 
     Attributes:
         kernels: (N, D or 1, C or 1, K, K), differentiable.
-        layout: N patches, and where their pixels look.
+        layout: N patches, and the object points of their pixels.
         illumination: (C or 1, height, width), what the image of every plane is multiplied by; or
             None.
     """
@@ -58,24 +58,24 @@ class PlaneBlur:
 
 
 def places_in_texture(
-    imaging: ImagingSystem, size: tuple[int, int], look: tuple[Tensor, Tensor] | None
+    imaging: ImagingSystem, size: tuple[int, int], object_points: tuple[Tensor, Tensor] | None
 ) -> tuple[tuple[int, int], Coordinates | None]:
-    """Find where the pixels of a sensor look in a texture.
+    """Find the object points of a sensor's pixels in a texture.
 
     Args:
         imaging: the sensor, and the scene that says where the texture's centre lies.
         size: height and width of the texture.
-        look: rows and columns where the pixels' chief rays meet the planes, each
+        object_points: rows and columns where the pixels' chief rays meet the planes, each
             (D, C, height, width); None: where a pinhole sees them.
 
     Returns:
-        Row and column that pixel (0, 0) looks at, where the others follow texel by texel, and None;
-        else (0, 0) and the coordinates of all pixels.
+        Row and column of the object point of pixel (0, 0), where the others follow texel by texel,
+        and None; else (0, 0) and the coordinates of all pixels.
     """
     scene, sensor = imaging.scene, imaging.sensor
     row, column = texture_origin(size, scene.texture_centre)
-    if look is not None:
-        down, across = look
+    if object_points is not None:
+        down, across = object_points
         return (0, 0), Coordinates(down + row, across + column)
     top = row - (0.5 * (sensor.height - 1) - sensor.centre_row)
     left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)

@@ -138,7 +138,7 @@ class PsfRenderer(Renderer):
         """Image each texture on a window of its own, all at once; see `Renderer.render_windows`.
 
         Rays of all windows are traced together, through a pupil that serves the whole sensor, and
-        one set of polynomials says where the windows look.
+        one set of polynomials gives the object points of all windows.
         """
         shown = [(window, texture[None]) for window, texture in zip(windows, textures, strict=True)]
         return torch.cat(self._render(lens, scene, shown, seed, values))
@@ -169,16 +169,16 @@ class PsfRenderer(Renderer):
         x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
         found = self.point_spread_functions(imaging, seed, (x, y))
         self._warn_of_loss(found)
-        looks = [None] * len(windows)
+        object_points = [None] * len(windows)
         if self.registration == "chief_rays":
-            looks = chief_ray_maps(imaging, windows)
+            object_points = chief_ray_maps(imaging, windows)
         nodes, images = self.fields[0] * self.fields[1], []
-        for i, (part, look) in enumerate(zip(parts, looks, strict=True)):
+        for i, (part, points) in enumerate(zip(parts, object_points, strict=True)):
             own = slice(i * nodes, (i + 1) * nodes)
             functions = found._replace(functions=found.functions[own], light=found.light[own])
             placed = replace(scene, texture_centre=shown[i][0].texture_centre)
             seen = replace(imaging, scene=placed, sensor=part.sensor)
-            images.append(part._blurred(seen, textures[i], functions, look))
+            images.append(part._blurred(seen, textures[i], functions, points))
         return images
 
     def _blurred(
@@ -186,17 +186,18 @@ class PsfRenderer(Renderer):
         imaging: ImagingSystem,
         textures: Tensor,
         found: FieldPointSpreadFunctions,
-        look: tuple[Tensor, Tensor] | None,
+        object_points: tuple[Tensor, Tensor] | None,
     ) -> Tensor:
-        """The image by functions that are known; `look` is where chief rays meet the scene, None
-        for a pinhole's.
+        """Render by known point spread functions.
+
+        `object_points` are those of the chief rays, None for a pinhole's.
         """
         scene, area = imaging.scene, (self.sensor.height, self.sensor.width)
         size = (textures.shape[-2], textures.shape[-1])
         layout = PatchLayout(
             patches(*area, *self.fields, textures),
             area,
-            *places_in_texture(imaging, size, look),
+            *places_in_texture(imaging, size, object_points),
             cpu_kernels_serve(imaging.system),
         )
         blur = PlaneBlur(found.functions, layout)

@@ -167,7 +167,7 @@ class Trial:
         return samples, noise, of_rays / psf_cost(renderer, self.scene, surfaces)
 
     def _windows(self) -> Sequence[SensorWindow]:
-        """The parts of the sensor, and where they look, to a whole texel."""
+        """The parts of the sensor with their object points, to a whole texel."""
         sensor, windows = self.probes.sensor, list(self.probes.windows.values())
         if not windows:
             centre = (float(round(sensor.centre_row)), float(round(sensor.centre_column)))
@@ -175,10 +175,10 @@ class Trial:
         system, wavelengths = self._double.system(), (self.scene.middle_wavelength,)
         middle = as_planes(self.scene, wavelengths=wavelengths)
         pupil = paraxial_exit_pupil(system, wavelengths)
-        looks = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), windows)
+        object_points = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), windows)
         return [
-            SensorWindow(window, tuple(float(c.mean().round()) for c in look))
-            for window, look in zip(windows, looks, strict=True)
+            SensorWindow(window, tuple(float(c.mean().round()) for c in points))
+            for window, points in zip(windows, object_points, strict=True)
         ]
 
     def _rendered_by_rays(self) -> Sequence[Reference]:
@@ -209,7 +209,7 @@ class Trial:
         return render
 
     def _placed(self, window: SensorWindow) -> PlanarScene:
-        """The scene with its textures where a window looks."""
+        """The scene with its textures at the object points of a window."""
         return replace(self.scene, texture_centre=window.texture_centre)
 
 

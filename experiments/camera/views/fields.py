@@ -117,8 +117,8 @@ class FieldViews(Imaging):
             def loss(image: Tensor, textures: Tensor, values: Mapping[str, Tensor]) -> Tensor:
                 raw = self._raw(image.to(lens.dtype), self.seed)
                 textures = textures.to(raw)
-                looks, _ = self._looked_at(lens, values, [w.sensor for w in windows])
-                truth = _seen(textures, looks, windows)[:, None]
+                object_points, _ = self._chief_ray_points(lens, values, [w.sensor for w in windows])
+                truth = _sampled(textures, object_points, windows)[:, None]
                 field = torch.stack([self.windows.coordinates(w.sensor, textures) for w in windows])
                 return comparison.loss(Views(truth, raw, field[:, None]), values)
 
@@ -140,9 +140,9 @@ class FieldViews(Imaging):
         rows = [self._shown(stage, index * count + i) for i in range(count)]
         sensors = [window for row in rows for window in row]
         repeated = textures.repeat_interleave(len(rows[0]), dim=0)
-        looks, centres = self._looked_at(lens, values, sensors)
+        object_points, centres = self._chief_ray_points(lens, values, sensors)
         windows = [SensorWindow(*pair) for pair in zip(sensors, centres, strict=True)]
-        truth = _seen(repeated, looks, windows)
+        truth = _sampled(repeated, object_points, windows)
         renderer = self._training if stage == "train" else self.evaluation_renderer
         image = renderer.render_windows(lens, self.scene, repeated, windows, seed, values)
         field = torch.stack([self.windows.coordinates(window, textures) for window in sensors])
@@ -159,17 +159,17 @@ class FieldViews(Imaging):
         zones = [self.windows.zone(share, number) for share in self.zones.values()]
         return [*zones, self.windows.anywhere(generator)]
 
-    def _looked_at(
+    def _chief_ray_points(
         self, lens: Lens, values: Mapping[str, Tensor], windows: Sequence[Sensor]
     ) -> tuple[list[tuple[Tensor, Tensor]] | None, list[tuple[float, float]]]:
-        """Rows and columns that windows look at, None for a pinhole's, and where their textures
-        lie, to a whole texel: `texture_centre` of each.
+        """Return the object points of windows (rows and columns; None for a pinhole's), and where
+        their textures lie, to a whole texel: `texture_centre` of each.
         """
         if self.truth == "pinhole":
             centres = [(float(round(w.centre_row)), float(round(w.centre_column))) for w in windows]
             return None, centres
-        looks = reference_chief_ray_map(lens, values, self.scene, self.whole, windows)
-        return looks, [nearest_texel(rows, columns) for rows, columns in looks]
+        object_points = reference_chief_ray_map(lens, values, self.scene, self.whole, windows)
+        return object_points, [nearest_texel(rows, columns) for rows, columns in object_points]
 
     def point_spread_functions(
         self,
@@ -200,13 +200,13 @@ class FieldViews(Imaging):
         return [gaussian_quadrature(lens, fields, wavelengths, rings, arms, depth, symmetry=False)]
 
 
-def _seen(
+def _sampled(
     textures: Tensor,
-    looks: Sequence[tuple[Tensor, Tensor]] | None,
+    object_points: Sequence[tuple[Tensor, Tensor]] | None,
     windows: Sequence[SensorWindow],
 ) -> Tensor:
-    """Textures (W, 3, h, w) where windows look, by a pinhole where it is not said where."""
-    if looks is None:
+    """Return textures (W, 3, h, w) at the object points of windows, a pinhole's where None."""
+    if object_points is None:
         found = [
             pinhole_image(texture, window.sensor, window.texture_centre)
             for texture, window in zip(textures, windows, strict=True)
@@ -214,6 +214,6 @@ def _seen(
         return linear_to_srgb(torch.stack(found))
     found = [
         sample_texture(texture, rows[0], columns[0], window.texture_centre)
-        for texture, (rows, columns), window in zip(textures, looks, windows, strict=True)
+        for texture, (rows, columns), window in zip(textures, object_points, windows, strict=True)
     ]
     return linear_to_srgb(torch.stack(found))

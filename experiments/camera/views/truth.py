@@ -48,8 +48,8 @@ def reference_chief_ray_map(
     pupil = differentiable_chief_pupil(
         system, wavelengths, paraxial_exit_pupil(system, wavelengths)
     )
-    looks = chief_ray_maps(ImagingSystem(system, planes, whole, pupil), windows)
-    return [(rows[:, 0], columns[:, 0]) for rows, columns in looks]
+    object_points = chief_ray_maps(ImagingSystem(system, planes, whole, pupil), windows)
+    return [(rows[:, 0], columns[:, 0]) for rows, columns in object_points]
 
 
 def sample_texture(
