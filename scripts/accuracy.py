@@ -1,4 +1,4 @@
-"""How wrong dolens is: reference rays, and the registration of the ground truth.
+"""Measure the errors of dolens: of reference rays, and of the registration of the ground truth.
 
 python scripts/accuracy.py
 """

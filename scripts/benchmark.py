@@ -1,4 +1,4 @@
-"""How fast tracing is on this machine, beside its error: reference, kernels, and other programs.
+"""Measure the speed of tracing beside its error: reference, kernels, and other programs.
 
 python scripts/benchmark.py --quick        about two minutes
 python scripts/benchmark.py                everything; about three quarters of an hour on two cores
@@ -160,7 +160,7 @@ def _on_cpu(threads: list[int]) -> dict:
 
 
 def _environment(options: argparse.Namespace, cores: int) -> dict:
-    """What ran where."""
+    """Return the programs and the machine of a measurement."""
     processor = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():

@@ -1,4 +1,4 @@
-"""Where wavefront coding wins: its gain over the best plain lens, against light and depth range.
+"""Measure the gain of wavefront coding over the best plain lens, against light and depth range.
 
     python scripts/coding_gain.py bound                # by linear filters: seconds, no training
     python scripts/coding_gain.py train --folder runs  # trains coded and plain cameras: hours

@@ -37,7 +37,7 @@ def views_of(group: Group, metric: str) -> tuple[str, ...]:
 
 
 def gain(group: Group, against: Group, metric: str, view: str) -> Interval | None:
-    """What a group gains in a view, over the seeds that both have; None where they share none.
+    """Return the gain of a group in a view over the seeds that both have; None where they share none.
 
     The interval is NaN where a run kept no scores of photographs, or of others than the rest.
     """
@@ -132,7 +132,7 @@ def _value(run: Run, metric: str, view: str) -> float:
 
 
 def _photographs(group: Group) -> str:
-    """How many photographs each of the runs was tested on."""
+    """Return how many photographs each of the runs was tested on."""
     counts = {len(run.scores.photographs) if run.scores else "?" for run in group.values()}
     return ", ".join(sorted(map(str, counts)))
 

@@ -74,7 +74,7 @@ def evaluated_spots(folder: Path, lens: Lens) -> SpotRays:
 
 
 def intercept(lens: Lens, values: dict, spots: SpotRays, ray: int) -> list[float]:
-    """Where a ray lands, mm."""
+    """Return the ray intercept on the sensor, mm."""
     status, _, point, *_ = exact.trace(
         lens,
         values,

@@ -1,4 +1,4 @@
-"""How long a camera trains until it reaches a PSNR, by the model that renders its images.
+"""Measure the training time of a camera to a PSNR, by the model that renders its images.
 
     python scripts/training_time.py train --folder runs --models auto auto_geometric rays wave
     python scripts/training_time.py show runs/* --figure training_time.png
@@ -54,7 +54,7 @@ class Training:
     test_wave: float
 
     def seconds(self, step: int) -> float:
-        """Of training up to a step; plans are spread over the steps."""
+        """Return the seconds of training up to a step; plans are spread over the steps."""
         return step * (self.step_seconds + self.plan_seconds / max(self.curve))
 
     def first(self, psnr: float) -> int | None:
@@ -71,7 +71,7 @@ class Training:
 
 
 def read_training(folder: Path) -> Training:
-    """What a run folder says of its training.
+    """Read the training of a run folder.
 
     Raises:
         InputError: no finished run with a validation curve.

@@ -104,7 +104,7 @@ def print_summary(lines: Sequence[dict]) -> None:
 
 
 def _many(rows: list[Row]) -> list[Row]:
-    """Of all threads, and of many rays where there are any."""
+    """Return the rows of all threads, and of many rays where there are any."""
     if not rows:
         return rows
     threads = max(row.threads for row in rows)

@@ -28,7 +28,7 @@ def reference_case(case: Case) -> Case:
 
 @torch.no_grad()
 def sensor_error(case: Case, reference: Case) -> tuple[float, float, int]:
-    """Of rays valid in both: largest distance of sensor points, mm.
+    """Return the largest distance of sensor points, mm, of rays valid in both.
 
     Returns:
         The error, the share of valid rays, and the number of rays valid in one only.

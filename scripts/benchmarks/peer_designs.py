@@ -91,7 +91,7 @@ def _compare(results: Results, problem: Problem, threads: int, rounds: int) -> N
 
 @dataclass(frozen=True)
 class Reached:
-    """Where our search ended: merit, iterations, and why if before the target."""
+    """The end of our search: merit, iterations, and why if before the target."""
 
     merit: float
     iterations: int

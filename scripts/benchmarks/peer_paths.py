@@ -1,4 +1,4 @@
-"""Where other programs lie: the command line's words, what is skipped, and versions."""
+"""Paths of other programs: the command line's words, what is skipped, and versions."""
 
 import re
 import sys
@@ -13,7 +13,7 @@ from dolens.errors import InputError
 
 
 def parse(words: Sequence[str]) -> dict[str, Path]:
-    """Where the peers lie, by the words that name them: `do=PATH deeplens=PATH optiland=PATH`.
+    """Read paths of peers from words: `do=PATH deeplens=PATH optiland=PATH`.
 
     Raises:
         InputError: a word of another form, an unknown name, or a path without the program.
@@ -55,7 +55,7 @@ def make_importable(paths: Mapping[str, Path]) -> None:
 
 
 def describe(paths: Mapping[str, Path]) -> str:
-    """Which peers run, and their versions as far as their folders tell."""
+    """Return the peers that run, and their versions as far as their folders tell."""
     return "; ".join(
         f"{peer.name} {_version(peer, paths[peer.word])}"
         if peer.word in paths

@@ -78,7 +78,7 @@ class SourceProgram(Peer):
         self._curved = [(n, numbers.index(n)) for n, _ in _curved(lens)]
 
     def sensor_points(self, rays: Rays, gradients: bool) -> tuple[Tensor, dict[str, Tensor]]:
-        """As `Peer`; the leaves are curvatures."""
+        """Trace as `Peer` says; the leaves are curvatures."""
         leaves = {}
         for number, place in self._curved:
             surface = self.model.surfaces[place]
@@ -141,7 +141,7 @@ class DeepLens(Peer):
                 self._curved[number] = made
 
     def sensor_points(self, rays: Rays, gradients: bool) -> tuple[Tensor, dict[str, Tensor]]:
-        """As `Peer`; the leaves are curvatures."""
+        """Trace as `Peer` says; the leaves are curvatures."""
         leaves = {}
         for number, surface in self._curved.items():
             surface.c = leaves[number] = surface.c.detach().requires_grad_(gradients)
@@ -174,7 +174,7 @@ class Optiland(Peer):
         }
 
     def sensor_points(self, rays: Rays, gradients: bool) -> tuple[Tensor, dict[str, Tensor]]:
-        """As `Peer`; the leaves are radii."""
+        """Trace as `Peer` says; the leaves are radii."""
         from optiland.rays import RealRays
 
         be = self._backend

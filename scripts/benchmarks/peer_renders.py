@@ -79,7 +79,7 @@ class SourceRender:
         return torch.stack(images)
 
     def gradient(self) -> Tensor:
-        """Of the mean squared image, in the plate's four cubic terms."""
+        """Return the gradient of the mean squared image with respect to the plate's cubic terms."""
         plate = self._model.surfaces[0]
         plate.ai = plate.ai.detach().requires_grad_()
         self.image().square().mean().backward()
@@ -151,7 +151,7 @@ def _image(lens: Lens, textures: Tensor, side: int, seed: int) -> Tensor:
 
 
 def _gradient(lens: Lens, textures: Tensor, side: int, seed: int) -> Tensor:
-    """As `SourceRender.gradient`."""
+    """Return the gradient as `SourceRender.gradient` does."""
     lens.requires_grad_(False)
     plate = lens.surfaces["5"]
     leaves = [getattr(plate, name).requires_grad_() for name in TERMS]

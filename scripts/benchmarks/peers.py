@@ -128,7 +128,7 @@ def _our_error(part: str, case: Case, exact: Case) -> dict[str, Any]:
 
 
 def _error(part: str, model: Peer, case: Case, exact: Case) -> dict[str, Any]:
-    """Of sensor points; of gradients in the curvatures, where all rays of the loss are valid."""
+    """Return the errors of sensor points, and of gradients where all rays of the loss are valid."""
     rays = compared_rays(case)
     with torch.no_grad():
         expected = exact.lens.trace(exact.rays)

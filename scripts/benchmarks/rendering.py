@@ -40,7 +40,7 @@ def _image(lens: Lens, pixels: int, seed: int, textures: Tensor) -> Tensor:
 
 
 def _gradient(lens: Lens, pixels: int, seed: int, textures: Tensor) -> dict[str, Tensor]:
-    """Of the mean squared image, in the plate's coefficients and the texture."""
+    """Return the gradient of the mean squared image: plate's coefficients and texture."""
     lens.zero_grad(set_to_none=True)
     leaf = textures.detach().requires_grad_()
     _image(lens, pixels, seed, leaf).square().mean().backward()

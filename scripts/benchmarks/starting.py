@@ -1,4 +1,4 @@
-"""How long a fresh process takes to its first traced rays, with and without compiled kernels."""
+"""Measure the time of a fresh process to its first traced rays, kernels compiled or not."""
 
 import json
 import os

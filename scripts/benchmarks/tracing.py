@@ -22,7 +22,7 @@ FORWARD = "forward"
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure.
+    """The settings of a measurement.
 
     Attributes:
         lenses: names of `cases`.
@@ -62,7 +62,7 @@ def gradient(case: Case, chunk: int, of_rays: bool) -> None:
 
 
 def gradients_by_name(case: Case, rays: Rays, of_rays: bool) -> dict[str, Tensor]:
-    """What `gradient` computes, by name; rays as one, directions without their own component."""
+    """Name the gradients of `gradient`; rays as one, directions without their own component."""
     case.lens.zero_grad(set_to_none=True)
     if of_rays:
         rays = _leaf(rays)
@@ -178,7 +178,7 @@ def _runner(part: str, case: Case, backend: str):  # noqa: ANN202 - a function o
 
 
 def _pieces(part: str, case: Case, backend: str, count: int) -> str:
-    """How the reference was run, where not all at once."""
+    """Return how the reference was run, where not all at once."""
     chunk = FORWARD_CHUNK if part == FORWARD else GRADIENT_CHUNK
     if backend != "reference" or case.count <= chunk:
         first = f"its first {case.count:.0e} rays: all need too much memory"

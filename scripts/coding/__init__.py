@@ -1,1 +1,1 @@
-"""Where wavefront coding wins: the parts of scripts/coding_gain.py."""
+"""The gain of wavefront coding: the parts of scripts/coding_gain.py."""
