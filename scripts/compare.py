@@ -37,7 +37,7 @@ def views_of(group: Group, metric: str) -> tuple[str, ...]:
 
 
 def gain(group: Group, against: Group, metric: str, view: str) -> Interval | None:
-    """Return the gain of a group in a view over the seeds that both have; None where they share none.
+    """Return the gain of a group in a view over the seeds that both have; None without such seeds.
 
     The interval is NaN where a run kept no scores of photographs, or of others than the rest.
     """
