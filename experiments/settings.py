@@ -1,13 +1,12 @@
-"""Settings that several experiments have, and checks of numbers."""
+"""Settings that several experiments have."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from experiments.checks import numbers_of
 
 
 @dataclass(frozen=True)
@@ -68,43 +67,3 @@ class Spots:
             lens.object_distance,
             symmetry=False,
         )
-
-
-def numbers_of(key: str, values: Any, count: int | None = None) -> list[float]:
-    """Return numbers of a configuration as floats.
-
-    Args:
-        key: their name in messages.
-        values: as they were given.
-        count: how many there must be; None: any.
-
-    Raises:
-        InputError: something else, or another count.
-    """
-    try:
-        numbers = [float(value) for value in values]
-    except (TypeError, ValueError):
-        raise InputError(f"{key}: must be numbers, not {values!r}") from None
-    if count is not None and len(numbers) != count:
-        raise InputError(f"{key}: {count} numbers are needed, not {len(numbers)}")
-    return numbers
-
-
-def check_count(key: str, number: Any) -> None:
-    """Refuse what is no integer of 1 or more.
-
-    Raises:
-        InputError: it is none.
-    """
-    if not (type(number) is int and number >= 1):
-        raise InputError(f"{key}: {number!r}; allowed: an integer of 1 or more")
-
-
-def check_positive(key: str, number: Any) -> None:
-    """Refuse what is no positive, finite number.
-
-    Raises:
-        InputError: it is none.
-    """
-    if not (isinstance(number, int | float) and 0.0 < number < math.inf):
-        raise InputError(f"{key}: {number!r}; allowed: a positive number")

@@ -9,7 +9,7 @@ from torch import nn
 
 from dolens.reconstruction import RelativisticDiscriminators
 from experiments.camera.reconstruction import Loss
-from experiments.settings import check_positive
+from experiments.checks import check_positive
 
 
 @dataclass(frozen=True)

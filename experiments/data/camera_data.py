@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dolens.errors import InputError
+from experiments.checks import check_count
 from experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
 from experiments.data.photographs import Photograph
 from experiments.data.resumable import ResumableLoader, ResumableSampler
@@ -242,8 +243,7 @@ class CropDataModule(lightning.LightningDataModule):
 
 
 def _count(key: str, value: int, smallest: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < smallest:
-        raise InputError(f"{key}: {value!r}; allowed: an integer of {smallest} or more")
+    check_count(key, value, smallest)
     return value
 
 

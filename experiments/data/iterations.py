@@ -3,7 +3,7 @@
 import lightning
 from torch.utils.data import DataLoader
 
-from dolens.errors import InputError
+from experiments.checks import check_count
 
 
 class IterationData(lightning.LightningDataModule):
@@ -18,8 +18,7 @@ class IterationData(lightning.LightningDataModule):
 
     def __init__(self, iterations: int = 1) -> None:
         super().__init__()
-        if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
-            raise InputError(f"data.iterations: {iterations!r}; allowed: an integer of 1 or more")
+        check_count("data.iterations", iterations)
         self.iterations = iterations
 
     def train_dataloader(self) -> DataLoader:

@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d
 
 from dolens.errors import InputError
 from dolens.sensor.colour import linear_to_srgb
+from experiments.checks import check_count
 from experiments.data.camera_data import CropDataModule, Split
 from experiments.data.crops import linear_light
 from experiments.data.photographs import Photograph, read_photograph
@@ -82,8 +83,7 @@ class PackagePhotographsDataModule(CropDataModule):
         super().__init__(**crops)
         self.entries = read_manifest(MANIFEST if manifest is None else Path(manifest))
         self.folders = data_folders() if folders is None else [Path(f) for f in folders]
-        if isinstance(shrink_to, bool) or not isinstance(shrink_to, int) or shrink_to < 1:
-            raise InputError(f"data.shrink_to: {shrink_to!r}; allowed: an integer of 1 or more")
+        check_count("data.shrink_to", shrink_to)
         self.shrink_to = shrink_to
         self.scikit_image = tuple(scikit_image)
 

@@ -27,7 +27,7 @@ from experiments.poses.accuracy_settings import (
     RayCounts,
 )
 from experiments.poses.basin import Basin
-from experiments.poses.bench import Bench, Light, draw, simulate
+from experiments.poses.bench import Bench, Light, check_precision, draw, simulate
 from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
@@ -80,8 +80,7 @@ class PoseAccuracyModule(Analysis):
         super().__init__(lens, experiment, folder)
         for part in parts:
             check_choice(part, PARTS, "parts")
-        if lens.dtype != torch.float64:
-            raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
+        check_precision(lens, "fitted")
         if not variables:
             raise InputError("variables: give at least one")
         self.seed, self.parts = int(seed), tuple(parts)

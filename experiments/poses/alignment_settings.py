@@ -13,7 +13,7 @@ from dolens.alignment.pixel_moments import Pixels
 from dolens.alignment.spot_moments import SENSOR
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.parameter_units import unit_factors
-from experiments.settings import check_count, check_positive
+from experiments.checks import check_count, check_positive
 
 
 @dataclass(frozen=True)

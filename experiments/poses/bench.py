@@ -15,6 +15,20 @@ from dolens.optics.lens import Lens
 from dolens.sensor.pixels import Sensor
 
 
+def check_precision(lens: Lens, use: str) -> None:
+    """Refuse a lens in single precision, in which poses lose what images know of them.
+
+    Args:
+        lens: the lens.
+        use: what is done with its poses, a participle.
+
+    Raises:
+        InputError: the lens is not in float64.
+    """
+    if lens.dtype != torch.float64:
+        raise InputError(f"lens_dtype: poses are {use} in float64, not {lens.dtype}")
+
+
 @dataclass(frozen=True)
 class Bench:
     """Places point sources in front of a lens, and the sensor behind it.

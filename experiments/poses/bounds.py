@@ -16,7 +16,7 @@ from dolens.optics.lens import Lens
 from experiments.analysis import Analysis
 from experiments.experiment import Figures
 from experiments.poses.arrangement import UNSEEN, Arrangement
-from experiments.poses.bench import Bench, Light, draw, repetitions, simulate
+from experiments.poses.bench import Bench, Light, check_precision, draw, repetitions, simulate
 from experiments.poses.bounds_figures import bounds_figures
 from experiments.poses.results import spread_metrics
 from experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
@@ -64,8 +64,7 @@ class PoseBoundsModule(Analysis):
         seed: int = 0,
     ) -> None:
         super().__init__(lens, experiment, folder)
-        if lens.dtype != torch.float64:
-            raise InputError(f"lens_dtype: poses are known in float64, not {lens.dtype}")
+        check_precision(lens, "known")
         if not variables or not arrangements:
             raise InputError("variables, arrangements: give at least one of each")
         self.seed = int(seed)

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 
 from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement
-from dolens.errors import InputError, check_choice
+from dolens.errors import check_choice
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from experiments.experiment import Experiment, Figures
-from experiments.poses.bench import Bench, Light, repetitions
+from experiments.poses.bench import Bench, Light, check_precision, repetitions
 from experiments.poses.estimates import Estimates, estimates, held_numbers
 from experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
 from experiments.poses.misalignment_figures import misalignment_figures
@@ -72,8 +72,7 @@ class MisalignmentModule(Experiment):
     ) -> None:
         super().__init__(lens, experiment, folder)
         self.automatic_optimization = False
-        if lens.dtype != torch.float64:
-            raise InputError(f"lens_dtype: poses are fitted in float64, not {lens.dtype}")
+        check_precision(lens, "fitted")
         self.plan, self.fits, self.stages, self.light = plan, plan.fits, plan.stages, light
         self.observations = Observations(lens, bench, light, plan.fits, measurement, int(seed))
         self.bench = self.observations.bench

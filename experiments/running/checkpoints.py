@@ -1,7 +1,7 @@
 """Checkpoints name the run that wrote them, and limit what a run that resumes may change."""
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from experiments.experiment import Experiment, refuse_another
+from experiments.running.plain_values import flat
 
 logger = logging.getLogger(__name__)
 
@@ -49,15 +50,7 @@ def settings_of(cfg: DictConfig) -> dict[str, Any]:
     and folders of the machine are not there at all.
     """
     kept = OmegaConf.masked_copy(cfg, [key for key in cfg if key not in _FREE])
-    return dict(_flat(OmegaConf.to_container(kept, resolve=False), ""))
-
-
-def _flat(node: Any, name: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(node, dict) and node:
-        for key, value in node.items():
-            yield from _flat(value, f"{name}.{key}" if name else str(key))
-    else:
-        yield name, node
+    return dict(flat(OmegaConf.to_container(kept, resolve=False)))
 
 
 def checked_checkpoint(

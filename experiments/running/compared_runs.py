@@ -10,6 +10,7 @@ import yaml
 
 from dolens.errors import InputError
 from experiments.camera.photograph_scores import PhotographScores, read_scores
+from experiments.running.plain_values import flat
 
 # How fast a run is, and where it was interrupted, changes nothing in what it finds.
 _PASSED_OVER = ("seed", "threads")
@@ -64,7 +65,7 @@ def read_run(folder: Path, judge: str | None = None) -> Run:
         choices["experiment"],
         int(config["seed"]),
         {k: str(v) for k, v in choices.items() if k != "experiment" and not k.startswith("hydra/")},
-        _flat({key: value for key, value in config.items() if key not in left_out}),
+        _leaves({key: value for key, value in config.items() if key not in left_out}),
         _judged(json.loads((folder / "metrics.json").read_text(encoding="utf-8")), judge),
         read_scores(folder, f"test_{judge}" if judge else "test"),
     )
@@ -149,14 +150,9 @@ def _package(choice: str) -> str:
     return package or group.replace("/", ".")
 
 
-def _flat(node: Any, name: str = "") -> dict[str, str]:
-    """Leaves of nested mappings, as JSON; lists are leaves."""
-    if not isinstance(node, dict) or not node:
-        return {name: json.dumps(node, sort_keys=True, default=str)}
-    found: dict[str, str] = {}
-    for key, value in node.items():
-        found |= _flat(value, f"{name}.{key}" if name else str(key))
-    return found
+def _leaves(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return the leaves of a configuration by their dotted names, as JSON."""
+    return {name: json.dumps(leaf, sort_keys=True, default=str) for name, leaf in flat(config)}
 
 
 def _prefixed(config: Mapping[str, str]) -> dict[str, str]:

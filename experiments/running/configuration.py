@@ -32,8 +32,9 @@ def checked(cfg: DictConfig) -> DictConfig:
     own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     refuse_renamed(own)
     own = without_dropped(own)
-    refuse_targets_in_lenses(own)
-    refuse_unknown_keys(own, _MADE)
-    refuse_missing(own, _MADE)
+    plain = OmegaConf.to_container(own, resolve=False)
+    refuse_targets_in_lenses(plain)
+    refuse_unknown_keys(plain, _MADE)
+    refuse_missing(plain, _MADE)
     refuse_unread(own, RunSettings.names())
     return own

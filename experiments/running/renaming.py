@@ -1,7 +1,7 @@
 """Old names of the configuration: refused in one line that has the new name, or translated."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, did_you_mean
+from experiments.running.plain_values import walk
 from experiments.running.renamed_keys import RENAMED, Key, Renamed
 from experiments.running.target_keys import Target, arguments_of, located
 
@@ -56,7 +57,7 @@ def refuse_renamed(cfg: DictConfig, renamed: Renamed = RENAMED) -> None:
         InputError: the first old name; the message has the new one.
     """
     plain = OmegaConf.to_container(cfg, resolve=False)
-    for path, value, holder in _settings("", plain, {}):
+    for path, value, holder in walk("", plain):
         change = _change(path, value, renamed)
         if change is None:
             continue
@@ -130,7 +131,7 @@ def _translated(override: Override, renamed: Renamed) -> tuple[list[str], list[s
     own = _change(path, value, renamed) or _moved_with(path, value, renamed)
     inner = [
         change
-        for where, part, _ in _settings(path, value, {})
+        for where, part, _ in walk(path, value)
         if where != path and (change := _change(where, part, renamed)) is not None
     ]
     changes = [change for change in (own, *inner) if change is not None]
@@ -214,18 +215,6 @@ def _new_path(key: Key, path: str) -> str | None:
     if found is None:
         return None
     return (key.new or "").replace("*", found[1] if star else "*")
-
-
-def _settings(
-    path: str, node: Any, holder: Mapping[str, Any]
-) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
-    """All settings of a part: path, value, and the mapping that holds it."""
-    if path:
-        yield path, node, holder
-    inner = node if isinstance(node, dict) else {}
-    parts = enumerate(node) if isinstance(node, list) else inner.items()
-    for key, value in parts:
-        yield from _settings(f"{path}.{key}" if path else str(key), value, inner)
 
 
 def _is_taken(path: str, holder: Mapping[str, Any]) -> bool:

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import MISSING
 
 from dolens.errors import InputError, check_keys
+from experiments.running.plain_values import walk
 
 _HYDRAS = frozenset(("_target_", "_partial_", "_convert_", "_recursive_", "_args_"))
 # A value that is another part of the configuration as a whole, as `network: ${network}`.
@@ -30,53 +31,55 @@ class Target(NamedTuple):
     keys: tuple[str, ...]
 
 
-def refuse_unknown_keys(cfg: DictConfig, parts: Sequence[str]) -> None:
+def refuse_unknown_keys(plain: Mapping[str, Any], parts: Sequence[str]) -> None:
     """Refuse keys beside a `_target_` that are no arguments of it.
 
     Args:
-        cfg: the composed configuration.
+        plain: the configuration, not resolved.
         parts: top-level keys that Hydra makes something of.
 
     Raises:
         InputError: the first such key, with the nearest argument that there is; or a target that
             does not exist.
     """
-    for target in targets(OmegaConf.to_container(cfg, resolve=False), parts):
+    for target in targets(plain, parts):
         allowed = arguments_of(located(target))
         if allowed is not None:
             check_keys(target.keys, allowed, target.path)
 
 
-def refuse_targets_in_lenses(cfg: DictConfig) -> None:
+def refuse_targets_in_lenses(plain: Mapping[str, Any]) -> None:
     """Refuse a `_target_` in a prescription: lens files are data, and make nothing.
+
+    Args:
+        plain: the configuration, not resolved.
 
     Raises:
         InputError: the first one.
     """
-    plain = OmegaConf.to_container(cfg, resolve=False)
     for group in HydraConfig.get().runtime.choices:
         name, _, package = str(group).partition("@")
         if name != "lens":
             continue
         lens = _at(plain, package or name)
-        for path, mapping in _mappings(package or name, lens):
-            for key in sorted(_HYDRAS.intersection(mapping)):
+        for path, node, _ in walk(package or name, lens):
+            for key in sorted(_HYDRAS.intersection(node)) if isinstance(node, dict) else ():
                 raise InputError(
                     f"{path}: unknown key '{key}'; a prescription is data and makes nothing"
                 )
 
 
-def refuse_missing(cfg: DictConfig, parts: Sequence[str]) -> None:
+def refuse_missing(plain: Mapping[str, Any], parts: Sequence[str]) -> None:
     """Refuse settings that must be given and are not: `???` in a file of the configuration.
 
     Args:
-        cfg: the composed configuration.
+        plain: the configuration, not resolved.
         parts: top-level keys that Hydra makes something of.
 
     Raises:
         InputError: the first such setting.
     """
-    for path, node in _settings(OmegaConf.to_container(cfg, resolve=False), parts):
+    for path, node in _settings(plain, parts):
         if node == MISSING:
             raise InputError(
                 f"{path}: must be given; neither experiment="
@@ -157,12 +160,3 @@ def _at(plain: Any, path: str) -> Any:
     for key in path.split("."):
         plain = plain.get(key) if isinstance(plain, dict) else None
     return plain
-
-
-def _mappings(path: str, node: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """All mappings within a node, with their dotted paths."""
-    inner = node if isinstance(node, dict) else dict(enumerate(node)) if type(node) is list else {}
-    if isinstance(node, dict):
-        yield path, node
-    for key, value in inner.items():
-        yield from _mappings(f"{path}.{key}", value)

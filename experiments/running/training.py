@@ -22,6 +22,7 @@ from experiments.experiment import Experiment, check_experiment
 from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
 from experiments.running.configuration import checked
 from experiments.running.extensions import import_extensions
+from experiments.running.plain_values import flat
 from experiments.running.resolvers import register_resolvers
 from experiments.running.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
 from experiments.running.run_settings import RunSettings
@@ -158,22 +159,18 @@ def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
     """The configuration as flat plain values, for TensorBoard's HPARAMS tab."""
-    flat: dict[str, Any] = {}
-
-    def visit(node: Any, name: str) -> None:
-        if isinstance(node, dict):
-            for key, value in node.items():
-                visit(value, f"{name}.{key}" if name else str(key))
-        elif isinstance(node, bool | int | float | str):
-            flat[name] = node
-        else:
-            flat[name] = str(node)
-
     # What `module` holds refers to the other groups and would only repeat them.
     left_out = ("module", "views", "lens", "callbacks", "logger", "trainer")
     whole = OmegaConf.to_container(cfg, resolve=True)
-    visit({key: value for key, value in whole.items() if key not in left_out}, "")
-    return {"experiment": HydraConfig.get().runtime.choices.get("experiment"), **flat}
+    leaves = flat({key: value for key, value in whole.items() if key not in left_out})
+    return {
+        "experiment": HydraConfig.get().runtime.choices.get("experiment"),
+        **{
+            name: leaf if isinstance(leaf, bool | int | float | str) else str(leaf)
+            for name, leaf in leaves
+            if leaf != {}
+        },
+    }
 
 
 def resume_command() -> str:

@@ -11,7 +11,7 @@ from dolens.optics.parameter_units import to_lens_units
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
-from experiments.settings import check_count
+from experiments.checks import check_count
 from experiments.speed.renders import Subject
 
 _SCENE_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")

@@ -20,8 +20,9 @@ from dolens.tolerancing import (
     tolerances_from,
 )
 from experiments.analysis import Analysis
+from experiments.checks import check_count, numbers_of
 from experiments.experiment import Figures
-from experiments.settings import Spots, check_count, numbers_of
+from experiments.settings import Spots
 from experiments.tables import Row
 from experiments.tolerances.figures import tolerance_figures
 from experiments.tolerances.tables import (
