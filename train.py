@@ -9,8 +9,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError
-from experiments.running.renaming import explained
-from experiments.running.training import run
+from dolens.experiments.running.renaming import explained
+from dolens.experiments.running.training import run
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")

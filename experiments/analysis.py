@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 
 import torch
 
-from experiments.experiment import Experiment
-from experiments.tables import Row, write_table
+from dolens.experiments.experiment import Experiment
+from dolens.experiments.tables import Row, write_table
 
 
 class Analysis(Experiment):

@@ -104,8 +104,9 @@ def check_experiment(module: Any, train: bool) -> None:
     kind = type(module).__name__
     if not isinstance(module, Experiment):
         raise InputError(
-            f"module: {kind} is no experiment; derive it from experiments.experiment.Experiment, "
-            "or from experiments.analysis.Analysis if it trains nothing"
+            f"module: {kind} is no experiment; derive it from "
+            "dolens.experiments.experiment.Experiment, or from "
+            "dolens.experiments.analysis.Analysis if it trains nothing"
         )
     if train and not module.trains:
         raise InputError(f"train: {kind} trains nothing; set train=false")

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
+from dolens.experiments.checks import numbers_of
 from dolens.optics.lens import Lens
-from experiments.checks import numbers_of
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from dolens.errors import InputError
+from dolens.experiments.camera.photograph_scores import format_interval
 from dolens.plotting import save_figure
 from dolens.plotting.coding_gain import GainRange, coding_gain_figure
-from experiments.camera.photograph_scores import format_interval
 from scripts.coding.bound import BoundGain, bound_gains
 from scripts.coding.trained import TrainedGain, trained_gains
 from scripts.finished_runs import train_unless_finished

@@ -16,9 +16,9 @@ from pathlib import Path
 import torch
 
 from dolens.errors import InputError
+from dolens.experiments.camera.photograph_scores import format_interval, statistics_of
+from dolens.experiments.running.compared_runs import Run, grouped, read_run
 from dolens.reconstruction.intervals import Interval, gain_interval
-from experiments.camera.photograph_scores import format_interval, statistics_of
-from experiments.running.compared_runs import Run, grouped, read_run
 
 METRICS = ("psnr_db", "ssim", "raw_psnr_db")
 

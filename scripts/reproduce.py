@@ -15,7 +15,7 @@ from pathlib import Path
 
 import yaml
 
-from experiments.running.renaming import translated
+from dolens.experiments.running.renaming import translated
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -24,6 +24,11 @@ ALLOWED = {
     "alignment": {"errors", "optics", "sensor", "rendering", "analysis", "diffraction", "optimize"},
     "reconstruction": {"errors", "optics", "sensor"},
     "plotting": {"errors", "optics", "analysis", "sensor", "rendering"},
+    # The command line stands above everything, the experiments too.
+    "cli": {
+        *("errors", "optics", "prescriptions", "analysis", "diffraction", "rendering"),
+        *("tolerancing", "plotting", "experiments"),
+    },
 }
 
 

@@ -8,9 +8,9 @@ import torch
 import yaml
 
 from dolens.errors import InputError
-from experiments.camera.photograph_scores import TABLE, scores_by_photograph
-from experiments.running.compared_runs import grouped, read_run
-from experiments.tables import write_table
+from dolens.experiments.camera.photograph_scores import TABLE, scores_by_photograph
+from dolens.experiments.running.compared_runs import grouped, read_run
+from dolens.experiments.tables import write_table
 from scripts.compare import gain, main
 
 

@@ -59,7 +59,7 @@ def configuration():
 @pytest.mark.parametrize("command", COMMANDS)
 def test_an_experiment_of_the_supplement_composes(configuration, command):
     cfg = compose("train", shlex.split(command))
-    assert cfg.module._target_.startswith("experiments.")
+    assert cfg.module._target_.startswith("dolens.experiments.")
 
 
 def test_the_supplement_is_complete():

@@ -6,11 +6,11 @@ from pathlib import Path
 import lightning
 
 from dolens.errors import InputError
+from dolens.experiments.design.design import DesignModule
+from dolens.experiments.design.tables import operand_table
+from dolens.experiments.tables import write_table
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, prescription_of, save_lens
-from experiments.design.design import DesignModule
-from experiments.design.tables import operand_table
-from experiments.tables import write_table
 
 logger = logging.getLogger(__name__)
 

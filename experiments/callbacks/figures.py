@@ -9,8 +9,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 
 from dolens.errors import InputError
+from dolens.experiments.experiment import Experiment, Figures
 from dolens.plotting import figure_to_image, save_figure
-from experiments.experiment import Experiment, Figures
 
 logger = logging.getLogger(__name__)
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import lightning
 
-from experiments.camera.photograph_scores import table_name
-from experiments.tables import write_table
+from dolens.experiments.camera.photograph_scores import table_name
+from dolens.experiments.tables import write_table
 
 
 class PhotographTable(lightning.Callback):

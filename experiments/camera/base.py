@@ -7,17 +7,17 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.optics.lens import Lens
-from dolens.optimize.variables import DesignVariables
-from experiments.camera.reconstruction import (
+from dolens.experiments.camera.reconstruction import (
     Loss,
     check_reconstruction,
     evaluating,
     loss_over_views,
     restoration_of,
 )
-from experiments.camera.views.base import Comparison, Imaging, Views
-from experiments.experiment import Experiment
+from dolens.experiments.camera.views.base import Comparison, Imaging, Views
+from dolens.experiments.experiment import Experiment
+from dolens.optics.lens import Lens
+from dolens.optimize.variables import DesignVariables
 
 
 class Camera(Experiment):

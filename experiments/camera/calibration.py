@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
 from dolens.sensor.psf_noise import noisy_point_spread_functions
 from dolens.tolerancing import tolerances_from
-from experiments.camera.views.base import Imaging
 
 
 class Miscalibration(Protocol):

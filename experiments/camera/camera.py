@@ -6,21 +6,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.experiments.camera.adversary import Adversary
+from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.calibration import Miscalibration
+from dolens.experiments.camera.calibration import check as check_miscalibrations
+from dolens.experiments.camera.costs import StepCosts
+from dolens.experiments.camera.evaluation import Evaluation, means_of, without_loss
+from dolens.experiments.camera.figures import camera_figures
+from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
+from dolens.experiments.camera.operands import CameraOperands
+from dolens.experiments.camera.photograph_scores import PhotographScores
+from dolens.experiments.camera.settings import Reconstruction, Training
+from dolens.experiments.camera.views.base import Imaging
+from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db
-from experiments.camera.adversary import Adversary
-from experiments.camera.base import Camera
-from experiments.camera.calibration import Miscalibration
-from experiments.camera.calibration import check as check_miscalibrations
-from experiments.camera.costs import StepCosts
-from experiments.camera.evaluation import Evaluation, means_of, without_loss
-from experiments.camera.figures import camera_figures
-from experiments.camera.lens_steps import LensSteps, variable_numbers
-from experiments.camera.operands import CameraOperands
-from experiments.camera.photograph_scores import PhotographScores
-from experiments.camera.settings import Reconstruction, Training
-from experiments.camera.views.base import Imaging
-from experiments.experiment import Figures
 
 
 class CameraModule(Camera):

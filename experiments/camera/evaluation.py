@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.calibration import Miscalibration
+from dolens.experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
+from dolens.experiments.camera.views.base import Views, seed_of
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
-from experiments.camera.base import Camera
-from experiments.camera.calibration import Miscalibration
-from experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
-from experiments.camera.views.base import Views, seed_of
 
 
 class Evaluation:

@@ -8,12 +8,12 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.reconstruction import evaluating
+from dolens.experiments.experiment import Figures
 from dolens.plotting import comparison_figure, layout_figure, psf_figure
 from dolens.reconstruction import psnr_db
 from dolens.sensor.colour import linear_to_srgb
-from experiments.camera.base import Camera
-from experiments.camera.reconstruction import evaluating
-from experiments.experiment import Figures
 
 _PUPIL_SAMPLES = 96  # along each side of the pupil
 

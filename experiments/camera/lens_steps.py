@@ -6,12 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.experiments.camera.lens_least_squares import LensLeastSquares
+from dolens.experiments.camera.operands import CameraOperands
+from dolens.experiments.camera.views.base import Imaging
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import to_file_units
 from dolens.optimize.variables import DesignVariables
-from experiments.camera.lens_least_squares import LensLeastSquares
-from experiments.camera.operands import CameraOperands
-from experiments.camera.views.base import Imaging
 
 
 class LensSteps:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.tables import Row
 from dolens.reconstruction.intervals import Interval, bootstrap_interval
-from experiments.tables import Row
 
 
 def table_name(stage: str = "test") -> str:

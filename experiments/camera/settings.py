@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import nn
 
+from dolens.experiments.camera.reconstruction import Loss
+from dolens.experiments.checks import check_positive
 from dolens.reconstruction import RelativisticDiscriminators
-from experiments.camera.reconstruction import Loss
-from experiments.checks import check_positive
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from dolens.errors import InputError
-from experiments.checks import check_count
-from experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
-from experiments.data.photographs import Photograph
-from experiments.data.resumable import ResumableLoader, ResumableSampler
+from dolens.experiments.checks import check_count
+from dolens.experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
+from dolens.experiments.data.photographs import Photograph
+from dolens.experiments.data.resumable import ResumableLoader, ResumableSampler
 
 Split = Literal["train", "validation", "test"]
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dolens.errors import InputError
-from experiments.data.crops import (
+from dolens.experiments.data.crops import (
     centred_crop,
     check_scale_range,
     check_size,
@@ -15,7 +15,7 @@ from experiments.data.crops import (
     random_crop,
     random_order,
 )
-from experiments.data.photographs import Photograph
+from dolens.experiments.data.photographs import Photograph
 
 
 class TrainingCrops(Dataset):

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from dolens.errors import InputError
+from dolens.experiments.data.photographs import Photograph
 from dolens.sensor.colour import srgb_to_linear
-from experiments.data.photographs import Photograph
 
 _log = logging.getLogger(__name__)
 _LINEAR_OF_BYTE = srgb_to_linear(torch.arange(256, dtype=torch.float64) / 255).float()

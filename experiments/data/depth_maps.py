@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from dolens.errors import InputError
-from experiments.data.photographs import DECODING_ERRORS, reason_of
+from dolens.experiments.data.photographs import DECODING_ERRORS, reason_of
 
 ENDINGS = (".npy", ".png", ".tif", ".tiff")
 """Endings of depth maps, in the order in which they are looked for."""

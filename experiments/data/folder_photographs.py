@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from dolens.errors import InputError
-from experiments.data.photographs import Photograph, read_photograph
+from dolens.experiments.data.photographs import Photograph, read_photograph
 
 _log = logging.getLogger(__name__)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError
-from experiments.data.camera_data import CropDataModule, Split
-from experiments.data.folder_photographs import FolderPhotographs
-from experiments.data.photographs import (
+from dolens.experiments.data.camera_data import CropDataModule, Split
+from dolens.experiments.data.folder_photographs import FolderPhotographs
+from dolens.experiments.data.photographs import (
     EXTENSIONS,
     list_photographs,
     normalised_extensions,

@@ -3,7 +3,7 @@
 import lightning
 from torch.utils.data import DataLoader
 
-from experiments.checks import check_count
+from dolens.experiments.checks import check_count
 
 
 class IterationData(lightning.LightningDataModule):

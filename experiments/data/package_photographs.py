@@ -12,12 +12,12 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from dolens.errors import InputError
+from dolens.experiments.checks import check_count
+from dolens.experiments.data.camera_data import CropDataModule, Split
+from dolens.experiments.data.crops import linear_light
+from dolens.experiments.data.photographs import Photograph, read_photograph
+from dolens.experiments.data.photos import TRAIN, read_installed
 from dolens.sensor.colour import linear_to_srgb
-from experiments.checks import check_count
-from experiments.data.camera_data import CropDataModule, Split
-from experiments.data.crops import linear_light
-from experiments.data.photographs import Photograph, read_photograph
-from experiments.data.photos import TRAIN, read_installed
 
 MANIFEST = Path(__file__).with_suffix(".csv")
 """The project's own list; its columns are those of `Entry`."""

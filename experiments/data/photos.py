@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError
-from experiments.data.camera_data import CropDataModule, Split
-from experiments.data.photographs import EXTENSIONS, Photograph, read_photograph
+from dolens.experiments.data.camera_data import CropDataModule, Split
+from dolens.experiments.data.photographs import EXTENSIONS, Photograph, read_photograph
 
 TRAIN: tuple[str, ...] = (
     "astronaut.png",

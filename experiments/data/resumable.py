@@ -7,7 +7,7 @@ from typing import Any, cast
 from torch.utils.data import DataLoader, Sampler
 
 from dolens.errors import InputError
-from experiments.data.crop_dataset import TrainingCrops
+from dolens.experiments.data.crop_dataset import TrainingCrops
 
 _log = logging.getLogger(__name__)
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError
-from experiments.data.depth_maps import ENDINGS, depth_map_of, is_depth_map, read_depth_map
-from experiments.data.folder_photographs import FolderPhotographs
-from experiments.data.image_folder import ImageFolderDataModule
-from experiments.data.photographs import Photograph, read_photograph
+from dolens.experiments.data.depth_maps import ENDINGS, depth_map_of, is_depth_map, read_depth_map
+from dolens.experiments.data.folder_photographs import FolderPhotographs
+from dolens.experiments.data.image_folder import ImageFolderDataModule
+from dolens.experiments.data.photographs import Photograph, read_photograph
 
 
 class RgbdFolderDataModule(ImageFolderDataModule):

@@ -13,16 +13,20 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice
+from dolens.experiments.design.figures import design_figures
+from dolens.experiments.design.iteration import (
+    Progress,
+    gradient_iteration,
+    least_squares_iteration,
+)
+from dolens.experiments.design.light import fit_edges, refuse_lost_light
+from dolens.experiments.design.tables import iteration_row, spot_metrics
+from dolens.experiments.experiment import Experiment, Figures
 from dolens.optics.lens import Lens
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
-from experiments.design.figures import design_figures
-from experiments.design.iteration import Progress, gradient_iteration, least_squares_iteration
-from experiments.design.light import fit_edges, refuse_lost_light
-from experiments.design.tables import iteration_row, spot_metrics
-from experiments.experiment import Experiment, Figures
 
 logger = logging.getLogger(__name__)
 

@@ -9,6 +9,8 @@ from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.analysis.spot_diagram import spot_diagram, working_f_numbers
+from dolens.experiments.design.tables import SQUARE_GRID_COUNT, spot_table
+from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.optimize import MeritSettings
 from dolens.plotting import (
@@ -19,8 +21,6 @@ from dolens.plotting import (
     rms_curves_figure,
     spots_figure,
 )
-from experiments.design.tables import SQUARE_GRID_COUNT, spot_table
-from experiments.experiment import Figures
 
 _FREQUENCIES = 51
 # Beyond this over the RMS radius a spot's modulation is nearly nothing.

@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.design.tables import spot_labels
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings
 from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
 from dolens.optimize.image_quality import ImageQuality
-from experiments.design.tables import spot_labels
 
 # Rings of the quadrature that tells where the edges of the beams are.
 _EDGE_RINGS = 40

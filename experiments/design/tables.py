@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.experiments.design.iteration import Progress
 from dolens.optics.lens import Lens
 from dolens.optimize import MeritFunction, MeritSettings
-from experiments.design.iteration import Progress
 
 logger = logging.getLogger(__name__)
 

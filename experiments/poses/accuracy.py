@@ -15,20 +15,20 @@ from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.spot_loss import SpotLoss
 from dolens.errors import InputError, call_with_settings, check_choice, check_keys
-from dolens.optics.lens import Lens
-from dolens.rendering.spot_image import SpotImager
-from experiments.analysis import Analysis
-from experiments.experiment import Figures
-from experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
-from experiments.poses.accuracy_settings import (
+from dolens.experiments.analysis import Analysis
+from dolens.experiments.experiment import Figures
+from dolens.experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
+from dolens.experiments.poses.accuracy_settings import (
     BasinSettings,
     ComparedImages,
     PhotonLevels,
     RayCounts,
 )
-from experiments.poses.basin import Basin
-from experiments.poses.bench import Bench, Light, check_precision, draw, simulate
-from experiments.tables import Row
+from dolens.experiments.poses.basin import Basin
+from dolens.experiments.poses.bench import Bench, Light, check_precision, draw, simulate
+from dolens.experiments.tables import Row
+from dolens.optics.lens import Lens
+from dolens.rendering.spot_image import SpotImager
 
 logger = logging.getLogger(__name__)
 

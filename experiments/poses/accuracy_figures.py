@@ -8,11 +8,11 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from dolens.alignment.pose import Pose
+from dolens.experiments.poses.basin import Basin
+from dolens.experiments.poses.labels import variable_label
+from dolens.experiments.tables import Row
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
 from dolens.rendering.spot_image import SpotImager
-from experiments.poses.basin import Basin
-from experiments.poses.labels import variable_label
-from experiments.tables import Row
 
 _LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}
 _MARKERS = {"noise_weighted": "o", "s21": "s"}

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.alignment.pixel_moments import Pixels
+from dolens.experiments.poses.alignment_result import COLUMNS, Alignment
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-from experiments.poses.alignment_result import COLUMNS, Alignment
 
 _PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
 

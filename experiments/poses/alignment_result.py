@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.element_fit import POSE
-from experiments.tables import Row
+from dolens.experiments.tables import Row
 
 # Numbers of a case as tables have them, of the element's pose and of the sensor's place.
 COLUMNS = ("tilt_x_deg", "tilt_y_deg", "decenter_x_um", "decenter_y_um")

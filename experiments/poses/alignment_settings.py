@@ -12,8 +12,8 @@ from dolens.alignment.element_fit import POSE
 from dolens.alignment.pixel_moments import Pixels
 from dolens.alignment.spot_moments import SENSOR
 from dolens.errors import InputError, check_choice, check_keys
+from dolens.experiments.checks import check_count, check_positive
 from dolens.optics.parameter_units import unit_factors
-from experiments.checks import check_count, check_positive
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError
-from experiments.poses.accuracy_settings import BasinSettings
-from experiments.poses.bench import Bench, Light, simulate
-from experiments.poses.iteration import iterate, loss_of, optimizer_of
-from experiments.poses.settings import spot_imager, stage_of
-from experiments.tables import Row
+from dolens.experiments.poses.accuracy_settings import BasinSettings
+from dolens.experiments.poses.bench import Bench, Light, simulate
+from dolens.experiments.poses.iteration import iterate, loss_of, optimizer_of
+from dolens.experiments.poses.settings import spot_imager, stage_of
+from dolens.experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 

@@ -12,15 +12,22 @@ from dolens.alignment.information import fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError, check_keys
+from dolens.experiments.analysis import Analysis
+from dolens.experiments.experiment import Figures
+from dolens.experiments.poses.arrangement import UNSEEN, Arrangement
+from dolens.experiments.poses.bench import (
+    Bench,
+    Light,
+    check_precision,
+    draw,
+    repetitions,
+    simulate,
+)
+from dolens.experiments.poses.bounds_figures import bounds_figures
+from dolens.experiments.poses.results import spread_metrics
+from dolens.experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
+from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
-from experiments.analysis import Analysis
-from experiments.experiment import Figures
-from experiments.poses.arrangement import UNSEEN, Arrangement
-from experiments.poses.bench import Bench, Light, check_precision, draw, repetitions, simulate
-from experiments.poses.bounds_figures import bounds_figures
-from experiments.poses.results import spread_metrics
-from experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
-from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 

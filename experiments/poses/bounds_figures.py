@@ -8,11 +8,11 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from dolens.experiments.experiment import Figures
+from dolens.experiments.poses.arrangement import UNSEEN, Arrangement
+from dolens.experiments.poses.labels import variable_label
 from dolens.plotting.corner import corner_figure
 from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-from experiments.experiment import Figures
-from experiments.poses.arrangement import UNSEEN, Arrangement
-from experiments.poses.labels import variable_label
 
 _MARKERS = "osD^vP*X"
 

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError, check_choice
-from experiments.analysis import Analysis
-from experiments.experiment import Figures
-from experiments.poses.coverage_figures import coverage_figure
-from experiments.poses.estimates import Estimates, probability
-from experiments.poses.misalignment import MisalignmentModule
-from experiments.poses.results import error_statistics
-from experiments.tables import Row
+from dolens.experiments.analysis import Analysis
+from dolens.experiments.experiment import Figures
+from dolens.experiments.poses.coverage_figures import coverage_figure
+from dolens.experiments.poses.estimates import Estimates, probability
+from dolens.experiments.poses.misalignment import MisalignmentModule
+from dolens.experiments.poses.results import error_statistics
+from dolens.experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 
@@ -26,8 +26,9 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
     """Compares errors of poses with their bounds over many measurements, case by case.
 
     Nothing is fitted from afar.  Every measurement's estimate is found by Gauss-Newton steps from
-    the truth, which is where a fit weighted by noise ends (see `experiments.poses.estimates`), and
-    fits hold what the measurement's own earlier fit found.  The first measurement, of number 0, is
+    the truth, which is where a fit weighted by noise ends (see
+    `dolens.experiments.poses.estimates`), and fits hold what the measurement's own earlier fit
+    found.  The first measurement, of number 0, is
     the one that `misalignment` fits with the same seed.
 
     Args:

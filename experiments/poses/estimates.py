@@ -13,9 +13,9 @@ from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import ImageMerit
 from dolens.errors import InputError
+from dolens.experiments.poses.settings import Fit
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
-from experiments.poses.settings import Fit
 
 # One linear step is exact enough within so many bounds; longer ones are followed by others.
 _NEAR = 5.0

@@ -10,9 +10,9 @@ from dolens.alignment.measurement import Measurement
 from dolens.alignment.noise_weighted import NoiseWeightedLoss
 from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import ImageLoss, ImageMerit, SpotLoss
+from dolens.experiments.poses.settings import Stage, blur_for, slopes_imager, spot_imager
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
-from experiments.poses.settings import Stage, blur_for, slopes_imager, spot_imager
 
 
 def loss_of(

@@ -12,15 +12,13 @@ from torch import Tensor, nn
 from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.errors import check_choice
-from dolens.optics.lens import Lens
-from dolens.rendering.spot_image import SpotImage, SpotImager
-from experiments.experiment import Experiment, Figures
-from experiments.poses.bench import Bench, Light, check_precision, repetitions
-from experiments.poses.estimates import Estimates, estimates, held_numbers
-from experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
-from experiments.poses.misalignment_figures import misalignment_figures
-from experiments.poses.observations import Observations
-from experiments.poses.results import (
+from dolens.experiments.experiment import Experiment, Figures
+from dolens.experiments.poses.bench import Bench, Light, check_precision, repetitions
+from dolens.experiments.poses.estimates import Estimates, estimates, held_numbers
+from dolens.experiments.poses.iteration import iterate, loss_of, optimizer_of, slopes_of
+from dolens.experiments.poses.misalignment_figures import misalignment_figures
+from dolens.experiments.poses.observations import Observations
+from dolens.experiments.poses.results import (
     error_over_bound,
     history_row,
     pose_metrics,
@@ -28,8 +26,10 @@ from experiments.poses.results import (
     spread_columns,
     spread_metrics,
 )
-from experiments.poses.settings import FitPlan, spot_imager
-from experiments.tables import Row, write_table
+from dolens.experiments.poses.settings import FitPlan, spot_imager
+from dolens.experiments.tables import Row, write_table
+from dolens.optics.lens import Lens
+from dolens.rendering.spot_image import SpotImage, SpotImager
 
 logger = logging.getLogger(__name__)
 

@@ -13,17 +13,17 @@ from torch import Tensor
 from dolens.alignment.information import FisherInformation
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
+from dolens.experiments.experiment import Figures
+from dolens.experiments.poses.estimates import Estimates
+from dolens.experiments.poses.labels import variable_label
+from dolens.experiments.poses.settings import Fit, Stage
+from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.plotting.convergence import convergence_figure
 from dolens.plotting.corner import corner_figure
 from dolens.plotting.spot_fit import spot_fit_figure
 from dolens.rendering.spot_image import SpotImage
 from dolens.sensor.pixels import Sensor
-from experiments.experiment import Figures
-from experiments.poses.estimates import Estimates
-from experiments.poses.labels import variable_label
-from experiments.poses.settings import Fit, Stage
-from experiments.tables import Row
 
 
 class FittedPoses(Protocol):

@@ -10,9 +10,9 @@ from dolens.alignment.photograph import read_measurements
 from dolens.alignment.pose import Pose
 from dolens.alignment.unmodelled import Unmodelled
 from dolens.errors import InputError
+from dolens.experiments.poses.bench import Bench, Light, draw, making, simulate
+from dolens.experiments.poses.settings import Fit
 from dolens.optics.lens import Lens
-from experiments.poses.bench import Bench, Light, draw, making, simulate
-from experiments.poses.settings import Fit
 
 
 class Observations:

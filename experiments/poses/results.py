@@ -8,8 +8,8 @@ from torch import Tensor
 
 from dolens.alignment.information import FisherInformation
 from dolens.alignment.pose import Pose
-from experiments.poses.settings import Stage
-from experiments.tables import Row
+from dolens.experiments.poses.settings import Stage
+from dolens.experiments.tables import Row
 
 # Of a normal distribution, 95 % lies within so many standard deviations.
 _WITHIN = 1.959964

@@ -20,16 +20,16 @@ from dolens.alignment.element_fit import (
 from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
 from dolens.alignment.spot_moments import MomentModel, moment_model, one_thread
 from dolens.errors import InputError
+from dolens.experiments.analysis import Analysis
+from dolens.experiments.experiment import Figures
+from dolens.experiments.poses.alignment_checks import one_exposure_error, sampling_error
+from dolens.experiments.poses.alignment_figures import Setup, alignment_figure
+from dolens.experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
+from dolens.experiments.poses.alignment_settings import Detector, Misalignments
+from dolens.experiments.settings import PupilRays, Spots
+from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import DEGREE, unit_of
-from experiments.analysis import Analysis
-from experiments.experiment import Figures
-from experiments.poses.alignment_checks import one_exposure_error, sampling_error
-from experiments.poses.alignment_figures import Setup, alignment_figure
-from experiments.poses.alignment_result import COLUMNS, SENSOR_COLUMNS, Alignment
-from experiments.poses.alignment_settings import Detector, Misalignments
-from experiments.settings import PupilRays, Spots
-from experiments.tables import Row
 
 logger = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from dolens.errors import InputError
-from experiments.experiment import Experiment, refuse_another
-from experiments.running.plain_values import flat
+from dolens.experiments.experiment import Experiment, refuse_another
+from dolens.experiments.running.plain_values import flat
 
 logger = logging.getLogger(__name__)
 

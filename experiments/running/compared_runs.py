@@ -9,8 +9,8 @@ from typing import Any
 import yaml
 
 from dolens.errors import InputError
-from experiments.camera.photograph_scores import PhotographScores, read_scores
-from experiments.running.plain_values import flat
+from dolens.experiments.camera.photograph_scores import PhotographScores, read_scores
+from dolens.experiments.running.plain_values import flat
 
 # How fast a run is, and where it was interrupted, changes nothing in what it finds.
 _PASSED_OVER = ("seed", "threads")

@@ -2,15 +2,15 @@
 
 from omegaconf import DictConfig, OmegaConf
 
-from experiments.running.dropped_entries import without_dropped
-from experiments.running.renaming import refuse_renamed
-from experiments.running.run_settings import RunSettings
-from experiments.running.target_keys import (
+from dolens.experiments.running.dropped_entries import without_dropped
+from dolens.experiments.running.renaming import refuse_renamed
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.target_keys import (
     refuse_missing,
     refuse_targets_in_lenses,
     refuse_unknown_keys,
 )
-from experiments.running.unread_settings import refuse_unread
+from dolens.experiments.running.unread_settings import refuse_unread
 
 # What Hydra makes; the lens is made by `dolens.prescriptions`, from data alone.
 _MADE = ("module", "data", "callbacks", "logger", "trainer")

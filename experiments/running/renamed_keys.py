@@ -82,7 +82,7 @@ RENAMED = Renamed(
                 "experiments.callbacks.speed_pictures.SpeedPictures",
                 "experiments.callbacks.tolerance_pictures.TolerancePictures",
             ),
-            "experiments.callbacks.figures.SaveFigures",
+            "dolens.experiments.callbacks.figures.SaveFigures",
         ),
         "dolens.imaging.choice.auto_renderer.AutoRenderer": (
             "dolens.rendering.auto.auto_renderer.AutoRenderer"
@@ -97,38 +97,38 @@ RENAMED = Renamed(
         "dolens.imaging.scene.PlanarScene": "dolens.scene.planar.PlanarScene",
         "dolens.imaging.sensor.Sensor": "dolens.sensor.pixels.Sensor",
         "experiments.calibration.NoisyMeasurement": (
-            "experiments.camera.calibration.NoisyMeasurement"
+            "dolens.experiments.camera.calibration.NoisyMeasurement"
         ),
-        "experiments.calibration.OtherDepth": "experiments.camera.calibration.OtherDepth",
-        "experiments.calibration.OtherSample": "experiments.camera.calibration.OtherSample",
-        "experiments.camera.CameraModule": "experiments.camera.camera.CameraModule",
-        "experiments.design.DesignModule": "experiments.design.design.DesignModule",
+        "experiments.calibration.OtherDepth": "dolens.experiments.camera.calibration.OtherDepth",
+        "experiments.calibration.OtherSample": "dolens.experiments.camera.calibration.OtherSample",
+        "experiments.camera.CameraModule": "dolens.experiments.camera.camera.CameraModule",
+        "experiments.design.DesignModule": "dolens.experiments.design.design.DesignModule",
         "experiments.lens_least_squares.CameraOptimizer": (
-            "experiments.camera.lens_least_squares.CameraOptimizer"
+            "dolens.experiments.camera.lens_least_squares.CameraOptimizer"
         ),
         "experiments.misalignment.MisalignmentModule": (
-            "experiments.poses.misalignment.MisalignmentModule"
+            "dolens.experiments.poses.misalignment.MisalignmentModule"
         ),
         "experiments.pose_accuracy.PoseAccuracyModule": (
-            "experiments.poses.accuracy.PoseAccuracyModule"
+            "dolens.experiments.poses.accuracy.PoseAccuracyModule"
         ),
         "experiments.pose_coverage.PoseCoverageModule": (
-            "experiments.poses.coverage.PoseCoverageModule"
+            "dolens.experiments.poses.coverage.PoseCoverageModule"
         ),
         "experiments.pose_knowledge.PoseKnowledgeModule": (
-            "experiments.poses.bounds.PoseBoundsModule"
+            "dolens.experiments.poses.bounds.PoseBoundsModule"
         ),
         "experiments.speed_vs_error.SpeedVsErrorModule": (
-            "experiments.speed.speed_vs_error.SpeedVsErrorModule"
+            "dolens.experiments.speed.speed_vs_error.SpeedVsErrorModule"
         ),
         "experiments.tolerances.TolerancesModule": (
-            "experiments.tolerances.tolerances.TolerancesModule"
+            "dolens.experiments.tolerances.tolerances.TolerancesModule"
         ),
         "experiments.triplet_alignment.TripletAlignmentModule": (
-            "experiments.poses.triplet_alignment.TripletAlignmentModule"
+            "dolens.experiments.poses.triplet_alignment.TripletAlignmentModule"
         ),
-        "experiments.views.depths.DepthViews": "experiments.camera.views.depths.DepthViews",
-        "experiments.views.fields.FieldViews": "experiments.camera.views.fields.FieldViews",
-        "experiments.views.layers.LayerViews": "experiments.camera.views.layers.LayerViews",
+        "experiments.views.depths.DepthViews": "dolens.experiments.camera.views.depths.DepthViews",
+        "experiments.views.fields.FieldViews": "dolens.experiments.camera.views.fields.FieldViews",
+        "experiments.views.layers.LayerViews": "dolens.experiments.camera.views.layers.LayerViews",
     },
 )

@@ -12,9 +12,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, did_you_mean
-from experiments.running.plain_values import walk
-from experiments.running.renamed_keys import RENAMED, Key, Renamed
-from experiments.running.target_keys import Target, arguments_of, located
+from dolens.experiments.running.plain_values import walk
+from dolens.experiments.running.renamed_keys import RENAMED, Key, Renamed
+from dolens.experiments.running.target_keys import Target, arguments_of, located
 
 # Text that the command line takes without quotes, and that it would not take for text.
 _PLAIN = re.compile(r"[A-Za-z_][\w./-]*")
@@ -184,8 +184,10 @@ def _text(value: Any) -> str:
 
 def _change(path: str, value: Any, renamed: Renamed) -> Change | None:
     """Return what has become of a setting; None where it is as it was."""
-    if path.rpartition(".")[2] == "_target_" and value in renamed.targets:
-        return Change(path, path, value, renamed.targets[value])
+    if path.rpartition(".")[2] == "_target_" and isinstance(value, str):
+        now = renamed.targets.get(value) or _within_the_package(value)
+        if now is not None:
+            return Change(path, path, value, now)
     for key in renamed.keys:
         new = _new_path(key, path)
         if new is not None:
@@ -195,6 +197,20 @@ def _change(path: str, value: Any, renamed: Renamed) -> Change | None:
     if isinstance(value, str) and value in renamed.values.get(path, {}):
         return Change(path, path, value, renamed.values[path][value])
     return None
+
+
+def _within_the_package(name: str) -> str | None:
+    """The name now of a class of the former top-level package `experiments`; None: it is another's.
+
+    A package `experiments` of the user's own keeps its names.
+    """
+    if not name.startswith("experiments."):
+        return None
+    try:
+        located(Target("", f"dolens.{name}", ()))
+    except InputError:
+        return None
+    return f"dolens.{name}"
 
 
 def _moved_with(path: str, value: Any, renamed: Renamed) -> Change | None:

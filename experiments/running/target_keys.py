@@ -10,7 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import MISSING
 
 from dolens.errors import InputError, check_keys
-from experiments.running.plain_values import walk
+from dolens.experiments.running.plain_values import walk
 
 _HYDRAS = frozenset(("_target_", "_partial_", "_convert_", "_recursive_", "_args_"))
 # A value that is another part of the configuration as a whole, as `network: ${network}`.

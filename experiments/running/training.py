@@ -15,17 +15,26 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError
+from dolens.experiments.callbacks.interruption import InterruptionNotice
+from dolens.experiments.experiment import Experiment, check_experiment
+from dolens.experiments.running.checkpoints import (
+    SettingsInCheckpoints,
+    checked_checkpoint,
+    settings_of,
+)
+from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.extensions import import_extensions
+from dolens.experiments.running.plain_values import flat
+from dolens.experiments.running.resolvers import register_resolvers
+from dolens.experiments.running.run_folder import (
+    describe_run,
+    peak_memory_mb,
+    plain_metrics,
+    write_json,
+)
+from dolens.experiments.running.run_settings import RunSettings
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
-from experiments.callbacks.interruption import InterruptionNotice
-from experiments.experiment import Experiment, check_experiment
-from experiments.running.checkpoints import SettingsInCheckpoints, checked_checkpoint, settings_of
-from experiments.running.configuration import checked
-from experiments.running.extensions import import_extensions
-from experiments.running.plain_values import flat
-from experiments.running.resolvers import register_resolvers
-from experiments.running.run_folder import describe_run, peak_memory_mb, plain_metrics, write_json
-from experiments.running.run_settings import RunSettings
 
 logger = logging.getLogger(__name__)
 

@@ -6,9 +6,9 @@ from functools import partial
 
 from matplotlib.figure import Figure
 
+from dolens.experiments.experiment import Figures
+from dolens.experiments.tables import Row
 from dolens.plotting import Point, pareto_figure
-from experiments.experiment import Figures
-from experiments.tables import Row
 
 # Part → cost's and error's columns, and their labels.
 _AXES = {

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import torch
 
+from dolens.experiments.speed.renders import Subject
+from dolens.experiments.speed.timing import by_turns
 from dolens.rendering.auto.probes import grey_levels
 from dolens.rendering.auto.survey import spread_pixels, survey
 from dolens.rendering.imaging_system import ImagingSystem
-from experiments.speed.renders import Subject
-from experiments.speed.timing import by_turns
 
 _POINTS, _TRUE_SAMPLES, _SIZE = 9, 160, 65
 

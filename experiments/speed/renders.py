@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.experiments.speed.timing import by_turns, peak_megabytes
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.agreement import (
     Agreement,
@@ -23,7 +24,6 @@ from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.pixels import Sensor
-from experiments.speed.timing import by_turns, peak_megabytes
 
 # Renders by more rays than these are timed on a window, and that multiplied.
 _MANY, _WINDOW, _MARGIN = 128, 64, 48

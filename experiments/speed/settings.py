@@ -7,12 +7,12 @@ from typing import Any
 import torch
 
 from dolens.errors import call_with_settings, check_keys
+from dolens.experiments.checks import check_count
+from dolens.experiments.speed.renders import Subject
 from dolens.optics.parameter_units import to_lens_units
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
-from experiments.checks import check_count
-from experiments.speed.renders import Subject
 
 _SCENE_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
 

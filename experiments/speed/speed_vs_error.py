@@ -5,21 +5,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dolens.errors import check_choice
-from dolens.optics.lens import Lens
-from dolens.plotting import Point, pareto_front
-from experiments.analysis import Analysis
-from experiments.experiment import Figures
-from experiments.speed.figures import speed_figures
-from experiments.speed.functions import function_rows
-from experiments.speed.renders import (
+from dolens.experiments.analysis import Analysis
+from dolens.experiments.experiment import Figures
+from dolens.experiments.speed.figures import speed_figures
+from dolens.experiments.speed.functions import function_rows
+from dolens.experiments.speed.renders import (
     Subject,
     gradient_agreements,
     render_contenders,
     render_rows,
 )
-from experiments.speed.settings import Contenders, Effort, subject_of
-from experiments.speed.traces import trace_rows
-from experiments.tables import Row
+from dolens.experiments.speed.settings import Contenders, Effort, subject_of
+from dolens.experiments.speed.traces import trace_rows
+from dolens.experiments.tables import Row
+from dolens.optics.lens import Lens
+from dolens.plotting import Point, pareto_front
 
 logger = logging.getLogger(__name__)
 

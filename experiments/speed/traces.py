@@ -6,11 +6,11 @@ from unittest import mock
 
 import torch
 
+from dolens.experiments.speed.renders import Subject
+from dolens.experiments.speed.timing import by_turns
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces import base, newton
-from experiments.speed.renders import Subject
-from experiments.speed.timing import by_turns
 
 _NEWTON_STEPS = (0, 1, 2, 3, 4, 5, 6, 8, 12)
 _DTYPES = {"float32": torch.float32, "float64": torch.float64}

@@ -6,6 +6,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dolens.experiments.experiment import Figures
+from dolens.experiments.tolerances.tables import per_unit
 from dolens.plotting.tolerances import (
     matrix_figure,
     offenders_figure,
@@ -13,8 +15,6 @@ from dolens.plotting.tolerances import (
     yield_figure,
 )
 from dolens.tolerancing import ToleranceAnalysis
-from experiments.experiment import Figures
-from experiments.tolerances.tables import per_unit
 
 _MOST_OFFENDERS = 20
 _UNIT_WORDS = {"deg": "µm per degree", "mm": "µm per mm", "%": "µm per %", "1/mm": "µm per 1/mm"}

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 
 import torch
 
+from dolens.experiments.tables import Row
 from dolens.tolerancing import ToleranceAnalysis, Tolerances
-from experiments.tables import Row
 
 # Parameters that a log is worth.
 _MOST = 12

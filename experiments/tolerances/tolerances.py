@@ -9,6 +9,18 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from dolens.experiments.analysis import Analysis
+from dolens.experiments.checks import check_count, numbers_of
+from dolens.experiments.experiment import Figures
+from dolens.experiments.settings import Spots
+from dolens.experiments.tables import Row
+from dolens.experiments.tolerances.figures import tolerance_figures
+from dolens.experiments.tolerances.tables import (
+    monte_carlo_rows,
+    offender_rows,
+    offender_text,
+    sensitivity_rows,
+)
 from dolens.optics.lens import Lens
 from dolens.tolerancing import (
     Outcome,
@@ -18,18 +30,6 @@ from dolens.tolerancing import (
     share_within,
     spot_weights,
     tolerances_from,
-)
-from experiments.analysis import Analysis
-from experiments.checks import check_count, numbers_of
-from experiments.experiment import Figures
-from experiments.settings import Spots
-from experiments.tables import Row
-from experiments.tolerances.figures import tolerance_figures
-from experiments.tolerances.tables import (
-    monte_carlo_rows,
-    offender_rows,
-    offender_text,
-    sensitivity_rows,
 )
 
 logger = logging.getLogger(__name__)

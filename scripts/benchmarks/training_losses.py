@@ -9,10 +9,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from torch import Tensor
 
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_lens
 from dolens.optics.lens import Lens
 from dolens.rendering.gradient_check import Loss
-from experiments.running.run_settings import RunSettings
-from experiments.running.training import build_lens
 
 ROOT = Path(__file__).resolve().parents[2]
 _SMALL = (

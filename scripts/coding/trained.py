@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dolens.errors import InputError
+from dolens.experiments.running.compared_runs import Run, read_run
 from dolens.reconstruction.intervals import Interval
-from experiments.running.compared_runs import Run, read_run
 from scripts.compare import gain
 
 CODED = "wavefront_coding"

@@ -15,11 +15,11 @@ from dolens.alignment.pose import Pose
 from dolens.alignment.spot_loss import ImageMerit
 from dolens.alignment.unmodelled import Unmodelled, unmodelled_of
 from dolens.errors import InputError
+from dolens.experiments.poses.estimates import Held, estimates, probability
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
-from experiments.poses.estimates import Held, estimates, probability
 
 WAVELENGTH, DISTANCE = 622.5, 864.0
 PHOTONS = 60_000

@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, open_dict
 
 from dolens.errors import InputError
-from experiments.running.training import run
+from dolens.experiments.running.training import run
 
 
 @pytest.fixture

@@ -7,12 +7,12 @@ import torch
 import yaml
 from hydra.utils import instantiate
 
+from dolens.experiments.camera.operands import CameraOperands
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_lens, run
 from dolens.optics.aiming import aim
 from dolens.optimize import operand_values
 from dolens.prescriptions import lens_from_prescription
-from experiments.camera.operands import CameraOperands
-from experiments.running.run_settings import RunSettings
-from experiments.running.training import build_lens, run
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET
 
 DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=1"]

@@ -6,8 +6,8 @@ import shutil
 import pytest
 import torch
 
-from experiments.running.checkpoints import SETTINGS
-from experiments.running.training import run
+from dolens.experiments.running.checkpoints import SETTINGS
+from dolens.experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 TINY_CAMERA = [

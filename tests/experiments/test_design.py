@@ -12,7 +12,7 @@ from tiny_experiment import figure_names
 from dolens import load_lens
 from dolens.analysis.pupil_quadrature import square_grid
 from dolens.errors import InputError
-from experiments.running.training import run
+from dolens.experiments.running.training import run
 
 QUIET = ["+trainer.enable_progress_bar=false"]
 UNPICTURED = ["callbacks.pictures=null", *QUIET]

@@ -4,10 +4,10 @@ import pytest
 from hydra.utils import instantiate
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from dolens.experiments.design.figures import pupil_note
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_lens
 from dolens.optimize import MeritSettings
-from experiments.design.figures import pupil_note
-from experiments.running.run_settings import RunSettings
-from experiments.running.training import build_lens
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dolens import load_lens
+from dolens.experiments.running.training import run
 from dolens.optimize import MeritSettings
-from experiments.running.training import run
 from tests.optics import exact
 
 QUIET = ["callbacks.pictures=null", "+trainer.enable_progress_bar=false"]

@@ -9,10 +9,10 @@ import torch
 from hydra.utils import instantiate
 from tiny_experiment import TINY, TINY_NETWORK
 
+from dolens.experiments.camera.calibration import NoisyMeasurement, OtherDepth, OtherSample
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_lens, run
 from dolens.rendering.psf import axial_point_spread_functions
-from experiments.camera.calibration import NoisyMeasurement, OtherDepth, OtherSample
-from experiments.running.run_settings import RunSettings
-from experiments.running.training import build_lens, run
 
 QUICK = ["trainer.max_epochs=1", "callbacks.pictures=null"]
 JUDGED = ["reference_renderers=wave", "miscalibrations=wrong"]

@@ -8,8 +8,8 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from experiments.analysis import Analysis
-from experiments.running.training import run
+from dolens.experiments.analysis import Analysis
+from dolens.experiments.running.training import run
 
 EXPERIMENT = """
 # @package _global_

@@ -6,9 +6,9 @@ import pytest
 import yaml
 
 from dolens import InputError
+from dolens.experiments.running.extensions import import_extensions
+from dolens.experiments.running.training import run
 from dolens.optics.surfaces import SURFACES, unregister_surface
-from experiments.running.extensions import import_extensions
-from experiments.running.training import run
 
 CYLINDER = """
 import dolens

@@ -8,6 +8,8 @@ import torch
 import yaml
 
 from dolens.errors import InputError
+from dolens.experiments.camera.views.fields import FieldViews
+from dolens.experiments.running.training import run
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.auto.probes import probe_image
 from dolens.rendering.psf_renderer import PsfRenderer
@@ -16,8 +18,6 @@ from dolens.scene.planar import PlanarScene
 from dolens.sensor.colour import srgb_to_linear
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
-from experiments.camera.views.fields import FieldViews
-from experiments.running.training import run
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY_DOUBLET
 
 LINES = (656.2725, 587.5618, 486.1327)

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dolens.errors import InputError
-from experiments.callbacks.figures import SaveFigures
-from experiments.experiment import Experiment
+from dolens.experiments.callbacks.figures import SaveFigures
+from dolens.experiments.experiment import Experiment
 
 
 class Drawn(Experiment):

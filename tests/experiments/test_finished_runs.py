@@ -7,9 +7,9 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
+from dolens.experiments.camera.camera import CameraModule
+from dolens.experiments.running.training import run
 from dolens.reconstruction import RestorationLoss
-from experiments.camera.camera import CameraModule
-from experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 TINY_CAMERA = ["experiment=wavefront_coding", *TINY, *TINY_NETWORK, "callbacks.pictures=null"]

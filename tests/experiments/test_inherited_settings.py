@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from dolens.errors import InputError
-from experiments.running.configuration import checked
-from experiments.running.training import run
+from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.training import run
 
 HEADER = "# @package _global_\ndefaults:\n"
 

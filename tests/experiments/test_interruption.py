@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from experiments.callbacks.interruption import InterruptionNotice
+from dolens.experiments.callbacks.interruption import InterruptionNotice
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ def test_the_checkpoint_to_go_on_from_is_named(tmp_path, caplog, written, said):
     for name in written:
         (tmp_path / f"{name}.ckpt").touch()
     notice = InterruptionNotice(tmp_path, "train")
-    with caplog.at_level(logging.WARNING, "experiments.callbacks.interruption"):
+    with caplog.at_level(logging.WARNING, "dolens.experiments.callbacks.interruption"):
         notice.on_exception(SimpleNamespace(global_step=97), None, KeyboardInterrupt())
     assert "Stopped at step 97 (KeyboardInterrupt)" in caplog.text
     assert said.format(folder=tmp_path) in caplog.text

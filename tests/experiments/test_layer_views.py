@@ -8,8 +8,8 @@ import torch
 from hydra.errors import InstantiationException
 
 from dolens.errors import InputError
-from experiments.data.occluders import with_occluders
-from experiments.running.training import run
+from dolens.experiments.data.occluders import with_occluders
+from dolens.experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 

@@ -9,10 +9,10 @@ import yaml
 
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError
+from dolens.experiments.camera.lens_least_squares import CameraOptimizer, LensLeastSquares
+from dolens.experiments.running.training import run
 from dolens.optimize.variables import DesignVariables
 from dolens.prescriptions import lens_from_prescription
-from experiments.camera.lens_least_squares import CameraOptimizer, LensLeastSquares
-from experiments.running.training import run
 from tests.experiments.tiny_experiment import FIXED_WINDOWS, TINY, TINY_DOUBLET, TINY_NETWORK
 
 DLS = ["optimizer.lens=dls", "optimizer.least_squares.every=2"]

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from dolens import InputError
-from experiments.running.run_settings import RunSettings
-from experiments.running.training import build_lens
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.training import build_lens
 
 
 @pytest.mark.parametrize(

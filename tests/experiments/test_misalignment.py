@@ -11,9 +11,9 @@ from tiny_experiment import figure_names
 
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
+from dolens.experiments.poses.settings import blur_for, spot_imager
+from dolens.experiments.running.training import run
 from dolens.sensor.pixels import Sensor
-from experiments.poses.settings import blur_for, spot_imager
-from experiments.running.training import run
 
 TINY = [
     "experiment=misalignment",

@@ -10,15 +10,15 @@ from torch import nn
 from torch.nn import functional
 
 from dolens.errors import InputError
-from dolens.reconstruction import Restoration, UNetRestoration, WienerUNetRestoration
-from dolens.sensor.colour import linear_to_srgb
-from experiments.camera.reconstruction import (
+from dolens.experiments.camera.reconstruction import (
     check_reconstruction,
     loss_over_views,
     loss_terms,
     restoration_of,
 )
-from experiments.running.training import run
+from dolens.experiments.running.training import run
+from dolens.reconstruction import Restoration, UNetRestoration, WienerUNetRestoration
+from dolens.sensor.colour import linear_to_srgb
 
 CAMERA = ["experiment=wavefront_coding", *TINY, "trainer.max_epochs=1", "callbacks.pictures=null"]
 CONVOLUTION = {

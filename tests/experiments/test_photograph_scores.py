@@ -7,14 +7,14 @@ import torch
 from tiny_experiment import TINY, TINY_NETWORK
 
 from dolens.errors import InputError
-from experiments.camera.photograph_scores import (
+from dolens.experiments.camera.photograph_scores import (
     TABLE,
     read_scores,
     scores_by_photograph,
     statistics_of,
 )
-from experiments.running.training import run
-from experiments.tables import write_table
+from dolens.experiments.running.training import run
+from dolens.experiments.tables import write_table
 
 VIEWS = ("near", "far")
 

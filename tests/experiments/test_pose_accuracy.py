@@ -7,7 +7,7 @@ import math
 import pytest
 from tiny_experiment import figure_names
 
-from experiments.running.training import run
+from dolens.experiments.running.training import run
 
 TINY = [
     "experiment=pose_accuracy",

@@ -7,11 +7,11 @@ import torch
 import yaml
 
 from dolens.errors import InputError
+from dolens.experiments.poses.bench import Bench, Light, draw, light_of, simulate
+from dolens.experiments.poses.observations import Observations
+from dolens.experiments.poses.settings import fit_plan
 from dolens.prescriptions import lens_from_prescription
 from dolens.sensor.pixels import Sensor
-from experiments.poses.bench import Bench, Light, draw, light_of, simulate
-from experiments.poses.observations import Observations
-from experiments.poses.settings import fit_plan
 
 BENCH = Bench(622.5, Sensor(32, 32, 0.15), [[0.0, 0.0, -864.0]])
 TILT, DISTANCE = "elements.lens.tilt_x", "sensor_distance"

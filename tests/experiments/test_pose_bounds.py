@@ -6,7 +6,7 @@ import json
 import pytest
 from tiny_experiment import figure_names
 
-from experiments.running.training import run
+from dolens.experiments.running.training import run
 
 TINY = [
     "experiment=pose_bounds",

@@ -8,7 +8,7 @@ from hydra.errors import InstantiationException
 from tiny_experiment import figure_names
 
 from dolens.errors import InputError
-from experiments.running.training import run
+from dolens.experiments.running.training import run
 
 SMALL = [
     "~fits.10",

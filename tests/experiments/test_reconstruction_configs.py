@@ -10,9 +10,9 @@ import torch
 from hydra.utils import instantiate
 from PIL import Image
 
+from dolens.experiments.running.training import run
 from dolens.reconstruction import RelativisticDiscriminators, Restoration, RestorationLoss
 from dolens.sensor.colour import linear_to_srgb
-from experiments.running.training import run
 
 EXPERIMENT = "experiment=wavefront_coding"
 

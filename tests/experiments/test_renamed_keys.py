@@ -7,11 +7,11 @@ import pytest
 from hydra.errors import HydraException
 
 from dolens.errors import InputError
-from experiments.running.configuration import checked
-from experiments.running.renamed_keys import RENAMED, Key, Renamed
-from experiments.running.renaming import explained, refuse_renamed, translated
-from experiments.running.target_keys import Target, located
-from experiments.running.training import run
+from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.renamed_keys import RENAMED, Key, Renamed
+from dolens.experiments.running.renaming import explained, refuse_renamed, translated
+from dolens.experiments.running.target_keys import Target, located
+from dolens.experiments.running.training import run
 
 CAMERA = "experiment=wavefront_coding"
 # Names that never were, so that the test says what a table can say.

@@ -10,9 +10,9 @@ import torch
 from tiny_experiment import figure_names
 
 from dolens.errors import InputError
+from dolens.experiments.running.training import run
+from dolens.experiments.speed.timing import by_turns, peak_megabytes
 from dolens.plotting import Point, pareto_front
-from experiments.running.training import run
-from experiments.speed.timing import by_turns, peak_megabytes
 
 SMALL = [
     "experiment=speed_vs_error",

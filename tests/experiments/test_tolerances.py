@@ -10,7 +10,7 @@ from tiny_experiment import figure_names
 
 from dolens import InputError, load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
-from experiments.running.training import run
+from dolens.experiments.running.training import run
 
 # The whole path, with few rays; the fields are aimed one by one, which takes most of the time.
 SMALL = [

@@ -20,9 +20,9 @@ from tiny_experiment import TINY, TINY_DOUBLET, TINY_NETWORK, figure_names
 
 from dolens import load_lens
 from dolens.errors import InputError
+from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.training import run
 from dolens.sensor.readout import Readout
-from experiments.running.configuration import checked
-from experiments.running.training import run
 
 EXPERIMENTS = sorted(p.stem for p in (Path(__file__).parents[2] / "conf/experiment").glob("*.yaml"))
 UNTESTED = ["test=false", "objective=train/loss"]

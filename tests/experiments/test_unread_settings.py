@@ -3,8 +3,8 @@
 import pytest
 
 from dolens.errors import InputError
-from experiments.running.configuration import checked
-from experiments.running.run_settings import RunSettings
+from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.run_settings import RunSettings
 
 UNREAD = {
     "a group": (["experiment=asphere", "discriminator=double_scale"], "discriminator="),

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dolens import load_lens
+from dolens.experiments.camera.views.fields import FieldViews
 from dolens.rendering.protocol import Renderer, SensorWindow
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.pupil.exit_pupil import ExitPupil
@@ -14,7 +15,6 @@ from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.colour import srgb_to_linear
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
-from experiments.camera.views.fields import FieldViews
 
 LINES = (656.2725, 587.5618, 486.1327)
 WHOLE = Sensor(96, 120, 0.08)

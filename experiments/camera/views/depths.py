@@ -9,6 +9,12 @@ from torch import Tensor
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.diffraction.diffraction_limit import with_diffraction_limit
 from dolens.errors import InputError
+from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.truth import (
+    check_truth,
+    reference_chief_ray_map,
+    sample_texture,
+)
 from dolens.optics.lens import Lens
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
@@ -17,8 +23,6 @@ from dolens.scene.planar import pinhole_image
 from dolens.scene.scene import Scene
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
-from experiments.camera.views.base import Comparison, Imaging, Views, seed_of
-from experiments.camera.views.truth import check_truth, reference_chief_ray_map, sample_texture
 
 
 class DepthViews(Imaging):

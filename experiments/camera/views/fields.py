@@ -9,6 +9,14 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays, gaussian_quadrature
 from dolens.errors import InputError
+from dolens.experiments.camera.views.base import Comparison, Imaging, Views, seed_of
+from dolens.experiments.camera.views.field_windows import FieldWindows
+from dolens.experiments.camera.views.truth import (
+    check_truth,
+    nearest_texel,
+    reference_chief_ray_map,
+    sample_texture,
+)
 from dolens.optics.lens import Lens
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer, SensorWindow
@@ -17,14 +25,6 @@ from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
-from experiments.camera.views.base import Comparison, Imaging, Views, seed_of
-from experiments.camera.views.field_windows import FieldWindows
-from experiments.camera.views.truth import (
-    check_truth,
-    nearest_texel,
-    reference_chief_ray_map,
-    sample_texture,
-)
 
 EVERYWHERE = "field"
 # Pixels along each side of point spread functions, where the training renderer has none.

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.camera.views.base import SCENE_OFFSET, Views, seed_of
+from dolens.experiments.camera.views.depths import DepthViews
+from dolens.experiments.data.occluders import with_occluders
 from dolens.optics.lens import Lens
 from dolens.scene.layered import LayeredScene
-from experiments.camera.views.base import SCENE_OFFSET, Views, seed_of
-from experiments.camera.views.depths import DepthViews
-from experiments.data.occluders import with_occluders
 
 
 class LayerViews(DepthViews):

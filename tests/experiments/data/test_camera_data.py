@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from experiments.data.camera_data import CropDataModule
-from experiments.data.photographs import Photograph
+from dolens.experiments.data.camera_data import CropDataModule
+from dolens.experiments.data.photographs import Photograph
 
 
 class _Data(CropDataModule):

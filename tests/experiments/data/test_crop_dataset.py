@@ -2,10 +2,10 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
-from experiments.data.crops import centred_crops, random_crop
-from experiments.data.photographs import Photograph
-from experiments.data.resumable import ResumableSampler
+from dolens.experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
+from dolens.experiments.data.crops import centred_crops, random_crop
+from dolens.experiments.data.photographs import Photograph
+from dolens.experiments.data.resumable import ResumableSampler
 
 
 def _photographs(count):

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
-from experiments.data.crops import (
+from dolens.experiments.data.crops import (
     _grid,
     centred_crop,
     centred_crops,
@@ -15,7 +14,8 @@ from experiments.data.crops import (
     random_crop,
     random_order,
 )
-from experiments.data.photographs import Photograph
+from dolens.experiments.data.photographs import Photograph
+from dolens.sensor.colour import linear_to_srgb, srgb_to_linear
 
 
 def _noise(height=60, width=80, name="noise"):

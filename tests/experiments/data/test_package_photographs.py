@@ -9,15 +9,15 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
-from dolens.sensor.colour import linear_to_srgb
-from experiments.data.package_photographs import (
+from dolens.experiments.data.package_photographs import (
     MANIFEST,
     PackagePhotographsDataModule,
     data_folders,
     read_manifest,
     shrunk,
 )
-from experiments.data.photographs import Photograph
+from dolens.experiments.data.photographs import Photograph
+from dolens.sensor.colour import linear_to_srgb
 
 COLUMNS = ("split", "package", "version", "path", "sha256", "title")
 FILES = (("train", "a.png"), ("validation", "b.png"), ("test", "deep/c.png"), ("test", "d.png"))

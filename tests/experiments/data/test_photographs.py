@@ -4,7 +4,7 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
-from experiments.data.photographs import (
+from dolens.experiments.data.photographs import (
     Photograph,
     list_photographs,
     probe_photograph,

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from dolens.errors import InputError
-from experiments.data import photos
-from experiments.data.photos import PhotosDataModule
+from dolens.experiments.data import photos
+from dolens.experiments.data.photos import PhotosDataModule
 
 
 def test_default_splits_are_disjoint_and_installed():

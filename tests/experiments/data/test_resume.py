@@ -6,8 +6,8 @@ import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 
 from dolens.errors import InputError
-from experiments.data.camera_data import CropDataModule
-from experiments.data.photographs import Photograph
+from dolens.experiments.data.camera_data import CropDataModule
+from dolens.experiments.data.photographs import Photograph
 
 STEPS = 5
 pytestmark = pytest.mark.filterwarnings(

@@ -8,13 +8,13 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
+from dolens.experiments.data.crops import centred_crop, random_crop
+from dolens.experiments.data.depth_maps import read_depth_map
+from dolens.experiments.data.photographs import Photograph
+from dolens.experiments.data.rgbd_folder import RgbdFolderDataModule
+from dolens.experiments.running.training import run
 from dolens.rendering.auto.probes import probe_texture
 from dolens.sensor.pixels import Sensor
-from experiments.data.crops import centred_crop, random_crop
-from experiments.data.depth_maps import read_depth_map
-from experiments.data.photographs import Photograph
-from experiments.data.rgbd_folder import RgbdFolderDataModule
-from experiments.running.training import run
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 

@@ -1,0 +1,37 @@
+"""The command `dolens` and its list of commands.
+
+A command's own file imports what it needs when it runs, so that `dolens --help` answers at once and
+the commands about a lens work without the packages that training needs.
+"""
+
+import sys
+
+import typer
+
+from dolens.errors import InputError
+
+app = typer.Typer(
+    name="dolens",
+    help="Look at lenses, design them, and train cameras: optics and reconstruction together.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def main() -> None:
+    """Run the command; a user's mistake ends it with one line and exit status 1."""
+    try:
+        app()
+    except InputError as error:
+        sys.exit(one_line(error))
+
+
+def one_line(problem: object) -> str:
+    """The message of a user's mistake, on one line."""
+    return "error: " + " ".join(str(problem).split())
+
+
+@app.callback()
+def _dolens() -> None:
+    """Keep `dolens` a group of commands, however few there are."""
