@@ -8,6 +8,7 @@ import sys
 
 import typer
 
+from dolens.cli.evaluate import evaluate
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -35,3 +36,6 @@ def one_line(problem: object) -> str:
 @app.callback()
 def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
+
+
+app.command("evaluate")(evaluate)

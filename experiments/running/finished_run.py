@@ -19,6 +19,7 @@ from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.running.composition import with_overrides
 from dolens.experiments.running.extensions import import_extensions
+from dolens.experiments.running.perturbed_lens import perturbed_state
 from dolens.experiments.running.recorded_run import RecordedRun, read_record
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_settings import RunSettings
@@ -89,8 +90,12 @@ def load_run(
     checkpoint: str | Path = "last",
     overrides: Sequence[str] = (),
     output: str | Path | None = None,
+    with_loss: bool = True,
 ) -> FinishedRun:
     """Load a run folder as objects, in the state of a checkpoint.
+
+    Parameters of the lens are those of the checkpoint, except where an override sets one to another
+    value; whether overrides make another camera besides is not looked at here.
 
     The folder says which classes are made, a user's own among them, which are looked for in the
     working folder and where Python looks: load only runs that you trust.  The checkpoint is read as
@@ -101,9 +106,9 @@ def load_run(
         folder: of the run.
         checkpoint: `last`, `best`, or the path of a file.
         overrides: as of the command line, applied over the run's own; see `with_overrides`.
-            Whether they make another camera is not looked at here: parameters of the lens are those
-            of the checkpoint in any case.
         output: where paths of the configuration within the run folder lead to; None: the folder.
+        with_loss: whether the loss is needed: a perceptual one looks for a classifier's weights,
+            and may download them.
 
     Raises:
         InputError: the folder is none of a run; it has no such checkpoint; a class is not there; or
@@ -127,16 +132,20 @@ def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Pa
     cfg = OmegaConf.create(dict(config))
     settings = RunSettings.of(cfg)
     with torch.random.fork_rng(devices=()):
-        lens = lens_from_prescription(
-            settings.prescription(), settings.dtype, where="lens", backend=settings.backend
-        )
-        module = _made("module", settings.module)(lens=lens)
+        module = _made("module", settings.module)(lens=_lens(settings.prescription(), settings))
     check_experiment(module, train=False)
     file, state = None, {}
     if module.trains:
         file = _checkpoint_file(record, checkpoint)
         state = read_checkpoint(file)
-        _take_up(module, state, file)
+        values = state["state_dict"]
+        if config["lens"] != record.config["lens"]:
+            lenses = (
+                _lens(settings.prescription(), settings),
+                _lens(record.config["lens"], settings),
+            )
+            values = perturbed_state(module, *lenses, values)
+        _take_up(module, {**state, "state_dict": values}, file)
     elif str(checkpoint) != CHECKPOINTS[0]:
         raise InputError(
             f"{record.folder}: {type(module).__name__} trains nothing, and has no checkpoint"
@@ -144,6 +153,12 @@ def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Pa
     module.eval()
     step, epoch = int(state.get("global_step", 0)), int(state.get("epoch", -1)) + 1
     return FinishedRun(record, cfg, settings, module, file, step, epoch)
+
+
+def _lens(prescription: Mapping[str, Any], settings: RunSettings) -> Lens:
+    return lens_from_prescription(
+        prescription, settings.dtype, where="lens", backend=settings.backend
+    )
 
 
 def _checkpoint_file(record: RecordedRun, checkpoint: str | Path) -> Path:
@@ -198,9 +213,20 @@ def _take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
     try:
         module.load_state_dict(state["state_dict"])
     except RuntimeError as error:
-        reason = " ".join(str(error).split())
+        reason = _misfit(state["state_dict"], module.state_dict()) or " ".join(str(error).split())
         raise InputError(f"{file} does not fit the run's configuration: {reason}") from None
     module.settle()
+
+
+def _misfit(found: Mapping[str, Any], own: Mapping[str, Any]) -> str:
+    """Return the first thing in which a state differs from what a module takes; nothing: ''."""
+    for name, value in own.items():
+        if name not in found:
+            return f"{name} is missing in the checkpoint"
+        if found[name].shape != value.shape:
+            shapes = tuple(found[name].shape), tuple(value.shape)
+            return f"{name} has shape {shapes[0]} in the checkpoint and {shapes[1]} here"
+    return next((f"there is no {name} here" for name in found if name not in own), "")
 
 
 def _made(key: str, config: DictConfig) -> Any:
