@@ -27,6 +27,7 @@ from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
+from dolens.stages import stage
 
 logger = logging.getLogger(__name__)
 
@@ -151,7 +152,8 @@ class DesignModule(Experiment):
             self.variables.write_to(lens)
             lens.sensor_distance.copy_(self.round_start_focus)
             self.variables.scaled.copy_(now)
-        self.merit = self._build(lens)
+        with stage("choosing the rays"):
+            self.merit = self._build(lens)
         fresh = math.isinf(float(self.best_merit))
         quality = self.merit.quality if fresh else self.merit_settings.image_quality(self.initial)
         self.initial_light = None if quality is None else quality.spots.light
