@@ -24,10 +24,11 @@ ALLOWED = {
     "alignment": {"errors", "optics", "sensor", "rendering", "analysis", "diffraction", "optimize"},
     "reconstruction": {"errors", "optics", "sensor"},
     "plotting": {"errors", "optics", "analysis", "sensor", "rendering"},
+    "manufacturing": {"errors", "optics", "prescriptions", "tolerancing", "plotting"},
     # The command line stands above everything, the experiments too.
     "cli": {
         *("errors", "optics", "prescriptions", "analysis", "diffraction", "rendering"),
-        *("tolerancing", "plotting", "experiments"),
+        *("tolerancing", "plotting", "manufacturing", "experiments"),
     },
 }
 
