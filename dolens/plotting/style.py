@@ -30,7 +30,8 @@ def field_label(field: Sequence[float] | Tensor, unit: str) -> str:
     """Return `14°`, or `(3, 14)°` for a field beside the y-z plane; in mm likewise."""
     x, y = (float(f"{float(value):.6g}") for value in field)
     space = "" if unit == "°" else " "
-    return f"{y:g}{space}{unit}" if x == 0.0 else f"({x:g}, {y:g}){space}{unit}"
+    label = f"{y:g}{space}{unit}" if x == 0.0 else f"({x:g}, {y:g}){space}{unit}"
+    return label.replace("-", "−")
 
 
 def wavelength_handles(wavelengths: Sequence[float] | Tensor) -> list[Line2D]:
