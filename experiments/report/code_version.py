@@ -1,0 +1,38 @@
+"""A fingerprint of the code that computes results."""
+
+import hashlib
+from functools import cache
+from pathlib import Path
+
+import dolens
+import dolens.experiments
+
+# In a checkout and in an installed wheel alike, conf/ lies beside the experiments.
+EXPERIMENTS = Path(dolens.experiments.__file__).resolve().parent
+CONFIGURATION = EXPERIMENTS.parent / "conf"
+_SOURCES = (
+    ("dolens", Path(dolens.__file__).resolve().parent, "*.py"),
+    ("experiments", EXPERIMENTS, "*.py"),
+    ("conf", CONFIGURATION, "*.yaml"),
+)
+# What only shows results changes none.
+_SHOWN_ONLY = ("cli", "commands", "lens_page", "report")
+# In a wheel these lie within dolens; they have a turn of their own.
+_WITHIN = ("experiments", "conf")
+
+
+@cache
+def code_fingerprint() -> str:
+    """Return twelve hexadecimal digits that change with the code or configuration of any run.
+
+    It covers the sources of dolens, its experiments and its configuration.
+    """
+    digest = hashlib.sha256()
+    for name, root, pattern in _SOURCES:
+        for path in sorted(root.rglob(pattern)):
+            inside = path.relative_to(root)
+            if inside.parts[0] in (*_SHOWN_ONLY, *_WITHIN):
+                continue
+            digest.update(f"{name}/{inside.as_posix()}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
