@@ -16,8 +16,9 @@ from dolens.experiments.report.code_version import code_fingerprint
 from dolens.experiments.report.plan import System
 from dolens.experiments.report.results import RECORD, is_finished, read_json
 
-# What a run may take to end by itself once it is interrupted.
-_GRACE_S = 20.0
+# What a run may take to end by itself once it is interrupted.  Ctrl-C in a terminal reaches it too;
+# a second signal at once would disturb what it saves.
+_FIRST_GRACE_S, _GRACE_S = 3.0, 20.0
 _POLL_S = 0.25
 
 
@@ -137,7 +138,11 @@ def _wait(process: subprocess.Popen, tick: Callable[[], None]) -> tuple[int, flo
 
 def _stop(process: subprocess.Popen) -> None:
     """Wait for an interrupted run, and end it if it does not end by itself."""
-    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(_FIRST_GRACE_S)
+        return
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
     try:
         process.wait(_GRACE_S)
     except subprocess.TimeoutExpired:
