@@ -6,15 +6,8 @@ from pathlib import Path
 
 import dolens
 import dolens.experiments
+from dolens.packaged import packaged_configuration
 
-# In a checkout and in an installed wheel alike, conf/ lies beside the experiments.
-EXPERIMENTS = Path(dolens.experiments.__file__).resolve().parent
-CONFIGURATION = EXPERIMENTS.parent / "conf"
-_SOURCES = (
-    ("dolens", Path(dolens.__file__).resolve().parent, "*.py"),
-    ("experiments", EXPERIMENTS, "*.py"),
-    ("conf", CONFIGURATION, "*.yaml"),
-)
 # What only shows results changes none.
 _SHOWN_ONLY = ("cli", "commands", "lens_page", "report")
 # In a wheel these lie within dolens; they have a turn of their own.
@@ -27,8 +20,13 @@ def code_fingerprint() -> str:
 
     It covers the sources of dolens, its experiments and its configuration.
     """
+    sources = (
+        ("dolens", Path(dolens.__file__).resolve().parent, "*.py"),
+        ("experiments", Path(dolens.experiments.__file__).resolve().parent, "*.py"),
+        ("conf", packaged_configuration(), "*.yaml"),
+    )
     digest = hashlib.sha256()
-    for name, root, pattern in _SOURCES:
+    for name, root, pattern in sources:
         for path in sorted(root.rglob(pattern)):
             inside = path.relative_to(root)
             if inside.parts[0] in (*_SHOWN_ONLY, *_WITHIN):

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.experiments.report.code_version import CONFIGURATION
 from dolens.experiments.report.plan import FOLDER
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
+from dolens.packaged import packaged_configuration
 from dolens.prescriptions import lens_from_prescription, load_prescription
 
 _NM_PER_MM = 1e6
@@ -53,7 +53,7 @@ def trace_errors(bundles: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 def golden_lens(bundle: Mapping[str, Any], dtype: torch.dtype) -> Lens:
     """Return the lens of a bundle."""
-    file = CONFIGURATION / "lens" / f"{bundle['lens']}.yaml"
+    file = packaged_configuration() / "lens" / f"{bundle['lens']}.yaml"
     prescription = load_prescription(file) | {"elements": bundle["elements"]}
     lens = lens_from_prescription(prescription, dtype, where=file.name)
     with torch.no_grad():

@@ -13,11 +13,11 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 
-from dolens.experiments.report.code_version import CONFIGURATION
 from dolens.experiments.report.golden_rays import load_golden_rays, trace_errors
 from dolens.experiments.running.run_folder import describe_run, peak_memory_mb, write_json
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
+from dolens.packaged import packaged_configuration
 from dolens.plotting import layout_figure, save_figure
 from dolens.prescriptions import lens_from_prescription, load_lens, prescription_of
 
@@ -67,13 +67,14 @@ def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     info = {**describe_run(0, "cpu", "float64", sys.argv), "module": MODULE}
     numbers = trace_errors(load_golden_rays())
+    prescribed = packaged_configuration() / "lens"
     for shown in SHOWN:
-        lens = load_lens(CONFIGURATION / "lens" / f"{shown.lens}.yaml", dtype=torch.float64)
+        lens = load_lens(prescribed / f"{shown.lens}.yaml", dtype=torch.float64)
         first_order = lens.first_order(_LINE_NM)
         numbers[f"efl_mm/{shown.lens}"] = float(first_order.efl.detach())
         numbers[f"bfd_mm/{shown.lens}"] = float(first_order.bfd.detach())
         save_figure(layout(lens, shown), folder / "figures" / f"layout_{shown.lens}.png")
-    numbers |= trace_costs(load_lens(CONFIGURATION / "lens" / "cooke_triplet.yaml"))
+    numbers |= trace_costs(load_lens(prescribed / "cooke_triplet.yaml"))
     numbers["cost/wall_s"] = time.perf_counter() - started
     numbers["cost/peak_memory_mb"] = peak_memory_mb(torch.device("cpu"))
     write_json(folder / "metrics.json", numbers)

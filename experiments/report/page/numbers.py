@@ -10,12 +10,11 @@ def number_text(value: float, digits: int = 4) -> str:
     """Return a number with so many significant digits, a true minus and no exponent letter."""
     if not math.isfinite(value):
         return "no number"
-    text = f"{value:.{digits}g}"
+    text = f"{value:#.{digits}g}"
     if "e" in text:
         mantissa, exponent = text.split("e")
-        text = f"{mantissa}·10{str(int(exponent)).translate(_SUPERSCRIPTS)}"
-    elif abs(value) >= 1.0 and "." not in text and digits > len(text.lstrip("-")):
-        text = f"{value:.{digits - len(text.lstrip('-'))}f}"
+        text = f"{mantissa.rstrip('.')}·10{str(int(exponent)).translate(_SUPERSCRIPTS)}"
+    text = text.rstrip(".")
     return text.replace("-", _MINUS)
 
 

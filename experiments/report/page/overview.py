@@ -16,7 +16,7 @@ _TITLES = {
 }
 # Words of the column; SOURCES has them in full.
 _KINDS = {"printed": "printed", "exact": "exact", "measured": "measured", "statement": "claim"}
-_COLUMNS = ("Item", "Statement", "Expected", "Found", "Source of the expected value")
+_COLUMNS = ("Statement", "Expected", "Found", "Expected value from")
 
 
 def overview(material: Material) -> Markup:
@@ -78,8 +78,11 @@ def checks_table(outcomes: Sequence[Outcome]) -> Markup:
 def _row(outcome: Outcome) -> tuple[Child, ...]:
     check = outcome.check
     return (
-        element("a", check.item, href=f"#{anchor(check.item)}"),
-        joined(check.what, " ", element("code", f"{check.run}: {check.metric}")),
+        joined(
+            element("a", check.item, href=f"#{anchor(check.item)}"),
+            f": {check.what} ",
+            element("code", f"{check.run}: {check.metric}"),
+        ),
         expected_text(check),
         element("span", found_text(outcome), class_=css_class(outcome.state)),
         joined(element("b", _KINDS[check.kind]), f": {check.source}"),

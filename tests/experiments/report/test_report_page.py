@@ -82,7 +82,7 @@ def test_text_is_escaped(text):
         "2 do not hold",
         "1 were not run",
         "20.50",  # the radius of lens/final.yaml
-        "2.895 ± 0.01 (95 %: 2.80",
+        "2.895 ± 0.010 (95 %: 2.800 to 3.000)",
         "not run",
         "No picture yet of singlet: absent.",
         "1 min 15 s, 12\N{NARROW NO-BREAK SPACE}345 rays, 1.5 GB of memory",

@@ -99,7 +99,7 @@ def test_an_interrupt_ends_the_run_and_writes_the_page(plan, tmp_path):
             raise KeyboardInterrupt
 
     sleeping = System("writes", "w", 1.0, module="report_sleeps")
-    plan = Plan((sleeping,), (), plan.sections)
+    plan = Plan((sleeping,), (), ())
     with pytest.raises(KeyboardInterrupt):
         make_report(plan, tmp_path / "report", Choice(), Impatient())
     assert (tmp_path / "report/index.html").is_file()
