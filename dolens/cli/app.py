@@ -8,6 +8,8 @@ import sys
 
 import typer
 
+from dolens.cli.report import HELP as REPORT_HELP
+from dolens.cli.report import report
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -35,3 +37,6 @@ def one_line(problem: object) -> str:
 @app.callback()
 def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
+
+
+app.command("report", help=REPORT_HELP)(report)
