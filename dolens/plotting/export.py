@@ -12,7 +12,6 @@ from torch import Tensor
 
 from dolens.errors import check_choice
 
-
 FORMATS = ("png", "pdf", "svg")
 # Dots per inch of the figure's size: two pixels for each that a screen of 96 dpi shows.
 _DPI = 200.0

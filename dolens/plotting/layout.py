@@ -15,8 +15,8 @@ from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.drawing import draw_layout, layout_drawing
-from dolens.plotting.section import SAMPLES, sag_of
 from dolens.plotting.number_text import number_text, with_minus
+from dolens.plotting.section import SAMPLES, sag_of
 from dolens.plotting.style import PAGE, SMALL, TITLE, open_axes
 
 # A sag below this share of the height of the drawing cannot be seen.
@@ -105,7 +105,16 @@ def layout_title(
 ) -> str:
     """Return the lens's name, its focal length at a wavelength in nm, and its working F-number."""
     optics = optics_text(system, wavelength, object_distance)
-    return f"{lens.name}: {optics}" if lens.name else optics
+    name = shown_name(lens)
+    return f"{name}: {optics}" if name else optics
+
+
+def shown_name(lens: Lens) -> str:
+    """Return the lens's name without the `, initial` of a prescription where a search begins.
+
+    A figure says itself whether it shows the lens before or after.
+    """
+    return lens.name.removesuffix(", initial")
 
 
 def optics_text(

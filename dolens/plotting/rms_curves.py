@@ -48,6 +48,7 @@ def rms_curves_figure(
     if not given:
         raise InputError("rms_curves_figure needs curves against field or against wavelength")
     figure = Figure(figsize=(PAGE if len(given) > 1 else 4.8, 3.9), layout="constrained")
+    figure.get_layout_engine().set(wspace=0.06)
     grid = figure.subplots(1, len(given), squeeze=False, sharey=True)
     for axes, (curves, draw) in zip(grid[0], given, strict=True):
         draw(axes, curves)

@@ -58,8 +58,8 @@ def spots_figure(
     """
     fields, waves = len(spots.fields), len(spots.wavelengths)
     drawn = _Drawn(spots)
-    columns = min(fields, _COLUMNS) if overlaid else waves
-    rows = math.ceil(fields / columns) if overlaid else fields
+    rows = math.ceil(fields / _COLUMNS) if overlaid else fields
+    columns = math.ceil(fields / rows) if overlaid else waves
     panel = min(_PANEL, (PAGE - 0.75) / columns)
     lines = 0 if title is None else title.count("\n") + 1
     figure = Figure(
@@ -216,10 +216,12 @@ def _label(grid: np.ndarray, fields: int, half: float, overlaid: bool) -> None:
     for number, axes in enumerate(grid.flat):
         if overlaid and number >= fields:
             axes.set_visible(False)
-            grid.flat[number - grid.shape[1]].tick_params(labelbottom=True)
+            above = grid.flat[number - grid.shape[1]]
+            above.tick_params(labelbottom=True)
+            above.set_xlabel("x (µm)", fontsize=SMALL + 1)
         axes.set(xlim=(-half, half), ylim=(-half, half), box_aspect=1.0)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+            axis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10)))
         ruled_axes(axes)
     for axes in grid[-1]:
         axes.set_xlabel("x (µm)", fontsize=SMALL + 1)

@@ -27,7 +27,7 @@ def log_ticks(axis: Axis) -> None:
         minors = tuple(range(2, 10)) if stride == 1 and decades < _MANY else (1.0,)
         axis.set_minor_locator(LogLocator(base=10.0, subs=minors, numticks=99))
         axis.set_minor_formatter(NullFormatter())
-        if -3 <= math.log10(low) and math.log10(high) <= 4:
+        if low >= 1e-3 and high <= 1e4:
             axis.set_major_formatter(FuncFormatter(lambda value, _: number_text(value)))
         return
     steps = next(found for most, found in _STEPS.items() if decades <= most)

@@ -31,7 +31,7 @@ from dolens.plotting import (
     spots_comparison_figure,
     spots_figure,
 )
-from dolens.plotting.layout import optics_text
+from dolens.plotting.layout import optics_text, shown_name
 from dolens.plotting.number_text import number_text
 
 _FREQUENCIES = 101
@@ -97,17 +97,19 @@ def design_figures(
             blur = 1e-3 * spot_table(lens, settings).mean
             most = min(most, _BLURRED / max(blur, 1e-12))
         frequencies = torch.linspace(0.0, most, _FREQUENCIES, dtype=torch.float64)
-        return modulation_figure(
-            {
-                name: merit_modulation(of, settings, frequencies)
-                for name, of in (("initial", initial), ("final", lens))
-            },
-            titled(
-                lens,
-                None,
-                f"MTF of {pupil_text(settings)}: contrast of the rays × diffraction limit",
-            ),
-        )
+        found = {
+            name: merit_modulation(of, settings, frequencies)
+            for name, of in (("initial", initial), ("final", lens))
+        }
+        # A panel says of which fields it has no wave-optical function.
+        panels = {
+            f"{name}\nproduct¹: {', '.join(products)}" if products else f"{name}\n": mtf
+            for name, (mtf, products) in found.items()
+        }
+        rows = [f"MTF with diffraction, {pupil_text(settings)}"]
+        if any(products for _, products in found.values()):
+            rows.append("¹ contrast of the rays × diffraction limit")
+        return modulation_figure(panels, titled(lens, None, "\n".join(rows)))
 
     def curves() -> Figure:
         edge = max(fields, key=_size)
@@ -141,7 +143,7 @@ def design_figures(
         figures["history"] = lambda: history_figure(
             merits,
             damping if any(value == value for value in damping) else None,
-            title=f"{lens.name}: history of the design" if lens.name else "History of the design",
+            title=": ".join(filter(None, [shown_name(lens), "history of the design"])),
             merit_label=f"merit ({merit_unit})" if merit_unit else "merit",
         )
     return figures
@@ -150,7 +152,7 @@ def design_figures(
 def titled(lens: Lens, stage: str | None, rest: str) -> str:
     """Return a title: name of the lens, stage, focal length and aperture; and the rest below."""
     optics = optics_text(lens.system(), lens.primary_wavelength, lens.object_distance)
-    name = ", ".join(part for part in (lens.name, stage) if part)
+    name = ", ".join(part for part in (shown_name(lens), stage) if part)
     return f"{name}: {optics}\n{rest}" if name else f"{optics}\n{rest}"
 
 

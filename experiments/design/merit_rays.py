@@ -1,8 +1,8 @@
 """Spots, contrast and RMS curves are computed over the very rays of `rms_spot_um`.
 
-A figure beside a headline number shows that number's rays.  A grid of rays is shown as it is.  Where
-the number is a Gaussian quadrature of the whole stop, a figure shows more rays of the same pupil,
-and its RMS radii are those of the quadrature.
+A figure beside a headline number shows that number's rays.  A grid of rays is shown as it is.
+Where the number is a Gaussian quadrature of the whole stop, a figure shows more rays of the same
+pupil, and its RMS radii are those of the quadrature.
 """
 
 import math
@@ -12,7 +12,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.analysis.modulation_transfer import Modulation, modulation, modulation_transfer
+from dolens.analysis.modulation_transfer import (
+    Modulation,
+    diffraction_limited_transfer,
+    field_directions,
+    modulation,
+    modulation_transfer,
+)
 from dolens.analysis.ray_intercepts import field_unit
 from dolens.analysis.rms_curves import RMSCurves
 from dolens.analysis.spot_diagram import (
@@ -22,16 +28,20 @@ from dolens.analysis.spot_diagram import (
     spot_diagram,
     working_f_numbers,
 )
+from dolens.diffraction.transfer import diffraction_modulation
 from dolens.errors import InputError
 from dolens.experiments.design.tables import SQUARE_GRID_COUNT, spot_table
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 from dolens.optimize import MeritSettings
 from dolens.optimize.image_quality import ImageQuality, QualityValues
+from dolens.plotting.style import field_label
 
 _CURVE_POINTS = 15
 # Rays along each side of a grid for transfer functions.
 _DENSE_GRID = 121
+# Airy radii beyond which a mean RMS radius leaves diffraction without a say.
+_STEEP = 10.0
 # A quadrature of the whole stop that holds for large aberrations too.
 _WHOLE_STOP = {"rings": 20, "arms": 24}
 
@@ -124,39 +134,81 @@ def merit_spots(lens: Lens, settings: MeritSettings) -> SpotDiagram:
 
 
 @torch.no_grad()
-def merit_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -> Modulation:
-    """Return the contrast of the spots times that of the pupil's diffraction.
+def merit_modulation(
+    lens: Lens, settings: MeritSettings, frequencies: Tensor
+) -> tuple[Modulation, list[str]]:
+    """Return the MTF with diffraction of the pupil of `rms_spot_um`.
 
-    The rays fill the pupil of `rms_spot_um`, more densely than that number needs.  The product is right where aberrations are far below a wavelength, and where they are many
-    wavelengths (Hopkins 1957; see `dolens.diffraction.diffraction_limit`).
+    Over the whole stop it is the pupil's autocorrelation.  Over a grid within the stop, and where
+    spots are many Airy discs large, it is the contrast of the rays times the diffraction limit.
+    The product is right where aberrations are far below a wavelength, and where they are many
+    wavelengths (see `dolens.diffraction.diffraction_limit`).
+
+    Returns:
+        The MTF, and labels of the fields that are such products.
     """
     fields, waves = settings.fields_of(lens), settings.wavelengths_of(lens)
-    found = modulation(lens, fields, waves, frequencies, object_distance=lens.object_distance)
-    tangential, sagittal, limit = found.tangential, found.sagittal, found.diffraction_limit
+    distance = lens.object_distance
     if pupil_share(lens, settings) < 1.0:
-        dense = {**settings.sampling_options, "count": _DENSE_GRID}
-        quality, _, hits = _traced(lens, replace(settings, sampling_options=dense))
-        points = _padded(hits, quality.spots.spot.cpu(), quality.spots.count)
-        points = points.unflatten(0, (len(fields), len(waves))).flatten(1, 2)
-        along = _along(found.fields)
-        across = torch.stack((along[:, 1], -along[:, 0]), -1)
-        light = points.isfinite().all(-1).double()
-        points = points.nan_to_num(0.0)
-        tangential, sagittal = (
-            torch.stack(
-                [
-                    modulation_transfer(p, w, frequencies, direction)
-                    for p, w, direction in zip(points, light, way, strict=True)
-                ]
-            )
-            for way in (along, across)
+        found = _grid_modulation(lens, settings, frequencies)
+        return found, [field_label(field, found.field_unit) for field in found.fields]
+    wavelengths = torch.tensor(list(waves), dtype=torch.float64)
+    numbers = working_f_numbers(lens, wavelengths, distance)
+    limit = diffraction_limited_transfer(frequencies, wavelengths[:, None], numbers[:, None]).mean(
+        0
+    )
+    airy = float(AIRY * 1e-3 * (wavelengths * numbers).mean())
+    if spot_table(lens, settings).mean > _STEEP * airy:
+        # Diffraction changes next to nothing, and a wave calculation takes long.
+        rays = modulation(lens, fields, waves, frequencies, object_distance=distance)
+        products = {"tangential": rays.tangential * limit, "sagittal": rays.sagittal * limit}
+        labels = [field_label(field, rays.field_unit) for field in rays.fields]
+        return replace(rays, **products, diffraction_limit=limit), labels
+    whole = diffraction_modulation(lens, fields, waves, frequencies, distance)
+    by_rays = [not done for done in whole.diffraction]
+    factor = torch.where(torch.tensor(by_rays)[:, None], limit, 1.0)
+    found = Modulation(
+        whole.fields,
+        whole.field_unit,
+        whole.wavelengths,
+        whole.frequencies,
+        whole.tangential * factor,
+        whole.sagittal * factor,
+        limit,
+    )
+    steep = zip(whole.fields, by_rays, strict=True)
+    return found, [field_label(field, whole.field_unit) for field, by_ray in steep if by_ray]
+
+
+def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -> Modulation:
+    """Return the contrast of the rays of a grid within the stop, times its diffraction limit.
+
+    The grid is denser than that of `rms_spot_um`, and as large.
+    """
+    fields, waves = settings.fields_of(lens), settings.wavelengths_of(lens)
+    dense = {**settings.sampling_options, "count": _DENSE_GRID}
+    quality, _, hits = _traced(lens, replace(settings, sampling_options=dense))
+    points = _padded(hits, quality.spots.spot.cpu(), quality.spots.count)
+    points = points.unflatten(0, (len(fields), len(waves))).flatten(1, 2)
+    light = points.isfinite().all(-1).double()
+    points = points.nan_to_num(0.0)
+    field = torch.tensor([tuple(one) for one in fields], dtype=torch.float64)
+    wavelengths = torch.tensor(list(waves), dtype=torch.float64)
+    along = field_directions(field, lens.object_distance)
+    across = torch.stack((along[:, 1], -along[:, 0]), -1)
+    tangential, sagittal = (
+        torch.stack(
+            [
+                modulation_transfer(p, w, frequencies, direction)
+                for p, w, direction in zip(points, light, way, strict=True)
+            ]
         )
-        limit = _grid_limit(lens, settings, found, frequencies)
-    return replace(
-        found,
-        tangential=tangential * limit,
-        sagittal=sagittal * limit,
-        diffraction_limit=limit,
+        for way in (along, across)
+    )
+    limit = _square_limit(_f_numbers(lens, settings, wavelengths), wavelengths, frequencies)
+    unit = field_unit(lens.object_distance)
+    return Modulation(
+        field, unit, wavelengths, frequencies, tangential * limit, sagittal * limit, limit
     )
 
 
@@ -185,31 +237,44 @@ def _curves(
     fields: Sequence[Sequence[float]],
     waves: Sequence[float],
 ) -> RMSCurves:
-    rows, together = [], []
-    for field in fields:
-        one = replace(
-            settings,
-            fields=[tuple(field)],
-            wavelengths=list(waves),
-            field_weights=None,
-            wavelength_weights=None,
-        )
-        try:
-            rows.append(_traced(lens, one)[1].rms)
-            common = replace(one, reference_spectrum="polychromatic")
-            together.append(_traced(lens, common)[1].mean_squares.mean().sqrt())
-        except InputError:  # no light of the field passes
-            rows.append(torch.full((len(waves),), math.nan))
-            together.append(torch.tensor(math.nan))
+    own = replace(settings, wavelengths=list(waves), field_weights=None, wavelength_weights=None)
+    try:
+        rms, together = _radii(lens, own, fields)
+    except InputError:  # no light of some field passes
+        rows = [_radii_or_none(lens, own, field) for field in fields]
+        rms, together = (torch.cat(part) for part in zip(*rows, strict=True))
     wavelengths = torch.tensor(list(waves), dtype=torch.float64)
     return RMSCurves(
         fields=torch.tensor([tuple(field) for field in fields], dtype=torch.float64),
         field_unit=field_unit(lens.object_distance),
         wavelengths=wavelengths,
-        rms=torch.stack([row.double().cpu() for row in rows]),
-        polychromatic=torch.stack([value.double().cpu() for value in together]),
+        rms=rms,
+        polychromatic=together,
         airy_radius=AIRY * wavelengths * 1e-6 * _f_numbers(lens, settings, wavelengths),
     )
+
+
+def _radii(
+    lens: Lens, settings: MeritSettings, fields: Sequence[Sequence[float]]
+) -> tuple[Tensor, Tensor]:
+    """Return RMS radii (F, W), and those of all wavelengths about their common reference, (F,)."""
+    settings = replace(settings, fields=[tuple(field) for field in fields])
+    quality = settings.image_quality(lens)
+    shape = (len(fields), len(settings.wavelengths_of(lens)))
+    rms = quality.values(lens).rms.double().cpu().reshape(shape)
+    common = replace(quality, reference_spectrum="polychromatic").values(lens)
+    return rms, common.mean_squares.double().cpu().reshape(shape).mean(-1).sqrt()
+
+
+def _radii_or_none(
+    lens: Lens, settings: MeritSettings, field: Sequence[float]
+) -> tuple[Tensor, Tensor]:
+    """Return the same of one field; NaN where none of its light passes."""
+    try:
+        return _radii(lens, settings, [field])
+    except InputError:
+        dark = torch.full((1, len(settings.wavelengths_of(lens))), math.nan, dtype=torch.float64)
+        return dark, dark[:, 0]
 
 
 def _traced(lens: Lens, settings: MeritSettings) -> tuple[ImageQuality, QualityValues, Tensor]:
@@ -231,20 +296,10 @@ def _f_numbers(lens: Lens, settings: MeritSettings, wavelengths: Tensor) -> Tens
     return whole / pupil_share(lens, settings)
 
 
-def _grid_limit(
-    lens: Lens, settings: MeritSettings, found: Modulation, frequencies: Tensor
-) -> Tensor:
-    """Return the diffraction limit of a square pupil, 1 - ν·λ·N with N over its whole width.
+def _square_limit(f_numbers: Tensor, wavelengths: Tensor, frequencies: Tensor) -> Tensor:
+    """Return the diffraction limit (Q,) of a square pupil, 1 - ν·λ·N with N over its whole width.
 
-    Goodman, Introduction to Fourier Optics, section 6.4; the grid's corners lie within the stop.
+    Goodman, Introduction to Fourier Optics, section 6.4; the mean over the wavelengths.
     """
-    number = _f_numbers(lens, settings, found.wavelengths)
-    s = frequencies * found.wavelengths[:, None] * 1e-6 * number[:, None]
+    s = frequencies * (wavelengths * 1e-6 * f_numbers)[:, None]
     return (1.0 - s).clamp(min=0.0).mean(0)
-
-
-def _along(fields: Tensor) -> Tensor:
-    """Return unit vectors along the fields, (F, 2); +y on the axis."""
-    tangents = torch.tan(torch.deg2rad(fields))
-    length = tangents.norm(dim=-1, keepdim=True)
-    return torch.where(length > 0.0, tangents / length, tangents.new_tensor([0.0, 1.0]))
