@@ -4,16 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.text import Annotation
-from matplotlib.transforms import Bbox
 
-# Where a label may stand about its point: direction, nearest first, at these distances in points.
+# Where a label may stand about its point: direction, and distance in points of 1/72 inch, the
+# nearest first.
 _DISTANCES = (5.0, 11.0, 18.0, 27.0, 38.0)
 _DIRECTIONS = ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
-_ALIGNED = {1: ("left", "bottom"), 0: ("center", "center"), -1: ("right", "top")}
-# Half the size of a marker, and the gap between texts, points of 1/72 inch.
+_PLACES = np.array([(d * x, d * y) for d in _DISTANCES for x, y in _DIRECTIONS])
+# A label farther out than this gets a line to its point.
+_NEAR = 11.0
+# Half the size of a marker, and the gap between texts.
 _MARKER, _GAP = 4.0, 1.5
+# Steps along a line between two of its points.
+_STEPS = 40
 
 
 def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], size: float) -> None:
@@ -25,100 +27,69 @@ def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], si
     Args:
         axes: with points and lines; its figure lays itself out once.
         labels: text, x and y of the point, colour.
-        size: of the text, points.
+        size: of the text, points of 1/72 inch.
     """
-    figure = axes.get_figure()
+    if not labels:
+        return
+    figure = axes.get_figure(root=True)
     figure.draw_without_rendering()
     scale = figure.dpi / 72.0
-    frame = axes.get_window_extent()
-    taken = [_box(point, _MARKER * scale) for point in _drawn_points(axes)]
-    taken += [text.get_window_extent() for text in axes.texts if text.get_text()]
+    frame = np.array(axes.get_window_extent().extents)
+    drawn = _drawn_points(axes)
+    half = _MARKER * scale
+    taken = np.concatenate([drawn - half, drawn + half], 1)
+    texts = [t.get_window_extent().extents for t in axes.texts if t.get_text()]
     if axes.get_legend() is not None:
-        taken.append(axes.get_legend().get_window_extent())
+        texts.append(axes.get_legend().get_window_extent().extents)
+    taken = np.concatenate([taken, np.array(texts).reshape(-1, 4)])
     for text, x, y, colour in labels:
-        best, least = None, np.inf
-        for distance in _DISTANCES:
-            for direction in _DIRECTIONS:
-                candidate = _label(axes, text, (x, y), direction, distance, colour, size)
-                box = candidate.get_window_extent().padded(_GAP * scale)
-                candidate.remove()
-                cost = sum(_shared(box, other) for other in taken) + _outside(box, frame)
-                if cost < least:
-                    best, least = (direction, distance, box), cost
-                if cost == 0.0:
-                    break
-            if least == 0.0:
-                break
-        direction, distance, box = best
-        placed = _label(axes, text, (x, y), direction, distance, colour, size)
-        if distance > _DISTANCES[1]:
-            placed.arrow_patch.set_visible(True)
-        taken.append(box)
-
-
-def _label(
-    axes: Axes,
-    text: str,
-    point: tuple[float, float],
-    direction: tuple[int, int],
-    distance: float,
-    colour: str,
-    size: float,
-) -> Annotation:
-    length = np.hypot(*direction)
-    offset = [distance * step / length for step in direction]
-    label = axes.annotate(
-        text,
-        point,
-        xytext=offset,
-        textcoords="offset points",
-        ha=_ALIGNED[direction[0]][0],
-        va=_ALIGNED[direction[1]][1],
-        fontsize=size,
-        color=colour,
-        arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "shrinkB": 3.0},
-    )
-    label.arrow_patch.set_visible(False)
-    label.set_in_layout(False)
-    return label
+        note = axes.annotate(
+            text,
+            (x, y),
+            xytext=(0.0, 0.0),
+            textcoords="offset points",
+            fontsize=size,
+            color=colour,
+            ha="center",
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "shrinkB": 3.0},
+        )
+        note.set_in_layout(False)
+        extent = note.get_window_extent()
+        reach = 0.5 * np.array([extent.width, extent.height])
+        # The text's centre, so far off that its nearest corner or side is at the wanted distance.
+        centres = _PLACES * scale + np.sign(_PLACES) * reach
+        point = axes.transData.transform((x, y))
+        gap = reach + _GAP * scale
+        boxes = np.concatenate([point + centres - gap, point + centres + gap], 1)
+        outside = np.prod(2.0 * gap) - _shared(boxes, frame[None])[:, 0]
+        cost = _shared(boxes, taken).sum(1) + 2.0 * outside
+        best = int(cost.argmin())
+        note.set_position(tuple(centres[best] / scale))
+        note.arrow_patch.set_visible(bool(np.abs(_PLACES[best]).max() > _NEAR))
+        taken = np.concatenate([taken, boxes[[best]]])
 
 
 def _drawn_points(axes: Axes) -> np.ndarray:
     """Return everything drawn as points, pixels, (N, 2): markers, and lines at small steps."""
-    found = []
+    found = [np.zeros((0, 2))]
+    share = np.linspace(0.0, 1.0, _STEPS)[:, None, None]
     for line in axes.get_lines():
-        if line.get_xdata(orig=True) is not None and line.get_transform() == axes.transData:
-            places = axes.transData.transform(np.column_stack(line.get_data()))
-            places = places[np.isfinite(places).all(1)]
-            found.append(places)
-            if line.get_linestyle() not in ("None", "none", "", " ") and len(places) > 1:
-                share = np.linspace(0.0, 1.0, 60)[:, None, None]
-                between = places[:-1] * (1.0 - share) + places[1:] * share
-                found.append(between.reshape(-1, 2))
-    found += [
-        axes.transData.transform(np.asarray(drawn.get_offsets()).reshape(-1, 2))
-        for drawn in axes.collections
-        if len(drawn.get_offsets())
-    ]
-    return np.concatenate(found) if found else np.zeros((0, 2))
+        if line.get_transform() != axes.transData:
+            continue
+        places = axes.transData.transform(line.get_path().vertices)
+        places = places[np.isfinite(places).all(1)]
+        found.append(places)
+        if line.get_linestyle() not in ("None", "none", "", " ") and len(places) > 1:
+            found.append((places[:-1] * (1.0 - share) + places[1:] * share).reshape(-1, 2))
+    for drawn in axes.collections:
+        offsets = np.asarray(drawn.get_offsets(), dtype=float).reshape(-1, 2)
+        found.append(axes.transData.transform(offsets))
+    return np.concatenate(found)
 
 
-def _box(point: np.ndarray, half: float) -> Bbox:
-    return Bbox.from_extents(*(point - half), *(point + half))
-
-
-def _shared(one: Bbox, other: Bbox) -> float:
-    """Return the area that two boxes share, pixels."""
-    across = min(one.x1, other.x1) - max(one.x0, other.x0)
-    up = min(one.y1, other.y1) - max(one.y0, other.y0)
-    return across * up if across > 0.0 and up > 0.0 else 0.0
-
-
-def _outside(box: Bbox, frame: Bbox) -> float:
-    """Return the area of a box outside of the frame, pixels; it counts twice."""
-    return 2.0 * (box.width * box.height - _shared(box, frame))
-
-
-def figure_of(axes: Axes) -> Figure:
-    """Return the figure that axes lie in, whatever subfigures there are between."""
-    return axes.get_figure(root=True)
+def _shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the areas that boxes (A, 4) share with others (B, 4), as x0 y0 x1 y1: (A, B)."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return (high - low).clip(min=0.0).prod(-1)

@@ -13,7 +13,7 @@ from dolens.plotting.scale_bar import scale_bar
 from dolens.plotting.style import PAGE, SMALL, TITLE
 from dolens.sensor.colour import linear_to_srgb
 
-_ENERGY = 0.995
+_ENERGY = 0.998
 _COLUMNS = 4
 _PANEL = 2.1
 _SMALLEST_WINDOW = 7
@@ -25,7 +25,7 @@ def psf_figure(
 ) -> Figure:
     """Show point spread functions, one panel a depth, in colour and normalised to their own peak.
 
-    All panels show the same square window: one that holds 99.5 % of the light of each function, and
+    All panels show the same square window: one that holds 99.8 % of the light of each function, and
     little more.  It need not be about the middle.
 
     Args:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import evaluating
 from dolens.experiments.experiment import Figures
 from dolens.optics.paraxial import first_order
@@ -22,26 +23,34 @@ from dolens.sensor.colour import linear_to_srgb
 _PUPIL_SAMPLES = 96  # along each side of the pupil
 # A window of point spread functions is doubled until it holds this share of each, up to so many
 # pixels along each side.
-_HELD, _LARGEST_WINDOW = 0.995, 1025
+_HELD, _LARGEST_WINDOW = 0.998, 1025
 
 
-def camera_figures(camera: Camera, crops: Mapping[str, Tensor], stage: str) -> Figures:
+def camera_figures(
+    camera: Camera,
+    crops: Mapping[str, Tensor],
+    stage: str,
+    scores: PhotographScores | None = None,
+) -> Figures:
     """Return `images`, `point_spread_functions` and `layout`.
 
     Args:
         camera: as it is.
         crops: stage → a texture (1, 3, h, w), linear light.
         stage: the stage whose crop is shown, `val` or `test`.
+        scores: of all photographs of the stage, for the title; None where there are none yet.
     """
     return {
-        "images": partial(_images, camera, crops, stage),
+        "images": partial(_images, camera, crops, stage, scores),
         "point_spread_functions": partial(_point_spread_functions, camera),
         "layout": partial(_layout, camera),
     }
 
 
 @torch.no_grad()
-def _images(camera: Camera, crops: Mapping[str, Tensor], stage: str) -> Figure:
+def _images(
+    camera: Camera, crops: Mapping[str, Tensor], stage: str, scores: PhotographScores | None
+) -> Figure:
     """Draw truth, raw and restored images; the same stage shows the same ones again."""
     # In evaluation mode: the network is shown as it is measured, and its statistics stay.
     with evaluating(camera.network):
@@ -52,10 +61,12 @@ def _images(camera: Camera, crops: Mapping[str, Tensor], stage: str) -> Figure:
     )
     quality = {"raw": psnr_db(raw, truth).tolist(), "restored": psnr_db(restored, truth).tolist()}
     kind = {"val": "validation", "test": "test"}[stage]
-    title = (
-        f"{shown_name(camera.lens)}: one crop of one {kind} photograph, PSNR of this crop\n"
-        "display-encoded (sRGB), clipped to [0, 1], not interpolated"
-    )
+    title = f"{shown_name(camera.lens)}: one crop of one {kind} photograph, PSNR of this crop"
+    if scores is not None:
+        found = scores.metrics["psnr_db"]
+        mean, count = float(found.mean()), len(found)
+        title += f"\n(restored, mean over {count} photographs and all views: {mean:.2f} dB)"
+    title += "\ndisplay-encoded (sRGB), clipped to [0, 1], not interpolated"
     labels = [_label(label) for label in camera.views.labels()]
     return comparison_figure(truth, raw, restored, labels, quality, title)
 
