@@ -219,12 +219,15 @@ def _poses(lens: Lens, tolerances: ShopTolerances) -> list[tuple[str, str]]:
         surfaces = f"S{element.first}-S{element.last}"
         rows.append((f"{name} ({surfaces})", "; ".join(pose) or "centred"))
         groups = (("tilt", TILTS), ("decentre", DISPLACEMENTS[:2]), ("shift", DISPLACEMENTS[2:]))
-        said = []
+        said = {}
         for word, keys in groups:
             found = [tolerances.labels.get(f"elements.{name}.{key}") for key in keys]
             known = [entry for entry in found if entry is not None]
-            if known:
-                number, unit = max(known)
-                said.append(f"{word} ±{number:.3g}{unit if unit == '°' else ' ' + unit}")
-        rows.append(("", ", ".join(said) or f"tilt, decentre: {AGREE}"))
+            size, unit = max(known, default=(0.0, ""))
+            said[word] = f"± {size:.3g}{unit if unit == '°' else ' ' + unit}" if known else AGREE
+        if set(said.values()) == {AGREE}:
+            rows.append(("", f"tilt, decentre, shift {AGREE}"))
+        else:
+            rows.append(("", f"tilt {said['tilt']}, shift {said['shift']}"))
+            rows.append(("", f"decentre {said['decentre']}"))
     return rows
