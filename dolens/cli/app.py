@@ -8,6 +8,7 @@ import sys
 
 import typer
 
+from dolens.cli.convert import convert
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -17,6 +18,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.command("convert")(convert)
 
 
 def main() -> None:
