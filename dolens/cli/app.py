@@ -9,6 +9,7 @@ import sys
 import typer
 
 from dolens.cli.convert import convert
+from dolens.cli.show import show
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -20,6 +21,7 @@ app = typer.Typer(
 )
 
 
+app.command("show")(show)
 app.command("convert")(convert)
 
 
