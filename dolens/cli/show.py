@@ -42,11 +42,11 @@ def show(
         list[float] | None, typer.Option(metavar="<nm>", help="A wavelength. Repeatable.")
     ] = None,
     f_number: Annotated[
-        float | None, typer.Option(help="Close the stop to this F-number.")
+        float | None, typer.Option(help="Set the stop to this F-number.")
     ] = None,
     entrance_pupil: Annotated[
         float | None,
-        typer.Option(metavar="<mm>", help="Close the stop to this entrance pupil diameter."),
+        typer.Option(metavar="<mm>", help="Set the stop to this entrance pupil diameter."),
     ] = None,
     index_model: Annotated[
         str | None, typer.Option(help="dfc, do or paper, instead of the file's own.")

@@ -8,9 +8,9 @@ import torch
 
 from dolens.analysis.conditions import field_points
 from dolens.errors import InputError
+from dolens.optics.aperture_setting import with_aperture
 from dolens.optics.fields import Fields
 from dolens.optics.lens import Lens
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 
 
 def prepared_lens(
@@ -27,12 +27,11 @@ def prepared_lens(
         fields: (x, y) of each: degrees for an object at infinity, else mm on the object.
         wavelengths: nm; the reference wavelength stays if it is one of them, and else is the middle
             one in their order.
-        f_number: focal length over the diameter of the entrance pupil, which the stop is closed to.
+        f_number: focal length over the diameter of the entrance pupil, which the stop is set to.
         entrance_pupil_diameter: mm, instead of an F-number.
 
     Raises:
-        InputError: a field, wavelength or aperture out of range, two apertures, or one that the
-            stop's clear aperture is too small for.
+        InputError: a field, wavelength or aperture out of range, or two apertures.
     """
     lens = copy.deepcopy(lens).to(device="cpu", dtype=torch.float64).requires_grad_(False)
     if wavelengths is not None:
@@ -51,35 +50,4 @@ def prepared_lens(
             raise InputError(f"fields must be within ±90 degrees, not {points.tolist()}")
         kind = "heights" if finite else "angles"
         lens.fields = Fields(kind, tuple((x, y) for x, y in points.tolist()))
-    if f_number is not None and entrance_pupil_diameter is not None:
-        raise InputError("give an F-number or the diameter of the entrance pupil, not both")
-    if f_number is not None:
-        _close_stop(lens, "F-number", f_number)
-    if entrance_pupil_diameter is not None:
-        _close_stop(lens, "entrance pupil diameter", entrance_pupil_diameter)
-    return lens
-
-
-def _close_stop(lens: Lens, what: str, value: float) -> None:
-    """Close the stop to an aperture; the paraxial pupil is proportional to the stop's size."""
-    if not (math.isfinite(value) and value > 0.0):
-        raise InputError(f"the {what} must be positive, not {value:g}")
-    first = lens.first_order(lens.primary_wavelength)
-    diameter, efl = float(first.entrance_pupil.diameter), abs(float(first.efl))
-    if what == "F-number" and not math.isfinite(efl):
-        raise InputError("an F-number needs a focal length, and the lens is afocal")
-    surface = lens.surfaces[str(lens.stop)]
-    aperture = surface.aperture
-    if not isinstance(aperture.edge, Circle):
-        raise InputError(f"surface {lens.stop}, the stop, is no circle: no {what} can be set")
-    size = surface.semi_diameter * (efl / value if what == "F-number" else value) / diameter
-    if not size <= surface.semi_diameter * (1.0 + 1e-9):
-        widest = efl / diameter if what == "F-number" else diameter
-        bound = "at least" if what == "F-number" else "at most"
-        raise InputError(
-            f"the {what} must be {bound} {widest:.4g}{'' if what == 'F-number' else ' mm'}, not "
-            f"{value:g}: surface {lens.stop}, the stop, is no larger"
-        )
-    surface.aperture = ClearAperture(
-        Circle(min(size, surface.semi_diameter)), aperture.obscuration
-    )
+    return with_aperture(lens, f_number, entrance_pupil_diameter)
