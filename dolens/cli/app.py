@@ -8,8 +8,10 @@ import sys
 
 import typer
 
+from dolens.cli.convert import convert
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
+from dolens.cli.show import show
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -19,6 +21,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.command("show")(show)
+app.command("convert")(convert)
 
 
 def main() -> None:
