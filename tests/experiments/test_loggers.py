@@ -145,6 +145,7 @@ def test_a_camera_logs_pictures_by_photograph_and_view(composed, tmp_path):
     tags = [tag for tag in log.Tags()["images"] if not tag.startswith("figures/")]
     names = {tag.rpartition("/")[0] for tag in tags}
     assert {tag.rpartition("/")[2] for tag in tags} == {"8m", "6m", "4.5m"}
+    assert not [name for name in names if name.endswith((".png", ".jpg"))]
     assert 1 <= len(names) <= 3 and len(tags) == 3 * len(names)
     # Of both epochs, at their steps.
     assert [image.step for image in log.Images(tags[0])] == [2, 4]
@@ -153,3 +154,18 @@ def test_a_camera_logs_pictures_by_photograph_and_view(composed, tmp_path):
     table = rows(tmp_path / "run" / "metrics.csv")
     assert [int(row["step"]) for row in table] == sorted({int(row["step"]) for row in table})
     assert len([row for row in table if row["val/psnr_db"]]) >= 2
+
+
+def test_a_resumed_run_goes_on_at_its_step(composed, tmp_path):
+    """In its own folder too: a loader then shows one curve without a fold."""
+    settings = (*TINY_CAMERA, "test=false", "objective=train/loss", "callbacks.best=null")
+    run(composed(*settings, "callbacks.validation_pictures=null", "+trainer.max_steps=2"))
+    first = [int(row["step"]) for row in rows(tmp_path / "run" / "metrics.csv")]
+    assert first == [0, 1, 2]
+    checkpoint = f"ckpt_path={tmp_path / 'run' / 'checkpoints' / 'last.ckpt'}"
+    run(composed(*settings, "callbacks.validation_pictures=null", checkpoint))
+    table = rows(tmp_path / "run" / "metrics.csv")
+    assert [int(row["step"]) for row in table] == [0, 1, 2, 3, 4]
+    log = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    log.Reload()
+    assert [point.step for point in log.Scalars("train/loss")] == [0, 1, 2, 3, 4]

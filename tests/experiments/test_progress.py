@@ -75,7 +75,7 @@ def test_a_log_has_a_line_every_so_often_and_names_a_stage_once(caplog, monkeypa
         display.update()
     assert len(caplog.messages) == 4
     assert caplog.messages[0] == (
-        "fit: step 30 of 120, epoch 2 of 6, 3.4 steps/s, 1:05 left; loss 0.01235, val/psnr_db 24.5"
+        "fit: step 30 of 120, 3.4 steps/s, 1:05 left, epoch 2 of 6; loss 0.01235, val/psnr_db 24.5"
     )
     state[0] = Snapshot("fit", stages=("planning", "compiling kernels: sphere forward"))
     for _ in range(5):
@@ -92,7 +92,7 @@ def drawn(snapshot, width=100):
 def test_a_terminal_has_a_bar_the_numbers_and_the_stage():
     first, second = drawn(SOME)
     assert first.startswith("fit ━━━")
-    assert first.endswith("step 30 of 120, epoch 2 of 6, 3.4 steps/s, 1:05 left")
+    assert first.endswith("step 30 of 120, 3.4 steps/s, 1:05 left, epoch 2 of 6")
     assert second.strip() == "loss 0.01235, val/psnr_db 24.5"
     waiting = Snapshot("fit", 0, 120, stages=("looking at the lens", "rays"), stage_s=7.0)
     assert "looking at the lens › rays, 0:07" in drawn(waiting)[-1]
@@ -160,7 +160,7 @@ class Slow(lightning.LightningModule):
     def on_train_epoch_start(self):
         if self.current_epoch == 0:
             with stage("looking at the lens"), stage("rays"):
-                time.sleep(0.5)
+                time.sleep(1.0)
 
     def training_step(self, batch, index):
         if self.fails and index == 1:
@@ -185,7 +185,7 @@ class Photographs(lightning.LightningDataModule):
     train_dataloader = val_dataloader = test_dataloader = loader
 
     def evaluation_photographs(self, split):
-        return [f"{split[:4]}{n // 2}" for n in range(8)]
+        return [f"{split[:4]}{n // 2}.png" for n in range(8)]
 
 
 def followed(tmp_path, module, **options):
@@ -211,10 +211,10 @@ def test_a_run_is_followed_from_its_first_second(tmp_path, caplog):
     waiting = [s for s in fit.states if s.stages]
     assert {s.stages for s in waiting} >= {("looking at the lens", "rays")}
     assert all(s.done == 0 for s in waiting)
-    # Its time is none of a step's: 20 ms, where 0.5 s went before.
+    # Its second is none of the first step's.
     steps = [s for s in fit.states if s.part == "fit" and s.done and not s.stages]
     assert [s.done for s in steps] == list(range(1, 13)) and steps[0].total == 12
-    assert steps[0].steps_per_second > 10.0
+    assert steps[0].steps_per_second > 1.0
     assert steps[-1].remaining_s == pytest.approx(0.0, abs=1e-6)
     assert {s.detail for s in steps} == {f"epoch {n} of 3" for n in (1, 2, 3)}
     # Validation and test say what they look at.

@@ -202,10 +202,11 @@ def _line(text: str) -> Text:
 
 @contextmanager
 def logging_above(console: Console) -> Iterator[None]:
-    """Have the root logger's handlers that write to a terminal write above a live display."""
+    """Have handlers of the log that write to a terminal write above a live display."""
+    loggers = [logging.getLogger(), *map(logging.getLogger, list(logging.root.manager.loggerDict))]
     handlers = [
         handler
-        for handler in logging.getLogger().handlers
+        for handler in dict.fromkeys(h for each in loggers for h in each.handlers)
         if isinstance(handler, logging.StreamHandler) and handler.stream.isatty()
     ]
     streams = [handler.setStream(_Above(console, handler.stream)) for handler in handlers]
