@@ -94,7 +94,12 @@ def overrides_of(folder: Path) -> tuple[str, ...]:
 
 def same_overrides(some: Iterable[str], others: Iterable[str]) -> bool:
     """Return whether two runs were given the same, but for what changes no result."""
-    return _kept(some) == _kept(others)
+    return set(telling_overrides(some)) == set(telling_overrides(others))
+
+
+def telling_overrides(overrides: Iterable[str]) -> tuple[str, ...]:
+    """Return those overrides that may change what a run finds."""
+    return tuple(entry for entry in overrides if not entry.lstrip("+~").startswith(_PASSED_OVER))
 
 
 def assigned(plan: Plan, given: Sequence[str]) -> dict[str, Path]:
@@ -155,9 +160,3 @@ def _system_of(plan: Plan, folder: Path) -> System | None:
         elif module is None and same_overrides(system.overrides, overrides_of(folder)):
             return system
     return None
-
-
-def _kept(overrides: Iterable[str]) -> frozenset[str]:
-    return frozenset(
-        entry for entry in overrides if not entry.lstrip("+~").startswith(_PASSED_OVER)
-    )
