@@ -19,9 +19,9 @@ logger = logging.getLogger(__name__)
 class SaveFigures(lightning.Callback):
     """Saves the figures of an experiment after its test, and logs those of its training.
 
-    `Experiment.figures` are saved as PNG files and logged as `figures/<name>` when the test ends;
+    `Experiment.figures` are saved as PNG files, and logged as `figures/<name>`, when the test ends;
     `Experiment.training_figures` are logged after the validation of every n-th epoch and of the
-    last.  A figure that has the name of one of training is logged as `figures/test_<name>`.  A figure
+    last.  A figure that has the name of one of training is logged as `figures/test_<name>`.  One
     that cannot be drawn is named in the log, and the others are drawn.
 
     Args:

@@ -87,11 +87,18 @@ class RunProgress(ProgressBar):
             self._listening.enter_context(listening(self._hear))
             self._display.open()
 
-    def teardown(self, *arguments: Any) -> None:
+    def teardown(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str
+    ) -> None:
         """Close the display."""
         self._close()
 
-    def on_exception(self, *arguments: Any) -> None:
+    def on_exception(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        exception: BaseException,
+    ) -> None:
         """Close the display, so that the message is not overwritten."""
         self._close()
 

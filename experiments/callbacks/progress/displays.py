@@ -165,8 +165,7 @@ class TerminalDisplay:
     def renderable(self) -> RenderableType:
         """Return the lines: bar and place, numbers, and what is being done."""
         now = self.snapshot()
-        waiting = bool(now.stages) and now.done == 0
-        unknown = now.total is None or waiting
+        unknown = now.total is None or now.done == 0  # a bar that stands at 0 says nothing
         bar = ProgressBar(
             total=None if unknown else float(max(now.total, 1)),
             completed=float(now.done),
