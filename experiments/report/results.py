@@ -48,10 +48,14 @@ class Result:
             found = {str(name): value for name, value in found.items()}.get(key)
         return float(found) if isinstance(found, int | float) else None
 
-    def figure(self, name: str) -> Path | None:
-        """Return the file of a figure, or None where the run has no such figure."""
-        path = self.folder / "figures" / f"{name}.png"
-        return path if path.is_file() else None
+    def figure(self, names: str) -> Path | None:
+        """Return the file of a figure, or None where the run has no such figure.
+
+        Args:
+            names: without the ending; of several, as `a|b`, the first that there is.
+        """
+        paths = [self.folder / "figures" / f"{name}.png" for name in names.split("|")]
+        return next((path for path in paths if path.is_file()), None)
 
 
 def read_result(name: str, folder: Path) -> Result:
