@@ -9,6 +9,8 @@ import sys
 import typer
 
 from dolens.cli.convert import convert
+from dolens.cli.report import HELP as REPORT_HELP
+from dolens.cli.report import report
 from dolens.cli.show import show
 from dolens.errors import InputError
 
@@ -41,3 +43,6 @@ def one_line(problem: object) -> str:
 @app.callback()
 def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
+
+
+app.command("report", help=REPORT_HELP)(report)

@@ -41,9 +41,7 @@ def show(
     wavelength: Annotated[
         list[float] | None, typer.Option(metavar="<nm>", help="A wavelength. Repeatable.")
     ] = None,
-    f_number: Annotated[
-        float | None, typer.Option(help="Set the stop to this F-number.")
-    ] = None,
+    f_number: Annotated[float | None, typer.Option(help="Set the stop to this F-number.")] = None,
     entrance_pupil: Annotated[
         float | None,
         typer.Option(metavar="<mm>", help="Set the stop to this entrance pupil diameter."),
@@ -198,7 +196,9 @@ def _write(
         console.print(f"{title}: {problem}", style="yellow", markup=False)
     if html is not None:
         size = html.stat().st_size
-        console.print(f"{html}: written, {written.sections} sections, {size / 1e6:.1f} MB", markup=False)
+        console.print(
+            f"{html}: written, {written.sections} sections, {size / 1e6:.1f} MB", markup=False
+        )
     if figures is not None:
         console.print(f"{figures}: {written.figures} figures, each as PNG and SVG", markup=False)
     console.print(f"in {seconds:.1f} s", style="dim", markup=False)

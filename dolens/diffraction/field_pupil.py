@@ -29,7 +29,8 @@ from dolens.optics.system import OpticalSystem
 # Samples across the pupil beyond which rays alone are used, and the fewest.
 MOST_SAMPLES, _FEWEST = 1024, 128
 _OVERSAMPLING = 1.5
-_DEGREE = 16
+# Degrees of the fit that are tried, and the waves that the first may leave.
+_DEGREES, _RESIDUAL = (10, 16), 0.005
 # Rays along each side of a beam where rays alone are used.
 _RAYS = 384
 # Share of the light whose rays the window of a point spread function holds.
@@ -67,7 +68,9 @@ class FieldPupil:
             front: W wavefronts.
             weights: (W,).
         """
-        fit = fit_pupil(front, _DEGREE)
+        fit = fit_pupil(front, _DEGREES[0])
+        if not bool((fit.residual <= _RESIDUAL).all()):
+            fit = fit_pupil(front, _DEGREES[1])
         found = cls(front, weights, fit, "")
         reason = found._obstacle()
         if not reason:
@@ -255,9 +258,9 @@ class FieldPupil:
         )
         inside = (unit.abs() <= 1.0 + 2.0 / samples).all(-1)
         unit = unit.clamp(-1.0, 1.0).flatten(1, 2)
-        pieces = []
+        pieces, degree = [], fit.coefficients.shape[-1] - 1
         for part in unit.split(_PIECE, 1):
-            (x, _), (y, _) = (chebyshev(part[..., axis], _DEGREE) for axis in (0, 1))
+            (x, _), (y, _) = (chebyshev(part[..., axis], degree) for axis in (0, 1))
             pieces.append(at_points(fit.coefficients, x, y))
         values = torch.cat(pieces, -1).unflatten(-1, (samples, samples))
         opd, whole, *crossings = values.unbind(1)

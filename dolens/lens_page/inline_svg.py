@@ -62,5 +62,7 @@ def rasterise(figure: Figure) -> None:
 def holds_pictures(figure: Figure) -> bool:
     """Return whether a figure shows images, whose colours must stay as they are."""
     return any(
-        isinstance(artist, AxesImage) for axes in figure.get_axes() for artist in axes.get_children()
+        isinstance(artist, AxesImage)
+        for axes in figure.get_axes()
+        for artist in axes.get_children()
     )

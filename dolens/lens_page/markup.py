@@ -92,7 +92,7 @@ def table_html(table: Table) -> str:
         cells = "".join(
             f"<td{_words(table, column)}>{escape(cell)}</td>" for column, cell in enumerate(row)
         )
-        rows.append(f'<tr{f" class={chr(34)}{kind}{chr(34)}" if kind else ""}>{cells}</tr>')
+        rows.append(f"<tr{f' class={chr(34)}{kind}{chr(34)}' if kind else ''}>{cells}</tr>")
     caption = f'<p class="caption">{escape(table.caption)}</p>' if table.caption else ""
     return (
         f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(rows)}</tbody>'

@@ -78,7 +78,9 @@ def lens_overview(lens: Lens) -> Overview:
         return spot_radii_table(found[0])
 
     poses = elements_table(lens)
-    sections = [TableSection("Prescription", [prescription_table(lens), *([poses] if poses else [])])]
+    sections = [
+        TableSection("Prescription", [prescription_table(lens), *([poses] if poses else [])])
+    ]
     for title, make in (
         ("First-order data", lambda: first_order_table(lens, where)),
         ("Seidel sums", lambda: seidel_table(lens, where)),

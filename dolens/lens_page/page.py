@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
-import torch
-
 from dolens.errors import InputError
 from dolens.lens_page.inline_svg import holds_pictures, inline_svg, rasterise
 from dolens.lens_page.markup import (
@@ -116,16 +114,14 @@ def _overview_blocks(overview: Overview, written: Written) -> list[Block]:
     return blocks
 
 
-def _block(
-    section: Section, drawn: bool, folder: str | Path | None, written: Written
-) -> Block:
+def _block(section: Section, drawn: bool, folder: str | Path | None, written: Written) -> Block:
     """Compute a section; where that fails the section says why."""
     try:
         content = section.make()
         body = _body(section, content, drawn, folder, written)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
-    except Exception as error:  # noqa: BLE001 - the other sections are worth having
+    except Exception as error:
         known = isinstance(error, InputError)
         reason = str(error) if known else f"{type(error).__name__}: {error}"
         reason = " ".join(reason.split())

@@ -3,7 +3,7 @@
 Every section is computed alone, so that one that fails leaves the others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,24 +14,15 @@ from matplotlib.figure import Figure
 from dolens.analysis.conditions import (
     FieldScan,
     field_scans,
-    spectral_lines,
     wavelength_interval,
 )
-from dolens.analysis.encircled_energy import encircled_energy
-from dolens.analysis.field_curves import field_curves
-from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
-from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
-from dolens.diffraction.illumination import relative_illumination
-from dolens.diffraction.point_spread import diffraction_encircled_energy, point_spread
-from dolens.diffraction.transfer import diffraction_modulation
-from dolens.diffraction.wavefront_error import wavefront_errors
 from dolens.errors import InputError
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
-from dolens.lens_page.tables import Table, field_text, number
+from dolens.lens_page.tables import Table
 from dolens.lens_page.viewer import viewer_html
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import layout_figure
@@ -145,9 +136,7 @@ class PageSections:
     def fans(self) -> Content:
         """Plot ray fans."""
         where = self.where
-        fans = ray_fans(
-            self.lens, where.fields, where.wavelengths, object_distance=self.distance
-        )
+        fans = ray_fans(self.lens, where.fields, where.wavelengths, object_distance=self.distance)
         return Content({"ray_fans": ray_fans_figure(fans, title="")})
 
     def mtf(self) -> Content:

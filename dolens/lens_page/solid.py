@@ -158,9 +158,13 @@ def _sides(system: OpticalSystem, number: int) -> list[Mesh]:
     sizes = [system.surfaces[n - 1].aperture.edge for n in (number, number + 1)]
     together = system.axes[number - 1].elements == system.axes[number].elements
     round_faces = all(size.rotational for size in sizes)
-    small, large = (number, number + 1) if sizes[0].semi_diameter < sizes[1].semi_diameter else (
-        number + 1,
-        number,
+    small, large = (
+        (number, number + 1)
+        if sizes[0].semi_diameter < sizes[1].semi_diameter
+        else (
+            number + 1,
+            number,
+        )
     )
     ratio = max(size.semi_diameter for size in sizes) / min(size.semi_diameter for size in sizes)
     if together and round_faces and ratio > 1.0 + 1e-9:
@@ -168,7 +172,9 @@ def _sides(system: OpticalSystem, number: int) -> list[Mesh]:
         edge = _edge(sizes[small - number])
         rim = np.zeros((AZIMUTHS, 3))
         rim[:, :2] = edge
-        sag, _, _, _ = sag_of(system, small, torch.from_numpy(edge[:, 0]), torch.from_numpy(edge[:, 1]))
+        sag, _, _, _ = sag_of(
+            system, small, torch.from_numpy(edge[:, 0]), torch.from_numpy(edge[:, 1])
+        )
         rim[:, 2] = sag.numpy()
         wide = rim * np.array([ratio, ratio, 1.0])
         corner = _turned(system, small, wide, True)

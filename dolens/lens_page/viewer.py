@@ -26,9 +26,7 @@ def viewer_html(found: Solid, where: Conditions) -> str:
         f'<label><input type="checkbox" data-field="{number}" checked>'
         f'<span class="key" style="background:{shade}"></span>{escape(label)}'
         f"{'' if rays else ' (no ray passes)'}</label>"
-        for number, (label, shade, rays) in enumerate(
-            zip(labels, shades, found.rays, strict=True)
-        )
+        for number, (label, shade, rays) in enumerate(zip(labels, shades, found.rays, strict=True))
     )
     return (
         '<div id="viewer"><canvas tabindex="0" aria-label="The lens in space; drag to turn it">'
