@@ -19,6 +19,7 @@ from dolens.analysis.conditions import (
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.errors import InputError
+from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
 from dolens.lens_page.tables import Table
@@ -82,6 +83,7 @@ class PageSections:
 
     def sections(self) -> list[Section]:
         """Return all sections in the order of the page."""
+        last = [] if self.tolerances is None else [Section("offenders", "Tolerances", self.offenders)]
         return [
             Section("layout", "Section", self.layout),
             Section("space", "In space", self.space),
@@ -89,6 +91,7 @@ class PageSections:
             Section("fans", "Ray fans", self.fans),
             Section("mtf", "MTF", self.mtf),
             Section("rms", "RMS against field and wavelength", self.rms),
+            *last,
         ]
 
     @cached_property
@@ -128,8 +131,7 @@ class PageSections:
         spots = self.overview.spots
         if spots is None:
             raise InputError("the spots could not be traced")
-        wide = len(spots.wavelengths) > 1
-        return Content({"spots": spots_figure(spots, overlaid=wide, title="")})
+        return Content({"spots": spots_figure(spots, overlaid=True, title="")})
 
     def fans(self) -> Content:
         """Plot ray fans."""
@@ -158,3 +160,12 @@ class PageSections:
         )
         figure = rms_curves_figure(against_field, against_wavelength, title="")
         return Content({"rms": figure})
+
+    def offenders(self) -> Content:
+        """Find the worst offenders among tolerances."""
+        found = offenders(self.lens, self.where, self.tolerances)
+        return Content(
+            {"worst_offenders": found.figure()},
+            [found.table()],
+            " ".join([*found.notes, found.summary()]),
+        )

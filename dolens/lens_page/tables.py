@@ -16,10 +16,10 @@ from dolens.optics.materials import abbe_number, index_d
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import Circle, Outline, Rectangle, Unlimited
 
-SEIDEL_HEADS = (*("S I", "S II", "S III", "S IV", "S V", "C L", "C T"),)
+SEIDEL_HEADS = ("S I", "S II", "S III", "S IV", "S V", "C L", "C T")
 SEIDEL_NAMES = (
-    *("spherical", "coma", "astigmatism", "Petzval", "distortion"),
-    *("axial colour", "lateral colour"),
+    *("spherical", "coma", "astigm.", "Petzval", "distort."),
+    *("axial col.", "lateral col."),
 )
 # Parameters that have a column of their own.
 _COLUMNS = ("curvature", "conic")
@@ -169,12 +169,14 @@ def seidel_table(lens: Lens, where: Conditions) -> Table:
     short, long = min(lines), max(lines)
     sums = lens.seidel(edge, wavelength, distance, (short, long))
     waves = torch.stack(list(sums)).T / (1e-6 * wavelength)
-    rows = [(str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)]
+    rows = [
+        (str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)
+    ]
     rows.append(("total", *(_fixed(value) for value in waves.sum(0).tolist())))
     unit = where.field_unit if where.field_unit == "°" else " mm"
     posed = "  They are those of the centred lens, without poses." if lens.elements else ""
     return Table(
-        ("#", *(f"{h} {n}" for h, n in zip(SEIDEL_HEADS, SEIDEL_NAMES, strict=True))),
+        ("#", *(f"{h}\n{n}" for h, n in zip(SEIDEL_HEADS, SEIDEL_NAMES, strict=True))),
         rows,
         f"In wavelengths of {wavelength:g} nm, at a field of {number(edge, 4)}{unit}; colours from "
         f"{short:g} to {long:g} nm.{posed}",

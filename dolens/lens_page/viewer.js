@@ -18,7 +18,8 @@
   }
 
   // ---- the camera: rows are the screen's right, up and towards the viewer, in the lens's axes
-  const centre = data.centre, reach = data.reach;
+  const reach = data.reach;
+  let centre = data.centre;
   let turn, zoom, pan;
   function side() { turn = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]; zoom = 1; pan = [0, 0]; }
   function rotate(x, y) {
@@ -35,14 +36,31 @@
     side();
     if (name === "turned") { rotate(0.65, 0.0); rotate(0.0, 0.35); }
     if (name === "front") turn = [[-1, 0, 0], [0, 1, 0], [0, 0, -1]];
+    fit();
   }
-  view("turned");
+  // What the view shows when it is chosen: half widths (mm) on the screen, and its middle.
+  let frame = [1, 1];
+  function fit() {
+    const low = [Infinity, Infinity], high = [-Infinity, -Infinity];
+    const look = (points) => {
+      for (let i = 0; i + 2 < points.length; i += 3) {
+        for (let axis = 0; axis < 2; axis++) {
+          const row = turn[axis];
+          let at = 0;
+          for (let k = 0; k < 3; k++) at += row[k] * (points[i + k] - data.centre[k]);
+          low[axis] = Math.min(low[axis], at);
+          high[axis] = Math.max(high[axis], at);
+        }
+      }
+    };
+    look(position);
+    lines.forEach(({ points }) => look(points));
+    frame = [0, 1].map((axis) => Math.max((high[axis] - low[axis]) / 2, 1e-9));
+    const middle = [0, 1].map((axis) => (high[axis] + low[axis]) / 2);
+    centre = data.centre.map((c, k) => c + turn[0][k] * middle[0] + turn[1][k] * middle[1]);
+  }
   function scales(width, height) {
-    // The lens lies along z: what is wide goes along the wider side of the canvas.
-    const fit = Math.min(width / (2.15 * data.half[2]), height / (2.3 * data.half[1]));
-    const whole = Math.min(width, height) / (2.05 * reach);
-    const mix = Math.abs(turn[0][2]);
-    return zoom * (whole + (Math.max(fit, whole) - whole) * mix * mix * mix);
+    return zoom * 0.46 * Math.min(width / frame[0], height / frame[1]);
   }
 
   // ---- geometry, once
@@ -85,6 +103,8 @@
   data.fields.forEach((field, i) => {
     field.rays.forEach((ray) => lines.push({ points: floats(ray), field: i }));
   });
+
+  view("turned");
 
   // Far triangles first: by buckets, since a lens has tens of thousands.
   const buckets = 2048, depthOf = new Uint16Array(triangles), starts = new Uint32Array(buckets + 1);

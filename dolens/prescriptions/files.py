@@ -65,16 +65,35 @@ def decode_prescription(data: bytes, path: str | Path) -> Any:
     suffix = _suffix(Path(path))
     if suffix == ".zmx":
         return prescription_from_zemax(decode_zemax(data, str(path)), str(path))
-    kind = "text" if suffix == ".txt" else "YAML"
+    if suffix == ".txt":
+        return prescription_from_diffoptics(_text(data, path, "text"), str(path))
+    return decode_yaml(data, path)
+
+
+def decode_yaml(data: bytes, where: str | Path) -> Any:
+    """Read YAML as plain values; nothing in it names code, and no key may be given twice.
+
+    Args:
+        data: what the file holds.
+        where: its name, for messages.
+
+    Raises:
+        InputError: it is not valid YAML; the message is one line.
+    """
+    text = _text(data, where, "YAML")
     try:
-        text = data.decode("utf-8")
-        if suffix == ".txt":
-            return prescription_from_diffoptics(text, str(path))
         # A subclass of the safe loader: it builds plain values only.
         return yaml.load(text, Loader=_UniqueKeyLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except yaml.YAMLError as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: is not valid {kind} ({reason})") from None
+        raise InputError(f"{where}: is not valid YAML ({reason})") from None
+
+
+def _text(data: bytes, where: str | Path, kind: str) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where}: is not valid {kind} ({error})") from None
 
 
 def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:
