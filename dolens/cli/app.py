@@ -8,7 +8,11 @@ import sys
 
 import typer
 
+from dolens.cli.convert import convert
 from dolens.cli.evaluate import evaluate
+from dolens.cli.report import HELP as REPORT_HELP
+from dolens.cli.report import report
+from dolens.cli.show import show
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -18,6 +22,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.command("show")(show)
+app.command("convert")(convert)
 
 
 def main() -> None:
@@ -39,3 +47,4 @@ def _dolens() -> None:
 
 
 app.command("evaluate")(evaluate)
+app.command("report", help=REPORT_HELP)(report)

@@ -1,4 +1,4 @@
-"""`dolens evaluate`: a run's camera again, on other photographs, at other depths, with other noise."""
+"""`dolens evaluate`: the camera of a run again, on other photographs, depths or noise."""
 
 import sys
 from collections.abc import Mapping

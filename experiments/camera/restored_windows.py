@@ -22,8 +22,8 @@ from dolens.reconstruction import Restoration
 
 GRID = 64
 DEFAULT_WINDOW = 512
-# Raw pixels beyond the margin change no restored value by more than this of full scale, to first
-# order, even if all of them changed by full scale in the most unfavourable way.
+# Of full scale: how much raw pixels beyond the margin may change a restored value, to first order,
+# where all of them change by full scale, alike or each by itself.
 _INFLUENCE = 1e-4
 _FIRST_PROBE, _LARGEST_PROBE = 256, 1024
 # Restored pixels that are looked at, from the middle of the probe: at several places of the grid.
@@ -115,15 +115,22 @@ def _reach(network: Restoration, functions: Tensor | None, size: int, device: to
             (gradient,) = torch.autograd.grad(
                 restored[0, :, row, column].sum(), raw, retain_graph=True
             )
-            share = gradient[0].abs().sum(dim=0)
             rows = (torch.arange(size, device=device) - row).abs()
             columns = (torch.arange(size, device=device) - column).abs()
             distance = torch.maximum(rows[:, None], columns)
-            rings = torch.zeros(size, dtype=torch.float64, device=device)
-            rings.index_add_(0, distance.flatten(), share.flatten().double())
-            beyond = rings.flip(0).cumsum(0).flip(0)  # at this distance or farther
-            farthest = max(farthest, int((beyond > _INFLUENCE).sum()))
+            alike = gradient[0].sum(dim=0)
+            each = gradient[0].square().sum(dim=0)
+            together = _beyond(distance, alike).abs(), _beyond(distance, each).sqrt()
+            counts = torch.nonzero(torch.maximum(*together) > _INFLUENCE).flatten()
+            farthest = max(farthest, int(counts[-1]) + 1 if len(counts) else 0)
     return farthest
+
+
+def _beyond(distance: Tensor, share: Tensor) -> Tensor:
+    """Sums of what lies at each distance or farther."""
+    rings = torch.zeros(len(distance), dtype=share.dtype, device=share.device)
+    rings.index_add_(0, distance.flatten(), share.flatten())
+    return rings.flip(0).cumsum(0).flip(0)
 
 
 @torch.no_grad()

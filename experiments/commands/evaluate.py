@@ -1,4 +1,4 @@
-"""A run's camera again, without training: on other photographs, at other depths, with other noise."""
+"""The camera of a run again, without training: on other photographs, depths, noise."""
 
 import json
 import logging

@@ -53,8 +53,8 @@ class Picture:
 def read_picture(path: str | Path) -> Picture:
     """Read a picture of 8 or 16 bits as the training's photographs are read.
 
-    Values are sRGB-encoded, whatever a colour profile says; the EXIF orientation is applied; grey is
-    repeated in the three channels; transparency is composited in linear light over black, where
+    Values are sRGB-encoded, whatever a colour profile says; the EXIF orientation is applied; grey
+    is repeated in the three channels; transparency is composited in linear light over black, where
     nothing sends light.
 
     Args:
@@ -99,9 +99,9 @@ def _profile_note(path: Path) -> tuple[str, ...]:
 
 
 def _sixteen_bits(path: Path) -> np.ndarray | None:
-    """Pixels (height, width, channels) of 16 bits, upright, float32 from 0 to 65535; None: fewer bits.
+    """Pixels (height, width, channels), upright, float32 from 0 to 65535; None: of fewer bits.
 
-    Pillow itself gives 8 bits of such colours.
+    Pillow itself gives 8 of 16 bits of a colour.
 
     Raises:
         InputError: a TIFF file that is no image of whole numbers.
@@ -144,9 +144,7 @@ def _deep_tiff(path: Path) -> np.ndarray | None:
     pixels = pixels.astype(np.float32)
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
     if pixels.ndim != 3 or pixels.shape[-1] > 4:
-        raise InputError(
-            f"{path}: pixels of shape {pixels.shape}; allowed: grey or RGB, with alpha"
-        )
+        raise InputError(f"{path}: pixels of shape {pixels.shape}; allowed: grey, RGB, RGBA")
     return _upright(65535 - pixels if white_is_zero else pixels, tag.value if tag else 1)
 
 

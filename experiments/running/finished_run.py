@@ -140,11 +140,9 @@ def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Pa
         state = read_checkpoint(file)
         values = state["state_dict"]
         if config["lens"] != record.config["lens"]:
-            lenses = (
-                _lens(settings.prescription(), settings),
-                _lens(record.config["lens"], settings),
-            )
-            values = perturbed_state(module, *lenses, values)
+            wanted = _lens(settings.prescription(), settings)
+            recorded = _lens(record.config["lens"], settings)
+            values = perturbed_state(module, wanted, recorded, values)
         _take_up(module, {**state, "state_dict": values}, file)
     elif str(checkpoint) != CHECKPOINTS[0]:
         raise InputError(

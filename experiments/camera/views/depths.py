@@ -172,12 +172,13 @@ class DepthViews(Imaging):
         values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
+        size: int | None = None,
     ) -> Tensor:
         """(depths, 3, K, K), on the axis."""
         samples = pupil_samples or self.psf_pupil_samples
         scene = self._psf_scene(depths)
         functions = axial_point_spread_functions(
-            lens, scene, self.sensor, self.psf_size, samples, values
+            lens, scene, self.sensor, size or self.psf_size, samples, values
         )
         if self.psf_diffraction == "none":
             return functions
@@ -200,9 +201,9 @@ class DepthViews(Imaging):
         functions = axial_function(lens, values, scene, self.sensor, self.psf_size, diffraction)
         mapping = (
             f"{scale:g} pixel(s) of the picture to one of the sensor, {size[1]}×{size[0]} of "
-            f"{1000.0 * self.sensor.pixel_pitch:g} µm; the blur on the axis everywhere "
-            f"({functions.shape[-1]} pixels wide, diffraction: {diffraction}); the run's own sensor "
-            f"has {self.sensor.width}×{self.sensor.height}"
+            f"{1000.0 * self.sensor.pixel_pitch:g} µm; the blur on the axis everywhere, in "
+            f"{functions.shape[-1]} pixels, diffraction: {diffraction} (the run's own sensor has "
+            f"{self.sensor.width}×{self.sensor.height})"
         )
         image = convolved(picture.to(lens.dtype), functions)
         return WholePicture(linear_to_srgb(picture)[None], image[None], None, mapping)
