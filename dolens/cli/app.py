@@ -8,6 +8,7 @@ import sys
 
 import typer
 
+from dolens.cli.apply import apply
 from dolens.cli.convert import convert
 from dolens.cli.evaluate import evaluate
 from dolens.cli.report import HELP as REPORT_HELP
@@ -47,4 +48,5 @@ def _dolens() -> None:
 
 
 app.command("evaluate")(evaluate)
+app.command("apply")(apply)
 app.command("report", help=REPORT_HELP)(report)

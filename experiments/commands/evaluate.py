@@ -114,7 +114,10 @@ def evaluate(
         config = with_overrides(record, overrides)
     changed = changed_places(record.config, config)
     _refuse_another_camera(changed, config, perturb_lens)
-    run = load_recorded(record, config, checkpoint)
+    own = _metrics_of(record.folder)
+    # A run that found no classifier for its loss had none; it is not looked for again.
+    with_loss = own.get("loss/perceptual_available") != 0.0
+    run = load_recorded(record, config, checkpoint, with_loss)
     (output / ".hydra").mkdir(parents=True)
     with _log_file(output / "log.txt"):
         for note in record.notes:
@@ -124,6 +127,8 @@ def evaluate(
         written = [*record.overrides, *overrides]
         OmegaConf.save(OmegaConf.create(written), output / ".hydra" / "overrides.yaml")
         metrics = _tested(run, output, _evaluated(run, given, changed), command)
+        if "network/pretrained" in own:  # of where the run began
+            metrics["network/pretrained"] = own["network/pretrained"]
         metrics["cost/wall_s"] = time.perf_counter() - started
         numbers = plain_metrics(metrics)
         write_json(output / "metrics.json", numbers)
@@ -133,7 +138,11 @@ def evaluate(
 
 def own_metrics(found: Evaluated) -> dict[str, float]:
     """Return the metrics of the run itself; none where it has not come to its end."""
-    file = found.run.folder / "metrics.json"
+    return _metrics_of(found.run.folder)
+
+
+def _metrics_of(folder: Path) -> dict[str, float]:
+    file = folder / "metrics.json"
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 

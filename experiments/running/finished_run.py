@@ -1,5 +1,6 @@
 """A run folder loaded again as objects: the trained module, its lens and its data."""
 
+import copy
 import logging
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -115,12 +116,59 @@ def load_run(
             the checkpoint is of another experiment, lens or network.
     """
     record = read_record(folder, output)
+    with working_folder_importable():
+        config = with_overrides(record, overrides)
+    return load_recorded(record, config, checkpoint, with_loss)
+
+
+def load_recorded(
+    record: RecordedRun,
+    config: Mapping[str, Any],
+    checkpoint: str | Path = "last",
+    with_loss: bool = True,
+) -> FinishedRun:
+    """Load a run as objects from its record; see `load_run`.
+
+    Args:
+        record: what the folder says.
+        config: the configuration, without interpolations: the record's, or changed.
+        checkpoint: as of `load_run`, and with_loss.
+        with_loss: likewise.
+
+    Raises:
+        InputError: as of `load_run`.
+    """
     register_resolvers()
     with working_folder_importable():
-        return _loaded(record, with_overrides(record, overrides), checkpoint)
+        return _loaded(record, config, checkpoint, with_loss)
 
 
-def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Path) -> FinishedRun:
+def _without_first_weights(config: Mapping[str, Any], with_loss: bool) -> dict[str, Any]:
+    """A configuration of a module that looks for no trained weights to begin with.
+
+    The checkpoint has all of the network's, and where the first ones came from need not be there.
+    Without the loss, its classifier's weights are not looked for either.
+    """
+    found = copy.deepcopy(dict(config))
+    network = _part(found, "reconstruction", "network")
+    if {"weights", "weights_file"} <= set(network):
+        network.update(weights="none", weights_file=None)
+    loss = _part(found, "reconstruction", "loss")
+    if "perceptual" in loss and not with_loss:
+        loss["perceptual"] = "none"
+    return found
+
+
+def _part(node: Any, *keys: str) -> dict[str, Any]:
+    """The mapping at a place; an empty one where there is none."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node if isinstance(node, dict) else {}
+
+
+def _loaded(
+    record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Path, with_loss: bool
+) -> FinishedRun:
     import_extensions(config.get("extensions"))
     try:
         refuse_unknown_keys(config, ("module",))
@@ -131,8 +179,9 @@ def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Pa
         ) from None
     cfg = OmegaConf.create(dict(config))
     settings = RunSettings.of(cfg)
+    made_of = OmegaConf.create(_without_first_weights(config["module"], with_loss))
     with torch.random.fork_rng(devices=()):
-        module = _made("module", settings.module)(lens=_lens(settings.prescription(), settings))
+        module = _made("module", made_of)(lens=_lens(settings.prescription(), settings))
     check_experiment(module, train=False)
     file, state = None, {}
     if module.trains:
