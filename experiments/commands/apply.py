@@ -75,7 +75,8 @@ class Options:
     white_level: float | None = None
 
     def __post_init__(self) -> None:
-        check_choice(self.bits, (8, 16), "--bits")
+        if self.bits not in (8, 16):
+            raise InputError(f"--bits: {self.bits}; allowed: 8, 16")
         check_choice(self.format, _FORMATS, "--format")
         if self.window < GRID or self.window % GRID:
             raise InputError(f"--window: {self.window}; allowed: multiples of {GRID}, pixels")
@@ -137,8 +138,8 @@ class PictureCamera:
         self.margin = margin_of(self.camera.network, self.functions, device)
         if self.margin is None:
             logger.warning(
-                "The network looks at more than a thousand pixels around each: pictures are "
-                "restored as a whole"
+                "The network looks farther than 200 pixels around each: pictures are restored as a "
+                "whole"
             )
 
     def depths(self) -> list[float]:

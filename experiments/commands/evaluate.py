@@ -15,7 +15,7 @@ import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from omegaconf import OmegaConf
 
 from dolens.errors import InputError
@@ -260,7 +260,10 @@ def _tested(
     torch.set_float32_matmul_precision(settings.matmul_precision)
     with working_folder_importable():
         callbacks = [instantiate(c) for c in (settings.callbacks or {}).values() if c]
-    kept = [callback for callback in callbacks if not isinstance(callback, ModelCheckpoint)]
+    unwanted: tuple[type, ...] = (ModelCheckpoint,)
+    if not settings.trainer.get("enable_progress_bar", True):
+        unwanted = (ModelCheckpoint, ProgressBar)
+    kept = [callback for callback in callbacks if not isinstance(callback, unwanted)]
     trainer: lightning.Trainer = instantiate(
         settings.trainer, callbacks=kept, logger=False, enable_checkpointing=False
     )

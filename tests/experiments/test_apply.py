@@ -154,26 +154,25 @@ def test_a_picture_goes_in_and_comes_out(tiny_run, tmp_path):
     assert 5.0 < found[0].metrics["raw_psnr_db"] < 60.0
     # What the simulated sensor gave, taken as a real one's, is restored to the same picture.
     raw = folder / "blocks_8m_raw.npy"
-    apply_run(tiny_run, [raw], Options(raw=True), out=tmp_path / "real")
-    again = read_picture(tmp_path / "real" / "blocks_8m_raw_restored.png").linear
+    camera.options = Options(raw=True, bits=16)
+    camera.restore(raw, tmp_path)
+    again = read_picture(tmp_path / "blocks_8m_raw_restored.png").linear
     first = read_picture(folder / "blocks_8m_restored.png").linear
     assert (linear_to_srgb(again) - linear_to_srgb(first)).abs().max() < 1.0 / 255
     assert read_picture(folder / "blocks_8m_restored.png").bits == 16
 
 
-def test_noise_belongs_to_the_seed_and_not_to_the_windows(loaded, pictures, tmp_path):
+def test_noise_belongs_to_the_seed_and_not_to_the_windows(pictures, tmp_path):
     write_picture(tmp_path / "grey.png", torch.full((3, 70, 140), 0.5), 8)
 
-    def restored(camera, folder):
-        folder.mkdir()
-        camera.apply(tmp_path / "grey.png", folder)
-        return linear_to_srgb(read_picture(folder / "grey_restored.png").linear)
+    def restored(**options):
+        pictures.options = Options(bits=16, **options)
+        pictures.apply(tmp_path / "grey.png", tmp_path)
+        return linear_to_srgb(read_picture(tmp_path / "grey_restored.png").linear)
 
-    first = restored(pictures, tmp_path / "first")
-    small = PictureCamera(loaded, Options(bits=16, window=64))
-    other = PictureCamera(loaded, Options(bits=16, seed=1))
-    assert (first - restored(small, tmp_path / "small")).abs().max() < 1e-4
-    assert (first - restored(other, tmp_path / "other")).abs().max() > 1e-2
+    first, small, other = restored(), restored(window=64), restored(seed=1)
+    assert (first - small).abs().max() < 1e-4
+    assert (first - other).abs().max() > 1e-2
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])
