@@ -232,7 +232,12 @@ class DesignModule(Experiment):
 
     def on_test_start(self) -> None:
         """Put the variables to the best round of a checkpoint, if nothing was trained."""
-        if not self._fit_seconds and math.isfinite(float(self.best_merit)):
+        if not self._fit_seconds:
+            self.settle()
+
+    def settle(self) -> None:
+        """Put the variables to the best round, if there was one."""
+        if math.isfinite(float(self.best_merit)):
             self._leave_best()
 
     def _leave_best(self) -> None:
