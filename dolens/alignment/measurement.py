@@ -12,6 +12,7 @@ from torch import Tensor
 from dolens.alignment.diffracted_light import diffracted_light, on_disc
 from dolens.alignment.unmodelled import Unmodelled
 from dolens.errors import InputError
+from dolens.optics.backend import trace_rays
 from dolens.optics.elements import Axes, from_lens_axes, to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays
@@ -164,7 +165,7 @@ def _by_rays(
     while passed < photons:
         count = min(_AT_A_TIME, _DRAWN * (photons - passed) + 1024)
         rays = _directions(lens, source, wavelength, count, source_diameter, generator)
-        hit = lens.trace(rays)
+        hit = trace_rays(lens.system(), rays)
         x, y = (c[hit.valid].double() for c in hit.position[:, :2].unbind(-1))
         if not len(x):
             raise InputError("no light from the source reaches the sensor plane")

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
+from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
 
@@ -210,7 +211,7 @@ def _passing(
             launches[field] = launch(field)
         position, direction, weight, whole = launches[field]
         position, direction = position.to(**options), direction.to(**options)
-        valid = lens.trace(Rays(position, direction, wavelength)).valid
+        valid = trace_rays(lens.system(), Rays(position, direction, wavelength)).valid
         launched += valid.numel()
         if not bool(valid.any()):
             raise InputError(f"no ray of field {field} and {wavelength:g} nm passes the lens")

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, field_tangents, launch
+from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Rays, Status
@@ -137,7 +138,8 @@ def trace_ray_intercepts(
         rays, started = _fitted(lens, field, aimed, nodes, pupil, object_distance)
         rays = Rays(rays.position[:, :count], rays.direction[:, :count], waves[:count, None])
         started = started[:, :count, None]
-    hit, chief = lens.trace(rays), lens.trace(chief_rays)
+    system = lens.system()
+    hit, chief = trace_rays(system, rays), trace_rays(system, chief_rays)
     valid = hit.valid & started
     reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
     reached = reached & aimed.converged[:, at, 0]

@@ -5,6 +5,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays
+from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
 
 # Stop coordinates are searched for the edge of the light on so many radii, twice.
@@ -34,7 +35,7 @@ class VignettedPupils:
 
     def passes(self, pupil: Tensor) -> Tensor:
         """Return whether rays through points of the stop pass the lens, (F, N), bool."""
-        return self.lens.trace(self.aim(pupil)).valid.cpu()
+        return trace_rays(self.lens.system(), self.aim(pupil)).valid.cpu()
 
     def centres(self, meridional: Tensor) -> Tensor:
         """Return the centroid of each vignetted pupil, (F, 2); every arm from it meets the

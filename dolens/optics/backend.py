@@ -1,6 +1,7 @@
 """The implementation that traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -20,6 +21,8 @@ from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane, trac
 logger = logging.getLogger("dolens.kernels")
 
 BACKENDS = ("auto", "reference", "cpu", "cuda")
+# Rays times surfaces below which a lens of backend `auto` is traced without kernels; see `is_few`.
+FEW = 2048
 # So many wavelengths are not searched for equal ones.
 _FEW = 64
 _KERNEL_DTYPES = (torch.float32, torch.float64)
@@ -77,6 +80,28 @@ def choose_backend(
         return device
     say_once(f"backend auto: the reference in PyTorch, since {reason}")
     return "reference"
+
+
+def is_few(system: OpticalSystem, rays: Rays) -> bool:
+    """Return whether PyTorch traces a user's rays at once, sooner than kernels are compiled.
+
+    They are few if a lens of backend `auto` has fewer than `FEW` surfaces times rays to trace: 300
+    rays through a triplet.  PyTorch then takes some milliseconds, and a first use of kernels some
+    tenths of a second, or some seconds where they must be compiled.
+
+    It depends on nothing but the number of rays and surfaces.  The kernels on disk, and calls
+    before this one, must not show in the last digits of a result.
+
+    Args:
+        system: the lens.
+        rays: as users give them.
+    """
+    if system.backend != "auto":
+        return False
+    shapes = [rays.position.shape[:-1], rays.direction.shape[:-1]]
+    if isinstance(rays.wavelength, Tensor):
+        shapes.append(rays.wavelength.shape)
+    return math.prod(torch.broadcast_shapes(*shapes)) * len(system.surfaces) < FEW
 
 
 def with_chosen_backend(system: OpticalSystem, others: Iterable[Tensor] = ()) -> OpticalSystem:

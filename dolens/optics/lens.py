@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, aim
-from dolens.optics.backend import check_backend, trace_rays
+from dolens.optics.backend import check_backend, is_few, trace_rays
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.materials import Medium
@@ -195,6 +195,10 @@ class Lens(nn.Module):
     ) -> TracedRays:
         """Trace rays from the object through every surface to the sensor plane.
 
+        With backend `auto`, fast kernels trace many rays, and PyTorch a few, so that these wait for
+        no compiler; see `dolens.optics.backend.is_few`.  Results agree to rounding.  A loop over
+        few rays is faster with the kernels: set `backend` to `cpu`.
+
         Args:
             rays: travelling towards +z in the medium before surface `first`; they may start
                 anywhere, and are first moved along their own line to that surface.  Rays in double
@@ -204,7 +208,7 @@ class Lens(nn.Module):
             last: number of the last; given, the trace ends there, in the medium behind it.
         """
         self._check_range(first, last)
-        return trace_rays(self.system(), rays, 1.0, record, first, last)
+        return trace_rays(self._system_for(rays), rays, 1.0, record, first, last)
 
     def sensor_to_scene(
         self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
@@ -221,7 +225,7 @@ class Lens(nn.Module):
             The rays on surface `first`, travelling towards -z in the medium before it.
         """
         self._check_range(first, last)
-        return trace_rays(self.system(), rays, -1.0, record, first, last)
+        return trace_rays(self._system_for(rays), rays, -1.0, record, first, last)
 
     def first_order(
         self, wavelength: float | Tensor = 587.5618, object_distance: float | Tensor | None = None
@@ -317,6 +321,11 @@ class Lens(nn.Module):
         near = torch.as_tensor(vergence(object_distance), dtype=self.dtype, device=self.device)
         near = near[..., None] if near.ndim else near
         return torch.where(near == 0.0, torch.deg2rad(field), field)
+
+    def _system_for(self, rays: Rays) -> OpticalSystem:
+        """The lens, traced by the reference if these rays are few."""
+        system = self.system()
+        return system.traced_by("reference") if is_few(system, rays) else system
 
     def _check_range(self, first: int, last: int | None) -> None:
         count = len(self.surfaces)

@@ -131,7 +131,7 @@ class ImageQuality(ABC):
     def values(self, lens: Lens) -> QualityValues:
         """Evaluate a lens as it is; rays that its apertures clip count as if they did not."""
         spots = self.spots
-        hit = lens.trace(spots.rays)
+        hit = trace_rays(lens.system(), spots.rays)
         deviations, growth = (part.T for part in self._traced(lens, hit))
         failed = (hit.status == Status.TIR) | (hit.status == Status.MISSED)
         clipped = spots.weight * (hit.status == Status.VIGNETTED)

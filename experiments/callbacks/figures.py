@@ -5,12 +5,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import lightning
-from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 
 from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, Figures
+from dolens.experiments.loggers.protocol import TakesPictures
 from dolens.plotting import figure_to_image, save_figure
+from dolens.stages import stage
 
 logger = logging.getLogger(__name__)
 
@@ -18,10 +19,10 @@ logger = logging.getLogger(__name__)
 class SaveFigures(lightning.Callback):
     """Saves the figures of an experiment after its test, and logs those of its training.
 
-    `Experiment.figures` are saved as PNG files and logged to TensorBoard when the test ends;
+    `Experiment.figures` are saved as PNG files, and logged as `figures/<name>`, when the test ends;
     `Experiment.training_figures` are logged after the validation of every n-th epoch and of the
-    last.  A figure that has the name of one of training is logged as `test_<name>`.  A figure that
-    cannot be drawn is named in the log, and the others are drawn.
+    last.  A figure that has the name of one of training is logged as `figures/test_<name>`.  One
+    that cannot be drawn is named in the log, and the others are drawn.
 
     Args:
         folder: the folder for PNG files; it is made when needed.
@@ -64,7 +65,8 @@ def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -
         return
     for name, draw in functions.items():
         try:
-            keep(name, draw())
+            with stage(f"figure {name}"):
+                keep(name, draw())
         except InputError as problem:
             logger.warning("No figure '%s': %s", name, problem)
         except Exception:
@@ -72,10 +74,10 @@ def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -
 
 
 def _log(trainer: lightning.Trainer, name: str, figure: Figure) -> None:
-    """Add a figure to every TensorBoard of a trainer, at its present step."""
-    boards = [entry for entry in trainer.loggers if isinstance(entry, TensorBoardLogger)]
-    if not boards:
+    """Give a figure to every logger that keeps pictures, at the present step."""
+    keeping = [entry for entry in trainer.loggers if isinstance(entry, TakesPictures)]
+    if not keeping:
         return
-    image = figure_to_image(figure)
-    for board in boards:
-        board.experiment.add_image(name, image, global_step=trainer.global_step)
+    picture = figure_to_image(figure).permute(1, 2, 0).numpy()
+    for entry in keeping:
+        entry.log_picture(f"figures/{name}", picture, trainer.global_step)

@@ -21,6 +21,7 @@ from dolens.experiments.camera.views.base import Imaging
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db
+from dolens.stages import stage as named_stage
 
 
 class CameraModule(Camera):
@@ -125,7 +126,8 @@ class CameraModule(Camera):
         epoch's first step comes here instead.
         """
         self._looked_in_epoch = self.current_epoch
-        self.views.prepare(self.lens, self.variables(), self.comparison(), self._photographs())
+        with named_stage("looking at the lens"):
+            self.views.prepare(self.lens, self.variables(), self.comparison(), self._photographs())
 
     def _photographs(self) -> Tensor | None:
         """Return photographs on which a renderer chooses its model, if the data have some."""
@@ -233,11 +235,13 @@ class CameraModule(Camera):
 
     def figures(self) -> Figures:
         """Return the first test crop, point spread functions, and the layout."""
-        return camera_figures(self, self._shown, "test")
+        return camera_figures(self, self._shown, "test", self.test_scores.get("test"))
 
     def training_figures(self) -> Figures:
-        """Return the same of the first validation crop."""
-        return camera_figures(self, self._shown, "val")
+        """Return those of the lens; `ValidationPictures` has the images."""
+        found = dict(camera_figures(self, self._shown, "val"))
+        del found["images"]
+        return found
 
     # ---------------------------------------------------------------- checkpoints
 

@@ -3,6 +3,7 @@
 import statistics
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 
 import torch
@@ -14,6 +15,7 @@ from dolens.experiments.camera.photograph_scores import PhotographScores, scores
 from dolens.experiments.camera.views.base import Views, seed_of
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
+from dolens.stages import stage as named_stage
 
 
 class Evaluation:
@@ -38,7 +40,8 @@ class Evaluation:
         values = camera.variables()
         for reference in (None, *camera.views.reference_renderers()):
             started = time.perf_counter()
-            taken, functions = camera.take(values, batch, stage, index, reference)
+            with named_stage(f"judge {reference}") if reference else nullcontext():
+                taken, functions = camera.take(values, batch, stage, index, reference)
             if reference is not None:
                 self._seconds.setdefault(reference, []).append(time.perf_counter() - started)
             name = stage if reference is None else f"{stage}_{reference}"
@@ -56,8 +59,9 @@ class Evaluation:
     ) -> None:
         for kind, calibration in self.miscalibrations.items():
             generator = torch.Generator().manual_seed(seed_of(0, "test", index))
-            wrong = calibration.functions(camera.views, camera.lens, values, exact, generator)
-            restored = camera.restore(taken, wrong).clamp(0.0, 1.0)
+            with named_stage(f"calibration {kind}"):
+                wrong = calibration.functions(camera.views, camera.lens, values, exact, generator)
+                restored = camera.restore(taken, wrong).clamp(0.0, 1.0)
             row = {f"psnr_db_miscalibrated/{kind}": _compared(psnr_db, restored, taken.truth)}
             self._add("test", row)
 

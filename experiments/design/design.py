@@ -27,12 +27,15 @@ from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
 from dolens.optimize.start import start_values
 from dolens.prescriptions import lens_from_prescription
+from dolens.stages import stage
 
 logger = logging.getLogger(__name__)
 
 SEMI_DIAMETERS = ("fixed", "automatic")
 # So many iterations are logged one by one; history.csv holds all.
 _LOGGED_FIRST = 20
+# Of merit functions without operands.
+_MERIT_UNITS = {"spots": "µm²", "wavefront": "λ²"}
 
 
 class DesignModule(Experiment):
@@ -151,7 +154,8 @@ class DesignModule(Experiment):
             self.variables.write_to(lens)
             lens.sensor_distance.copy_(self.round_start_focus)
             self.variables.scaled.copy_(now)
-        self.merit = self._build(lens)
+        with stage("choosing the rays"):
+            self.merit = self._build(lens)
         fresh = math.isinf(float(self.best_merit))
         quality = self.merit.quality if fresh else self.merit_settings.image_quality(self.initial)
         self.initial_light = None if quality is None else quality.spots.light
@@ -317,8 +321,17 @@ class DesignModule(Experiment):
 
     def figures(self) -> Figures:
         """Return the layout, spots, ray fans, MTF, RMS curves and the history."""
-        evaluated = (self.lens, self.initial, self.evaluation)
-        return design_figures(*evaluated, self.history, self.mtf_max_frequency)
+        merit = self.merit_settings
+        # Weights of operands have units of their own, and so has the sum.
+        unit = _MERIT_UNITS.get(merit.quality, "") if isinstance(merit.quality, str) else ""
+        return design_figures(
+            self.lens,
+            self.initial,
+            self.evaluation,
+            self.history,
+            self.mtf_max_frequency,
+            "" if merit.operands else unit,
+        )
 
     # ---------------------------------------------------------------- checkpoints
 

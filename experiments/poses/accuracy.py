@@ -29,6 +29,7 @@ from dolens.experiments.poses.bench import Bench, Light, check_precision, draw, 
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +112,8 @@ class PoseAccuracyModule(Analysis):
         for part in self.parts:
             started = time.perf_counter()
             logger.info("%s", part)
-            getattr(self, f"_{part}")()
+            with named_stage(part):
+                getattr(self, f"_{part}")()
             self.write_tables()
             self.numbers[f"cost/{part}_s"] = time.perf_counter() - started
         return self.numbers

@@ -10,13 +10,16 @@ from typing import Any
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.interruption import InterruptionNotice
 from dolens.experiments.experiment import Experiment, check_experiment
+from dolens.experiments.loggers.history import History
+from dolens.experiments.loggers.protocol import RunSummary, summarise
 from dolens.experiments.running.checkpoints import (
     SettingsInCheckpoints,
     checked_checkpoint,
@@ -37,6 +40,14 @@ from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
 
 logger = logging.getLogger(__name__)
+
+# The groups whose options tell runs from each other.
+_COMPARED = (
+    *("experiment", "lens", "scene", "renderer", "evaluation_renderer", "views", "readout"),
+    *("network", "discriminator", "loss", "optimizer", "data"),
+)
+# Keys that say where files go, not what is computed.
+_PLACES = ("callbacks", "logger", "hydra")
 
 register_resolvers()
 
@@ -71,9 +82,12 @@ def run(cfg: DictConfig) -> float:
         checkpoint = checked_checkpoint(checkpoint, module, written, settings.train)
     data = instantiate(settings.data)
     callbacks = [instantiate(entry) for entry in (settings.callbacks or {}).values() if entry]
+    if not settings.trainer.get("enable_progress_bar", True):
+        callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
     callbacks.append(SettingsInCheckpoints(written))
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
+    loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
     (folder / "lens").mkdir(exist_ok=True)
     (folder / ".hydra").mkdir(exist_ok=True)
@@ -105,11 +119,15 @@ def run(cfg: DictConfig) -> float:
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
     numbers = plain_metrics(metrics)
     write_json(folder / "metrics.json", numbers)
+    summary = RunSummary(
+        choices=choices_of(cfg),
+        settings=hyperparameters(cfg),
+        objective=settings.objective,
+        numbers=numbers,
+        step=trainer.global_step,
+    )
     for entry in loggers:
-        # Once, at the end and with the metrics, or TensorBoard's HPARAMS tab stays empty.
-        if isinstance(entry, TensorBoardLogger):
-            # At the last step: a loader takes a step back for a restart, and drops all before it.
-            entry.log_hyperparams(hyperparameters(cfg), numbers, step=trainer.global_step)
+        summarise(entry, summary)
         entry.finalize("success")
     logger.info("Run folder: %s", folder)
     objective = settings.objective
@@ -167,19 +185,47 @@ def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
 
 
 def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
-    """The configuration as flat plain values, for TensorBoard's HPARAMS tab."""
-    # What `module` holds refers to the other groups and would only repeat them.
-    left_out = ("module", "views", "lens", "callbacks", "logger", "trainer")
+    """Return all settings of a run as flat plain values."""
+    # What `module` holds refers to the other groups and would only repeat them; the others say
+    # where files go.
+    left_out = ("module", "views", "callbacks", "logger")
     whole = OmegaConf.to_container(cfg, resolve=True)
     leaves = flat({key: value for key, value in whole.items() if key not in left_out})
     return {
         "experiment": HydraConfig.get().runtime.choices.get("experiment"),
-        **{
-            name: leaf if isinstance(leaf, bool | int | float | str) else str(leaf)
-            for name, leaf in leaves
-            if leaf != {}
-        },
+        **{name: _plain(leaf) for name, leaf in leaves if leaf != {}},
     }
+
+
+def choices_of(cfg: DictConfig) -> dict[str, Any]:
+    """Return the few settings that tell a run from others.
+
+    These are the experiment and the seed, the options that were chosen, and each key that the
+    command line gave or a sweep varied, `lens.*` and `trainer.*` too, with its value.
+    """
+    hydra = HydraConfig.get()
+    options = {
+        group: str(option)
+        for group, option in hydra.runtime.choices.items()
+        if group in _COMPARED and option is not None
+    }
+    found: dict[str, Any] = {**options, "seed": cfg.seed}
+    for override in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+        key = override.key_or_group
+        if override.is_delete() or key in found or key.partition(".")[0] in _PLACES:
+            continue
+        value = OmegaConf.select(cfg, key)
+        if not OmegaConf.is_config(value):
+            found[key] = _plain(value)
+        elif OmegaConf.is_list(value) or key not in hydra.runtime.choices:
+            found[key] = str(OmegaConf.to_container(value, resolve=True))
+        else:
+            found[key] = str(hydra.runtime.choices[key])
+    return found
+
+
+def _plain(value: Any) -> bool | int | float | str:
+    return value if isinstance(value, bool | int | float | str) else str(value)
 
 
 def resume_command() -> str:

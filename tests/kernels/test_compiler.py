@@ -3,13 +3,15 @@
 import os
 import subprocess
 import sys
+import time
+from types import SimpleNamespace
 
 import pytest
 from numba.core import config
-from numba.core.caching import FunctionCache
 
-from dolens.kernels.cpu import compiler
+from dolens.kernels.cpu import compiler, kernel_files
 from dolens.kernels.cpu.plane import clip
+from dolens.stages import listening
 
 PROGRAM = """
 import logging, sys
@@ -65,34 +67,83 @@ def forget(monkeypatch):
     compiler.compile_block.cache_clear()
 
 
-def test_a_cache_without_a_place_costs_time_only(forget, caplog):
-    """Neither beside the sources nor in the user's own directory."""
+def test_a_user_without_a_home_folder_waits_for_the_compiler_again(forget, caplog):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
 
-    def no_place(self, function):
-        raise RuntimeError("no locator available")
-
-    forget.setattr(FunctionCache, "__init__", no_place)
+    forget.setattr(kernel_files, "cache_folder", no_home)
     assert compiler.compile_block(clip, "float32") != 0
-    assert "cannot be kept for the next start: no locator available" in caplog.text
+    assert "cannot be kept for the next start: Could not determine home" in caplog.text
 
 
-def test_a_full_disk_costs_time_only(forget, caplog):
-    def full(self, sig, data):
-        raise OSError(28, "No space left on device")
-
-    forget.setattr(compiler._StampedCache, "load_overload", lambda self, sig, context: None)
-    forget.setattr(FunctionCache, "save_overload", full)
+def test_a_folder_that_cannot_be_written_costs_time_only(forget, caplog, tmp_path):
+    """Nor does anything lie beside the sources, where an installation may be read-only."""
+    (tmp_path / "file").touch()
+    forget.setattr(config, "CACHE_DIR", str(tmp_path / "file"))
     assert compiler.compile_block(clip, "float32") != 0
-    assert "No space left on device" in caplog.text
+    assert "cannot be kept for the next start" in caplog.text
 
 
-def test_a_damaged_cache_is_compiled_anew(forget, caplog, tmp_path):
+@pytest.mark.parametrize("damage", [b"", b"not a kernel", None], ids=["empty", "other", "cut"])
+def test_a_damaged_kernel_is_compiled_anew(forget, caplog, tmp_path, damage):
     forget.setattr(config, "CACHE_DIR", str(tmp_path))
     compiler.compile_block(clip, "float32")
-    (index,) = tmp_path.rglob("*.nbi")
-    index.write_bytes(b"")
+    (kept,) = tmp_path.rglob("*.kernel")
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
     forget.setattr(compiler, "_kernels", {})
     compiler.compile_block.cache_clear()
     assert compiler.compile_block(clip, "float32") != 0
     assert "damaged" in caplog.text
-    assert index.stat().st_size > 0
+    assert kept.stat().st_size > len(whole) // 2
+    assert list(tmp_path.rglob("*.kernel")) == [kept]  # and no temporary file is left
+    assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 1
+
+
+def test_kernels_lie_in_the_users_cache_folder(monkeypatch, tmp_path):
+    monkeypatch.setattr(config, "CACHE_DIR", "")
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert kernel_files.cache_folder() == tmp_path / "dolens" / "kernels"
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for not_absolute in ("", "here"):
+        monkeypatch.setenv("XDG_CACHE_HOME", not_absolute)
+        assert kernel_files.cache_folder() == tmp_path / "home/.cache/dolens/kernels"
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "numba"))
+    assert kernel_files.cache_folder() == tmp_path / "numba" / "dolens"
+
+
+def test_another_processor_and_another_source_have_other_files(forget, tmp_path):
+    """So machines that share a home folder never run each other's instructions."""
+
+    def path(source=("module", "name"), features="+avx2"):
+        codegen = SimpleNamespace(magic_tuple=lambda: ("x86_64", "some-cpu", features))
+        return kernel_files.KernelFiles("clip", "0" * 64, source).path(codegen)
+
+    forget.setattr(config, "CACHE_DIR", str(tmp_path))
+    assert path() == path()
+    assert len({path(), path(features="+avx2,+avx512f"), path(source=("module", "other"))}) == 3
+
+
+def test_kernels_of_versions_that_are_long_gone_are_deleted(tmp_path):
+    now = time.time()
+    for name, days in (("used", 1.0), ("forgotten", 400.0)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "clip.kernel").touch()
+        os.utime(tmp_path / name, (now - 86400.0 * days,) * 2)
+    kernel_files.delete_old(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["used"]
+
+
+def test_compiling_is_a_stage(forget, tmp_path):
+    """A program around the library can say why it waits."""
+    forget.setattr(config, "CACHE_DIR", str(tmp_path))
+    heard = []
+    for _ in range(2):
+        compiler._kernels.clear()
+        compiler.compile_block.cache_clear()
+        with listening(heard.append):
+            compiler.compile_block(clip, "float32")
+    # Not when the kernel is read from disk.
+    name = ("compiling kernels: clip",)
+    assert heard == [(name, True), (name, False)]

@@ -7,10 +7,9 @@ kernel as a Python function.  Each is compiled when a lens first needs it, and k
 import hashlib
 import inspect
 import logging
-import pickle
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,12 @@ from typing import Any
 from llvmlite import binding, ir
 from numba import types
 from numba.core import config, event
-from numba.core.caching import FunctionCache
 from numba.core.ccallback import CFunc
-from numba.core.runtime import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
+
+from dolens.kernels.cpu.kernel_files import KernelFiles
+from dolens.stages import stage
 
 logger = logging.getLogger("dolens.kernels")
 
@@ -159,36 +159,6 @@ def source_of(factory: Factory) -> tuple[str, ...]:
     return function.__module__, function.__qualname__, factory.__name__, digest
 
 
-class _StampedCache(FunctionCache):
-    """Numba's cache on disk serves; a directory that cannot be written costs only the cache."""
-
-    def __init__(self, function: Callable[..., None], factory: Factory, real: str) -> None:
-        super().__init__(function)
-        self._source = (*source_of(factory), real)
-
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        # Not what the kernel closes over, as Numba has it: its helpers differ in every process.
-        return sig, self._source, codegen.magic_tuple(), stamp()
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        # Numba's own prepares to compile first, which imports SciPy and half of Numba (0.6 s);
-        # compiled code needs the runtime's symbols only.
-        rtsys.initialize(target_context)
-        try:
-            with self._guard_against_spurious_io_errors():
-                return self._load_overload(sig, target_context)
-        except (EOFError, pickle.UnpicklingError, OSError) as error:
-            logger.warning("compiled kernels on disk are damaged and made anew: %r", error)
-            self.flush()
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        try:
-            super().save_overload(sig, data)
-        except OSError as error:
-            logger.warning("compiled kernels cannot be kept for the next start: %s", error)
-
-
 _kernels: dict[tuple[Factory, str], CFunc] = {}
 
 
@@ -196,13 +166,14 @@ def _compiled(factory: Factory, real: str, signature: Any) -> CFunc:
     with _lock:
         kernel = _kernels.get((factory, real))
         if kernel is None:
-            with _wide_vectors(), _announced():
+            with _wide_vectors(), _announced(factory.__name__.replace("_", " ")):
                 function = factory(REALS[real])
                 form = normalize_signature(signature)
                 kernel = CFunc(function, form, locals={}, options=dict(OPTIONS))
                 try:
-                    kernel._cache = _StampedCache(function, factory, real)
-                except RuntimeError as error:  # no source, or no directory that can be written
+                    source = (*source_of(factory), real)
+                    kernel._cache = KernelFiles(f"{factory.__name__}-{real}", stamp(), source)
+                except RuntimeError as error:  # no source, or no home folder
                     logger.warning("compiled kernels cannot be kept for the next start: %s", error)
                 kernel.compile()
             _kernels[factory, real] = kernel
@@ -210,22 +181,39 @@ def _compiled(factory: Factory, real: str, signature: Any) -> CFunc:
 
 
 class _Announcement(event.Listener):
-    """The log says once a process that kernels are being compiled; reading the cache is silent."""
+    """The log says once a process that kernels are being compiled; reading the cache is silent.
+
+    Args:
+        name: of the kernel, for the stage that listeners are told of.
+    """
 
     said = False
 
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._compiling = ExitStack()
+
     def on_start(self, event: Any) -> None:
+        """Enter the stage with the first of Numba's passes."""
+        if self._name:
+            self._compiling.enter_context(stage(f"compiling kernels: {self._name}"))
+            self._name = ""
         if not _Announcement.said:
             _Announcement.said = True
             logger.info("compiling kernels (once for this machine; some seconds)")
 
     def on_end(self, event: Any) -> None:
-        """Say nothing."""
+        """Stay in the stage: other passes follow."""
+
+    def close(self) -> None:
+        """Leave the stage when the kernel is there."""
+        self._compiling.close()
 
 
 @contextmanager
-def _announced() -> Iterator[None]:
-    with event.install_listener("numba:run_pass", _Announcement()):
+def _announced(name: str) -> Iterator[None]:
+    announcement = _Announcement(name)
+    with closing(announcement), event.install_listener("numba:run_pass", announcement):
         yield
 
 

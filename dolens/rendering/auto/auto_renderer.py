@@ -19,6 +19,7 @@ from dolens.rendering.auto.trial import ProbeSet, Trial, with_values
 from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
+from dolens.stages import stage
 
 logger = logging.getLogger(__name__)
 
@@ -174,7 +175,8 @@ class AutoRenderer(Renderer):
             renewed = before.renderer.with_pupil(lens, scene, values)
             # The whole sensor is measured with the pupil that it was rendered with until now.
             renderer = renewed if self.windows else before.renderer
-            now = measured(renderer, before.dtype, before.decisions, trial)
+            with stage("checking the renderer's plan"):
+                now = measured(renderer, before.dtype, before.decisions, trial)
             now = replace(now, seconds=before.seconds + time.perf_counter() - started)
             if now.error <= max(self.tolerance, before.error) and self.tolerances.serves_still(
                 before.agreement, now.agreement
@@ -189,7 +191,8 @@ class AutoRenderer(Renderer):
             logger.info("renderer auto: the lens has changed, error %.2g grey levels", now.error)
             started -= before.seconds
         self.plans += 1
-        chosen = choose(trial, self.tolerances)
+        with stage("planning the renderer"):
+            chosen = choose(trial, self.tolerances)
         self._cast = trial.lens(chosen.dtype).requires_grad_(False)
         self.choice = replace(
             chosen,

@@ -15,6 +15,7 @@ from dolens.rendering.protocol import Renderer
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.sensor.pixels import Sensor
+from dolens.stages import stage
 
 MODELS: Mapping[str, type[Renderer]] = {r.model: r for r in (PsfRenderer, RayRenderer)}
 
@@ -176,14 +177,18 @@ def measured(
     trial: Trial,
 ) -> Choice:
     """A renderer with its errors and the agreement of its gradients in a trial."""
+    with stage("errors on probe images"):
+        errors, uncertainty = trial.errors(renderer, dtype), trial.uncertainty
+    with stage("gradients beside those of rays"):
+        agreement = trial.agreement(renderer, dtype)
     return Choice(
         renderer,
         dtype,
         tuple(decisions),
-        trial.errors(renderer, dtype),
-        trial.uncertainty,
+        errors,
+        uncertainty,
         trial.requirements.tolerance,
-        agreement=trial.agreement(renderer, dtype),
+        agreement=agreement,
     )
 
 
@@ -195,7 +200,8 @@ def choose(trial: Trial, tolerances: Tolerances) -> Choice:
     """
 
     def attempt(tolerance: float) -> tuple[float, tuple[Choice, float]]:
-        found = trial.plan(tolerance)
+        with stage("fields, window and rays"):
+            found = trial.plan(tolerance)
         choice = measured(found.renderer, found.dtype, found.decisions, trial)
         worst = max(choice.error, tolerances.error * tolerances.excess(choice.agreement))
         return worst, (choice, found.without_diffraction)

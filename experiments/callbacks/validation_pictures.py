@@ -1,0 +1,142 @@
+"""Validation photographs as the camera sees and restores them, over the training."""
+
+import lightning
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.experiments.callbacks.photograph_names import shown_name
+from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.reconstruction import evaluating
+from dolens.experiments.loggers.protocol import TakesPictures
+from dolens.reconstruction import psnr_db
+from dolens.sensor.colour import linear_to_srgb
+from dolens.stages import stage
+
+_GAP, _TEXT = 4, 15  # pixels between pictures, and of the line of text above them
+# Wider pictures are cut to their middle: a log is no archive.
+_WIDEST = 256
+
+
+class ValidationPictures(lightning.Callback):
+    """Logs truth, sensor's image and restored image side by side, with their PSNR.
+
+    The pictures are called `<photograph>/<view>`, as `chelsea/8m`; each shows the same crop
+    every time, the photograph's first, with the noise with which validation measures it.
+
+    Args:
+        photographs: how many, spread over those of validation.
+        times: how often at most in a training, evenly spaced, the last time after its last epoch.
+
+    Raises:
+        InputError: a number below 1.
+    """
+
+    def __init__(self, photographs: int = 3, times: int = 8) -> None:
+        for name, value in (("photographs", photographs), ("times", times)):
+            if value < 1:
+                raise InputError(
+                    f"callbacks.validation_pictures: {name} {value}; allowed: 1 or more"
+                )
+        self.photographs, self.times = photographs, times
+        self._crops: dict[int, str] = {}
+        self._seen = 0
+
+    def on_validation_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Choose the crops, if it is time for pictures."""
+        self._crops, self._seen = {}, 0
+        find = getattr(trainer.datamodule, "evaluation_photographs", None)
+        kept = any(isinstance(entry, TakesPictures) for entry in trainer.loggers)
+        if find is None or not kept or trainer.sanity_checking or not self._due(trainer):
+            return
+        first: dict[str, int] = {}
+        for crop, name in enumerate(find("validation")):
+            first.setdefault(name, crop)
+        names = list(first)
+        count = min(self.photographs, len(names))
+        chosen = [names[(2 * n + 1) * len(names) // (2 * count)] for n in range(count)]
+        self._crops = {first[name]: name for name in chosen}
+
+    def _due(self, trainer: lightning.Trainer) -> bool:
+        """Return whether this epoch's validation is among those that pictures are logged of."""
+        epoch, epochs = trainer.current_epoch, trainer.max_epochs or 0
+        every = trainer.check_val_every_n_epoch or 1
+        validations = epochs // every
+        if validations <= self.times:  # all; or training without an end in epochs
+            return validations > 0 or epoch % self.times == 0
+        # Of validations 1 … V those where n·times/V passes a whole number: the last is among them.
+        number = (epoch + 1) // every
+        return number * self.times // validations > (number - 1) * self.times // validations
+
+    @torch.no_grad()
+    def on_validation_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: object,
+        batch: Tensor,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Log the pictures of the chosen crops in this batch."""
+        chosen = {n: self._crops.get(self._seen + n) for n in range(len(batch))}
+        self._seen += len(batch)
+        if not isinstance(pl_module, Camera) or not any(chosen.values()):
+            return
+        with stage("pictures"), evaluating(pl_module.network):
+            taken, functions = pl_module.take(pl_module.variables(), batch, "val", batch_idx)
+            restored = pl_module.restore(taken, functions).clamp(0.0, 1.0).float().cpu()
+        truth, raw = taken.truth.float().cpu(), linear_to_srgb(taken.raw).float().cpu()
+        for crop, photograph in chosen.items():
+            for view, label in enumerate(pl_module.views.labels()):
+                if photograph is not None:
+                    images = (truth[crop, view], raw[crop, view], restored[crop, view])
+                    _log(trainer, f"{shown_name(photograph)}/{label}", *images)
+
+
+def _log(
+    trainer: lightning.Trainer, name: str, truth: Tensor, raw: Tensor, restored: Tensor
+) -> None:
+    of_sensor, of_network = (float(psnr_db(i[None], truth[None])) for i in (raw, restored))
+    texts = ("truth", f"sensor {of_sensor:.2f} dB", f"restored {of_network:.2f} dB")
+    picture = side_by_side(dict(zip(texts, (truth, raw, restored), strict=True)))
+    for entry in trainer.loggers:
+        if isinstance(entry, TakesPictures):
+            entry.log_picture(name, picture, trainer.global_step, ", ".join(texts[1:]))
+
+
+def side_by_side(images: dict[str, Tensor]) -> np.ndarray:
+    """Return images in a row, each under its text.
+
+    Args:
+        images: text → (3, H, W), 0 to 1, display-encoded, all of one shape.
+
+    Returns:
+        (height, width, 3), uint8.
+    """
+    shown = {text: _middle(image) for text, image in images.items()}
+    # Small ones are enlarged, so that the texts find room; pixels stay whole.
+    sizes = next(iter(shown.values())).shape[:2]
+    times = max(1, -(-128 // sizes[1]))
+    height, width = (times * size for size in sizes)
+    whole = Image.new(
+        "RGB", (len(shown) * (width + _GAP) - _GAP, height + _TEXT + 2), (255, 255, 255)
+    )
+    draw, font = ImageDraw.Draw(whole), ImageFont.load_default(12)
+    for place, (text, image) in enumerate(shown.items()):
+        left = place * (width + _GAP)
+        draw.text((left + 1, 0), text, fill=(0, 0, 0), font=font)
+        large = Image.fromarray(image).resize((width, height), Image.Resampling.NEAREST)
+        whole.paste(large, (left, _TEXT + 2))
+    return np.asarray(whole)
+
+
+def _middle(image: Tensor) -> np.ndarray:
+    """Return the middle of an image (3, H, W) as (h, w, 3), uint8."""
+    top, left = (max(size - _WIDEST, 0) // 2 for size in image.shape[-2:])
+    cut = image[:, top : top + _WIDEST, left : left + _WIDEST]
+    return (cut.permute(1, 2, 0) * 255.0).round().clamp(0, 255).to(torch.uint8).numpy()

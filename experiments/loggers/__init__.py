@@ -1,0 +1,1 @@
+"""Loggers of a run: curves, pictures, and a summary by which runs are compared."""

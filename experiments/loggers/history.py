@@ -1,0 +1,94 @@
+"""The history of a run as a table, `metrics.csv`."""
+
+import csv
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers.logger import Logger
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
+
+from dolens.experiments.loggers.protocol import RunSummary
+from dolens.experiments.tables import write_table
+
+_STEP = "step"
+
+
+class History(Logger):
+    """Writes all numbers that are logged, a row a step, whatever other loggers there are.
+
+    A row has the numbers of training and of validation at its step; what was not logged there is
+    empty.  Where the table exists already, as of a run that is resumed in its own folder, its rows
+    before the first new step stay.
+
+    Args:
+        path: of the table.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        super().__init__()
+        self.path = Path(path)
+        self._columns: list[str] = []
+        self._row: dict[str, Any] = {}
+
+    @property
+    def name(self) -> str:
+        """Return the name of this logger."""
+        return "history"
+
+    @property
+    def version(self) -> str:
+        """Return an empty text: there is one."""
+        return ""
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any, *others: Any, **options: Any) -> None:
+        """Keep none: .hydra has them all."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Add numbers to the row of a step; a row is written when another one begins."""
+        step = 0 if step is None else int(step)
+        if self._row and step != self._row[_STEP]:
+            self._write()
+        if not self._row:
+            self._row = {_STEP: step}
+        self._row |= {name: value for name, value in metrics.items() if name != _STEP}
+
+    def log_summary(self, summary: RunSummary) -> None:
+        """Write the last row; metrics.json has the summary."""
+        self.finalize("success")
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """Write the last row."""
+        if self._row:
+            self._write()
+
+    def _write(self) -> None:
+        row, self._row = self._row, {}
+        if not self._columns:
+            self._rewrite([*_rows_before(self.path, row[_STEP]), row])
+        elif row.keys() <= set(self._columns):
+            with self.path.open("a", newline="", encoding="utf-8") as file:
+                csv.DictWriter(file, self._columns, lineterminator="\n").writerow(row)
+        else:
+            # A number that was not there before, as of the first validation, is a new column.
+            self._rewrite([*_rows_before(self.path, None), row])
+
+    def _rewrite(self, rows: list[dict[str, Any]]) -> None:
+        """Write the whole table aside, and put it in its place at once."""
+        aside = self.path.with_suffix(".csv.new")
+        write_table(aside, rows)
+        os.replace(aside, self.path)
+        self._columns = list(dict.fromkeys(name for row in rows for name in row))
+
+
+def _rows_before(path: Path, step: int | None) -> list[dict[str, str]]:
+    """Return the rows of a table, those before a step where one is given; none without a table."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return [row for row in rows if step is None or int(row[_STEP]) < step]
