@@ -8,7 +8,9 @@ import sys
 
 import typer
 
+from dolens.cli.apply import apply
 from dolens.cli.convert import convert
+from dolens.cli.evaluate import evaluate
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
@@ -45,4 +47,6 @@ def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
 
 
+app.command("evaluate")(evaluate)
+app.command("apply")(apply)
 app.command("report", help=REPORT_HELP)(report)
