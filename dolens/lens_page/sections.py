@@ -83,7 +83,9 @@ class PageSections:
 
     def sections(self) -> list[Section]:
         """Return all sections in the order of the page."""
-        last = [] if self.tolerances is None else [Section("offenders", "Tolerances", self.offenders)]
+        last = (
+            [] if self.tolerances is None else [Section("offenders", "Tolerances", self.offenders)]
+        )
         return [
             Section("layout", "Section", self.layout),
             Section("space", "In space", self.space),

@@ -169,9 +169,7 @@ def seidel_table(lens: Lens, where: Conditions) -> Table:
     short, long = min(lines), max(lines)
     sums = lens.seidel(edge, wavelength, distance, (short, long))
     waves = torch.stack(list(sums)).T / (1e-6 * wavelength)
-    rows = [
-        (str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)
-    ]
+    rows = [(str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)]
     rows.append(("total", *(_fixed(value) for value in waves.sum(0).tolist())))
     unit = where.field_unit if where.field_unit == "°" else " mm"
     posed = "  They are those of the centred lens, without poses." if lens.elements else ""
