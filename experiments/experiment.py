@@ -76,6 +76,12 @@ class Experiment(lightning.LightningModule):
             checkpoint: the whole checkpoint.
         """
 
+    def settle(self) -> None:
+        """Bring the lens to what a finished training leaves, with a checkpoint's state loaded.
+
+        A search may leave its best round and not its last.
+        """
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store the identity and the state."""
         checkpoint["dolens"] = self.identity()

@@ -12,13 +12,14 @@ FILES = sorted(p for top in ("dolens", "experiments") for p in (ROOT / top).rglo
 ALLOWED = {
     "errors": set(),
     "stages": set(),
+    "packaged": {"errors"},
     "kernels": {"errors", "stages"},
     "optics": {"errors", "kernels"},
-    "prescriptions": {"errors", "optics"},
+    "prescriptions": {"errors", "packaged", "optics"},
     "sensor": {"errors", "optics"},
     "scene": {"errors", "optics", "sensor"},
     "analysis": {"errors", "optics", "scene", "sensor"},
-    "diffraction": {"errors", "optics", "scene", "sensor"},
+    "diffraction": {"errors", "optics", "scene", "sensor", "analysis"},
     "rendering": {
         *("errors", "stages", "optics", "kernels", "scene", "sensor", "analysis", "diffraction")
     },
@@ -26,13 +27,11 @@ ALLOWED = {
     "tolerancing": {"errors", "optics", "analysis"},
     "alignment": {"errors", "optics", "sensor", "rendering", "analysis", "diffraction", "optimize"},
     "reconstruction": {"errors", "optics", "sensor"},
-    "plotting": {"errors", "optics", "analysis", "sensor", "rendering"},
-    # The command line stands above everything, the experiments too.
-    "cli": {
-        *("errors", "optics", "prescriptions", "analysis", "diffraction", "rendering"),
-        *("tolerancing", "plotting", "experiments"),
-    },
+    "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
+    "manufacturing": {"errors", "optics", "prescriptions", "tolerancing", "plotting"},
 }
+# The command line stands above everything, the experiments too.
+ALLOWED["cli"] = {*ALLOWED, "experiments"}
 
 
 def imports(path):

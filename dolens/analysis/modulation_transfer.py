@@ -151,7 +151,7 @@ def modulation(
     light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
     points = intercepts.points.flatten(1, 2)
     frequency = torch.as_tensor(frequencies, dtype=torch.float64).cpu()
-    along = _radial(field, object_distance)
+    along = field_directions(field, object_distance)
     across = torch.stack((along[:, 1], -along[:, 0]), -1)
     curves = []
     for spot, share, tangential, sagittal in zip(points, light, along, across, strict=True):
@@ -176,8 +176,13 @@ def modulation(
     )
 
 
-def _radial(field: Tensor, object_distance: float | None) -> Tensor:
-    """Return unit vectors along the fields, (F, 2); +y on the axis."""
+def field_directions(field: Tensor, object_distance: float | None) -> Tensor:
+    """Return unit vectors along the fields (F, 2) on the sensor, (F, 2); +y on the axis.
+
+    Args:
+        field: (F, 2), degrees or mm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+    """
     angles = torch.deg2rad(field) if vergence(object_distance) == 0.0 else field
     slopes, _ = field_tangents(angles, object_distance)
     length = slopes.norm(dim=-1, keepdim=True)

@@ -8,6 +8,10 @@ import sys
 
 import typer
 
+from dolens.cli.convert import convert
+from dolens.cli.report import HELP as REPORT_HELP
+from dolens.cli.report import report
+from dolens.cli.show import show
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -17,6 +21,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.command("show")(show)
+app.command("convert")(convert)
 
 
 def main() -> None:
@@ -35,3 +43,6 @@ def one_line(problem: object) -> str:
 @app.callback()
 def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
+
+
+app.command("report", help=REPORT_HELP)(report)

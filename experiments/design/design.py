@@ -34,6 +34,8 @@ logger = logging.getLogger(__name__)
 SEMI_DIAMETERS = ("fixed", "automatic")
 # So many iterations are logged one by one; history.csv holds all.
 _LOGGED_FIRST = 20
+# Of merit functions without operands.
+_MERIT_UNITS = {"spots": "µm²", "wavefront": "λ²"}
 
 
 class DesignModule(Experiment):
@@ -234,7 +236,12 @@ class DesignModule(Experiment):
 
     def on_test_start(self) -> None:
         """Put the variables to the best round of a checkpoint, if nothing was trained."""
-        if not self._fit_seconds and math.isfinite(float(self.best_merit)):
+        if not self._fit_seconds:
+            self.settle()
+
+    def settle(self) -> None:
+        """Put the variables to the best round, if there was one."""
+        if math.isfinite(float(self.best_merit)):
             self._leave_best()
 
     def _leave_best(self) -> None:
@@ -314,8 +321,17 @@ class DesignModule(Experiment):
 
     def figures(self) -> Figures:
         """Return the layout, spots, ray fans, MTF, RMS curves and the history."""
-        evaluated = (self.lens, self.initial, self.evaluation)
-        return design_figures(*evaluated, self.history, self.mtf_max_frequency)
+        merit = self.merit_settings
+        # Weights of operands have units of their own, and so has the sum.
+        unit = _MERIT_UNITS.get(merit.quality, "") if isinstance(merit.quality, str) else ""
+        return design_figures(
+            self.lens,
+            self.initial,
+            self.evaluation,
+            self.history,
+            self.mtf_max_frequency,
+            "" if merit.operands else unit,
+        )
 
     # ---------------------------------------------------------------- checkpoints
 

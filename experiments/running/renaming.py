@@ -121,6 +121,18 @@ def translated(overrides: Sequence[str], renamed: Renamed = RENAMED) -> tuple[li
     return found, notes
 
 
+def with_targets_of_now(node: Any, renamed: Renamed = RENAMED) -> Any:
+    """Return plain values in which every `_target_` has its name of now."""
+    if isinstance(node, list):
+        return [with_targets_of_now(value, renamed) for value in node]
+    if not isinstance(node, dict):
+        return node
+    found = {key: with_targets_of_now(value, renamed) for key, value in node.items()}
+    target = found.get("_target_")
+    change = _change("_target_", target, renamed) if isinstance(target, str) else None
+    return found if change is None else {**found, "_target_": change.after}
+
+
 def _translated(override: Override, renamed: Renamed) -> tuple[list[str], list[str]]:
     group, path = override.key_or_group, override.package or override.key_or_group
     value = None if override.is_sweep_override() else override.value()

@@ -1,23 +1,32 @@
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
+from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 
 @pytest.fixture
 def composed(root: Path, tmp_path: Path) -> Iterator[Callable[..., DictConfig]]:
     """Compose an experiment as train.py does, with its run folder under tmp_path."""
+    with composing(root, tmp_path) as build:
+        yield build
+
+
+@contextmanager
+def composing(root: Path, parent: Path) -> Iterator[Callable[..., DictConfig]]:
+    """A function that composes an experiment with its run folder under a parent."""
 
     def build(*overrides: str, folder: str = "run") -> DictConfig:
         cfg = compose("train", list(overrides), return_hydra_config=True)
-        output = tmp_path / folder
+        output = parent / folder
         output.mkdir(exist_ok=True)
         with open_dict(cfg):
             cfg.hydra.runtime.output_dir = str(output)
@@ -29,6 +38,35 @@ def composed(root: Path, tmp_path: Path) -> Iterator[Callable[..., DictConfig]]:
         yield build
     GlobalHydra.instance().clear()
     HydraConfig.instance().cfg = None
+
+
+@pytest.fixture(scope="session")
+def tiny_run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run of a tiny camera; tests copy it, and write nothing into it."""
+    return finished_run(root, tmp_path_factory.mktemp("finished"), *TINY_CAMERA)
+
+
+TINY_CAMERA = (
+    "experiment=wavefront_coding",
+    *TINY,
+    *TINY_NETWORK,
+    "trainer.max_epochs=1",
+    "learning_rates.network=0.05",
+)
+
+
+def finished_run(root: Path, parent: Path, *overrides: str, name: str = "run") -> Path:
+    """Train, and leave the whole run folder, with what Hydra writes into it for train.py."""
+    with composing(root, parent) as build:
+        cfg = build(*overrides, folder=name)
+        records = parent / name / ".hydra"
+        records.mkdir()
+        OmegaConf.save(cfg.hydra.overrides.task, records / "overrides.yaml")
+        OmegaConf.save(OmegaConf.create({"hydra": cfg.hydra}), records / "hydra.yaml")
+        own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+        OmegaConf.save(own, records / "config.yaml")
+        run(cfg)
+    return parent / name
 
 
 @pytest.fixture

@@ -66,6 +66,8 @@ class Imaging(ABC):
     """
 
     keeps_pupil: ClassVar[bool] = False
+    # Where the point spread functions are taken, for titles.
+    psf_place: ClassVar[str] = "on the axis, at the distances of the scene"
 
     def __init__(self, scene: Scene, renderer: Renderer, readout: Readout, seed: int) -> None:
         self.scene = scene
@@ -79,6 +81,15 @@ class Imaging(ABC):
     def sensor(self) -> Sensor:
         """The pixels of one image."""
         return self.renderer.sensor
+
+    @property
+    def image_sensor(self) -> Sensor:
+        """The whole sensor, of which an image may be a window."""
+        return self.renderer.sensor
+
+    def field_shares(self) -> Sequence[float]:
+        """Return the fields that drawings show, over the sensor's half diagonal, from the axis."""
+        return (0.0, 1.0)
 
     @property
     def object_distance(self) -> float:
@@ -118,8 +129,12 @@ class Imaging(ABC):
         values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
+        size: int | None = None,
     ) -> Tensor:
-        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's."""
+        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's.
+
+        K is the views' own number of pixels, or the odd one that is given as `size`.
+        """
 
     @abstractmethod
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:

@@ -157,12 +157,13 @@ class DepthViews(Imaging):
         values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
+        size: int | None = None,
     ) -> Tensor:
         """(depths, 3, K, K), on the axis."""
         samples = pupil_samples or self.psf_pupil_samples
         scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
         functions = axial_point_spread_functions(
-            lens, scene, self.sensor, self.psf_size, samples, values
+            lens, scene, self.sensor, size or self.psf_size, samples, values
         )
         if self.psf_diffraction == "none":
             return functions

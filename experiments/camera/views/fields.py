@@ -62,6 +62,7 @@ class FieldViews(Imaging):
     """
 
     keeps_pupil = True
+    psf_place = "at shares of the sensor's half diagonal"
 
     def __init__(
         self,
@@ -101,6 +102,15 @@ class FieldViews(Imaging):
         self.evaluation_renderer = self._training
         if evaluation_renderer is not None:
             self.evaluation_renderer = evaluation_renderer.for_windows(sensor, places)
+
+    @property
+    def image_sensor(self) -> Sensor:
+        """The whole sensor."""
+        return self.whole
+
+    def field_shares(self) -> list[float]:
+        """Return the zones."""
+        return sorted(set(self.zones.values()))
 
     def labels(self) -> list[str]:
         """The zones, and the whole field."""
@@ -177,14 +187,15 @@ class FieldViews(Imaging):
         values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
+        size: int | None = None,
     ) -> Tensor:
         """(zones, 3, K, K), at the middles of the zones' windows."""
         scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
         found = []
         for share in self.zones.values():
             window = self.windows.zone(share, 0)
-            size = self._training.psf_size or _PSF_SIZE
-            renderer = PsfRenderer(window, (1, 1), pupil_samples or 32, size, jitter=False)
+            side = size or self._training.psf_size or _PSF_SIZE
+            renderer = PsfRenderer(window, (1, 1), pupil_samples or 32, side, jitter=False)
             imaging = ImagingSystem.of(lens.system(values), scene, window)
             functions = renderer.point_spread_functions(imaging, 0)
             found.append(functions.functions[0, 0])

@@ -1,0 +1,130 @@
+"""Encircled energy is the share of an image point's light within a radius of its centroid."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.ray_intercepts import (
+    in_double_precision,
+    trace_ray_intercepts,
+    uniform_pupil_points,
+)
+from dolens.analysis.spot_diagram import AIRY, moments, spectral_shares, working_f_numbers
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+
+@dataclass(frozen=True)
+class EncircledEnergy:
+    """Encircled energy of F fields at Q radii, of all wavelengths together; float64 on the CPU.
+
+    Attributes:
+        fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
+        radii_um: (Q,), µm from the centroid of the polychromatic light.
+        energy: (F, Q), from 0 to 1, share of the light that passes the lens; NaN where none does.
+        airy_radius_um: µm, 1.22·λ·N at the wavelengths' mean, with the paraxial working F-number.
+        diffraction: whether diffraction is part of it, or only rays, of each field.
+    """
+
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
+    radii_um: Tensor
+    energy: Tensor
+    airy_radius_um: float
+    diffraction: tuple[bool, ...]
+
+    def radius_um(self, share: float) -> Tensor:
+        """Return the radius (F,), µm, that holds a share of the light, interpolated linearly; NaN
+        where the largest radius holds less.
+        """
+        found = []
+        for curve in self.energy:
+            beyond = torch.nonzero(curve >= share).flatten()
+            if not len(beyond):
+                found.append(torch.nan)
+                continue
+            at = int(beyond[0])
+            if at == 0:
+                found.append(float(self.radii_um[0]))
+                continue
+            part = (share - curve[at - 1]) / (curve[at] - curve[at - 1])
+            found.append(float(torch.lerp(self.radii_um[at - 1], self.radii_um[at], part)))
+        return torch.tensor(found, dtype=torch.float64)
+
+
+@torch.no_grad()
+def encircled_energy(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    radii_um: Sequence[float] | Tensor | None = None,
+    rays: int = 4000,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> EncircledEnergy:
+    """Compute the geometric encircled energy from rays spread uniformly over the stop.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm; all of a field make one spot.
+        radii_um: (Q,), µm, ascending; None for 101 from zero to the largest spot's.
+        rays: of each field and wavelength, a multiple of four, before apertures clip any.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+
+    Raises:
+        InputError: no fields or wavelengths, weights that do not fit, radii that do not ascend from
+            zero or more, or a wrong number of rays.
+    """
+    lens = in_double_precision(lens)
+    pupil, weight = uniform_pupil_points(rays)
+    pupil, weight = pupil[weight > 0.0], weight[weight > 0.0]
+    intercepts = trace_ray_intercepts(lens, fields, wavelengths, pupil, object_distance)
+    waves = intercepts.wavelengths
+    spectrum = spectral_shares(wavelength_weights, len(waves))
+    light = (weight * intercepts.valid * spectrum[:, None]).flatten(1, 2)
+    points = intercepts.points.flatten(1, 2)
+    centroid, _ = moments(points, light)
+    distance = 1e3 * (points - centroid[:, None]).norm(dim=-1)
+    airy = 1e3 * AIRY * 1e-6 * (waves * working_f_numbers(lens, waves, object_distance))
+    if radii_um is None:
+        reach = float(distance.nan_to_num(0.0).amax()) or float(airy.amax())
+        radii_um = torch.linspace(0.0, 1.02 * reach, 101, dtype=torch.float64)
+    radii = checked_radii(radii_um)
+    curves = []
+    for spot, share in zip(distance, light, strict=True):
+        lit = share > 0.0
+        if not bool(lit.any()):
+            curves.append(torch.full_like(radii, torch.nan))
+            continue
+        order = spot[lit].argsort()
+        inside = torch.searchsorted(spot[lit][order], radii, right=True)
+        within = torch.cat([share.new_zeros(1), share[lit][order].cumsum(0)])
+        curves.append(within[inside] / within[-1])
+    return EncircledEnergy(
+        intercepts.fields,
+        intercepts.field_unit,
+        waves,
+        radii,
+        torch.stack(curves),
+        float(spectrum @ airy),
+        (False,) * len(curves),
+    )
+
+
+def checked_radii(radii_um: Sequence[float] | Tensor) -> Tensor:
+    """Return radii (Q,) in µm as float64.
+
+    Raises:
+        InputError: they do not ascend from zero or more.
+    """
+    radii = torch.as_tensor(radii_um, dtype=torch.float64).cpu().reshape(-1)
+    if not len(radii) or not bool((radii >= 0.0).all()) or bool((radii.diff() <= 0.0).any()):
+        raise InputError(f"radii must ascend from 0 µm or more, not {radii_um}")
+    return radii

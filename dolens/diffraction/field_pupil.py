@@ -1,0 +1,306 @@
+"""The pupils of one field's wavelengths, from which its image of a point is computed.
+
+Where a Fourier transform of the pupil holds, diffraction is part of the image.  Where the wavefront
+is too steep for it (a spot of hundreds of Airy discs), or the edge of the pupil is made by rays
+that miss a surface, rays alone make the image; `reason` says which.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.field import fourier_field
+from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.propagation import choose_propagation
+from dolens.diffraction.pupil_edges import coverage
+from dolens.diffraction.pupil_fit import (
+    PupilFit,
+    RegularPupil,
+    at_points,
+    chebyshev,
+    fit_pupil,
+    regular_pupil,
+)
+from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
+from dolens.optics.system import OpticalSystem
+
+# Samples across the pupil beyond which rays alone are used, and the fewest.
+MOST_SAMPLES, _FEWEST = 1024, 128
+_OVERSAMPLING = 1.5
+# Degrees of the fit that are tried, and the waves that the first may leave.
+_DEGREES, _RESIDUAL = (10, 16), 0.005
+# Rays along each side of a beam where rays alone are used.
+_RAYS = 384
+# Share of the light whose rays the window of a point spread function holds.
+_HELD = 0.99
+# Points of the line that rays are counted on for their transfer function, and points of a pupil
+# that are evaluated at a time.
+_LINE, _PIECE = 4096, 1 << 14
+
+
+@dataclass(frozen=True)
+class FieldPupil:
+    """The pupils of one field at W wavelengths.
+
+    Attributes:
+        front: W wavefronts about one point of the sensor.
+        weights: (W,), of the wavelengths.
+        fit: of the wavefronts; None where rays alone are used.
+        reason: why diffraction is part of the image or not.
+    """
+
+    front: Wavefront
+    weights: Tensor
+    fit: PupilFit | None
+    reason: str
+
+    @classmethod
+    def of(
+        cls, system: OpticalSystem, point: ObjectPoints, front: Wavefront, weights: Tensor
+    ) -> "FieldPupil":
+        """Choose how light is propagated, by wavefronts of 32 rays a side or more.
+
+        Args:
+            system: the lens, in double precision.
+            point: W times the field's.
+            front: W wavefronts.
+            weights: (W,).
+        """
+        fit = fit_pupil(front, _DEGREES[0])
+        if not bool((fit.residual <= _RESIDUAL).all()):
+            fit = fit_pupil(front, _DEGREES[1])
+        found = cls(front, weights, fit, "")
+        reason = found._obstacle()
+        if not reason:
+            return replace(found, reason="Fourier transform of the pupil")
+        rays = pupil_wavefront(system, point, front.wavelength, front.centre, _RAYS)
+        return cls(rays, weights, None, f"rays alone: {reason}")
+
+    @property
+    def diffraction(self) -> bool:
+        """Return whether diffraction is part of the image."""
+        return self.fit is not None
+
+    @property
+    def airy_radius(self) -> float:
+        """Return 0.61·λ over half the pupil's width in direction cosines, mm; the largest of all
+        wavelengths and the smaller width count.
+        """
+        lit = self.front.coverage > 0.0
+        cosine = self.front.direction
+        high = torch.where(lit[..., None], cosine, -math.inf).amax((1, 2))
+        low = torch.where(lit[..., None], cosine, math.inf).amin((1, 2))
+        wave = MM_PER_NM * self.front.wavelength / self.front.index
+        width = (high - low).amin(-1).clamp(min=1e-9)
+        return float((1.22 * wave / width).amax())
+
+    @property
+    def spot_radius(self) -> float:
+        """Return the radius (mm) about the centre that holds 99 % of the light by rays."""
+        distance, light = self._spot()
+        order = distance.argsort()
+        within = light[order].cumsum(0)
+        at = int(torch.searchsorted(within, _HELD * within[-1]))
+        return float(distance[order][min(at, len(order) - 1)])
+
+    def irradiance(self, x: Tensor, y: Tensor) -> tuple[Tensor, float]:
+        """Compute the irradiance on a regular grid, with the share of the light as unit.
+
+        Args:
+            x: (X,), mm from the centre, equally spaced.
+            y: (Y,), mm.
+
+        Returns:
+            (Y, X), 1/mm², and the Strehl ratio's denominator: the irradiance of a perfect
+            wavefront at the centre.  Rays alone give the mean over each cell.
+        """
+        if self.fit is None:
+            return self._counted(x, y), math.nan
+        samples = self.samples(float(torch.cat([x.abs(), y.abs()]).amax()))
+        pupil = regular_pupil(self.fit, samples)
+        field = fourier_field(pupil, x, y)
+        perfect = _unaberrated(pupil)
+        total = self.weights @ pupil.flux
+        irradiance = field.real.square() + field.imag.square()
+        mixed = torch.einsum("w,wyx->yx", self.weights, irradiance) / total
+        return mixed, float(self.weights @ perfect / total)
+
+    def transfer(self, frequencies: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the optical transfer function along and across a direction of the sensor.
+
+        The transfer function is the pupil's autocorrelation (Goodman, Introduction to Fourier
+        Optics, section 6.3).  It comes from the line spread function, whose samples are the squared
+        moduli of Fourier transforms of the pupil's rows, summed.
+
+        Args:
+            frequencies: (Q,), cycles/mm.
+            direction: (2,), unit vector.
+
+        Returns:
+            (2, Q), complex, of all wavelengths, along and across; and (2, Q), the modulus without
+            aberrations, NaN where rays alone are used.
+        """
+        if self.fit is None:
+            return self._transfer_of_rays(frequencies, direction)
+        pupil = self._on_grid(self.samples(0.0, 2.0), direction)
+        share = self.weights * pupil.flux
+        share = (share / share.sum())[:, None]
+        turns = pupil.opd / (MM_PER_NM * pupil.wavelength)[:, None, None]
+        function = torch.polar(pupil.amplitude, 2.0 * torch.pi * turns)
+        perfect = pupil.amplitude.to(function.dtype)
+        found, limit = [], []
+        for axis in range(2):
+            found.append((share * _autocorrelation(function, pupil, axis, frequencies)).sum(0))
+            limit.append((share * _autocorrelation(perfect, pupil, axis, frequencies)).sum(0).abs())
+        return torch.stack(found), torch.stack(limit)
+
+    def _transfer_of_rays(self, frequencies: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        light = self.weights[:, None, None] * self.front.amplitude * self.front.weight
+        lit = light > 0.0
+        share, points = light[lit] / light.sum(), self.front.intercept[lit]
+        found = []
+        for way in (direction, torch.stack((direction[1], -direction[0]))):
+            height = points @ way.to(points)
+            # Rays are counted on a fine line first: so many do not each need a phase.
+            low, high = float(height.amin()), float(height.amax())
+            step = (high - low) / _LINE or 1.0
+            place = (height - low) / step
+            first = place.floor().clamp(max=_LINE - 1.0)
+            line = share.new_zeros(_LINE + 1)
+            line.index_add_(0, first.long(), share * (1.0 - (place - first)))
+            line.index_add_(0, first.long() + 1, share * (place - first))
+            at = low + step * torch.arange(_LINE + 1).to(line)
+            phase = -2.0 * torch.pi * frequencies[:, None] * at
+            found.append(torch.complex(phase.cos() @ line, phase.sin() @ line))
+        return torch.stack(found), frequencies.new_full((2, len(frequencies)), math.nan)
+
+    def encircled_rays(self, radii: Tensor) -> Tensor:
+        """Return the shares (Q,) of the light whose rays land within radii (mm) of the centre."""
+        distance, light = self._spot()
+        order = distance.argsort()
+        within = torch.cat([light.new_zeros(1), light[order].cumsum(0)])
+        return within[torch.searchsorted(distance[order], radii, right=True)] / within[-1]
+
+    def samples(self, half_window: float, spots: float = 1.0) -> int:
+        """Return G, samples across the pupil, that keep copies of the image out of a window.
+
+        Args:
+            half_window: mm.
+            spots: how many times the spot's own extent must fit beside it.
+        """
+        wave = MM_PER_NM * self.front.wavelength / self.front.index
+        width = (self.fit.high - self.fit.low).amax(-1)
+        reach = spots * self._farthest() + half_window
+        needed = _OVERSAMPLING * float((width * reach / wave).amax())
+        return max(_FEWEST, 4 * math.ceil(needed / 4.0))
+
+    def _farthest(self) -> float:
+        lit = self.front.coverage >= 0.5
+        away = self.front.intercept.abs().amax(-1)
+        return float(torch.where(lit, away, 0.0).amax())
+
+    def _obstacle(self) -> str:
+        """Return why a Fourier transform does not hold; nothing where it does."""
+        half = 1.1 * self.spot_radius + 4.0 * self.airy_radius
+        needed = max(self.samples(half), self.samples(0.0, 2.0))
+        if needed > MOST_SAMPLES:
+            return f"the wavefront needs {needed} samples across the pupil"
+        pupil = regular_pupil(self.fit, self.samples(half))
+        chosen = choose_propagation(self.fit, pupil.flux, half)
+        reasons = zip(chosen.fourier.tolist(), chosen.reasons, strict=True)
+        return next((reason.removeprefix("direct: ") for good, reason in reasons if not good), "")
+
+    def _spot(self) -> tuple[Tensor, Tensor]:
+        """Return rays' distances (mm) from the centre, and their light, both (M,)."""
+        light = self.weights[:, None, None] * self.front.amplitude * self.front.weight
+        lit = light > 0.0
+        return self.front.intercept.norm(dim=-1)[lit], light[lit]
+
+    def _counted(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return the light of rays in cells about the points of a grid, by bilinear shares."""
+        light = self.weights[:, None, None] * self.front.amplitude * self.front.weight
+        lit = light > 0.0
+        light, points = light[lit] / light.sum(), self.front.intercept[lit]
+        step_x, step_y = float(x[1] - x[0]), float(y[1] - y[0])
+        column, row = (points[:, 0] - x[0]) / step_x, (points[:, 1] - y[0]) / step_y
+        found = light.new_zeros(len(y) * len(x))
+        for right in (0, 1):
+            for up in (0, 1):
+                c, r = column.floor() + right, row.floor() + up
+                share = (1.0 - (column - c).abs()) * (1.0 - (row - r).abs())
+                inside = (c >= 0) & (c < len(x)) & (r >= 0) & (r < len(y))
+                at = (r * len(x) + c)[inside].long()
+                found.index_add_(0, at, (light * share)[inside])
+        return found.reshape(len(y), len(x)) / (step_x * step_y)
+
+    def _on_grid(self, samples: int, direction: Tensor) -> RegularPupil:
+        """Evaluate the pupil on a grid whose last dimension runs along a direction, and the other
+        across it; `cosines` are along and across, from the middle.
+        """
+        fit, front = self.fit, self.front
+        along = direction.to(fit.low)
+        if float(along[0]) == 0.0 or float(along[1]) == 0.0:
+            pupil = regular_pupil(fit, samples)
+            if float(along[1]) == 0.0:
+                return pupil
+            turned = pupil.amplitude.mT, pupil.opd.mT, pupil.cosines.flip(1)
+            return replace(pupil, **dict(zip(("amplitude", "opd", "cosines"), turned, strict=True)))
+        across = torch.stack((along[1], -along[0]))
+        middle, half = 0.5 * (fit.low + fit.high), 0.5 * (fit.high - fit.low)
+        step = (torch.arange(samples).to(fit.low) + 0.5) * (2.0 / samples) - 1.0
+        reach = torch.stack([half @ along.abs(), half @ across.abs()], -1)
+        grid = reach[..., None] * step
+        offset = grid[:, 1, :, None, None] * across + grid[:, 0, None, :, None] * along
+        unit = (middle[:, None, None] + offset - fit.centre[:, None, None]) / (
+            fit.half_width[:, None, None]
+        )
+        inside = (unit.abs() <= 1.0 + 2.0 / samples).all(-1)
+        unit = unit.clamp(-1.0, 1.0).flatten(1, 2)
+        pieces, degree = [], fit.coefficients.shape[-1] - 1
+        for part in unit.split(_PIECE, 1):
+            (x, _), (y, _) = (chebyshev(part[..., axis], degree) for axis in (0, 1))
+            pieces.append(at_points(fit.coefficients, x, y))
+        values = torch.cat(pieces, -1).unflatten(-1, (samples, samples))
+        opd, whole, *crossings = values.unbind(1)
+        lit = (front.coverage > 0.0).flatten(1).any(-1)[:, None, None]
+        passed = (inside & lit).to(opd.dtype)
+        surfaces = front.clipping.values()
+        for surface, x, y in zip(surfaces, crossings[::2], crossings[1::2], strict=True):
+            passed = torch.minimum(passed, coverage(surface.aperture, x, y))
+        cell = (2.0 * reach / samples).prod(-1)
+        flux = (whole.square() * passed).sum((-2, -1)) * cell
+        return RegularPupil(whole * passed, opd, grid, flux, front.wavelength, front.index)
+
+
+def _unaberrated(pupil: RegularPupil) -> Tensor:
+    """Return the irradiance (W,), 1/mm², at the centre of a perfect wavefront's image."""
+    cell = (pupil.cosines[..., 1] - pupil.cosines[..., 0]).prod(-1)
+    wave = MM_PER_NM * pupil.wavelength / pupil.index
+    return (pupil.amplitude.sum((-2, -1)) * cell / wave).square()
+
+
+def _autocorrelation(
+    function: Tensor, pupil: RegularPupil, axis: int, frequencies: Tensor
+) -> Tensor:
+    """Return the transfer function (W, Q) of pupil functions (W, G, G), along the last dimension
+    (axis 0 of `cosines`) or the one before.
+    """
+    dim = -1 if axis == 0 else -2
+    size = 2 * function.shape[-1]
+    line = torch.fft.fft(function, size, dim=dim)
+    spread = (line.real.square() + line.imag.square()).sum(-2 if axis == 0 else -1)
+    spread = spread / spread.sum(-1, keepdim=True)
+    step = pupil.cosines[:, axis, 1] - pupil.cosines[:, axis, 0]
+    wave = MM_PER_NM * pupil.wavelength / pupil.index
+    order = torch.fft.fftfreq(size, dtype=torch.float64, device=spread.device)
+    # U(ρ) goes with exp(+ikρα), and the transform with exp(-i…): sample j lies at -j·λ/(n'·Δα).
+    place = -(wave / step)[:, None] * order
+    phase = -2.0 * torch.pi * frequencies[:, None] * place[:, None]
+    found = torch.complex(
+        (spread[:, None] * phase.cos()).sum(-1), (spread[:, None] * phase.sin()).sum(-1)
+    )
+    # Beyond the autocorrelation's support only its periodic copies are left.
+    beyond = (frequencies * wave[:, None]).abs() >= (step * function.shape[-1])[:, None]
+    return found.masked_fill(beyond, 0.0)

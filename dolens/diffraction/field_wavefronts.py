@@ -1,0 +1,107 @@
+"""Wavefronts of a lens's fields and wavelengths, from which its diffraction is computed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.ray_intercepts import field_unit
+from dolens.analysis.spot_diagram import spectral_shares
+from dolens.diffraction.entrance_beam import find_beam
+from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+# Rays along each side of the beam that find where the light lands.
+_COARSE = 16
+
+
+@dataclass(frozen=True)
+class FieldWavefronts:
+    """Wavefronts of F fields and W wavelengths; no gradient.
+
+    All wavelengths of a field have one reference point on the sensor, so that lateral colour shows
+    as a tilt.
+
+    Attributes:
+        fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
+        weights: (W,), shares of the wavelengths in polychromatic values.
+        centre: (F, 2), mm on the sensor: the centroid of the polychromatic light.
+        wavefront: F·W wavefronts to spheres about `centre`, wavelengths of a field together.
+        lit: (F, W), bool: light passes.
+    """
+
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
+    weights: Tensor
+    centre: Tensor
+    wavefront: Wavefront
+    lit: Tensor
+
+
+@torch.no_grad()
+def field_wavefronts(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+    samples: int = 32,
+) -> FieldWavefronts:
+    """Trace the wavefronts of every field and wavelength.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+        samples: rays along each side of a box about each beam.
+
+    Raises:
+        InputError: no fields or wavelengths, weights that do not fit, or a sphere that cannot be
+            placed.
+    """
+    system = lens.system().double()
+    options = {"dtype": torch.float64, "device": system.device}
+    field = torch.as_tensor(fields, **options)
+    waves = torch.as_tensor(wavelengths, **options).reshape(-1)
+    if field.ndim != 2 or field.shape[-1] != 2 or not len(field) or not len(waves):
+        raise InputError("fields must be pairs (x, y) and wavelengths numbers, at least one each")
+    spectrum = spectral_shares(wavelength_weights, len(waves)).to(**options)
+    shape = (len(field), len(waves))
+    every = field.repeat_interleave(len(waves), 0)
+    points = object_points(every, object_distance)
+    wave = waves.repeat(len(field))
+    beam = find_beam(system, points, wave)
+    middle = field.new_zeros(len(every), 2)
+    coarse = pupil_wavefront(system, points, wave, middle, _COARSE, beam=beam)
+    light = (coarse.amplitude * coarse.weight).unflatten(0, shape) * spectrum[:, None, None]
+    total = light.sum((1, 2, 3))
+    landed = coarse.intercept.unflatten(0, shape)
+    centre = (light[..., None] * landed).sum((1, 2, 3)) / total[:, None]
+    centre = centre.where(total[:, None] > 0.0, 0.0)
+    centres = centre.repeat_interleave(len(waves), 0)
+    front = pupil_wavefront(system, points, wave, centres, samples, beam=beam)
+    return FieldWavefronts(
+        field.cpu(),
+        field_unit(object_distance),
+        waves.cpu(),
+        spectrum.cpu(),
+        centre.cpu(),
+        front,
+        (front.flux > 0.0).unflatten(0, shape).cpu(),
+    )
+
+
+def object_points(fields: Tensor, object_distance: float | None) -> ObjectPoints:
+    """Return the object points of fields (N, 2), degrees for an object at infinity, else mm."""
+    if field_unit(object_distance) == "°":
+        return ObjectPoints.at_infinity(fields)
+    away = torch.full_like(fields[:, :1], -float(object_distance))
+    return ObjectPoints.at(torch.cat([fields, away], -1))

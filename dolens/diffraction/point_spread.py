@@ -1,0 +1,246 @@
+"""Point spread functions and encircled energy of a lens's fields, with diffraction."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.encircled_energy import EncircledEnergy, checked_radii
+from dolens.analysis.spot_diagram import AIRY, working_f_numbers
+from dolens.diffraction.field_pupil import FieldPupil
+from dolens.diffraction.field_wavefronts import FieldWavefronts, field_wavefronts, object_points
+from dolens.diffraction.pupil_edges import coverage
+from dolens.diffraction.pupil_fit import dilated
+from dolens.diffraction.wavefront import Wavefront
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+# The window holds the rays and so many Airy radii around them.
+_BEYOND, _AIRY_RADII = 1.1, 3.5
+# Fewest steps of the irradiance's grid to an Airy radius, and most across a window.
+_STEPS, _MOST = 3.5, 1024
+_CELLS = 128
+
+
+@dataclass(frozen=True)
+class PointSpread:
+    """Point spread functions of F fields, of all wavelengths together; float64 on the CPU.
+
+    Attributes:
+        fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
+        centre: (F, 2), mm on the sensor, of the windows: the centroids of the light.
+        half_width_um: (F,), µm, from the centre to the sides of the window.
+        irradiance: (F, M, M), share of the light per µm², the mean over a cell of the window; rows
+            run along +y and columns along +x.  NaN where no light passes.
+        held: (F,), share of the light inside the window.
+        strehl_ratio: (F,), highest irradiance over that of the same pupil without aberrations; NaN
+            where rays alone make the image.
+        airy_radius_um: µm, 1.22·λ·N with the paraxial working F-number, mean over wavelengths.
+        diffraction: whether diffraction is part of each field's image, or rays alone make it.
+        reasons: why, of each.
+    """
+
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
+    centre: Tensor
+    half_width_um: Tensor
+    irradiance: Tensor
+    held: Tensor
+    strehl_ratio: Tensor
+    airy_radius_um: float
+    diffraction: tuple[bool, ...]
+    reasons: tuple[str, ...]
+
+
+@torch.no_grad()
+def point_spread(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+    cells: int = _CELLS,
+    half_width_um: float | None = None,
+) -> PointSpread:
+    """Compute the point spread function of every field, by the Fourier transform of its pupil.
+
+    Where the wavefront is too steep for that, rays alone make the image; `reasons` says so.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+        cells: M, along each side of the window.
+        half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
+
+    Raises:
+        InputError: no fields or wavelengths, weights that do not fit, or fewer than two cells.
+    """
+    if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
+        raise InputError(f"a window needs two cells and a positive width, not {cells}")
+    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    dark = torch.full((cells, cells), math.nan, dtype=torch.float64)
+    rows = []
+    for pupil in field_pupils(lens, found, object_distance):
+        if pupil is None:
+            rows.append((math.nan, dark, math.nan, math.nan, False, "no light passes"))
+            continue
+        half = _half_width(pupil) if half_width_um is None else 1e-3 * half_width_um
+        irradiance, peak, perfect = _mean_irradiance(pupil, half, cells)
+        held = float(irradiance.sum()) * (2.0 * half / cells) ** 2
+        strehl = peak / perfect
+        rows.append((1e3 * half, 1e-6 * irradiance, held, strehl, pupil.diffraction, pupil.reason))
+    half_widths, windows, held, strehl, diffraction, reasons = zip(*rows, strict=True)
+    return PointSpread(
+        found.fields,
+        found.field_unit,
+        found.wavelengths,
+        found.centre,
+        torch.tensor(half_widths, dtype=torch.float64),
+        torch.stack([window.cpu() for window in windows]),
+        torch.tensor(held, dtype=torch.float64),
+        torch.tensor(strehl, dtype=torch.float64),
+        _airy_um(lens, found, object_distance),
+        diffraction,
+        reasons,
+    )
+
+
+@torch.no_grad()
+def diffraction_encircled_energy(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    radii_um: Sequence[float] | Tensor | None = None,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> EncircledEnergy:
+    """Compute encircled energy with diffraction, by sums over the point spread function.
+
+    Light outside the window counts: the whole is what passes the pupil.  Fields whose wavefront is
+    too steep have that of their rays.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        radii_um: (Q,), µm, ascending, from the centroid; None for 101 from zero to the edge of the
+            largest window of `point_spread`.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+
+    Raises:
+        InputError: no fields or wavelengths, weights that do not fit, or radii that do not ascend.
+    """
+    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    pupils = list(field_pupils(lens, found, object_distance))
+    airy = _airy_um(lens, found, object_distance)
+    if radii_um is None:
+        reach = max((_half_width(pupil) for pupil in pupils if pupil), default=4e-3 * airy)
+        radii_um = torch.linspace(0.0, 1e3 * reach, 101, dtype=torch.float64)
+    radii = checked_radii(radii_um)
+    curves = [
+        torch.full_like(radii, math.nan) if pupil is None else _encircled(pupil, 1e-3 * radii)
+        for pupil in pupils
+    ]
+    return EncircledEnergy(
+        found.fields,
+        found.field_unit,
+        found.wavelengths,
+        radii,
+        torch.stack(curves).cpu(),
+        airy,
+        tuple(pupil is not None and pupil.diffraction for pupil in pupils),
+    )
+
+
+def field_pupils(
+    lens: Lens, found: FieldWavefronts, object_distance: float | None
+) -> list[FieldPupil | None]:
+    """Return the pupils of every field; None for a field without light."""
+    system = lens.system().double()
+    count = len(found.wavelengths)
+    weights = found.weights.to(system.device)
+    pupils = []
+    for number, lit in enumerate(found.lit.any(1).tolist()):
+        if not lit:
+            pupils.append(None)
+            continue
+        which = torch.arange(number * count, (number + 1) * count, device=system.device)
+        field = found.fields[number].to(system.device).expand(count, 2)
+        point = object_points(field, object_distance)
+        pupils.append(FieldPupil.of(system, point, _part(found.wavefront, which), weights))
+    return pupils
+
+
+def _part(front: Wavefront, which: Tensor) -> Wavefront:
+    """Return some of the wavefronts, with the apertures that clip these."""
+    values = {
+        name: value[which] if isinstance(value, Tensor) else value
+        for name, value in vars(front).items()
+    }
+    passing = dilated(values["coverage"] > 0.0, 2)
+    kept = {}
+    for number, crossing in front.crossings.items():
+        x, y = crossing[which].unbind(-1)
+        if bool((coverage(front.clipping[number].aperture, x, y)[passing] < 1.0).any()):
+            kept[number] = crossing[which]
+    values["crossings"] = kept
+    values["clipping"] = {number: front.clipping[number] for number in kept}
+    return Wavefront(**values)
+
+
+def _half_width(pupil: FieldPupil) -> float:
+    """Return the half width (mm) of a window that holds a field's light."""
+    return _BEYOND * pupil.spot_radius + _AIRY_RADII * pupil.airy_radius
+
+
+def _mean_irradiance(pupil: FieldPupil, half: float, cells: int) -> tuple[Tensor, float, float]:
+    """Return means over cells (M, M), 1/mm², the highest sample, and a perfect lens's."""
+    parts = 1
+    if pupil.diffraction:
+        wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius / cells)
+        parts = max(1, min(wanted, _MOST // cells))
+    fine = parts * cells
+    grid = (torch.arange(fine).to(pupil.weights) + 0.5) * (2.0 * half / fine) - half
+    irradiance, perfect = pupil.irradiance(grid, grid)
+    peak = float(irradiance.amax())
+    means = irradiance.unflatten(1, (cells, parts)).unflatten(0, (cells, parts)).mean((1, 3))
+    return means, peak, perfect
+
+
+def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
+    """Return the shares (Q,) of a field's light within radii in mm."""
+    radii = radii.to(pupil.weights)
+    if not pupil.diffraction:
+        return pupil.encircled_rays(radii)
+    half = float(radii[-1]) + 1e-9
+    cells = min(max(2 * math.ceil(half * 2.0 * _STEPS / pupil.airy_radius), 2 * _CELLS), _MOST)
+    step = 2.0 * half / cells
+    grid = (torch.arange(cells).to(pupil.weights) + 0.5) * step - half
+    light = pupil.irradiance(grid, grid)[0].flatten() * step * step
+    distance = torch.hypot(grid[:, None], grid[None]).flatten()
+    # A cell that the circle cuts counts by the part that lies inside.
+    order = distance.argsort()
+    distance, within = distance[order], light[order].cumsum(0)
+    within = torch.cat([within.new_zeros(1), within])
+    inner = torch.searchsorted(distance, radii - 0.5 * step)
+    outer = torch.searchsorted(distance, radii + 0.5 * step)
+    found = []
+    for radius, low, high in zip(radii, inner.tolist(), outer.tolist(), strict=True):
+        edge = light[order[low:high]]
+        share = ((radius - distance[low:high]) / step + 0.5).clamp(0.0, 1.0)
+        found.append(within[low] + (edge * share).sum())
+    return torch.stack(found)
+
+
+def _airy_um(lens: Lens, found: FieldWavefronts, object_distance: float | None) -> float:
+    numbers = working_f_numbers(lens, found.wavelengths, object_distance)
+    return float(found.weights @ (1e-3 * AIRY * found.wavelengths * numbers))

@@ -1,0 +1,93 @@
+"""The modulation transfer function with diffraction, from the pupil's autocorrelation."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.modulation_transfer import field_directions
+from dolens.diffraction.field_wavefronts import field_wavefronts
+from dolens.diffraction.point_spread import field_pupils
+from dolens.optics.lens import Lens
+
+
+@dataclass(frozen=True)
+class DiffractionModulation:
+    """MTF with diffraction of F fields at Q frequencies, of all wavelengths; float64 on the CPU.
+
+    Attributes:
+        fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
+        frequencies: (Q,), cycles/mm on the sensor.
+        tangential: (F, Q), of a pattern that varies along the field's own direction, y for one in
+            the y-z plane and on the axis; NaN where no light passes.
+        sagittal: (F, Q), of one that varies across it.
+        tangential_limit: (F, Q), of the same pupil without aberrations; NaN where rays alone are
+            used.
+        sagittal_limit: (F, Q).
+        diffraction: whether diffraction is part of it, or rays alone, of each field.
+        reasons: why, of each.
+    """
+
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
+    frequencies: Tensor
+    tangential: Tensor
+    sagittal: Tensor
+    tangential_limit: Tensor
+    sagittal_limit: Tensor
+    diffraction: tuple[bool, ...]
+    reasons: tuple[str, ...]
+
+
+@torch.no_grad()
+def diffraction_modulation(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    frequencies: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> DiffractionModulation:
+    """Compute the polychromatic MTF with diffraction.
+
+    Where a wavefront is too steep for a Fourier transform of the pupil, the field has the geometric
+    MTF of its rays; `reasons` says so.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        frequencies: (Q,), cycles/mm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+
+    Raises:
+        InputError: no fields or wavelengths, or weights that do not fit.
+    """
+    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    frequency = torch.as_tensor(frequencies, dtype=torch.float64, device=lens.device).reshape(-1)
+    dark = torch.full_like(frequency, math.nan).expand(4, -1)
+    along = field_directions(found.fields, object_distance).to(lens.device)
+    pupils = field_pupils(lens, found, object_distance)
+    rows = []
+    for pupil, tangential in zip(pupils, along, strict=True):
+        if pupil is None:
+            rows.append(dark)
+            continue
+        found_here, limit = pupil.transfer(frequency, tangential)
+        rows.append(torch.cat([found_here.abs(), limit]))
+    curves = torch.stack(rows, 1).cpu()
+    return DiffractionModulation(
+        found.fields,
+        found.field_unit,
+        found.wavelengths,
+        frequency.cpu(),
+        *curves,
+        tuple(pupil is not None and pupil.diffraction for pupil in pupils),
+        tuple("no light passes" if pupil is None else pupil.reason for pupil in pupils),
+    )

@@ -1,0 +1,1 @@
+"""A designed lens becomes what a workshop asks for: solids in a STEP file, and drawings."""

@@ -1,0 +1,88 @@
+"""Solids are drawn as shaded triangles, to see at a glance what a STEP file holds."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from dolens.manufacturing.modeller import Shape, box, common, occ, parts
+from dolens.plotting.style import SMALL, TITLE, colours
+
+# Triangles stay this close to a solid, as a share of its size.
+_COARSE = 0.002
+_ANGLE = 0.15
+_LIGHT = np.array([-0.4, -0.75, 0.53])
+
+
+def triangles(solid: Shape) -> np.ndarray:
+    """Return triangles (N, 3, 3) that cover a solid's surface, mm, corners seen from outside."""
+    occ("BRepMesh").BRepMesh_IncrementalMesh(solid, _COARSE, True, _ANGLE, False)
+    found = []
+    for face in parts(solid, "FACE"):
+        place = occ("TopLoc").TopLoc_Location()
+        mesh = occ("BRep").BRep_Tool.Triangulation_s(face, place)
+        move = place.Transformation()
+        nodes = [mesh.Node(k).Transformed(move) for k in range(1, mesh.NbNodes() + 1)]
+        points = np.array([[p.X(), p.Y(), p.Z()] for p in nodes])
+        corners = [mesh.Triangle(k) for k in range(1, mesh.NbTriangles() + 1)]
+        index = np.array([[c.Value(1), c.Value(2), c.Value(3)] for c in corners]) - 1
+        reversed_face = face.Orientation() == occ("TopAbs").TopAbs_REVERSED
+        found.append(points[index[:, ::-1] if reversed_face else index])
+    return np.concatenate(found)
+
+
+def mesh_volume(corners: np.ndarray) -> float:
+    """Return the volume (mm³) that closed triangles (N, 3, 3) enclose: Σ a·(b × c)/6."""
+    a, b, c = corners.transpose(1, 0, 2)
+    return float((a * np.cross(b, c)).sum() / 6.0)
+
+
+def solids_figure(solids: Mapping[str, Shape], title: str) -> Figure:
+    """Draw solids obliquely, whole and cut open along the plane x = 0.
+
+    Args:
+        solids: name → solid in the lens's axes, mm.
+        title: of the figure.
+    """
+    figure = Figure(figsize=(10.0, 5.0), layout="constrained")
+    meshes = {name: triangles(solid) for name, solid in solids.items()}
+    everything = np.concatenate(list(meshes.values())).reshape(-1, 3)
+    low, high = everything.min(0), everything.max(0)
+    half = box((0.0, *(low[1:] - 1.0)), high + 1.0)
+    halves = {name: triangles(common(solid, half)) for name, solid in solids.items()}
+    shades = dict(zip(meshes, colours(len(meshes)), strict=True))
+    for number, (shown, caption) in enumerate(((meshes, "whole"), (halves, "cut at x = 0")), 1):
+        axes = figure.add_subplot(1, 2, number, projection="3d", proj_type="ortho")
+        for name, mesh in shown.items():
+            _draw(axes, mesh, shades[name])
+        axes.set(xlim=(low[2], high[2]), ylim=(low[0], high[0]), zlim=(low[1], high[1]))
+        axes.set_box_aspect(np.maximum((high - low)[[2, 0, 1]], 1e-6), zoom=0.95)
+        axes.set_xlabel("z (mm)", fontsize=SMALL)
+        axes.set_ylabel("x (mm)", fontsize=SMALL)
+        axes.set_zlabel("y (mm)", fontsize=SMALL)
+        axes.tick_params(labelsize=SMALL - 1)
+        axes.locator_params(nbins=4)
+        axes.set_title(caption, fontsize=SMALL + 1)
+        axes.view_init(elev=18, azim=-62)
+    handles = [Patch(color=shade, label=name) for name, shade in shades.items()]
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=6, fontsize=SMALL, frameon=False
+    )
+    figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def _draw(axes: Axes3D, mesh: np.ndarray, shade: str) -> None:
+    # Matplotlib's upright axis is its third: the lens's z, x, y are drawn as x, y, z.
+    mesh = mesh[:, :, [2, 0, 1]]
+    normal = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    bright = 0.45 + 0.55 * np.abs((normal / np.maximum(length, 1e-30)) @ _LIGHT)
+    colour = np.array([int(shade[k : k + 2], 16) / 255.0 for k in (1, 3, 5)])
+    faces = np.concatenate([np.outer(bright, colour), np.ones((len(mesh), 1))], axis=1)
+    axes.add_collection3d(
+        Poly3DCollection(mesh, facecolors=faces, edgecolors=faces, linewidths=0.2)
+    )

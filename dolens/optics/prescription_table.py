@@ -1,0 +1,215 @@
+"""The prescription of a lens as a table of plain values: what `repr(lens)` and pages show."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from dolens.optics.materials import abbe_number, index_d
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
+from dolens.optics.tables import html_table, printable, text_table
+
+HEADINGS = (
+    "surface",
+    "type",
+    "radius (mm)",
+    "thickness (mm)",
+    "material",
+    "semi-diameter (mm)",
+    "conic",
+    "further terms",
+)
+# More names of coefficients than these are counted.
+_NAMED = 4
+
+
+@dataclass(frozen=True)
+class SurfaceRow:
+    """One surface of a prescription.
+
+    Attributes:
+        number: from 1.
+        kind: the surface's type, as prescriptions write it.
+        radius: mm, `inf` for a plane; None for a shape without one.
+        thickness: mm, to the next surface or the sensor.
+        material: the medium behind the surface.
+        index_d: its index at the d line.
+        abbe_number: its Abbe number Vd, `inf` without dispersion.
+        semi_diameter: mm, of the clear aperture's farthest point.
+        aperture: `circle`, `rectangle` or `none`, and its obscuration where there is one.
+        conic: None for a shape without one.
+        terms: further coefficients by name; the lists of numbers of a shape, such as a spline's,
+            are left out.
+        stop: whether it is the stop.
+        element: name of the element with a pose of its own that carries it, or nothing.
+    """
+
+    number: int
+    kind: str
+    radius: float | None
+    thickness: float
+    material: str
+    index_d: float
+    abbe_number: float
+    semi_diameter: float
+    aperture: str
+    conic: float | None
+    terms: dict[str, float]
+    stop: bool
+    element: str
+
+    @property
+    def mark(self) -> str:
+        """Return which further terms shape the surface, in a few words."""
+        used = [name for name, value in self.terms.items() if value != 0.0]
+        if not self.terms:
+            return ""
+        if not used:
+            return f"{len(self.terms)} terms, all 0" if len(self.terms) > 1 else "1 term, 0"
+        return ", ".join(used) if len(used) <= _NAMED else f"{len(used)} terms"
+
+    def cells(self) -> list[str]:
+        """Return the row as text, under `HEADINGS`."""
+        extent = _number(self.semi_diameter)
+        if self.aperture != "circle":
+            extent += f" ({self.aperture})"
+        return [
+            f"{self.number} (stop)" if self.stop else str(self.number),
+            self.kind,
+            "" if self.radius is None else _number(self.radius),
+            _number(self.thickness),
+            self.material,
+            extent,
+            "" if not self.conic else _number(self.conic),
+            self.mark,
+        ]
+
+
+@dataclass(frozen=True)
+class PrescriptionTable:
+    """The prescription of a lens.
+
+    Attributes:
+        name: of the lens.
+        index_model: of its materials.
+        object_distance: mm in front of the first vertex, `inf` for infinity.
+        object_material: the medium in front of the lens.
+        surfaces: in the order that light meets them.
+        sensor_distance: mm from the last vertex.
+        sensor_diameter: mm; None where the prescription gives none.
+        elements: name of an element with a pose → its parameters that are not zero, degrees and mm.
+    """
+
+    name: str
+    index_model: str
+    object_distance: float
+    object_material: str
+    surfaces: tuple[SurfaceRow, ...]
+    sensor_distance: float
+    sensor_diameter: float | None
+    elements: dict[str, dict[str, float]]
+
+    @property
+    def heading(self) -> str:
+        """Return the lens's name and number of surfaces, in one line."""
+        count = len(self.surfaces)
+        plural = "surface" if count == 1 else "surfaces"
+        return printable(f"{self.name or 'Lens'}: {count} {plural}, index model {self.index_model}")
+
+    @property
+    def notes(self) -> list[str]:
+        """Return lines about elements with a pose of their own."""
+        found = []
+        for name, pose in self.elements.items():
+            numbers = [row.number for row in self.surfaces if row.element == name]
+            values = ", ".join(f"{key} {_number(value)}" for key, value in pose.items())
+            carried = f"surfaces {numbers[0]} to {numbers[-1]}"
+            found.append(printable(f"element {name} ({carried}): {values or 'no tilt or shift'}"))
+        return found
+
+    def cells(self) -> list[list[str]]:
+        """Return rows of text under `HEADINGS`: object, surfaces, sensor."""
+        sensor = "" if self.sensor_diameter is None else _number(0.5 * self.sensor_diameter)
+        first = ["object", "", "", _number(self.object_distance), self.object_material, "", "", ""]
+        last = ["sensor", "plane", "", "", "", sensor, "", ""]
+        return [first, *(row.cells() for row in self.surfaces), last]
+
+    def text(self) -> str:
+        """Return the table as lines of text."""
+        return "\n".join([self.heading, text_table(HEADINGS, self.cells(), 2), *self.notes])
+
+    def html(self) -> str:
+        """Return the table as HTML, all text escaped."""
+        rows = [["∞" if cell == "inf" else cell for cell in row] for row in self.cells()]
+        notes = [[note] for note in self.notes]
+        beside = html_table(["elements"], notes) if notes else ""
+        return html_table(HEADINGS, rows, self.heading, 2) + beside
+
+
+@torch.no_grad()
+def prescription_table(lens: nn.Module) -> PrescriptionTable:
+    """Return the prescription of a `Lens` in its present state as plain values."""
+    carrier = {
+        number: name
+        for name, element in lens.elements.items()
+        for number in range(element.first, element.last + 1)
+    }
+    gaps = [float(gap) for gap in lens.thicknesses.values()] + [float(lens.sensor_distance)]
+    rows = []
+    surfaces = zip(lens.surfaces.values(), gaps, lens.materials[1:], strict=True)
+    for number, (surface, gap, medium) in enumerate(surfaces, 1):
+        values = {
+            name: float(value) for name, value in surface.named_parameters() if value.ndim == 0
+        }
+        curvature = values.pop("curvature", None)
+        conic = values.pop("conic", None)
+        plane = surface.kind in ("plane", "aperture")
+        radius = math.inf if plane else None
+        if curvature is not None:
+            radius = math.inf if curvature == 0.0 else 1.0 / curvature
+        rows.append(
+            SurfaceRow(
+                number,
+                surface.kind,
+                radius,
+                gap,
+                medium.name,
+                index_d(medium),
+                abbe_number(medium),
+                surface.semi_diameter,
+                _aperture(surface.aperture),
+                conic,
+                values,
+                number == lens.stop,
+                carrier.get(number, ""),
+            )
+        )
+    return PrescriptionTable(
+        lens.name,
+        lens.index_model,
+        math.inf if lens.object_distance is None else float(lens.object_distance),
+        lens.materials[0].name,
+        tuple(rows),
+        gaps[-1],
+        lens.sensor_diameter,
+        {
+            name: {
+                key: float(value) for key, value in element.named_parameters() if float(value) != 0
+            }
+            for name, element in lens.elements.items()
+        },
+    )
+
+
+def _aperture(aperture: ClearAperture) -> str:
+    edge = aperture.edge
+    if isinstance(edge, Rectangle):
+        found = f"rectangle {_number(2.0 * edge.half_width_x)} × {_number(2.0 * edge.half_width_y)}"
+    else:
+        found = "circle" if isinstance(edge, Circle) else "no edge"
+    return f"{found}, obscured" if aperture.obscuration is not None else found
+
+
+def _number(value: float) -> str:
+    return f"{value:.7g}"

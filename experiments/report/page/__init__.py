@@ -1,0 +1,1 @@
+"""The report's page: pure functions from finished runs to HTML."""

@@ -1,0 +1,144 @@
+"""The top of the page: what holds and what does not."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+from dolens.experiments.report.checks import SOURCES, Check, Outcome, State
+from dolens.experiments.report.page.html import Child, Markup, element, joined, prose, table
+from dolens.experiments.report.page.material import Material
+from dolens.experiments.report.page.numbers import limit_text, number_text, value_text
+
+_ORDER = (State.FAILS, State.NOT_RUN, State.HOLDS)
+_TITLES = {
+    State.FAILS: "Does not hold",
+    State.NOT_RUN: "Not run",
+    State.HOLDS: "Holds",
+}
+# Words of the column; SOURCES has them in full.
+_KINDS = {"printed": "printed", "exact": "exact", "measured": "measured", "statement": "claim"}
+_COLUMNS = ("Statement", "Expected", "Found", "Expected value from")
+
+
+def overview(material: Material) -> Markup:
+    """Return the counts, a table for each state, and what cannot be compared at all."""
+    counts = Counter(outcome.state for outcome in material.outcomes)
+    badges = [
+        element(
+            "span", f"{counts[state]} {_count_words(state)}", class_=f"badge {css_class(state)}"
+        )
+        for state in _ORDER
+    ]
+    return element(
+        "section",
+        element("h2", "What holds and what does not"),
+        element("p", *_spaced(badges)),
+        element("p", f"Sources: {_legend()}.", class_="quiet"),
+        *(_of_state(material, state) for state in _ORDER),
+        _runs_that_failed(material),
+        _not_compared(material),
+        id="checks",
+    )
+
+
+def css_class(state: State) -> str:
+    """Return the class that colours a state."""
+    return {State.HOLDS: "holds", State.FAILS: "fails", State.NOT_RUN: "not-run"}[state]
+
+
+def anchor(item: str) -> str:
+    """Return the id of an item's section."""
+    return "".join(c if c.isalnum() else "-" for c in item.lower())
+
+
+def expected_text(check: Check) -> str:
+    """Return what passes, as `4.29 ± 0.01`, `at most 5` or `2 to 3`."""
+    if check.expected is not None and check.tolerance is not None:
+        expected = value_text(check.expected, check.tolerance)
+        return f"{expected} ± {limit_text(check.tolerance)}"
+    if check.low is None:
+        return f"at most {limit_text(float(check.high))}"
+    if check.high is None:
+        return f"at least {limit_text(check.low)}"
+    return f"{limit_text(check.low)} to {limit_text(check.high)}"
+
+
+def found_text(outcome: Outcome) -> str:
+    """Return the value that was found, or why there is none."""
+    if outcome.value is None:
+        return outcome.note or "not run"
+    tolerance = outcome.check.tolerance
+    return value_text(outcome.value, tolerance) if tolerance else number_text(outcome.value, 3)
+
+
+def checks_table(outcomes: Sequence[Outcome]) -> Markup:
+    """Return the checks of several items in a table."""
+    return table(_COLUMNS, [_row(outcome) for outcome in outcomes], "checks")
+
+
+def _row(outcome: Outcome) -> tuple[Child, ...]:
+    check = outcome.check
+    return (
+        joined(
+            element("a", check.item, href=f"#{anchor(check.item)}"),
+            f": {check.what} ",
+            element("code", f"{check.run}: {check.metric}"),
+        ),
+        expected_text(check),
+        element("span", found_text(outcome), class_=css_class(outcome.state)),
+        joined(element("b", _KINDS[check.kind]), f": {check.source}"),
+    )
+
+
+def _of_state(material: Material, state: State) -> Markup | None:
+    found = [outcome for outcome in material.outcomes if outcome.state is state]
+    if not found:
+        return element("p", "Every check that was run holds.") if state is State.FAILS else None
+    summary = element("summary", f"{_TITLES[state]} ({len(found)})")
+    return element(
+        "details", summary, checks_table(found), open=None if state is State.NOT_RUN else ""
+    )
+
+
+def _runs_that_failed(material: Material) -> Markup | None:
+    if not material.failed:
+        return None
+    return joined(
+        element("h3", "Runs that ended with an error"),
+        *(
+            joined(element("p", element("b", name)), element("pre", words))
+            for name, words in material.failed.items()
+        ),
+    )
+
+
+def _not_compared(material: Material) -> Markup | None:
+    items = [item for item in material.plan.items() if item.not_compared]
+    if not items:
+        return None
+    return joined(
+        element("h3", "What is printed but cannot be compared"),
+        element(
+            "ul",
+            *(
+                element(
+                    "li",
+                    element("a", item.item, href=f"#{anchor(item.item)}"),
+                    ": ",
+                    prose(item.not_compared),
+                )
+                for item in items
+            ),
+        ),
+    )
+
+
+def _legend() -> str:
+    return "; ".join(f"{_KINDS[kind]} – {words}" for kind, words in SOURCES.items())
+
+
+def _count_words(state: State) -> str:
+    return {State.HOLDS: "hold", State.FAILS: "do not hold", State.NOT_RUN: "were not run"}[state]
+
+
+def _spaced(children: Sequence[Markup]) -> list[Child]:
+    return [part for child in children for part in (child, " ")]

@@ -1,0 +1,48 @@
+"""The documentation site is built from the repository alone, without the network."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built site; a broken link, anchor or name in the API ends the build."""
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder],
+        cwd=ROOT,
+        env={**os.environ, "https_proxy": "http://127.0.0.1:9", "http_proxy": "http://127.0.0.1:9"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    return folder
+
+
+def test_every_page_of_the_navigation_is_built(site):
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = re.findall(r"([\w/]+)\.(?:md|ipynb)\b", text.partition("nav:")[2])
+    assert len(pages) > 30
+    for page in pages:
+        assert (site / f"{page}.html").is_file(), page
+
+
+def test_no_page_loads_anything_from_the_network(site):
+    for page in site.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r'<(?:script|img|iframe)[^>]*\bsrc="(https?:[^"]*)"', text)
+        loaded += re.findall(r'<link[^>]*rel="stylesheet"[^>]*href="(https?:[^"]*)"', text)
+        assert not loaded, (page.name, loaded)
+
+
+def test_the_api_has_what_a_user_imports(site):
+    text = "".join(p.read_text(encoding="utf-8") for p in (site / "api").glob("*.html"))
+    for name in ("load_lens", "DampedLeastSquares", "RayRenderer", "UNetRestoration", "Experiment"):
+        assert name in text, name
