@@ -65,7 +65,7 @@ def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -
         return
     for name, draw in functions.items():
         try:
-            with stage(f"figure {name}"):
+            with stage(f"drawing: {name}"):
                 keep(name, draw())
         except InputError as problem:
             logger.warning("No figure '%s': %s", name, problem)
