@@ -23,13 +23,18 @@ _PANELS = 3
 _LINES = {"noise_weighted": "-", "s21": "--"}
 
 
-def photons_figure(rows: Sequence[Row], true: Pose, title: str) -> Figure:
+def photons_figure(
+    rows: Sequence[Row], true: Pose, title: str, measurements: int | None = None
+) -> Figure:
     """Draw a panel for each variable: RMS errors of both estimates, and the bound.
+
+    Bars are standard errors: an RMS value of n normal errors has one of itself over √(2n).
 
     Args:
         rows: of accuracy.csv.
         true: the pose whose variables are fitted.
         title: the title.
+        measurements: n, of each RMS error; None for no bars.
     """
     names = true.names
     rows_of_panels = -(-len(names) // _PANELS)
@@ -46,11 +51,8 @@ def photons_figure(rows: Sequence[Row], true: Pose, title: str) -> Figure:
             mine = [r for r in own if r["estimator"] == estimator]
             counts = [r["count"] for r in mine]
             found = [float(r["rms_error"]) for r in mine]
-            # The standard error of an RMS value of n normal numbers is itself over √(2n).
-            spread = [
-                value / (2.0 * float(r["measurements"])) ** 0.5
-                for value, r in zip(found, mine, strict=True)
-            ]
+            share = (2.0 * measurements) ** -0.5 if measurements else 0.0
+            spread = [share * value for value in found] if measurements else None
             axes.errorbar(
                 counts,
                 found,

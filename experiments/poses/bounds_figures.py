@@ -84,7 +84,7 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
                 continue
             share = float(found.bounds[found.pose.names.index(name)]) / scales[name]
             seen = share < UNSEEN
-            offset = 0.13 * (number - 0.5 * (len(arrangements) - 1))
+            offset = 0.17 * (number - 0.5 * (len(arrangements) - 1))
             axes.plot(
                 share if seen else 8.0 * far,
                 row + offset,
