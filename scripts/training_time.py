@@ -77,7 +77,7 @@ def read_training(folder: Path) -> Training:
         InputError: no finished run with a validation curve.
     """
     run = read_run(folder)
-    events = EventAccumulator(str(next((folder / "tensorboard").rglob("events.*")).parent))
+    events = EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
     if _TAG not in events.Tags()["scalars"]:
         raise InputError(f"{folder}: TensorBoard's file has no {_TAG}")

@@ -8,8 +8,12 @@ import sys
 
 import typer
 
+from dolens.cli.apply import apply
+from dolens.cli.convert import convert
+from dolens.cli.evaluate import evaluate
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
+from dolens.cli.show import show
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -19,6 +23,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+app.command("show")(show)
+app.command("convert")(convert)
 
 
 def main() -> None:
@@ -39,4 +47,6 @@ def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
 
 
+app.command("evaluate")(evaluate)
+app.command("apply")(apply)
 app.command("report", help=REPORT_HELP)(report)

@@ -2,7 +2,7 @@
 
 from dolens.plotting.before_after import before_after_figure
 from dolens.plotting.comparison import comparison_figure
-from dolens.plotting.export import figure_to_image, save_figure
+from dolens.plotting.export import figure_to_image, save_figure, save_figures
 from dolens.plotting.history import history_figure
 from dolens.plotting.layout import layout_figure
 from dolens.plotting.modulation import modulation_figure
@@ -10,7 +10,7 @@ from dolens.plotting.pareto import Point, pareto_figure, pareto_front
 from dolens.plotting.psf import psf_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
-from dolens.plotting.spots import spots_figure
+from dolens.plotting.spots import spots_comparison_figure, spots_figure
 
 __all__ = [
     "Point",
@@ -26,5 +26,7 @@ __all__ = [
     "ray_fans_figure",
     "rms_curves_figure",
     "save_figure",
+    "save_figures",
+    "spots_comparison_figure",
     "spots_figure",
 ]

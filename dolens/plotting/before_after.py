@@ -30,7 +30,7 @@ def before_after_figure(
         fields_deg: degrees, as for `layout_figure`.
         rays: a field.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        titles: of the two; None for `before` and `after` with their names and focal lengths.
+        titles: of the two; None for `initial` and `final` with names, focal lengths and F-numbers.
 
     Raises:
         InputError: as `layout_figure` does.
@@ -45,16 +45,18 @@ def before_after_figure(
     )
     half_height = max(drawing.half_height for drawing in drawings)
     legend = any(drawing.needs_legend for drawing in drawings)
-    height = min(drawn_height(z_limits, half_height, legend), 4.2)
+    height = min(drawn_height(z_limits, half_height, legend), 3.6)
     # The upper drawing has no numbers below.  Were there height to spare, constrained layout would
     # widen axes of equal scales until their labels leave the figure.
     figure = Figure(figsize=(WIDTH, 2.0 * height - 0.5), layout="constrained")
     grid = figure.subplots(2, 1, sharex=True, sharey=True)
     for number, (axes, lens, drawing) in enumerate(zip(grid, lenses, drawings, strict=True)):
-        draw_layout(axes, drawing, z_limits, half_height)
+        draw_layout(axes, drawing, z_limits, half_height, legend=number == 0)
         if titles is None:
-            name = layout_title(lens, drawing.system, drawing.fans[0].wavelength)
-            axes.set_title(f"{('before', 'after')[number]}: {name}", fontsize=TITLE)
+            line = drawing.fans[0].wavelength
+            name = layout_title(lens, drawing.system, line, object_distance)
+            stage = ("initial", "final")[number]
+            axes.set_title(f"({'ab'[number]}) {stage}: {name}", fontsize=TITLE)
         else:
             axes.set_title(titles[number], fontsize=TITLE)
     grid[0].set_xlabel("")

@@ -8,11 +8,13 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.plotting.style import SMALL
+from dolens.plotting.style import PAGE, SMALL, TITLE
 
 # Inches: a picture is shown about one to one at 120 dpi, unless that is tiny or huge.
 _SMALLEST, _LARGEST = 1.7, 3.2
 _DPI = 120
+# Wide enough for a title.
+_NARROWEST = 5.0
 
 
 @torch.no_grad()
@@ -22,6 +24,7 @@ def comparison_figure(
     restored: Tensor,
     labels: Sequence[str],
     psnr: Mapping[str, Sequence[float]] | None = None,
+    title: str | None = None,
 ) -> Figure:
     """Show raw images above restored ones, one column a view. The truth stands at the left where it
     is the same for all views, else above them.
@@ -32,9 +35,10 @@ def comparison_figure(
         restored: (views, 3, H, W), the same.
         labels: one a view.
         psnr: {"raw": dB per view, "restored": dB per view} for the titles, or None for none.
+        title: above all.
 
     Returns:
-        A figure whose pictures are not interpolated.
+        A figure whose pictures are not interpolated; values are clipped to [0, 1].
     """
     if (
         raw.ndim != 4
@@ -56,12 +60,15 @@ def comparison_figure(
     beside = int(truth.ndim == 3)
 
     height, width = truth.shape[-2:]
-    panel = min(max(width / _DPI, _SMALLEST), _LARGEST)
-    tall = panel * height / width + 0.4
+    columns = views + beside
+    panel = min(min(max(width / _DPI, _SMALLEST), _LARGEST), (PAGE - 0.2) / columns)
+    tall = panel * height / width + 0.35
+    heading = 0.2 * (title.count("\n") + 1) + 0.1 if title else 0.0
     figure = Figure(
-        figsize=(panel * (views + beside) + 0.2, len(images) * tall), layout="constrained"
+        figsize=(max(panel * columns + 0.2, _NARROWEST), len(images) * tall + heading),
+        layout="constrained",
     )
-    grid = figure.add_gridspec(len(images), views + beside)
+    grid = figure.add_gridspec(len(images), columns)
     if beside:
         axes = figure.add_subplot(grid[:, 0])
         _show(axes, truth)
@@ -73,6 +80,8 @@ def comparison_figure(
             known = psnr is not None and name in psnr
             quality = f": {float(psnr[name][column]):.1f} dB" if known else ""
             axes.set_title(f"{name}, {label}{quality}", fontsize=SMALL)
+    if title:
+        figure.suptitle(title, fontsize=TITLE - 1)
     return figure
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.system import OpticalSystem
+from dolens.plotting.number_text import with_minus
 from dolens.plotting.section import (
     Profile,
     axis_angle,
@@ -21,7 +22,7 @@ from dolens.plotting.section import (
     surface_profile,
     trace_fan,
 )
-from dolens.plotting.style import SMALL, colours, open_axes, spectral_colour
+from dolens.plotting.style import SMALL, open_axes, ordered_colours, spectral_colour
 
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.1
@@ -71,8 +72,10 @@ def layout_drawing(
     rays: int,
     object_distance: float | None = None,
     values: Mapping[str, Tensor] | None = None,
+    sensor: float | None = None,
 ) -> LayoutDrawing:
     """Section a lens and trace its rays; arguments and errors are those of `layout_figure`."""
+    sensor = sensor or lens.sensor_diameter
     lines = [wavelength] if isinstance(wavelength, int | float) else list(wavelength)
     _check(fields_deg, rays, lines)
     system = lens.system(values)
@@ -86,7 +89,7 @@ def layout_drawing(
         for line in lines
     ]
     height = max((float(np.abs(y).max()) for _, y in profiles if len(y)), default=1.0)
-    height = max(height, 0.5 * (lens.sensor_diameter or 0.0))
+    height = max(height, 0.5 * (sensor or 0.0))
     reach = max(
         [height, *(float(np.abs(fan.paths[..., 1]).max()) for fan in fans if len(fan.paths))]
     )
@@ -96,7 +99,7 @@ def layout_drawing(
         profiles,
         fans,
         height,
-        0.5 * lens.sensor_diameter if lens.sensor_diameter else reach,
+        0.5 * sensor if sensor else reach,
         (start - margin, sensor_z + margin),
         1.06 * max(reach, _stop_bar(system.stop, profiles, height)),
     )
@@ -176,7 +179,8 @@ def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:
     lines = sorted({fan.wavelength for fan in fans})
     by_wavelength = len(lines) > 1
     keys = lines if by_wavelength else list(dict.fromkeys(fan.field for fan in fans))
-    shades = [spectral_colour(line) for line in lines] if by_wavelength else colours(len(keys))
+    shades = [spectral_colour(line) for line in lines]
+    shades = shades if by_wavelength else ordered_colours(len(keys))
     colour_of = dict(zip(keys, shades, strict=True))
     passing = dict.fromkeys(keys, False)
     for fan in fans:
@@ -195,7 +199,7 @@ def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:
             [],
             color=colour_of[key],
             linewidth=1.2,
-            label=f"{key:g}{unit}" if passing[key] else f"{key:g}{unit} (no ray passes)",
+            label=with_minus(f"{key:g}{unit}") + ("" if passing[key] else " (no ray passes)"),
         )
         for key in keys
     ]

@@ -15,13 +15,14 @@ from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.drawing import draw_layout, layout_drawing
+from dolens.plotting.number_text import number_text, with_minus
 from dolens.plotting.section import SAMPLES, sag_of
-from dolens.plotting.style import SMALL, TITLE, open_axes
+from dolens.plotting.style import PAGE, SMALL, TITLE, open_axes
 
 # A sag below this share of the height of the drawing cannot be seen.
 _VISIBLE = 0.02
 # Inches.
-WIDTH = 9.0
+WIDTH = PAGE
 
 
 @torch.no_grad()
@@ -33,6 +34,7 @@ def layout_figure(
     object_distance: float | None = None,
     title: str | None = None,
     values: Mapping[str, Tensor] | None = None,
+    sensor: float | None = None,
 ) -> Figure:
     """Draw the section of a lens in the y-z plane, with ray fans coloured by field or wavelength.
 
@@ -53,8 +55,9 @@ def layout_figure(
         fields_deg: angles of the chief rays in object space, from the axis towards +y, degrees.
         rays: rays a field; one alone is the chief ray.
         object_distance: mm in front of the first vertex; None for an object at infinity.
-        title: None for the lens's name and focal length.
+        title: None for the lens's name, focal length and F-number.
         values: lens parameters to use instead of the stored ones, as `Lens.system` takes them.
+        sensor: mm, the sensor's extent in this section; None: that of the prescription.
 
     Returns:
         A figure of equal scale in y and z, in mm.
@@ -63,7 +66,7 @@ def layout_figure(
         InputError: there are no fields or rays, a field is not within ±90°, or the object is not
             in front of the entrance pupil and the first vertex.
     """
-    drawing = layout_drawing(lens, wavelength, fields_deg, rays, object_distance, values)
+    drawing = layout_drawing(lens, wavelength, fields_deg, rays, object_distance, values, sensor)
     system = drawing.system
     plates = [
         number
@@ -83,23 +86,47 @@ def layout_figure(
         axes = figure.add_subplot()
     draw_layout(axes, drawing, drawing.z_limits, drawing.half_height)
     line = drawing.fans[0].wavelength
-    axes.set_title(layout_title(lens, system, line) if title is None else title, fontsize=TITLE)
+    if title is None:
+        title = layout_title(lens, system, line, object_distance)
+    axes.set_title(title, fontsize=TITLE)
     return figure
 
 
 def drawn_height(z_limits: tuple[float, float], half_height: float, legend: bool) -> float:
     """Return the height (inches) of a layout of the usual width at equal scales of both axes."""
     # What axes and legend take beside the drawing.
-    beside = 0.75 + (0.8 if legend else 0.0)
+    beside = 0.95 + (0.9 if legend else 0.0)
     drawn = (WIDTH - beside) * 2.0 * half_height / (z_limits[1] - z_limits[0])
     return min(max(drawn, 1.0), 6.2) + 0.85
 
 
-def layout_title(lens: Lens, system: OpticalSystem, wavelength: float) -> str:
-    """Return the lens's name, and its focal length at a wavelength in nm."""
-    efl = float(first_order(system, wavelength).efl)
-    optics = f"f = {efl:.4g} mm at {wavelength:.4g} nm" if math.isfinite(efl) else "afocal"
-    return f"{lens.name}: {optics}" if lens.name else optics
+def layout_title(
+    lens: Lens, system: OpticalSystem, wavelength: float, object_distance: float | None = None
+) -> str:
+    """Return the lens's name, its focal length at a wavelength in nm, and its working F-number."""
+    optics = optics_text(system, wavelength, object_distance)
+    name = shown_name(lens)
+    return f"{name}: {optics}" if name else optics
+
+
+def shown_name(lens: Lens) -> str:
+    """Return the lens's name without the `, initial` of a prescription where a search begins.
+
+    A figure says itself whether it shows the lens before or after.
+    """
+    return lens.name.removesuffix(", initial")
+
+
+def optics_text(
+    system: OpticalSystem, wavelength: float, object_distance: float | None = None
+) -> str:
+    """Return focal length and working F-number, `f = 50.02 mm, F/4.91 at 587.6 nm`."""
+    found = first_order(system, wavelength, object_distance)
+    efl, f_number = float(found.efl), abs(float(found.working_f_number))
+    if not math.isfinite(efl):
+        return "afocal"
+    aperture = f", F/{number_text(f_number)}" if math.isfinite(f_number) else ""
+    return with_minus(f"f = {efl:.4g} mm{aperture} at {wavelength:.4g} nm")
 
 
 def _depth(system: OpticalSystem, number: int) -> float:
@@ -117,14 +144,13 @@ def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
     zero = torch.zeros_like(t)
     # The curves of x³ + y³ coincide: a thin one is drawn over a thick one.
     for label, x, y, style in (
-        ("h(x, 0)", t, zero, {"color": "#56B4E9", "linewidth": 3.0}),
-        ("h(0, y)", zero, t, {"color": "#D55E00", "linewidth": 1.2, "linestyle": "--"}),
+        ("along x, h(x, 0)", t, zero, {"color": "#56B4E9", "linewidth": 3.0}),
+        ("along y, h(0, y)", zero, t, {"color": "#D55E00", "linewidth": 1.2, "linestyle": "--"}),
     ):
         sag, _, _, exists = sag_of(system, number, x, y)
         axes.plot(t[exists], 1e3 * sag[exists], label=label, **style)
-    axes.set_xlabel("x, y (mm)", fontsize=SMALL + 1)
-    axes.set_ylabel("sag (µm)", fontsize=SMALL + 1)
-    axes.set_title(f"Sag of surface {number}", fontsize=SMALL + 1)
+    axes.set_xlabel("x or y (mm)", fontsize=SMALL + 1)
+    axes.set_ylabel(f"sag h of surface {number} (µm)", fontsize=SMALL + 1)
     axes.grid(True, color="0.9", linewidth=0.6)
-    axes.legend(frameon=False, fontsize=SMALL)
+    axes.legend(frameon=False, fontsize=SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     open_axes(axes)

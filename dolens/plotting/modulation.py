@@ -1,56 +1,111 @@
 """The modulation transfer function is plotted against frequency."""
 
 import math
+from collections.abc import Mapping
 
+import torch
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from dolens.analysis.modulation_transfer import Modulation
-from dolens.plotting.style import SMALL, TITLE, colours, field_label, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
+
+_TANGENTIAL, _SAGITTAL = "-", (0, (1, 1.2))
+# Curves that differ by less are one on paper.
+_SAME = 2e-3
 
 
-def modulation_figure(mtf: Modulation, title: str | None = "Geometric MTF") -> Figure:
+def modulation_figure(
+    mtf: Modulation | Mapping[str, Modulation], title: str | None = "Geometric MTF"
+) -> Figure:
     """Plot contrast against frequency: tangential solid, sagittal dotted, the diffraction limit
     dashed.
 
+    Several functions of the same fields, as of a lens before and after, stand side by side at one
+    scale.  Fields whose curves are the same share one entry of the legend.
+
     Args:
-        mtf: the data.
+        mtf: the data, or name → data, the names written above.
         title: above the axes.
 
     Returns:
         A figure; fields that no light reaches are named so in the legend.
     """
-    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
-    axes = figure.add_subplot()
+    panels = dict(mtf) if isinstance(mtf, Mapping) else {"": mtf}
+    figure = Figure(figsize=(PAGE, 4.0), layout="constrained")
+    grid = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
+    names = {}
+    for axes, (name, found) in zip(grid, panels.items(), strict=True):
+        names[name] = _draw(axes, found)
+        if name:
+            axes.set_title(name, fontsize=SMALL + 1)
+    grid[0].set_ylabel("modulation (contrast)", fontsize=SMALL + 1)
+    first = next(iter(panels.values()))
+    shades = ordered_colours(len(first.fields))
+    grouped = _agreed(list(names.values()))
+    handles = [
+        Line2D([], [], color=shades[number], linewidth=1.5, label=label)
+        for number, label in grouped.items()
+    ]
+    for label, dashes in (("tangential", _TANGENTIAL), ("sagittal", _SAGITTAL)):
+        handles.append(Line2D([], [], color="0.3", linestyle=dashes, linewidth=1.5, label=label))
+    handles.append(Line2D([], [], color="black", linestyle="--", label="diffraction limit"))
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
+    )
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
+
+
+def _draw(axes: Axes, mtf: Modulation) -> dict[int, str]:
+    """Draw one lens; return labels of the legend, by the number of the field that is drawn."""
     frequency = mtf.frequencies.numpy()
-    limit = {"color": "black", "linewidth": 1.1, "linestyle": "--"}
-    axes.plot(frequency, mtf.diffraction_limit.numpy(), label="diffraction limit", **limit)
-    shades = colours(len(mtf.fields))
+    limit = {"color": "black", "linewidth": 1.1, "linestyle": "--", "label": "diffraction limit"}
+    axes.plot(frequency, mtf.diffraction_limit.numpy(), **limit)
+    labels: dict[int, list[str]] = {}
+    shades = ordered_colours(len(mtf.fields))
     for number, (field, colour) in enumerate(zip(mtf.fields, shades, strict=True)):
         label = field_label(field, mtf.field_unit)
         if math.isnan(float(mtf.tangential[number, 0])):
-            axes.plot([], [], color=colour, label=f"{label} (no light passes)")
+            labels[number] = [f"{label} (no light passes)"]
             continue
-        # On the axis of a centred lens the two coincide.
-        axes.plot(
-            frequency,
-            mtf.tangential[number].numpy(),
-            color=colour,
-            linewidth=1.5,
-            label=f"{label} tangential",
+        twin = next((n for n in labels if _alike(mtf, n, number)), None)
+        if twin is not None:
+            labels[twin].append(label)
+            continue
+        labels[number] = [label]
+        curves = (
+            ("tangential", mtf.tangential, _TANGENTIAL),
+            ("sagittal", mtf.sagittal, _SAGITTAL),
         )
-        axes.plot(
-            frequency,
-            mtf.sagittal[number].numpy(),
-            color=colour,
-            linewidth=1.5,
-            linestyle=":",
-            label=f"{label} sagittal",
-        )
+        for way, curve, dashes in curves:
+            axes.plot(
+                frequency,
+                curve[number].numpy(),
+                color=colour,
+                linewidth=1.5,
+                linestyle=dashes,
+                label=f"{label} {way}",
+            )
     axes.set(xlim=(frequency.min(), frequency.max()), ylim=(0.0, 1.02))
     axes.set_xlabel("frequency (cycles/mm)", fontsize=SMALL + 1)
-    axes.set_ylabel("modulation", fontsize=SMALL + 1)
     ruled_axes(axes)
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=SMALL)
-    if title:
-        axes.set_title(title, fontsize=TITLE)
-    return figure
+    return {number: ", ".join(found) for number, found in labels.items()}
+
+
+def _alike(mtf: Modulation, one: int, other: int) -> bool:
+    pairs = ((curve[one], curve[other]) for curve in (mtf.tangential, mtf.sagittal))
+    return all(torch.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in pairs)
+
+
+def _agreed(labels: list[dict[int, str]]) -> dict[int, str]:
+    """Return the labels of a legend that is right for all panels."""
+    if all(found == labels[0] for found in labels):
+        return labels[0]
+    # Where panels join other fields, each field has its own entry; a curve may hide another.
+    every = {number: text for found in labels for number, text in found.items()}
+    return {
+        number: text.split(",")[0] if "(" not in text else text for number, text in every.items()
+    }

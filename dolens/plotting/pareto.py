@@ -5,9 +5,12 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from dolens.plotting.style import SMALL, TITLE, colours, open_axes
+from dolens.plotting.label_placement import place_labels
+from dolens.plotting.style import MARKERS, PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.ticks import log_ticks
 
-_MARKERS = "osD^vP*X"
+# Room around the points, as a share of the axes' length in decades, and at least in decades.
+_ROOM, _LEAST_ROOM = 0.12, 0.15
 
 
 class Point(NamedTuple):
@@ -45,43 +48,56 @@ def pareto_figure(
     Returns:
         A figure.
     """
-    figure = Figure(figsize=(7.2, 4.8), layout="constrained")
+    figure = Figure(figsize=(PAGE, 4.4), layout="constrained")
     axes = figure.add_subplot()
     least = floor or 0.0
     everything = [p for points in families.values() for p in points]
     front = pareto_front(everything)
+    labels = []
     for (name, points), colour, marker in zip(
-        families.items(), colours(len(families)), _MARKERS * len(families), strict=False
+        families.items(), colours(len(families)), MARKERS * len(families), strict=False
     ):
         x, y = [p.cost for p in points], [max(p.error, least) for p in points]
         sizes = [90.0 if p.marked else 22.0 for p in points]
         axes.scatter(x, y, sizes, color=colour, marker=marker, label=name, zorder=3)
-        for point in points:
-            if point.marked or point in front:
-                axes.annotate(
-                    point.label,
-                    (point.cost, max(point.error, least)),
-                    xytext=(5, 4),
-                    textcoords="offset points",
-                    fontsize=SMALL - 1,
-                    color=colour,
-                )
+        labels += [
+            (p.label, p.cost, max(p.error, least), "black")
+            for p in points
+            if p.marked or p in front
+        ]
     if front:
         x = [p.cost for p in front]
         y = [max(p.error, least) for p in front]
         axes.step(x, y, where="post", color="0.6", linewidth=1.0, zorder=1, label="Pareto front")
     if floor:
-        axes.axhline(floor, color="0.75", linewidth=0.8, linestyle=":")
+        look = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
+        axes.axhline(floor, label="what the reference can tell", **look)
     axes.set(xscale="log", yscale="log")
+    if everything:
+        axes.set_xlim(*_limits([p.cost for p in everything]))
+        axes.set_ylim(
+            *_limits([max(p.error, least) for p in everything] + ([floor] if floor else []))
+        )
     axes.set_xlabel(cost, fontsize=SMALL + 1)
     axes.set_ylabel(error, fontsize=SMALL + 1)
-    axes.grid(True, color="0.92", linewidth=0.6)
-    axes.set_axisbelow(True)
-    open_axes(axes)
-    axes.legend(frameon=False, fontsize=SMALL)
+    ruled_axes(axes)
+    log_ticks(axes.xaxis)
+    log_ticks(axes.yaxis)
+    handles, names = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=SMALL
+    )
     if title:
         axes.set_title(title, fontsize=TITLE)
+    # One text for points at one place.
+    place_labels(axes, list(dict.fromkeys(labels)), SMALL - 1)
     return figure
+
+
+def _limits(values: Sequence[float]) -> tuple[float, float]:
+    low, high = min(values), max(values)
+    factor = max((high / low) ** _ROOM, 10.0**_LEAST_ROOM)
+    return low / factor, high * factor
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:

@@ -5,6 +5,8 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.ray_fans import RayFans
 from dolens.plotting.style import (
+    DASHES,
+    PAGE,
     SMALL,
     TITLE,
     field_label,
@@ -16,7 +18,9 @@ from dolens.plotting.style import (
 _HEIGHT = 1.45
 
 
-def ray_fans_figure(fans: RayFans, title: str | None = "Ray fans") -> Figure:
+def ray_fans_figure(
+    fans: RayFans, title: str | None = "Ray fans", pupil: float | None = None
+) -> Figure:
     """Plot one row for every field: the tangential fan at the left, the sagittal one at the right.
 
     All panels have one scale, in µm; lines end where rays no longer pass.
@@ -24,10 +28,14 @@ def ray_fans_figure(fans: RayFans, title: str | None = "Ray fans") -> Figure:
     Args:
         fans: the data.
         title: above all panels.
+        pupil: the part of the stop's semi-diameter whose rays count elsewhere; what lies beyond it
+            is shaded.  None: all of it.
     """
     rows = len(fans.fields)
-    figure = Figure(figsize=(7.2, _HEIGHT * rows + 1.3), layout="constrained")
+    figure = Figure(figsize=(PAGE, _HEIGHT * rows + 1.3), layout="constrained")
     grid = figure.subplots(rows, 2, squeeze=False, sharex=True, sharey=True)
+    # The numbers at both ends of neighbouring axes stay apart.
+    figure.get_layout_engine().set(wspace=0.06)
     coordinate = fans.coordinate.numpy()
     both = (fans.tangential_um.numpy(), fans.sagittal_um.numpy())
     reach = max(float(np.nanmax(np.abs(fan), initial=0.0)) for fan in both) or 1.0
@@ -35,9 +43,21 @@ def ray_fans_figure(fans: RayFans, title: str | None = "Ray fans") -> Figure:
         for axes, fan in zip(grid[row], both, strict=True):
             axes.axhline(0.0, color="0.6", linewidth=0.7, zorder=1)
             axes.axvline(0.0, color="0.6", linewidth=0.7, zorder=1)
-            for line, wavelength in zip(fan[row], fans.wavelengths, strict=True):
-                colour = spectral_colour(float(wavelength))
-                axes.plot(coordinate, line, color=colour, linewidth=1.3, gid="fan", zorder=3)
+            if pupil is not None and pupil < 1.0:
+                for side in (-1.0, 1.0):
+                    axes.axvspan(side * pupil, side, color="0.92", linewidth=0.0, zorder=0)
+            for number, (line, wavelength) in enumerate(
+                zip(fan[row], fans.wavelengths, strict=True)
+            ):
+                axes.plot(
+                    coordinate,
+                    line,
+                    color=spectral_colour(float(wavelength)),
+                    linestyle=DASHES[number % len(DASHES)],
+                    linewidth=1.3,
+                    gid="fan",
+                    zorder=3,
+                )
             axes.set(
                 xlim=(-1.0, 1.0),
                 xticks=(-1.0, -0.5, 0.0, 0.5, 1.0),
@@ -54,12 +74,11 @@ def ray_fans_figure(fans: RayFans, title: str | None = "Ray fans") -> Figure:
         axes.set_title(name, fontsize=SMALL + 1)
         below = grid[-1, 0 if along == "y" else 1]
         below.set_xlabel(f"{along} on the stop / semi-diameter", fontsize=SMALL + 1)
+    handles = wavelength_handles(fans.wavelengths)
+    for number, handle in enumerate(handles):
+        handle.set_linestyle(DASHES[number % len(DASHES)])
     figure.legend(
-        handles=wavelength_handles(fans.wavelengths),
-        loc="outside lower center",
-        ncols=5,
-        frameon=False,
-        fontsize=SMALL,
+        handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
     )
     if title:
         figure.suptitle(title, fontsize=TITLE)

@@ -7,13 +7,18 @@ from matplotlib.figure import Figure
 from dolens.analysis.rms_curves import RMSCurves
 from dolens.errors import InputError
 from dolens.plotting.style import (
+    DASHES,
+    PAGE,
     SMALL,
     TITLE,
-    colours,
     field_label,
+    ordered_colours,
     ruled_axes,
     spectral_colour,
 )
+
+# Lines that differ by less of the largest radius are one on paper.
+_SAME = 2e-3
 
 
 def rms_curves_figure(
@@ -24,7 +29,8 @@ def rms_curves_figure(
     """Plot RMS spot radii, µm: at the left over the field, at the right over the wavelength.
 
     Over the field every wavelength has a line, and all together a black one; over the wavelength
-    every field has a line.  Airy's radius is dashed: over the field, that of the middle wavelength.
+    every field has a line; fields whose lines are the same share one.  Airy's radius is grey: over
+    the field, that of the middle wavelength.
 
     Args:
         against_field: None to leave its axes out.
@@ -41,15 +47,16 @@ def rms_curves_figure(
     ]
     if not given:
         raise InputError("rms_curves_figure needs curves against field or against wavelength")
-    figure = Figure(figsize=(5.2 * len(given), 4.0), layout="constrained")
+    figure = Figure(figsize=(PAGE if len(given) > 1 else 4.8, 3.9), layout="constrained")
+    figure.get_layout_engine().set(wspace=0.06)
     grid = figure.subplots(1, len(given), squeeze=False, sharey=True)
     for axes, (curves, draw) in zip(grid[0], given, strict=True):
         draw(axes, curves)
         ruled_axes(axes)
         axes.legend(
             loc="upper center",
-            bbox_to_anchor=(0.5, -0.14),
-            ncols=3,
+            bbox_to_anchor=(0.5, -0.16),
+            ncols=2,
             frameon=False,
             fontsize=SMALL,
         )
@@ -68,30 +75,43 @@ def _over_field(axes: Axes, curves: RMSCurves) -> None:
             length,
             1e3 * curves.rms[:, wave].numpy(),
             color=spectral_colour(float(wavelength)),
+            linestyle=DASHES[wave % len(DASHES)],
             linewidth=1.3,
             label=f"{float(wavelength):g} nm",
         )
     if len(curves.wavelengths) > 1:
         together = 1e3 * curves.polychromatic.numpy()
-        axes.plot(length, together, color="black", linewidth=1.8, label="polychromatic")
+        axes.plot(length, together, color="black", linewidth=1.8, label="all, common centroid")
     airy = 1e3 * float(torch.median(curves.airy_radius))
-    axes.plot(length, [airy] * len(length), color="0.5", linestyle="--", label="Airy radius")
-    unit = "degrees" if curves.field_unit == "°" else curves.field_unit
-    axes.set_xlabel(f"field ({unit})", fontsize=SMALL + 1)
+    axes.plot(length, [airy] * len(length), color="0.6", linewidth=2.5, label="Airy radius")
+    axes.set_xlabel(f"field ({curves.field_unit})", fontsize=SMALL + 1)
     axes.set_xlim(length.min(), length.max())
 
 
 def _over_wavelength(axes: Axes, curves: RMSCurves) -> None:
     waves = curves.wavelengths.numpy()
-    for number, colour in enumerate(colours(len(curves.fields))):
+    shades = ordered_colours(len(curves.fields))
+    for number, names in _distinct(curves).items():
         axes.plot(
             waves,
             1e3 * curves.rms[number].numpy(),
-            color=colour,
+            color=shades[number],
+            linestyle=DASHES[number % len(DASHES)],
             linewidth=1.5,
-            label=field_label(curves.fields[number], curves.field_unit),
+            label=", ".join(names),
         )
     airy = 1e3 * curves.airy_radius.numpy()
-    axes.plot(waves, airy, color="0.5", linestyle="--", label="Airy radius")
+    axes.plot(waves, airy, color="0.6", linewidth=2.5, label="Airy radius")
     axes.set_xlabel("wavelength (nm)", fontsize=SMALL + 1)
     axes.set_xlim(waves.min(), waves.max())
+
+
+def _distinct(curves: RMSCurves) -> dict[int, list[str]]:
+    """Return the fields whose lines differ, by number, each with the names of all that share it."""
+    found: dict[int, list[str]] = {}
+    scale = float(curves.rms.nan_to_num(0.0).abs().max())
+    for number, (field, line) in enumerate(zip(curves.fields, curves.rms, strict=True)):
+        alike = {"rtol": 0.0, "atol": _SAME * scale, "equal_nan": True}
+        twin = next((n for n in found if torch.allclose(curves.rms[n], line, **alike)), number)
+        found.setdefault(twin, []).append(field_label(field, curves.field_unit))
+    return found

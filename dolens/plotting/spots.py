@@ -1,6 +1,7 @@
 """Spot diagrams are plotted."""
 
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,7 +11,10 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from dolens.analysis.spot_diagram import SpotDiagram
+from dolens.errors import InputError
+from dolens.plotting.number_text import number_text
 from dolens.plotting.style import (
+    PAGE,
     SMALL,
     TITLE,
     field_label,
@@ -22,6 +26,13 @@ from dolens.plotting.style import (
 _PANEL = 1.75
 # Fields of an overlaid diagram stand side by side, up to so many in a row.
 _COLUMNS = 4
+# Above a panel: its numbers, and in the first row the wavelength too.
+_HEADING = 0.15
+# A chief ray farther out than the light by this factor is left out.
+_CHIEF_REACH = 1.3
+# The last of the compared columns gets a magnified copy where its light reaches less than this
+# share of the common scale.
+_LOST = 0.4
 
 
 def spots_figure(
@@ -32,7 +43,8 @@ def spots_figure(
     A row for every field and a column for every wavelength, all of one scale, so that colours that
     land apart are seen apart; or a panel for every field with all wavelengths in it.  The circle is
     Airy's, about the spot's centroid (overlaid: that of the reference or nearest wavelength); the
-    cross is the chief ray of the reference wavelength, where it is within the panel.
+    cross is the chief ray of the reference wavelength, where it is near the light.  Above each
+    panel stand the RMS radius and the largest distance of a ray from the centroid.
 
     Artists carry gids: `spot`, `airy`, `chief`.
 
@@ -45,101 +57,171 @@ def spots_figure(
         A figure; panels that no light reaches say so.
     """
     fields, waves = len(spots.fields), len(spots.wavelengths)
-    centre = spots.polychromatic_centroid
-    points = (1e3 * (spots.intercepts - centre[:, None, None])).numpy()
-    middles = (1e3 * (spots.centroid - centre[:, None])).numpy()
-    airy = 1e3 * spots.airy_radius.numpy()
-    chief = (1e3 * (spots.chief - centre)).numpy()
-    half = _half_width(points, airy)
-
-    columns = min(fields, _COLUMNS) if overlaid else waves
-    rows = math.ceil(fields / columns) if overlaid else fields
+    drawn = _Drawn(spots)
+    rows = math.ceil(fields / _COLUMNS) if overlaid else fields
+    columns = math.ceil(fields / rows) if overlaid else waves
+    panel = min(_PANEL, (PAGE - 0.75) / columns)
+    lines = 0 if title is None else title.count("\n") + 1
     figure = Figure(
         figsize=(
-            max(_PANEL * columns + (0.55 if overlaid else 0.75), 4.2),
-            (_PANEL + (0.5 if overlaid else 0.08)) * rows + (0.6 if overlaid else 1.25),
+            max(panel * columns + 0.75, 4.6),
+            (panel + (0.5 if overlaid else 2.0 * _HEADING)) * rows + 0.8 + 0.18 * lines,
         ),
         layout="constrained",
     )
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    nearest = int((spots.wavelengths - spots.reference_wavelength).abs().argmin())
     for field in range(fields):
         label = field_label(spots.fields[field], spots.field_unit)
         if overlaid:
             axes = grid[divmod(field, columns)]
-            # The widest first, so that none hides another.
-            for wave in spots.rms[field].nan_to_num(0.0).argsort(descending=True).tolist():
-                _scatter(axes, points[field, wave], float(spots.wavelengths[wave]))
-            _marks(axes, chief[field], np.zeros(2), airy[nearest])
-            radius = float(spots.polychromatic_rms[field])
-            extent = np.linalg.norm(points[field], axis=-1)
-            _radii(axes, radius, 1e-3 * float(np.nanmax(extent, initial=-math.inf)))
-            axes.set_title(label, fontsize=SMALL + 1)
+            drawn.field(axes, field)
+            axes.set_title(f"{label}\n{drawn.numbers(field)}", fontsize=SMALL)
             continue
         for wave in range(waves):
             axes = grid[field, wave]
-            wavelength = float(spots.wavelengths[wave])
-            _scatter(axes, points[field, wave], wavelength)
-            _marks(axes, chief[field], middles[field, wave], airy[wave])
-            _radii(axes, float(spots.rms[field, wave]), float(spots.geo[field, wave]))
-            if field == 0:
-                axes.set_title(f"{wavelength:g} nm", fontsize=SMALL + 1)
+            drawn.spot(axes, field, wave)
+            heading = f"{float(spots.wavelengths[wave]):g} nm\n" if field == 0 else ""
+            axes.set_title(heading + drawn.numbers(field, wave), fontsize=SMALL)
         grid[field, 0].set_ylabel(f"{label}\ny (µm)", fontsize=SMALL + 1)
-    _label(grid, fields, half, overlaid)
+    _label(grid, fields, drawn.reach, overlaid)
     _legend(figure, spots, overlaid)
     if title:
         figure.suptitle(title, fontsize=TITLE)
     return figure
 
 
-def _half_width(points: np.ndarray, airy: np.ndarray) -> float:
-    """Return the distance (µm) from the centre to the edge of every panel, with room for the
-    numbers.
+def spots_comparison_figure(
+    compared: Mapping[str, SpotDiagram], title: str | None = "Spot diagrams"
+) -> Figure:
+    """Plot the spots of several lenses, or of one before and after, on one scale.
+
+    A row for every field, a column for every lens, all wavelengths in one panel.  Where the last
+    column's light takes little of the common scale, another column shows it magnified, and says by
+    how much.
+
+    Args:
+        compared: name → spots; of the same fields.
+        title: above all panels.
+
+    Raises:
+        InputError: nothing to compare, or fields that differ.
     """
-    reach = max(float(np.nanmax(np.abs(points), initial=0.0)), float(airy.max()))
-    return 1.2 * reach
-
-
-def _scatter(axes: Axes, points: np.ndarray, wavelength: float) -> None:
-    axes.plot(
-        points[:, 0],
-        points[:, 1],
-        linestyle="none",
-        marker="o",
-        markersize=1.1,
-        markeredgewidth=0.0,
-        color=spectral_colour(wavelength),
-        gid="spot",
-        zorder=3,
-    )
-
-
-def _marks(axes: Axes, chief: np.ndarray, middle: np.ndarray, radius: float) -> None:
-    if np.isfinite(middle).all():
-        circle = Circle(
-            tuple(middle), radius, fill=False, edgecolor="black", linewidth=0.8, gid="airy"
+    diagrams = list(compared.values())
+    if not diagrams or any(d.fields.shape != diagrams[0].fields.shape for d in diagrams):
+        raise InputError(
+            "spots_comparison_figure needs spots of the same fields, of one lens or more"
         )
-        axes.add_patch(circle)
-        circle.set_zorder(4)
-    if np.isfinite(chief).all():
-        style = {"markersize": 6, "markeredgewidth": 0.8, "color": "black"}
-        axes.plot(*chief, marker="+", linestyle="none", gid="chief", zorder=5, **style)
+    drawn = {name: _Drawn(spots) for name, spots in compared.items()}
+    reach = max(d.reach for d in drawn.values())
+    columns = [(name, one, reach) for name, one in drawn.items()]
+    last, own = list(drawn.items())[-1]
+    if own.reach < _LOST * reach:
+        columns.append((f"{last}, ×{number_text(reach / own.reach, 2)}", own, own.reach))
+    fields = len(diagrams[0].fields)
+    panel = min(_PANEL, (PAGE - 1.1) / len(columns))
+    lines = 0 if title is None else title.count("\n") + 1
+    size = (
+        max(panel * len(columns) + 1.1, 4.6),
+        (panel + 2.0 * _HEADING) * fields + 0.8 + 0.18 * lines,
+    )
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(fields, len(columns), squeeze=False, sharex="col")
+    for column, (name, one, half) in enumerate(columns):
+        for field in range(fields):
+            axes = grid[field, column]
+            one.field(axes, field)
+            heading = f"{name}\n" if field == 0 else ""
+            axes.set_title(heading + one.numbers(field), fontsize=SMALL)
+        _label(grid[:, [column]], fields, half, False)
+    for row, field in enumerate(diagrams[0].fields):
+        label = field_label(field, diagrams[0].field_unit)
+        grid[row, 0].set_ylabel(f"{label}\ny (µm)", fontsize=SMALL + 1)
+        for axes, (_, _, half) in zip(grid[row, 1:], columns[1:], strict=True):
+            axes.tick_params(labelleft=half != reach)
+    _legend(figure, diagrams[0], True)
+    if title:
+        figure.suptitle(title, fontsize=TITLE)
+    return figure
 
 
-def _radii(axes: Axes, rms: float, geo: float) -> None:
-    """Write both radii, given in mm, in a panel's upper corner."""
-    text = "no light passes" if math.isnan(rms) else f"RMS {1e3 * rms:.3g}, GEO {1e3 * geo:.3g} µm"
-    axes.text(0.03, 0.985, text, va="top", fontsize=SMALL - 1, transform=axes.transAxes)
+class _Drawn:
+    """Draws the spots of one diagram, in µm about the centroid of each field."""
+
+    def __init__(self, spots: SpotDiagram) -> None:
+        self.spots = spots
+        centre = spots.polychromatic_centroid
+        self.points = (1e3 * (spots.intercepts - centre[:, None, None])).numpy()
+        self.middles = (1e3 * (spots.centroid - centre[:, None])).numpy()
+        self.airy = 1e3 * spots.airy_radius.numpy()
+        self.nearest = int((spots.wavelengths - spots.reference_wavelength).abs().argmin())
+        rings = np.abs(self.middles).max(-1) + self.airy
+        light = max(_largest(self.points), _largest(rings))
+        chief = (1e3 * (spots.chief - centre)).numpy()
+        self.chief = np.where(np.abs(chief) <= _CHIEF_REACH * light, chief, np.nan)
+        # From the centre to the edge of a panel, µm.
+        self.reach = 1.08 * max(light, _largest(self.chief)) or 1.0
+
+    def field(self, axes: Axes, field: int) -> None:
+        """Draw all wavelengths of a field, the widest first, so that none hides another."""
+        for wave in self.spots.rms[field].nan_to_num(0.0).argsort(descending=True).tolist():
+            self._points(axes, field, wave)
+        self._marks(axes, self.chief[field], np.zeros(2), self.airy[self.nearest])
+
+    def spot(self, axes: Axes, field: int, wave: int) -> None:
+        """Draw one wavelength of a field."""
+        self._points(axes, field, wave)
+        self._marks(axes, self.chief[field], self.middles[field, wave], self.airy[wave])
+
+    def numbers(self, field: int, wave: int | None = None) -> str:
+        """Return the RMS radius and the largest distance from the centroid, for a heading."""
+        if wave is None:
+            rms = float(self.spots.polychromatic_rms[field])
+            far = _largest(np.linalg.norm(self.points[field], axis=-1))
+        else:
+            rms = float(self.spots.rms[field, wave])
+            far = 1e3 * float(self.spots.geo[field, wave])
+        if math.isnan(rms):
+            return "no light passes"
+        return f"RMS {number_text(1e3 * rms)}, max {number_text(far)} µm"
+
+    def _points(self, axes: Axes, field: int, wave: int) -> None:
+        axes.plot(
+            *self.points[field, wave].T,
+            linestyle="none",
+            marker="o",
+            markersize=1.1,
+            markeredgewidth=0.0,
+            color=spectral_colour(float(self.spots.wavelengths[wave])),
+            gid="spot",
+            zorder=3,
+            rasterized=self.points[field, wave].shape[0] > 500,
+        )
+
+    @staticmethod
+    def _marks(axes: Axes, chief: np.ndarray, middle: np.ndarray, radius: float) -> None:
+        if np.isfinite(middle).all():
+            look = {"fill": False, "edgecolor": "black", "linewidth": 0.8, "zorder": 4}
+            axes.add_patch(Circle(tuple(middle), radius, gid="airy", **look))
+        if np.isfinite(chief).all():
+            style = {"markersize": 6, "markeredgewidth": 0.8, "color": "black"}
+            axes.plot(*chief, marker="+", linestyle="none", gid="chief", zorder=5, **style)
+
+
+def _largest(values: np.ndarray) -> float:
+    """Return the largest finite size, 0 where there is none."""
+    return float(np.nanmax(np.abs(values), initial=0.0))
 
 
 def _label(grid: np.ndarray, fields: int, half: float, overlaid: bool) -> None:
     for number, axes in enumerate(grid.flat):
         if overlaid and number >= fields:
             axes.set_visible(False)
-            grid.flat[number - grid.shape[1]].tick_params(labelbottom=True)
+            above = grid.flat[number - grid.shape[1]]
+            above.tick_params(labelbottom=True)
+            above.set_xlabel("x (µm)", fontsize=SMALL + 1)
         axes.set(xlim=(-half, half), ylim=(-half, half), box_aspect=1.0)
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+            axis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10)))
         ruled_axes(axes)
     for axes in grid[-1]:
         axes.set_xlabel("x (µm)", fontsize=SMALL + 1)
@@ -149,12 +231,19 @@ def _label(grid: np.ndarray, fields: int, half: float, overlaid: bool) -> None:
 
 
 def _legend(figure: Figure, spots: SpotDiagram, overlaid: bool) -> None:
-    style = {"linestyle": "none", "markersize": 6, "markeredgewidth": 0.8, "color": "black"}
-    handles = wavelength_handles(spots.wavelengths) if overlaid else []
-    handles += [
+    style: dict = {"linestyle": "none", "markersize": 6, "markeredgewidth": 0.8, "color": "black"}
+    handles: Sequence[Line2D] = [
+        *(_dots(spots) if overlaid else ()),
         Line2D([], [], marker="o", markerfacecolor="none", label="Airy disc", **style),
         Line2D([], [], marker="+", label="chief ray", **style),
     ]
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
     )
+
+
+def _dots(spots: SpotDiagram) -> list[Line2D]:
+    handles = wavelength_handles(spots.wavelengths)
+    for handle in handles:
+        handle.set(linestyle="none", marker="o", markersize=4)
+    return handles

@@ -1,7 +1,7 @@
 """A written lens file is read again and compared with its prescription."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from dolens.errors import InputError
 from dolens.prescriptions.checks import as_number
@@ -44,6 +44,43 @@ def require_same(
         if key not in before and key[0] not in assumed:
             place = "".join(f"{part}: " for part in key[:-1])
             raise InputError(f"{where}: {place}a {kind} file always has '{key[-1]}'; give it")
+
+
+class Difference(NamedTuple):
+    """A `Difference` is a key of a prescription that another one lacks, adds or says otherwise.
+
+    Attributes:
+        place: (`surface 3`,), (`sensor`,) or () for the lens.
+        key: as a prescription writes it.
+        before: None where the first prescription has no such key.
+        after: None where the second has none.
+    """
+
+    place: tuple[str, ...]
+    key: str
+    before: Any
+    after: Any
+
+
+def differences(
+    before: Mapping[str, Any], after: Mapping[str, Any], medium: Callable[[str], str] = str
+) -> list[Difference]:
+    """Return the keys in which two prescriptions differ, in the order of the first.
+
+    Numbers must agree to the last bit, a radius through its curvature; what both leave to a default
+    is the same.
+
+    Args:
+        before: a prescription.
+        after: another one.
+        medium: names that mean the same medium become one.
+    """
+    first, second = _flat(before, medium), _flat(after, medium)
+    return [
+        Difference(key[:-1], key[-1], first.get(key), second.get(key))
+        for key in dict.fromkeys((*first, *second))
+        if first.get(key) != second.get(key)
+    ]
 
 
 def _flat(prescription: Mapping[str, Any], medium: Callable[[str], str]) -> dict[tuple, Any]:

@@ -1,5 +1,6 @@
 """Lens files are read and written."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,23 +74,77 @@ def load_prescription(path: str | Path) -> Any:
             that names the file, and the line, surface and key where there is one.
     """
     path = find_lens(path)
-    suffix = _suffix(path)
+    _suffix(path)
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    return decode_prescription(data, path)
+
+
+def decode_prescription(data: bytes, path: str | Path) -> Any:
+    """Read the content of a lens file as plain data.
+
+    Args:
+        data: what the file holds.
+        path: its suffix says which format that is; messages name it.
+
+    Raises:
+        InputError: see `load_prescription`.
+    """
+    suffix = _suffix(Path(path))
     if suffix == ".zmx":
         return prescription_from_zemax(decode_zemax(data, str(path)), str(path))
-    kind = "text" if suffix == ".txt" else "YAML"
+    if suffix == ".txt":
+        return prescription_from_diffoptics(_text(data, path, "text"), str(path))
+    return decode_yaml(data, path)
+
+
+def decode_yaml(data: bytes, where: str | Path) -> Any:
+    """Read YAML as plain values; nothing in it names code, and no key may be given twice.
+
+    Args:
+        data: what the file holds.
+        where: its name, for messages.
+
+    Raises:
+        InputError: it is not valid YAML; the message is one line.
+    """
+    text = _text(data, where, "YAML")
     try:
-        text = data.decode("utf-8")
-        if suffix == ".txt":
-            return prescription_from_diffoptics(text, str(path))
         # A subclass of the safe loader: it builds plain values only.
         return yaml.load(text, Loader=_UniqueKeyLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except yaml.YAMLError as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: is not valid {kind} ({reason})") from None
+        raise InputError(f"{where}: is not valid YAML ({reason})") from None
+
+
+def _text(data: bytes, where: str | Path, kind: str) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where}: is not valid {kind} ({error})") from None
+
+
+def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:
+    """Return what a lens file of that name would hold; nothing is written.
+
+    Args:
+        prescription: plain data, as `prescription_of` returns it.
+        path: its suffix says the format (.yaml, .yml, .txt or .zmx); messages name it.
+
+    Raises:
+        InputError: the format cannot hold the lens; the message names the surface and key.
+    """
+    suffix = _suffix(Path(path))
+    if suffix == ".zmx":
+        return encode_zemax(zemax_of(prescription, str(path)))
+    if suffix == ".txt":
+        return diffoptics_text_of(prescription, str(path)).encode()
+    text = yaml.safe_dump(
+        prescription, sort_keys=False, default_flow_style=None, width=200, allow_unicode=True
+    )
+    return text.encode()
 
 
 def load_lens(
@@ -126,16 +181,7 @@ def save_lens(lens: Lens, path: str | Path) -> None:
         InputError: the format cannot hold the lens; the message names the surface and key.
     """
     path = Path(path)
-    suffix = _suffix(path)
-    prescription = prescription_of(lens)
-    if suffix == ".zmx":
-        data = encode_zemax(zemax_of(prescription, str(path)))
-    elif suffix == ".txt":
-        data = diffoptics_text_of(prescription, str(path)).encode()
-    else:
-        text = yaml.safe_dump(prescription, sort_keys=False, default_flow_style=None, width=200)
-        data = text.encode()
-    path.write_bytes(data)
+    path.write_bytes(encode_prescription(prescription_of(lens), path))
 
 
 def _suffix(path: Path) -> str:

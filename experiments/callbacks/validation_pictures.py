@@ -7,6 +7,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.callbacks.photograph_names import shown_name
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.reconstruction import evaluating
 from dolens.experiments.loggers.protocol import TakesPictures
@@ -22,7 +23,7 @@ _WIDEST = 256
 class ValidationPictures(lightning.Callback):
     """Logs truth, sensor's image and restored image side by side, with their PSNR.
 
-    The pictures are called `<photograph>/<view>`, as `chelsea/1000 mm`; each shows the same crop
+    The pictures are called `<photograph>/<view>`, as `chelsea/8m`; each shows the same crop
     every time, the photograph's first, with the noise with which validation measures it.
 
     Args:
@@ -94,7 +95,7 @@ class ValidationPictures(lightning.Callback):
             for view, label in enumerate(pl_module.views.labels()):
                 if photograph is not None:
                     images = (truth[crop, view], raw[crop, view], restored[crop, view])
-                    _log(trainer, f"{photograph}/{label}", *images)
+                    _log(trainer, f"{shown_name(photograph)}/{label}", *images)
 
 
 def _log(

@@ -235,7 +235,7 @@ class CameraModule(Camera):
 
     def figures(self) -> Figures:
         """Return the first test crop, point spread functions, and the layout."""
-        return camera_figures(self, self._shown, "test")
+        return camera_figures(self, self._shown, "test", self.test_scores.get("test"))
 
     def training_figures(self) -> Figures:
         """Return those of the lens; `ValidationPictures` has the images."""

@@ -1,6 +1,7 @@
 """Figures of a camera: its images, its point spread functions, and its layout."""
 
 import copy
+import math
 from collections.abc import Mapping
 from functools import partial
 
@@ -9,32 +10,47 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.photograph_scores import PhotographScores
 from dolens.experiments.camera.reconstruction import evaluating
 from dolens.experiments.experiment import Figures
+from dolens.optics.paraxial import first_order
 from dolens.plotting import comparison_figure, layout_figure, psf_figure
+from dolens.plotting.layout import layout_title, optics_text, shown_name
+from dolens.plotting.number_text import number_text
 from dolens.reconstruction import psnr_db
 from dolens.sensor.colour import linear_to_srgb
 
 _PUPIL_SAMPLES = 96  # along each side of the pupil
+# A window of point spread functions is doubled until it holds this share of each, up to so many
+# pixels along each side.
+_HELD, _LARGEST_WINDOW = 0.998, 1025
 
 
-def camera_figures(camera: Camera, crops: Mapping[str, Tensor], stage: str) -> Figures:
+def camera_figures(
+    camera: Camera,
+    crops: Mapping[str, Tensor],
+    stage: str,
+    scores: PhotographScores | None = None,
+) -> Figures:
     """Return `images`, `point_spread_functions` and `layout`.
 
     Args:
         camera: as it is.
         crops: stage → a texture (1, 3, h, w), linear light.
         stage: the stage whose crop is shown, `val` or `test`.
+        scores: of all photographs of the stage, for the title; None where there are none yet.
     """
     return {
-        "images": partial(_images, camera, crops, stage),
+        "images": partial(_images, camera, crops, stage, scores),
         "point_spread_functions": partial(_point_spread_functions, camera),
         "layout": partial(_layout, camera),
     }
 
 
 @torch.no_grad()
-def _images(camera: Camera, crops: Mapping[str, Tensor], stage: str) -> Figure:
+def _images(
+    camera: Camera, crops: Mapping[str, Tensor], stage: str, scores: PhotographScores | None
+) -> Figure:
     """Draw truth, raw and restored images; the same stage shows the same ones again."""
     # In evaluation mode: the network is shown as it is measured, and its statistics stay.
     with evaluating(camera.network):
@@ -44,21 +60,77 @@ def _images(camera: Camera, crops: Mapping[str, Tensor], stage: str) -> Figure:
         images.cpu()[0] for images in (taken.truth, linear_to_srgb(taken.raw), restored)
     )
     quality = {"raw": psnr_db(raw, truth).tolist(), "restored": psnr_db(restored, truth).tolist()}
-    return comparison_figure(truth, raw, restored, camera.views.labels(), quality)
+    kind = {"val": "validation", "test": "test"}[stage]
+    title = f"{shown_name(camera.lens)}: one crop of one {kind} photograph, PSNR of this crop"
+    if scores is not None:
+        found = scores.metrics["psnr_db"]
+        mean, count = float(found.mean()), len(found)
+        title += f"\n(restored, mean over {count} photographs and all views: {mean:.2f} dB)"
+    title += "\ndisplay-encoded (sRGB), clipped to [0, 1], not interpolated"
+    labels = [_label(label) for label in camera.views.labels()]
+    return comparison_figure(truth, raw, restored, labels, quality, title)
 
 
 @torch.no_grad()
 def _point_spread_functions(camera: Camera) -> Figure:
     views = camera.views
-    functions = views.point_spread_functions(camera.lens, camera.variables(), _PUPIL_SAMPLES)
+    functions = _whole_functions(camera)
+    lens = copy.deepcopy(camera.lens).cpu()
+    optics = optics_text(lens.system(), lens.primary_wavelength, views.object_distance)
     return psf_figure(
-        functions.cpu(), views.psf_labels(), views.sensor.pixel_pitch, "Point spread functions"
+        functions.cpu(),
+        [_label(label) for label in views.psf_labels()],
+        views.sensor.pixel_pitch,
+        f"{shown_name(lens)}: {optics}\nPSFs {views.psf_place}",
     )
+
+
+def _whole_functions(camera: Camera) -> Tensor:
+    """Return point spread functions in a window that cuts next to nothing off."""
+    lens, values, views = camera.lens, camera.variables(), camera.views
+    found = views.point_spread_functions(lens, values, _PUPIL_SAMPLES)
+    while True:
+        size = 2 * found.shape[-1] - 1
+        if size > _LARGEST_WINDOW:
+            return found
+        wider = views.point_spread_functions(lens, values, _PUPIL_SAMPLES, size=size)
+        held = found.sum((1, 2, 3)) >= _HELD * wider.sum((1, 2, 3))
+        if bool(held.all()):
+            return found
+        found = wider
 
 
 def _layout(camera: Camera) -> Figure:
+    """Draw the section along the sensor's diagonal, with the fields of the camera's views."""
+    lens, views = copy.deepcopy(camera.lens).cpu(), camera.views
+    sensor, distance = views.image_sensor, views.object_distance
+    diagonal = math.hypot(sensor.height, sensor.width) * sensor.pixel_pitch
+    system = lens.system()
+    found = first_order(system, lens.primary_wavelength, distance)
+    height = 0.5 * diagonal / abs(float(found.magnification))
+    away = distance + float(found.entrance_pupil.z)
+    angles = [math.degrees(math.atan2(share * height, away)) for share in views.field_shares()]
+    size = f"{number_text(sensor.width * sensor.pixel_pitch)} × "
+    size += f"{number_text(sensor.height * sensor.pixel_pitch)} mm"
+    title = layout_title(lens, system, lens.primary_wavelength, distance)
     return layout_figure(
-        copy.deepcopy(camera.lens).cpu(),
-        object_distance=camera.views.object_distance,
-        title=camera.lens.name,
+        lens,
+        lens.primary_wavelength,
+        [float(f"{angle:.3g}") for angle in angles],
+        object_distance=distance,
+        title=f"{title}\nobject at {_metres(distance)}, diagonal of the sensor of {size}",
+        sensor=diagonal,
     )
+
+
+def _metres(distance: float) -> str:
+    """Return a distance in mm as `6 m`, or in mm below a metre."""
+    if distance >= 1000.0:
+        return f"{number_text(1e-3 * distance)} m"
+    return f"{number_text(distance)} mm"
+
+
+def _label(label: str) -> str:
+    """Return `8 m` for the label `8m` of a depth; other labels as they are."""
+    number = label.removesuffix("m")
+    return f"{number} m" if number != label and number.replace(".", "").isdigit() else label

@@ -34,6 +34,8 @@ logger = logging.getLogger(__name__)
 SEMI_DIAMETERS = ("fixed", "automatic")
 # So many iterations are logged one by one; history.csv holds all.
 _LOGGED_FIRST = 20
+# Of merit functions without operands.
+_MERIT_UNITS = {"spots": "µm²", "wavefront": "λ²"}
 
 
 class DesignModule(Experiment):
@@ -319,8 +321,17 @@ class DesignModule(Experiment):
 
     def figures(self) -> Figures:
         """Return the layout, spots, ray fans, MTF, RMS curves and the history."""
-        evaluated = (self.lens, self.initial, self.evaluation)
-        return design_figures(*evaluated, self.history, self.mtf_max_frequency)
+        merit = self.merit_settings
+        # Weights of operands have units of their own, and so has the sum.
+        unit = _MERIT_UNITS.get(merit.quality, "") if isinstance(merit.quality, str) else ""
+        return design_figures(
+            self.lens,
+            self.initial,
+            self.evaluation,
+            self.history,
+            self.mtf_max_frequency,
+            "" if merit.operands else unit,
+        )
 
     # ---------------------------------------------------------------- checkpoints
 

@@ -5,11 +5,20 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from matplotlib.figure import Figure
 
-from dolens.analysis.modulation_transfer import modulation
 from dolens.analysis.ray_fans import ray_fans
-from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
-from dolens.analysis.spot_diagram import spot_diagram, working_f_numbers
-from dolens.experiments.design.tables import SQUARE_GRID_COUNT, spot_table
+from dolens.analysis.spot_diagram import working_f_numbers
+from dolens.experiments.design.merit_rays import (
+    merit_modulation,
+    merit_rms_against_field,
+    merit_rms_against_wavelength,
+    merit_spots,
+    pupil_share,
+    pupil_text,
+    rays_text,
+    reference_text,
+    whole_stop_rms,
+)
+from dolens.experiments.design.tables import spot_table
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.optimize import MeritSettings
@@ -19,12 +28,17 @@ from dolens.plotting import (
     modulation_figure,
     ray_fans_figure,
     rms_curves_figure,
+    spots_comparison_figure,
     spots_figure,
 )
+from dolens.plotting.layout import optics_text, shown_name
+from dolens.plotting.number_text import number_text
 
-_FREQUENCIES = 51
+_FREQUENCIES = 101
 # Beyond this over the RMS radius a spot's modulation is nearly nothing.
 _BLURRED = 1.5
+# Significant digits of a headline's radius.
+_DIGITS = 4
 
 
 def design_figures(
@@ -33,8 +47,12 @@ def design_figures(
     settings: MeritSettings,
     history: Sequence[Mapping[str, float]],
     max_frequency: float | None = None,
+    merit_unit: str = "",
 ) -> Figures:
     """Return the layout, spots, ray fans, MTF and RMS curves of a design, and its history.
+
+    All are over the rays of `rms_spot_um`; where those do not fill the stop, titles give the
+    number over the whole stop besides, and ray fans show what lies beyond.
 
     Args:
         lens: the design.
@@ -43,17 +61,25 @@ def design_figures(
         history: a row of numbers for every iteration; empty if nothing was trained.
         max_frequency: the end of the MTF curves, cycles/mm; None: half of the diffraction limit, or
             less, where the spots of the design leave no contrast.
+        merit_unit: of the merit function, for the history; empty where it has none.
     """
     fields = [tuple(field) for field in settings.fields_of(lens)]
     waves = list(settings.wavelengths_of(lens))
     distance = lens.object_distance
 
-    pupil = pupil_note(settings)
+    def spots() -> Figure:
+        title = titled(lens, "final", _radius(lens, settings))
+        return spots_figure(merit_spots(lens, settings), len(waves) == 1, title)
 
-    def spots(of: Lens, title: str) -> Figure:
-        found = spot_diagram(of, fields, waves, object_distance=distance)
-        rays = int((found.weight > 0.0).sum())
-        return spots_figure(found, title=f"Spots, {title}: {rays} rays over the whole stop{pupil}")
+    def compared() -> Figure:
+        both = {"initial": initial, "final": lens}
+        first, last = (number_text(spot_table(of, settings).mean, _DIGITS) for of in both.values())
+        rows = [f"mean RMS radius {first} → {last} µm, {_rays(settings)}"]
+        rows += [] if len(waves) == 1 else ["panels: all wavelengths about their common centroid"]
+        return spots_comparison_figure(
+            {name: merit_spots(of, settings) for name, of in both.items()},
+            titled(lens, None, "\n".join(rows)),
+        )
 
     def layouts() -> Figure:
         # Drawn in the y-z plane: fields beside it would be drawn elsewhere than they are.
@@ -62,7 +88,7 @@ def design_figures(
             initial, lens, lens.primary_wavelength, angles or [0.0], object_distance=distance
         )
 
-    def transfer(of: Lens, title: str) -> Figure:
+    def transfer() -> Figure:
         most = max_frequency
         if most is None:
             wave = torch.tensor([lens.primary_wavelength], dtype=torch.float64)
@@ -71,62 +97,78 @@ def design_figures(
             blur = 1e-3 * spot_table(lens, settings).mean
             most = min(most, _BLURRED / max(blur, 1e-12))
         frequencies = torch.linspace(0.0, most, _FREQUENCIES, dtype=torch.float64)
-        found = modulation(of, fields, waves, frequencies, object_distance=distance)
-        return modulation_figure(found, title=f"Geometric MTF, {title}, of the whole stop{pupil}")
+        found = {
+            name: merit_modulation(of, settings, frequencies)
+            for name, of in (("initial", initial), ("final", lens))
+        }
+        # A panel says of which fields it has no wave-optical function.
+        panels = {
+            f"{name}\nproduct¹: {', '.join(products)}" if products else f"{name}\n": mtf
+            for name, (mtf, products) in found.items()
+        }
+        rows = [f"MTF with diffraction, {pupil_text(settings)}"]
+        if any(products for _, products in found.values()):
+            rows.append("¹ contrast of the rays × diffraction limit")
+        return modulation_figure(panels, titled(lens, None, "\n".join(rows)))
 
     def curves() -> Figure:
+        edge = max(fields, key=_size)
+        what = ["RMS spot radius", rays_text(settings), reference_text(settings)]
         return rms_curves_figure(
-            rms_against_field(lens, waves, max(fields, key=_size), object_distance=distance)
-            if any(_size(field) > 0.0 for field in fields)
-            else None,
-            rms_against_wavelength(lens, fields, _interval(waves), object_distance=distance),
-            title=f"RMS spot radius, rays over the whole stop{pupil}",
+            merit_rms_against_field(lens, settings, edge) if _size(edge) > 0.0 else None,
+            merit_rms_against_wavelength(lens, settings, _interval(waves)),
+            titled(lens, "final", ", ".join(filter(None, what))),
+        )
+
+    def fans() -> Figure:
+        share = pupil_share(lens, settings)
+        beyond = f"; shaded: beyond {pupil_text(settings)}" if share < 1.0 else ""
+        return ray_fans_figure(
+            ray_fans(lens, fields, waves, object_distance=distance),
+            titled(lens, "final", f"ray fans across the whole stop{beyond}"),
+            share,
         )
 
     figures: dict[str, Callable[[], Figure]] = {
         "layout": layouts,
-        "spots": lambda: spots(lens, "final"),
-        "spots_initial": lambda: spots(initial, "initial"),
-        "ray_fans": lambda: ray_fans_figure(
-            ray_fans(lens, fields, waves, object_distance=distance),
-            title=f"Ray fans, final, across the whole stop{pupil}",
-        ),
-        "modulation": lambda: transfer(lens, "final"),
-        "modulation_initial": lambda: transfer(initial, "initial"),
+        "spots": spots,
+        "spots_before_after": compared,
+        "ray_fans": fans,
+        "modulation": transfer,
         "rms_curves": curves,
     }
     if history:
         damping = [row.get("train/damping", float("nan")) for row in history]
         merits = [row["train/merit"] for row in history]
         figures["history"] = lambda: history_figure(
-            merits, damping if any(value == value for value in damping) else None
+            merits,
+            damping if any(value == value for value in damping) else None,
+            title=": ".join(filter(None, [shown_name(lens), "history of the design"])),
+            merit_label=f"merit ({merit_unit})" if merit_unit else "merit",
         )
     return figures
 
 
-def pupil_note(settings: MeritSettings) -> str:
-    """Return lines for titles that name the rays of `rms_spot_um`, if they are not the figure's.
+def titled(lens: Lens, stage: str | None, rest: str) -> str:
+    """Return a title: name of the lens, stage, focal length and aperture; and the rest below."""
+    optics = optics_text(lens.system(), lens.primary_wavelength, lens.object_distance)
+    name = ", ".join(part for part in (shown_name(lens), stage) if part)
+    return f"{name}: {optics}\n{rest}" if name else f"{optics}\n{rest}"
 
-    The figures' rays fill the stop evenly, and radii count from each colour's own centroid.
 
-    Args:
-        settings: of `rms_spot_um`.
+def _radius(lens: Lens, settings: MeritSettings) -> str:
+    """Return the headline's number and rays; and the number of the whole stop, if that differs."""
+    number = number_text(spot_table(lens, settings).mean, _DIGITS)
+    text = f"mean RMS radius {number} µm, {_rays(settings)}"
+    whole = whole_stop_rms(lens, settings)
+    if whole is None:
+        return text
+    return f"{text}\n(over the whole stop: {number_text(whole)} µm)"
 
-    Returns:
-        Lines, each with a line break before it; empty where only the number of rays differs.
-    """
-    notes = []
-    if settings.sampling == "square_grid":
-        options = settings.sampling_options
-        count = options.get("count") or SQUARE_GRID_COUNT
-        half_width = options.get("half_width")
-        width = "the first surface" if half_width is None else f"±{half_width:g} mm"
-        notes.append(f"{count}×{count} rays over {width}")
-    if settings.reference_spectrum == "polychromatic":
-        notes.append("one centroid for all colours")
-    if settings.reference == "chief":
-        notes.append("the chief ray as centre")
-    return "\n(rms_spot_um: " + ",\n".join(notes) + ")" if notes else ""
+
+def _rays(settings: MeritSettings) -> str:
+    note = reference_text(settings)
+    return f"{rays_text(settings)}\n{note}" if note else rays_text(settings)
 
 
 def _size(field: tuple[float, float]) -> float:

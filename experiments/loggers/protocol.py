@@ -32,15 +32,19 @@ class RunSummary:
     step: int
 
     def headline_numbers(self) -> dict[str, float]:
-        """Return the objective first, and the few numbers that runs are compared by."""
-        found = {"objective": self.objective} if self.objective in self.numbers else {}
-        named = {name: self.numbers[key] for name, key in found.items()}
+        """Return the few numbers that runs are compared by.
+
+        The first is the objective, as `Objective`: TensorBoard sorts columns by name, and a capital
+        letter comes before the others.  Then the means of the test, and the seconds.
+        """
+        found = {}
+        if self.objective in self.numbers:
+            found["Objective"] = self.numbers[self.objective]
         for name, number in self.numbers.items():
-            first, _, rest = name.partition("/")
-            of_test = first == "test" and rest.count("/") == 0
-            if of_test or name in ("cost/wall_s", self.objective):
-                named[name] = number
-        return named
+            of_test = name.startswith("test/") and name.count("/") == 1
+            if of_test or name in (self.objective, "cost/wall_s"):
+                found[name] = number
+        return found
 
 
 @runtime_checkable

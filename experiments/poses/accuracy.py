@@ -29,6 +29,7 @@ from dolens.experiments.poses.bench import Bench, Light, check_precision, draw, 
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImager
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +112,8 @@ class PoseAccuracyModule(Analysis):
         for part in self.parts:
             started = time.perf_counter()
             logger.info("%s", part)
-            getattr(self, f"_{part}")()
+            with named_stage(part):
+                getattr(self, f"_{part}")()
             self.write_tables()
             self.numbers[f"cost/{part}_s"] = time.perf_counter() - started
         return self.numbers
@@ -125,7 +127,9 @@ class PoseAccuracyModule(Analysis):
         name = self.lens.name
         title = f"{name}: error and light, {self.by_photons.measurements} measurements each"
         figures = {
-            "photons": lambda: photons_figure(self.rows, self.true, title),
+            "photons": lambda: photons_figure(
+                self.rows, self.true, title, self.by_photons.measurements
+            ),
             "rays": lambda: rays_figure(
                 self.numbers,
                 self.imagers,

@@ -18,6 +18,7 @@ from dolens.experiments.poses.bench import Bench, Light, simulate
 from dolens.experiments.poses.iteration import iterate, loss_of, optimizer_of
 from dolens.experiments.poses.settings import spot_imager, stage_of
 from dolens.experiments.tables import Row
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -74,8 +75,9 @@ class Basin:
         across, up = self.along.values()
         for weight in self.centroid_weights:
             # The grid's rows from below, as `table` takes them.
-            for second, first in itertools.product(up, across):
-                self.rows.append(self._row(measured, bounds, weight, (first, second)))
+            for number, (second, first) in enumerate(itertools.product(up, across), 1):
+                with named_stage(f"starts: {number} of {len(up) * len(across)}"):
+                    self.rows.append(self._row(measured, bounds, weight, (first, second)))
             mine = [row for row in self.rows if row["centroid_weight"] == weight]
             logger.info(
                 "basin, centroid weight %g: %d of %d starts converge, %.2g s each",

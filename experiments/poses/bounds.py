@@ -28,6 +28,7 @@ from dolens.experiments.poses.results import spread_metrics
 from dolens.experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +88,8 @@ class PoseBoundsModule(Analysis):
         """Evaluate every arrangement."""
         numbers: dict[str, float] = {}
         for number, (name, pose) in enumerate(self.poses.items()):
-            found = self._evaluate(number, name, pose)
+            with named_stage(f"arrangement: {name}"):
+                found = self._evaluate(number, name, pose)
             self.arrangements.append(found)
             numbers |= self._metrics(found)
             logger.info("%s: %s", name, self._verdict(found))

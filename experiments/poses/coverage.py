@@ -18,6 +18,7 @@ from dolens.experiments.poses.estimates import Estimates, probability
 from dolens.experiments.poses.misalignment import MisalignmentModule
 from dolens.experiments.poses.results import error_statistics
 from dolens.experiments.tables import Row
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +82,8 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             self._hold(number)
             self.information[fit.name] = self._information(number)
         for case in self.cases:
-            self._work_out(case)
+            with named_stage(f"case: {case}"):
+                self._work_out(case)
             self.write_tables()
         return self._metrics()
 

@@ -30,6 +30,7 @@ from dolens.experiments.poses.settings import FitPlan, spot_imager
 from dolens.experiments.tables import Row, write_table
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -172,14 +173,16 @@ class MisalignmentModule(Experiment):
         """Find errors and bounds of every fit; log them, and write the tables."""
         for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
             self._hold(number)
-            information = self._information(number)
+            with named_stage(f"bounds: {fit.name}"):
+                information = self._information(number)
             self.information[fit.name] = information
             truth = self.truth(number)
             rows = pose_rows(fit.name, pose, self.initial[number], information, truth)
             self.log_dict(pose_metrics(rows))
             if self.monte_carlo and self.observations.photograph is None:
                 draws = range(1, self.monte_carlo + 1)
-                found = self._estimates(number, draws, self.light, self.estimates)
+                with named_stage(f"{len(draws)} measurements drawn: {fit.name}"):
+                    found = self._estimates(number, draws, self.light, self.estimates)
                 self.estimates[fit.name] = found
                 values = found.values[found.settled]
                 self.log(f"pose_unsettled/{fit.name}", float(len(draws) - len(values)))

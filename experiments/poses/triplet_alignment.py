@@ -30,6 +30,7 @@ from dolens.experiments.settings import PupilRays, Spots
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import DEGREE, unit_of
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +89,7 @@ class TripletAlignmentModule(Analysis):
     @torch.no_grad()
     def analyse(self) -> dict[str, float]:
         """Simulate all cases, and fit them in one batch."""
-        with one_thread():
+        with one_thread(), named_stage("cases and their fits"):
             self.alignment = self._align()
         logger.info("%s", self.alignment.verdict())
         return self.alignment.summary()

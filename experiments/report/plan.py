@@ -98,7 +98,8 @@ class Picture:
 
     Attributes:
         run: the system.
-        name: of the file in its folder `figures`, without the ending.
+        name: of the file in its folder `figures`, without the ending; of `a|b` the first there is,
+            since runs of other versions may be taken.
         caption: one sentence.
     """
 

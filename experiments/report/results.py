@@ -48,10 +48,14 @@ class Result:
             found = {str(name): value for name, value in found.items()}.get(key)
         return float(found) if isinstance(found, int | float) else None
 
-    def figure(self, name: str) -> Path | None:
-        """Return the file of a figure, or None where the run has no such figure."""
-        path = self.folder / "figures" / f"{name}.png"
-        return path if path.is_file() else None
+    def figure(self, names: str) -> Path | None:
+        """Return the file of a figure, or None where the run has no such figure.
+
+        Args:
+            names: without the ending; of several, as `a|b`, the first that there is.
+        """
+        paths = [self.folder / "figures" / f"{name}.png" for name in names.split("|")]
+        return next((path for path in paths if path.is_file()), None)
 
 
 def read_result(name: str, folder: Path) -> Result:
@@ -94,7 +98,12 @@ def overrides_of(folder: Path) -> tuple[str, ...]:
 
 def same_overrides(some: Iterable[str], others: Iterable[str]) -> bool:
     """Return whether two runs were given the same, but for what changes no result."""
-    return _kept(some) == _kept(others)
+    return set(telling_overrides(some)) == set(telling_overrides(others))
+
+
+def telling_overrides(overrides: Iterable[str]) -> tuple[str, ...]:
+    """Return those overrides that may change what a run finds."""
+    return tuple(entry for entry in overrides if not entry.lstrip("+~").startswith(_PASSED_OVER))
 
 
 def assigned(plan: Plan, given: Sequence[str]) -> dict[str, Path]:
@@ -155,9 +164,3 @@ def _system_of(plan: Plan, folder: Path) -> System | None:
         elif module is None and same_overrides(system.overrides, overrides_of(folder)):
             return system
     return None
-
-
-def _kept(overrides: Iterable[str]) -> frozenset[str]:
-    return frozenset(
-        entry for entry in overrides if not entry.lstrip("+~").startswith(_PASSED_OVER)
-    )

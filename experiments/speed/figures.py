@@ -15,28 +15,29 @@ _AXES = {
     "trace": (
         "with_gradient_ns",
         "error_um",
-        "ns a ray and surface, forward and back",
-        "largest error on the sensor, µm",
+        "time per ray and surface, forward and backward (ns)",
+        "largest error on the sensor (µm)",
     ),
     "psf": (
         "forward_s",
         "error_grey_levels",
-        "s a function",
-        "RMS error on a photograph-like image, grey levels",
+        "time per point spread function (s)",
+        "RMS error of an image (grey levels)",
     ),
     "render": (
         "with_gradient_s",
         "error_grey_levels",
-        "s an image, forward and back",
-        "RMS error on a photograph-like image, grey levels",
+        "time per image, forward and backward (s)",
+        "RMS error of an image (grey levels)",
     ),
 }
 _GRADIENT_AXES = (
     "with_gradient_s",
     "gradient_error",
-    "s an image, forward and back",
-    "error of the gradient over that of rays, relative",
+    "time per image, forward and backward (s)",
+    "relative error of the gradient (no unit)",
 )
+_TITLES = {"trace": "ray traces", "psf": "point spread functions", "render": "images"}
 _LEAST_ERROR = {"trace": 1e-10, "psf": None, "render": None}
 
 
@@ -61,13 +62,17 @@ def _part_figure(rows: Sequence[Row], scene: str, part: str) -> Figure:
     cost, error, *labels = _AXES[part]
     floor = _uncertainty(rows, scene) if part == "render" else _LEAST_ERROR[part]
     points = _points(rows, scene, part, cost, error)
-    return pareto_figure(points, *labels, f"{scene}: {part}", floor)
+    return pareto_figure(points, *labels, f"{_name(scene)}: {_TITLES[part]}", floor)
 
 
 def _gradient_figure(rows: Sequence[Row], scene: str) -> Figure:
     cost, error, *labels = _GRADIENT_AXES
     points = _points(rows, scene, "render", cost, error)
-    return pareto_figure(points, *labels, f"{scene}: gradients", None)
+    return pareto_figure(points, *labels, f"{_name(scene)}: gradients of images", None)
+
+
+def _name(scene: str) -> str:
+    return scene.replace("_", " ")
 
 
 def _points(
@@ -78,7 +83,7 @@ def _points(
     for row in rows:
         if (row["scene"], row["part"]) == (scene, part) and math.isfinite(float(row[error])):
             model = str(row["model"])
-            point = Point(str(row["setting"]), row[cost], row[error], model == "auto")
+            point = Point(_setting(str(row["setting"])), row[cost], row[error], model == "auto")
             families.setdefault(model, []).append(point)
     return families
 
@@ -87,3 +92,8 @@ def _uncertainty(rows: Sequence[Row], scene: str) -> float | None:
     """Return the grey levels below which errors of a scene's renders are not known."""
     mine = [row for row in rows if (row["scene"], row["part"]) == (scene, "render")]
     return mine[0]["error_uncertainty"] if mine else None
+
+
+def _setting(setting: str) -> str:
+    """Return a label: one ray, not `1 rays`."""
+    return "1 ray" if setting == "1 rays" else setting

@@ -20,6 +20,7 @@ from dolens.experiments.speed.traces import trace_rows
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.plotting import Point, pareto_front
+from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +68,8 @@ class SpeedVsErrorModule(Analysis):
         for subject in self.subjects:
             for part in self.parts:
                 logger.info("%s: %s", subject.name, part)
-                self.rows += getattr(self, f"_{part}")(subject)
+                with named_stage(f"{subject.name}, {part}"):
+                    self.rows += getattr(self, f"_{part}")(subject)
                 self.write_tables()
         return self.numbers
 

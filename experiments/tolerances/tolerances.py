@@ -22,6 +22,7 @@ from dolens.experiments.tolerances.tables import (
     sensitivity_rows,
 )
 from dolens.optics.lens import Lens
+from dolens.stages import stage as named_stage
 from dolens.tolerancing import (
     Outcome,
     ToleranceAnalysis,
@@ -105,7 +106,8 @@ class TolerancesModule(Analysis):
 
     def analyse(self) -> dict[str, float]:
         """Find sensitivities, draw lenses, and trace them."""
-        self.analysis = self._analyse()
+        with named_stage("sensitivities and drawn lenses"):
+            self.analysis = self._analyse()
         numbers = self._metrics(self.analysis)
         logger.info("Worst offenders, each alone and refocused:\n%s", offender_text(self.analysis))
         logger.info("%s", self._verdict(numbers))

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.figures import SaveFigures
 from dolens.experiments.experiment import Experiment
+from dolens.experiments.loggers.tensorboard import TensorBoard
 
 
 class Drawn(Experiment):
@@ -45,7 +45,7 @@ class Unlisted(Drawn):
 
 @pytest.fixture
 def trainer(tmp_path):
-    board = TensorBoardLogger(tmp_path, name="", version="")
+    board = TensorBoard(str(tmp_path))
     return SimpleNamespace(
         loggers=[board], current_epoch=0, max_epochs=8, global_step=0, sanity_checking=False
     )
@@ -71,7 +71,7 @@ def test_figures_of_training_come_at_their_interval_and_after_the_last_epoch(tra
         callback.on_validation_end(trainer, module)
     assert module.count == 4
     assert not saved(tmp_path / "figures")
-    assert logged(trainer, tmp_path) == {"images": [0, 3, 6, 7]}
+    assert logged(trainer, tmp_path) == {"figures/images": [0, 3, 6, 7]}
 
 
 def test_nothing_is_logged_in_a_sanity_check(trainer, tmp_path):
@@ -85,7 +85,7 @@ def test_figures_of_the_test_are_saved_and_kept_apart_from_those_of_training(tra
     module = Drawn(["images", "layout"], training=["images"])
     SaveFigures(tmp_path / "figures").on_test_end(trainer, module)
     assert saved(tmp_path / "figures") == {"images.png", "layout.png"}
-    assert set(logged(trainer, tmp_path)) == {"test_images", "layout"}
+    assert set(logged(trainer, tmp_path)) == {"figures/test_images", "figures/layout"}
     assert module.count == 2
 
 

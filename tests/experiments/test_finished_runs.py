@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
@@ -43,14 +44,39 @@ def test_a_default_loader_shows_every_point_of_a_camera(composed, tmp_path):
         assert log.Scalars(name)[-1].value == pytest.approx(value, rel=1e-6), name
 
 
-def test_the_hyperparameters_come_with_the_metrics(composed, tmp_path):
+def test_the_table_of_runs_has_what_was_chosen_and_the_objective_first(composed, tmp_path):
+    given = ("lens.surfaces.1.radius=25.1", "trainer.max_epochs=1", "data.scale_range=[1.0,1.5]")
+    run(composed(*TINY_CAMERA, *UNTESTED, *given, "network.width=6"))
+    summary = EventAccumulator(str(tmp_path / "run" / "tensorboard" / "summary"))
+    summary.Reload()
+    found = summary.PluginTagToContent("hparams")
+    # A list of columns of this run would be taken for that of all runs.
+    assert set(found) == {"_hparams_/session_start_info", "_hparams_/session_end_info"}
+    content = plugin_data_pb2.HParamsPluginData.FromString(found["_hparams_/session_start_info"])
+    columns = content.session_start_info.hparams
+    assert columns["lens.surfaces.1.radius"].number_value == 25.1
+    assert columns["trainer.max_epochs"].number_value == 1
+    assert columns["network.width"].number_value == 6
+    assert columns["data.scale_range"].string_value == "[1.0, 1.5]"
+    assert columns["experiment"].string_value == "wavefront_coding"
+    assert columns["network"].string_value == "wiener_unet"
+    assert columns["seed"].number_value == 0
+    assert not [name for name in columns if name.startswith(("callbacks", "logger", "hydra"))]
+    assert len(columns) < 50
+    # TensorBoard sorts the numbers by name: a capital letter comes before all others.
+    numbers = sorted(summary.Tags()["scalars"])
+    assert numbers[0] == "Objective" and len(numbers) < 15
+
+
+def test_the_text_of_a_run_has_all_its_settings(composed, tmp_path):
     run(composed(*TINY_CAMERA, *UNTESTED, "trainer.max_epochs=1"))
     log = loaded(tmp_path / "run")
-    found = log.PluginTagToContent("hparams")
-    content = plugin_data_pb2.HParamsPluginData.FromString(found["_hparams_/session_start_info"])
-    assert "learning_rates.optics" in content.session_start_info.hparams
-    content = plugin_data_pb2.HParamsPluginData.FromString(found["_hparams_/experiment"])
-    assert "train/loss" in {info.name.tag for info in content.experiment.metric_infos}
+    (text,) = log.Tensors("settings/text_summary")
+    settings = yaml.safe_load(
+        text.tensor_proto.string_val[0].decode().strip("`").removeprefix("yaml")
+    )
+    assert settings["learning_rates.optics"] > 0.0 and settings["trainer.max_epochs"] == 1
+    assert settings["lens.surfaces.1.radius"] != 0.0
 
 
 def test_a_default_loader_shows_every_iteration_of_a_design(composed, tmp_path):

@@ -9,6 +9,7 @@ import lightning
 from lightning.pytorch.callbacks import ProgressBar
 
 from dolens.errors import InputError
+from dolens.experiments.callbacks.photograph_names import shown_name
 from dolens.experiments.callbacks.progress.displays import Display, display_for, logger
 from dolens.experiments.callbacks.progress.state import MovingAverage, Snapshot, clock_text
 from dolens.stages import StageEvent, listening
@@ -87,11 +88,18 @@ class RunProgress(ProgressBar):
             self._listening.enter_context(listening(self._hear))
             self._display.open()
 
-    def teardown(self, *arguments: Any) -> None:
+    def teardown(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str
+    ) -> None:
         """Close the display."""
         self._close()
 
-    def on_exception(self, *arguments: Any) -> None:
+    def on_exception(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        exception: BaseException,
+    ) -> None:
         """Close the display, so that the message is not overwritten."""
         self._close()
 
@@ -251,6 +259,10 @@ class RunProgress(ProgressBar):
         self._done += 1
         self._update()
 
+    def on_test_epoch_end(self, *arguments: Any) -> None:
+        """Leave the photographs: what follows is named by stages."""
+        self._detail = ""
+
     def _look_up_photographs(self, trainer: lightning.Trainer, split: str) -> None:
         find = getattr(trainer.datamodule, "evaluation_photographs", None)
         self._names = [] if find is None else find(split)
@@ -260,7 +272,9 @@ class RunProgress(ProgressBar):
         """Name what a batch of crops shows, and how it is looked at."""
         if not self._names:
             return
-        names = list(dict.fromkeys(self._names[self._seen : self._seen + len(batch)]))
+        names = list(
+            dict.fromkeys(map(shown_name, self._names[self._seen : self._seen + len(batch)]))
+        )
         self._seen += len(batch)
         labels = module.views.labels() if hasattr(module, "views") else []
         pieces = [_listed("photograph", names), _listed("view", labels)]

@@ -165,8 +165,7 @@ class TerminalDisplay:
     def renderable(self) -> RenderableType:
         """Return the lines: bar and place, numbers, and what is being done."""
         now = self.snapshot()
-        waiting = bool(now.stages) and now.done == 0
-        unknown = now.total is None or waiting
+        unknown = now.total is None or now.done == 0  # a bar that stands at 0 says nothing
         bar = ProgressBar(
             total=None if unknown else float(max(now.total, 1)),
             completed=float(now.done),
@@ -203,11 +202,12 @@ def _line(text: str) -> Text:
 
 @contextmanager
 def logging_above(console: Console) -> Iterator[None]:
-    """Have the root logger's handlers that write to a terminal write above a live display."""
+    """Have handlers of the log that write to a terminal write above a live display."""
+    loggers = [logging.getLogger(), *map(logging.getLogger, list(logging.root.manager.loggerDict))]
     handlers = [
         handler
-        for handler in logging.getLogger().handlers
-        if isinstance(handler, logging.StreamHandler) and handler.stream.isatty()
+        for handler in dict.fromkeys(h for each in loggers for h in each.handlers)
+        if isinstance(handler, logging.StreamHandler) and _is_terminal(handler.stream)
     ]
     streams = [handler.setStream(_Above(console, handler.stream)) for handler in handlers]
     try:
@@ -215,6 +215,11 @@ def logging_above(console: Console) -> Iterator[None]:
     finally:
         for handler, stream in zip(handlers, streams, strict=True):
             handler.setStream(stream)
+
+
+def _is_terminal(stream: Any) -> bool:
+    """Return whether a stream, which a handler may lack, is a terminal."""
+    return getattr(stream, "isatty", lambda: False)()
 
 
 class _Above(io.TextIOBase):

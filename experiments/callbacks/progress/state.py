@@ -62,14 +62,15 @@ class Snapshot:
     stage_s: float = 0.0
 
     def headline(self) -> str:
-        """Return steps, place, speed and remaining time."""
+        """Return steps, speed, remaining time and place."""
+        what = "step" if self.part == "fit" else "batch"
         steps = f"{self.done}" if self.total is None else f"{self.done} of {self.total}"
-        pieces = [f"step {steps}", self.detail]
+        pieces = [f"{what} {steps}"]
         if self.steps_per_second is not None:
             pieces.append(speed_text(self.steps_per_second))
-        if self.remaining_s is not None:
+        if self.remaining_s is not None and self.done != self.total:
             pieces.append(f"{clock_text(self.remaining_s)} left")
-        return ", ".join(piece for piece in pieces if piece)
+        return ", ".join(piece for piece in (*pieces, self.detail) if piece)
 
     def number_text(self) -> str:
         """Return the numbers; those of training without their `train/`."""

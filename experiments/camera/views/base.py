@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.errors import InputError
+from dolens.experiments.camera.views.whole import Placing, WholePicture
 from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
@@ -66,6 +68,8 @@ class Imaging(ABC):
     """
 
     keeps_pupil: ClassVar[bool] = False
+    # Where the point spread functions are taken, for titles.
+    psf_place: ClassVar[str] = "on the axis, at the distances of the scene"
 
     def __init__(self, scene: Scene, renderer: Renderer, readout: Readout, seed: int) -> None:
         self.scene = scene
@@ -79,6 +83,15 @@ class Imaging(ABC):
     def sensor(self) -> Sensor:
         """The pixels of one image."""
         return self.renderer.sensor
+
+    @property
+    def image_sensor(self) -> Sensor:
+        """The whole sensor, of which an image may be a window."""
+        return self.renderer.sensor
+
+    def field_shares(self) -> Sequence[float]:
+        """Return the fields that drawings show, over the sensor's half diagonal, from the axis."""
+        return (0.0, 1.0)
 
     @property
     def object_distance(self) -> float:
@@ -118,12 +131,35 @@ class Imaging(ABC):
         values: Mapping[str, Tensor],
         pupil_samples: int | None = None,
         depths: Sequence[float] | None = None,
+        size: int | None = None,
     ) -> Tensor:
-        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's."""
+        """(views, 3, K, K), of the training's views; or of depths (mm) instead of the scene's.
+
+        K is the views' own number of pixels, or the odd one that is given as `size`.
+        """
 
     @abstractmethod
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Rays of spots that stand for what the views see, one entry for each object distance."""
+
+    def whole_picture(
+        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
+    ) -> WholePicture:
+        """Image a picture (3, h, w) of any size, linear light, as a plane at one depth.
+
+        Raises:
+            InputError: the views image no whole pictures.
+        """
+        raise InputError(f"views: {type(self).__name__} images no whole pictures")
+
+    def field_of(self, height: int, width: int) -> Tensor | None:
+        """Where each pixel of an image about the middle of the sensor lies, (2, H, W), x and y over
+        half the sensor's diagonal; None where the camera is the same all over.
+
+        Raises:
+            InputError: the image is larger than the sensor.
+        """
+        return None
 
     def reference_renderers(self) -> Sequence[str]:
         """Names of renderers that make the test images besides."""

@@ -1,5 +1,7 @@
 """The section of one item of the supplement."""
 
+import shlex
+
 from dolens.experiments.report.checks import State
 from dolens.experiments.report.page.html import Child, Markup, element, joined, prose, table
 from dolens.experiments.report.page.material import Material
@@ -17,8 +19,14 @@ from dolens.experiments.report.page.overview import (
 )
 from dolens.experiments.report.page.pictures import embedded, size_of
 from dolens.experiments.report.plan import Item, Row
-from dolens.experiments.report.results import Result
+from dolens.experiments.report.results import Result, telling_overrides
 from dolens.experiments.report.runner import shown_command
+
+_BADGES = {
+    State.HOLDS: "its checks hold",
+    State.FAILS: "does not hold",
+    State.NOT_RUN: "not run",
+}
 
 
 def item_section(material: Material, item: Item) -> Markup:
@@ -81,8 +89,7 @@ def command_of(material: Material, name: str) -> str:
     system = material.plan.system(name)
     if result is None or not result.overrides:
         return shown_command(system)
-    kept = [entry for entry in result.overrides if not entry.startswith("hydra.")]
-    return " ".join(["dolens train", *(f"'{e}'" if set(e) & set(" []{}") else e for e in kept)])
+    return shlex.join(["dolens", "train", *telling_overrides(result.overrides)])
 
 
 def _lens_value(material: Material, row: Row) -> float | None:
@@ -94,7 +101,7 @@ def _badge(material: Material, item: Item) -> Markup:
     states = {outcome.state for outcome in material.outcomes_of(item.item)}
     for state in (State.FAILS, State.HOLDS, State.NOT_RUN):
         if state in states:
-            return element("span", str(state), class_=f"badge {css_class(state)}")
+            return element("span", _BADGES[state], class_=f"badge {css_class(state)}")
     return (
         element("span", "shown, no check", class_="badge quiet")
         if item.runs

@@ -1,0 +1,83 @@
+"""The command `dolens convert`."""
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def convert(
+    old: Annotated[Path, typer.Argument(metavar="A", help="Lens file: .yaml, .txt or .zmx.")],
+    new: Annotated[
+        Path, typer.Argument(metavar="B", help="File to write; its suffix says the format.")
+    ],
+    index_model: Annotated[
+        str | None,
+        typer.Option(help="dfc, do or paper, instead of the model that A names."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite B if it exists.")] = False,
+) -> None:
+    """Convert a lens file to another format, and say what was changed or lost.
+
+    Formats: dolens's own YAML (.yaml, .yml), dO's text (.txt) and Zemax's (.zmx).
+
+    B is read again and compared with A key by key. What its format
+    cannot hold is dropped and listed, if it is a name or a remark. If light
+    would go another way, the lens is refused and nothing is written.
+
+    Example: dolens convert my_lens.zmx my_lens.yaml
+    """
+    from rich.console import Console
+
+    from dolens.errors import InputError
+    from dolens.prescriptions.conversion import converted
+    from dolens.prescriptions.files import load_prescription
+    from dolens.prescriptions.zemax_unread import unread_in_zemax
+
+    prescription = load_prescription(old)
+    if not force and new.exists():
+        same = new.samefile(old)
+        raise InputError(
+            f"{new}: {'is A itself' if same else 'exists already'}; --force overwrites it"
+        )
+    found = converted(prescription, str(old), str(new), index_model)
+    changes = list(found.changes)
+    if old.suffix.lower() == ".zmx":
+        unread = unread_in_zemax(old.read_bytes())
+        if unread:
+            changes.append(f"not read from {old.name}: {', '.join(unread)}")
+    _write(found.data, new)
+
+    console = Console(highlight=False, soft_wrap=True)
+    surfaces = len(found.after.surfaces)
+    console.print(f"{new}: written, {surfaces} surface{'s' * (surfaces != 1)}", markup=False)
+    for change in changes:
+        console.print(f"  - {change}", markup=False)
+    if not changes:
+        console.print("  nothing was lost or changed", markup=False)
+    elif found.same_numbers:
+        console.print(
+            "  every radius, thickness, index and aperture is the same to the last bit",
+            markup=False,
+        )
+
+
+def _write(data: bytes, path: Path) -> None:
+    """Write a whole file or none."""
+    from dolens.errors import InputError
+
+    name = None
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".dolens-", delete=False) as file:
+            name = file.name
+            file.write(data)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(name, 0o666 & ~mask)
+        os.replace(name, path)
+    except OSError as error:
+        if name is not None and os.path.exists(name):
+            os.unlink(name)
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

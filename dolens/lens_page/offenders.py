@@ -1,0 +1,239 @@
+"""The worst offenders among a lens's tolerances, for its page.
+
+A file of tolerances is YAML::
+
+    elements:                     # optional, as in a lens file: groups that tilt and move
+      front: {surfaces: [1, 2]}
+    tolerances:                   # as experiment=cooke_sensitivity has them
+      elements.*.tilt_[xy]: 0.05                              # half-ranges: degrees,
+      elements.*.decenter_[xy]: {half_range: 0.02}            # mm,
+      surfaces.*.curvature: {half_range: 0.001, relative: true}    # or shares of the value
+    tolerance_factor: 1           # optional; multiplies all of them
+
+An experiment's file does as well: its `lens.elements` and `tolerances` are read.  Without a file,
+every group of cemented glass may tilt by 0.05°, and be moved by 0.02 mm; glass may be 0.02 mm too
+thick, and curvatures 0.1 % too strong.  Of a small lens all lengths are less: 0.25 % of its largest
+clear diameter.
+"""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from torch import nn
+
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.pupil_quadrature import gaussian_quadrature
+from dolens.errors import InputError, check_keys
+from dolens.lens_page.tables import Table, number
+from dolens.optics.elements import Element
+from dolens.optics.lens import Lens
+from dolens.plotting.tolerances import offenders_figure, parameter_label
+from dolens.prescriptions.checks import require_mapping
+from dolens.prescriptions.files import decode_yaml
+from dolens.prescriptions.poses import elements_from
+from dolens.tolerancing import (
+    Contributions,
+    Sensitivities,
+    Tolerances,
+    contributions,
+    linear_spots,
+    sensitivities,
+    spot_weights,
+    tolerances_from,
+)
+
+DEFAULT = "default"
+# Half-ranges: degrees, mm, a share of the curvature; and mm as a share of the largest diameter.
+_TILT, _LENGTH, _CURVATURE, _OF_DIAMETER = 0.05, 0.02, 0.001, 0.0025
+_RINGS, _ARMS = 4, 12
+_MOST = 12
+_OWN_KEYS = ("tolerances", "tolerance_factor", "elements")
+
+
+@dataclass(frozen=True)
+class Offenders:
+    """What tolerances do to a lens, by the linear ray model.
+
+    Attributes:
+        tolerances: P of them.
+        sensitivities: of each alone.
+        contributions: of each to the mean square radius of refocused lenses.
+        notes: what was assumed or not read, a sentence each.
+    """
+
+    tolerances: Tolerances
+    sensitivities: Sensitivities
+    contributions: Contributions
+    notes: list[str]
+
+    def figure(self) -> Figure:
+        """Draw the worst offenders as bars."""
+        t, c, s = self.tolerances, self.contributions, self.sensitivities
+        first = c.order[:_MOST]
+        return offenders_figure(
+            [f"{parameter_label(t.names[p])}  {t.label(p)}" for p in first],
+            c.share[first].tolist(),
+            {
+                "refocused": s.increase()[first].tolist(),
+                "not refocused": s.increase(refocused=False)[first].tolist(),
+            },
+        )
+
+    def table(self) -> Table:
+        """Return the worst offenders, one a row."""
+        t, c, s = self.tolerances, self.contributions, self.sensitivities
+        growth, unfocused = s.increase(), s.increase(refocused=False)
+        rows = [
+            (
+                parameter_label(t.names[p]),
+                t.label(p).replace("deg", "°").replace("-", "−"),
+                f"{100.0 * float(c.share[p]):.1f} %",
+                number(1e3 * growth[p], 3),
+                number(1e3 * unfocused[p], 3),
+                number(1e3 * s.largest_centroid_shift[p], 3),
+            )
+            for p in c.order[:_MOST]
+        ]
+        heads = ("parameter", "tolerance", "share", "RMS grows", "not refocused", "spot moves")
+        return Table(
+            heads,
+            rows,
+            f"The worst {len(rows)} of {len(t.names)} tolerances. RMS radius over all spots, and "
+            "motion of the farthest spot, in µm, at the end of each tolerance alone; share: of the "
+            "average rise of the mean square radius, refocused.",
+            frozenset({0, 1}),
+        )
+
+    def summary(self) -> str:
+        """Return the radius as designed, and that expected under all tolerances."""
+        design = 1e3 * self.contributions.nominal**0.5
+        expected = 1e3 * self.contributions.expected_rms
+        return (
+            f"RMS radius over all spots, refocused: {number(design, 4)} µm as designed, "
+            f"{number(expected, 4)} µm expected under all tolerances together (linear ray model)."
+        )
+
+
+def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
+    """Find the worst offenders of a lens.
+
+    Args:
+        lens: as designed, in double precision; it stays as it is.
+        where: fields, which are taken on both sides of the axis in x and in y, and wavelengths.
+        source: `default`, or a YAML file; see the module.
+
+    Raises:
+        InputError: the file cannot be read or names what the lens does not have, or no light of
+            a field passes.
+    """
+    lens = copy.deepcopy(lens).requires_grad_(True)
+    notes: list[str] = []
+    if str(source) == DEFAULT:
+        _add_elements(lens)
+        given, factor = _usual(lens, notes), 1.0
+    else:
+        given, factor = _read(lens, Path(source), notes)
+    tolerances = tolerances_from(lens, given, factor)
+    fields = _all_around(where.fields.tolist())
+    spots = gaussian_quadrature(
+        lens,
+        fields,
+        where.wavelengths.tolist(),
+        _RINGS,
+        _ARMS,
+        where.object_distance,
+        symmetry=False,
+    )
+    model = linear_spots(lens, spots, tolerances.names)
+    weights = spot_weights(None, spots.count)
+    return Offenders(
+        tolerances,
+        sensitivities(model, tolerances.steps, weights),
+        contributions(model, tolerances, weights),
+        notes,
+    )
+
+
+def _all_around(fields: list[list[float]]) -> list[tuple[float, float]]:
+    """Return fields along y on all four sides of the axis: a perturbed lens has no symmetry."""
+    found: dict[tuple[float, float], None] = {}
+    for x, y in fields:
+        for point in ((x, y), (-x, -y), (y, -x), (-y, x)):
+            found[(point[0] + 0.0, point[1] + 0.0)] = None
+    return list(found)
+
+
+def _add_elements(lens: Lens) -> None:
+    """Make an element of every group of cemented glass that belongs to none."""
+    taken = {n for e in lens.elements.values() for n in range(e.first, e.last + 1)}
+    glass = [medium.name not in ("air", "occluder") for medium in lens.materials]
+    first = None
+    for n in range(1, len(lens.surfaces) + 1):
+        if first is None and glass[n]:
+            first = n
+        if first is not None and not glass[n]:
+            if taken.isdisjoint(range(first, n + 1)):
+                lens.elements[_free(f"element {first}–{n}", lens.elements)] = Element(
+                    first, n, dtype=lens.dtype
+                )
+            first = None
+
+
+def _free(name: str, elements: nn.ModuleDict) -> str:
+    return name if name not in elements else _free(f"{name}'", elements)
+
+
+def _usual(lens: Lens, notes: list[str]) -> dict[str, Any]:
+    """Return the tolerances of a lens that no file gives any."""
+    largest = 2.0 * max(surface.semi_diameter for surface in lens.surfaces.values())
+    length = min(_LENGTH, float(f"{_OF_DIAMETER * largest:.1g}"))
+    given: dict[str, Any] = {}
+    if lens.elements:
+        given["elements.*.tilt_[xy]"] = _TILT
+        given["elements.*.decenter_[xy]"] = length
+        given["elements.*.shift_z"] = length
+    for n, medium in enumerate(lens.materials[1:-1], 1):
+        if medium.name not in ("air", "occluder"):
+            given[f"thicknesses.{n}"] = length
+    for n, surface in lens.surfaces.items():
+        curvature = getattr(surface, "curvature", None)
+        if curvature is not None and float(curvature.detach()) != 0.0:
+            given[f"surfaces.{n}.curvature"] = {"half_range": _CURVATURE, "relative": True}
+    notes.append(
+        f"Usual tolerances, uniform over ± the half-range: elements tilt by {_TILT:g}°, and are "
+        f"decentred and shifted by {length:g} mm; glass thickness {length:g} mm; curvatures "
+        f"{100 * _CURVATURE:g} %."
+    )
+    return given
+
+
+def _read(lens: Lens, path: Path, notes: list[str]) -> tuple[Mapping[str, Any], Any]:
+    """Return the tolerances of a file and their factor; the lens gets the file's elements."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"--tolerances: {path}: cannot be read ({error.strerror})") from None
+    content = decode_yaml(data, path)
+    require_mapping(content, str(path))
+    elements = content.get("elements")
+    if "defaults" in content:
+        # An experiment's file: it also says how its own run is done.
+        own = content.get("lens")
+        if isinstance(own, Mapping):
+            elements = own.get("elements")
+        unread = [str(key) for key in content if key not in (*_OWN_KEYS, "defaults", "lens")]
+        if unread:
+            notes.append(f"Not read from {path.name}: {', '.join(unread)}.")
+    else:
+        check_keys(content, _OWN_KEYS, str(path))
+    if "tolerances" not in content:
+        raise InputError(f"{path}: 'tolerances' is missing")
+    if elements is not None:
+        for name, element in elements_from(elements, lens.dtype, str(path)).items():
+            lens.elements[name] = element
+    notes.append(f"Tolerances of {path.name}.")
+    return content["tolerances"], content.get("tolerance_factor", 1.0)

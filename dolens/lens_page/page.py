@@ -1,0 +1,184 @@
+"""The page of a lens is written: one file that needs nothing else."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+
+from dolens.errors import InputError
+from dolens.lens_page.inline_svg import holds_pictures, inline_svg, rasterise
+from dolens.lens_page.markup import (
+    GENERATOR,
+    Block,
+    figure_html,
+    note_html,
+    page_html,
+    problem_html,
+    table_html,
+)
+from dolens.lens_page.overview import Overview, lens_overview
+from dolens.lens_page.preparation import prepared_lens
+from dolens.lens_page.sections import Content, PageSections, Section
+from dolens.lens_page.tables import field_text, number
+from dolens.optics.lens import Lens
+from dolens.plotting.export import save_figure
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass
+class Written:
+    """What `write_page` wrote.
+
+    Attributes:
+        sections: on the page.
+        figures: on the page, or in the folder.
+        problems: section and reason of whatever could not be computed; the page says so too.
+    """
+
+    sections: int = 0
+    figures: int = 0
+    problems: list[tuple[str, str]] = field(default_factory=list)
+
+
+def write_page(
+    lens: Lens,
+    path: str | Path | None,
+    fields: Sequence[Sequence[float]] | None = None,
+    wavelengths: Sequence[float] | None = None,
+    f_number: float | None = None,
+    entrance_pupil_diameter: float | None = None,
+    tolerances: str | Path | None = None,
+    figures: str | Path | None = None,
+    command: str = "",
+    progress: Progress | None = None,
+) -> Written:
+    """Write a page about a lens: its section, its aberrations, and what a designer asks for.
+
+    The page is one HTML file with figures, tables and a view in space that can be turned; it needs
+    no network.  What cannot be computed is named on the page, with the reason, in its place.
+
+    Args:
+        lens: stays as it is.
+        path: the page's file; None writes figures only.
+        fields: (x, y) of each, degrees for an object at infinity, else mm; None for the lens's own.
+        wavelengths: nm; None for the lens's own.
+        f_number: sets the stop; or
+        entrance_pupil_diameter: mm, sets the stop.
+        tolerances: `default`, or a YAML file (see `dolens.lens_page.offenders`), adds the worst
+            offenders; None leaves them out.
+        figures: a folder that gets every figure as PNG and SVG.
+        command: what made the page, for its heading.
+
+    Rarely needed:
+        progress: is called with a title, the steps done and the number of all steps.
+
+    Raises:
+        InputError: a setting is out of range, or a file cannot be written.
+    """
+    lens = prepared_lens(lens, fields, wavelengths, f_number, entrance_pupil_diameter)
+    overview = lens_overview(lens)
+    listed = PageSections(lens, overview, tolerances).sections()
+    written = Written()
+    blocks = _overview_blocks(overview, written)
+    said = progress or (lambda title, done, total: None)
+    for at, section in enumerate(listed):
+        said(section.title, at, len(listed))
+        blocks.append(_block(section, path is not None, figures, written))
+    said("done", len(listed), len(listed))
+    # The section and the view in space come first, before the tables.
+    tables, drawings = blocks[: len(overview.sections)], blocks[len(overview.sections) :]
+    blocks = [*drawings[:2], *tables, *drawings[2:]]
+    if path is not None:
+        _write(Path(path), page_html(overview.name, _facts(lens, overview), command, blocks))
+    written.sections = len(blocks)
+    return written
+
+
+def is_page(path: str | Path) -> bool:
+    """Return whether a file is a page that `write_page` wrote."""
+    with Path(path).open("rb") as file:
+        return f'name="generator" content="{GENERATOR} '.encode() in file.read(600)
+
+
+def _overview_blocks(overview: Overview, written: Written) -> list[Block]:
+    blocks = []
+    for section in overview.sections:
+        body = "".join(map(problem_html, section.problems)) + "".join(
+            map(table_html, section.tables)
+        )
+        written.problems += [(section.title, problem) for problem in section.problems]
+        name = re.sub(r"[^a-z]+", "-", section.title.lower())
+        blocks.append(Block(name, section.title, body))
+    return blocks
+
+
+def _block(section: Section, drawn: bool, folder: str | Path | None, written: Written) -> Block:
+    """Compute a section; where that fails the section says why."""
+    try:
+        content = section.make()
+        body = _body(section, content, drawn, folder, written)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+    except Exception as error:
+        known = isinstance(error, InputError)
+        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        reason = " ".join(reason.split())
+        written.problems.append((section.title, reason))
+        body = problem_html(reason)
+    return Block(section.name, section.title, body)
+
+
+def _body(
+    section: Section, content: Content, drawn: bool, folder: str | Path | None, written: Written
+) -> str:
+    parts = [note_html(content.note), content.html]
+    for name, figure in content.figures.items():
+        written.figures += 1
+        if drawn:
+            label = escape(f"{section.title}: {name.replace('_', ' ')}")
+            svg = inline_svg(figure, re.sub(r"\W", "", name), label)
+            parts.append(figure_html(svg, holds_pictures(figure)))
+        if folder is not None:
+            rasterise(figure)
+            for suffix in (".png", ".svg"):
+                save_figure(figure, Path(folder) / f"{name}{suffix}", dpi=200)
+    written.problems += [(section.title, problem) for problem in content.problems]
+    parts += [problem_html(problem) for problem in content.problems]
+    parts += [table_html(table) for table in content.tables]
+    return "".join(parts)
+
+
+def _facts(lens: Lens, overview: Overview) -> list[tuple[str, str]]:
+    """Return what the heading says."""
+    where = overview.conditions
+    first = lens.first_order(where.reference_wavelength, where.object_distance)
+    facts = [
+        ("focal length", f"{number(first.efl)} mm"),
+        ("F-number", number(abs(float(first.f_number)), 4)),
+    ]
+    if where.object_distance is not None:
+        facts.append(("object at", f"{number(where.object_distance)} mm"))
+        facts.append(("working F-number", number(abs(float(first.working_f_number)), 4)))
+    facts.append(
+        ("fields", ", ".join(field_text(point, where.field_unit) for point in where.fields))
+    )
+    waves = [
+        f"{float(wave):g}{'*' if float(wave) == where.reference_wavelength else ''}"
+        for wave in where.wavelengths
+    ]
+    if len(waves) == 1:
+        waves = [waves[0].rstrip("*")]
+    facts.append(("wavelengths", f"{', '.join(waves)} nm"))
+    if lens.sensor_diameter:
+        facts.append(("image circle", f"{number(lens.sensor_diameter)} mm"))
+    facts.append(("indices", lens.index_model))
+    return facts
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from None

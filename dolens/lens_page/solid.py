@@ -1,0 +1,270 @@
+"""A lens is described in space: surfaces as meshes, glass between them, rays of its fields."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.vignetting import VignettedPupils
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+from dolens.optics.rays import Rays
+from dolens.optics.surfaces.clear_aperture import Outline
+from dolens.optics.system import OpticalSystem
+from dolens.plotting.section import sag_of
+
+AZIMUTHS = 64
+_RINGS = 10
+# Rays start this far in front of the lens, in units of the distance from lens to sensor.
+_LEAD = 0.12
+# Azimuths of the rays on the edge of a beam, and how far inside of it they run.
+_RIM, _INSIDE = 16, 0.995
+_ALONG = (0.33, 0.67)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh of quadrilaterals, mm, in the lens's axes.
+
+    Attributes:
+        kind: `glass` (a refracting surface), `side` (of an element), `cap` (where the half in
+            front of the plane x = 0 is cut away), `stop`, `block` (an obscuration) or `sensor`.
+        positions: (rings, around, 3), float32; neighbours are joined.
+        normals: (rings, around, 3), float32, unit vectors.
+        closed: whether the last point of a ring is joined with the first.
+    """
+
+    kind: str
+    positions: np.ndarray
+    normals: np.ndarray
+    closed: bool = True
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A lens in space.
+
+    Attributes:
+        meshes: of everything but rays.
+        rims: (points, 3) each, mm: the edges of surfaces.
+        rays: for each field, paths (points, 3), mm, from in front of the lens to the sensor.
+    """
+
+    meshes: list[Mesh]
+    rims: list[np.ndarray]
+    rays: list[list[np.ndarray]]
+
+
+@torch.no_grad()
+def solid(lens: Lens, where: Conditions) -> Solid:
+    """Describe a lens in space with rays of its fields at the reference wavelength.
+
+    Args:
+        lens: in double precision, on the CPU.
+        where: fields and the object's distance.
+    """
+    system = lens.system()
+    rays = [_field_rays(lens, where, number) for number in range(len(where.fields))]
+    meshes: list[Mesh] = []
+    rims: list[np.ndarray] = []
+    count = len(system.surfaces)
+    glass = [_is_glass(system, number) for number in range(count + 1)]
+    for number in range(1, count + 1):
+        surface = system.surfaces[number - 1]
+        if glass[number - 1] or glass[number]:
+            meshes.append(_surface_mesh(system, number, "glass", surface.aperture.edge))
+            rims.append(_rim(system, number, 1.0, close=True))
+        if surface.aperture.obscuration is not None:
+            meshes.append(_surface_mesh(system, number, "block", surface.aperture.obscuration))
+        if number < count and glass[number]:
+            meshes.extend(_sides(system, number))
+    meshes.append(_stop(system))
+    meshes.append(_sensor(lens, rays))
+    return Solid(meshes, rims, rays)
+
+
+def _is_glass(system: OpticalSystem, number: int) -> bool:
+    return system.materials[number].name not in ("air", "occluder")
+
+
+def _placed(system: OpticalSystem, number: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return points (..., 3) of a surface in the lens's axes, at x and y in its own."""
+    sag, _, _, _ = sag_of(system, number, torch.from_numpy(x), torch.from_numpy(y))
+    return _turned(system, number, np.stack([x, y, sag.numpy()], -1), True)
+
+
+def _turned(system: OpticalSystem, number: int, vectors: np.ndarray, moved: bool) -> np.ndarray:
+    """Return points (moved) or directions in a surface's axes in those of the lens."""
+    axes = system.axes[number - 1]
+    if axes.rotation is None:
+        return vectors + (np.array([0.0, 0.0, float(axes.z)]) if moved else 0.0)
+    turned = vectors @ axes.rotation.double().numpy().T
+    return turned + axes.origin.double().numpy() if moved else turned
+
+
+def _edge(outline: Outline) -> np.ndarray:
+    """Return x and y of an outline at even azimuths, (azimuths, 2); corners are kept."""
+    angle = np.linspace(0.0, 2.0 * math.pi, AZIMUTHS, endpoint=False)
+    unit = np.stack([np.cos(angle), np.sin(angle)], -1)
+    if outline.rotational:
+        return outline.semi_diameter * unit
+    half = np.array(outline.extent)
+    # Azimuths of a square hit all four corners; stretched, they hit those of the rectangle.
+    return half * unit / np.abs(unit).max(-1, keepdims=True)
+
+
+def _surface_mesh(system: OpticalSystem, number: int, kind: str, outline: Outline) -> Mesh:
+    """Return a surface over an outline, ring by ring from its vertex."""
+    edge = _edge(outline)
+    share = np.concatenate([[0.0], np.sqrt(np.linspace(0.0, 1.0, _RINGS + 1)[1:])])
+    x, y = (share[:, None] * edge[None, :, axis] for axis in (0, 1))
+    _, sx, sy, _ = sag_of(system, number, torch.from_numpy(x), torch.from_numpy(y))
+    normals = np.stack([-sx.numpy(), -sy.numpy(), np.ones_like(x)], -1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return _mesh(
+        kind,
+        _placed(system, number, x, y),
+        np.broadcast_to(_turned(system, number, normals, False), (*x.shape, 3)),
+    )
+
+
+def _mesh(kind: str, positions: np.ndarray, normals: np.ndarray | None = None) -> Mesh:
+    """Return a mesh of closed rings (R, azimuths, 3); without normals, with those of its shape."""
+    if normals is None:
+        along = np.gradient(positions, axis=0)
+        across = np.roll(positions, -1, 1) - np.roll(positions, 1, 1)
+        normals = np.cross(across, along)
+        length = np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = normals / np.where(length > 0.0, length, 1.0)
+    return Mesh(kind, positions.astype("<f4"), normals.astype("<f4"))
+
+
+def _rim(system: OpticalSystem, number: int, scale: float = 1.0, close: bool = False) -> np.ndarray:
+    edge = scale * _edge(system.surfaces[number - 1].aperture.edge)
+    points = _placed(system, number, edge[:, 0], edge[:, 1])
+    return np.concatenate([points, points[:1]]) if close else points
+
+
+def _sides(system: OpticalSystem, number: int) -> list[Mesh]:
+    """Return the ground edge of the glass behind a surface, and its section.
+
+    The edge is a flat outwards, and a cylinder.
+    Where the flat would cut through the larger surface, the edge is a straight cone.
+    """
+    front, back = _rim(system, number), _rim(system, number + 1)
+    sizes = [system.surfaces[n - 1].aperture.edge for n in (number, number + 1)]
+    together = system.axes[number - 1].elements == system.axes[number].elements
+    round_faces = all(size.rotational for size in sizes)
+    small, large = (
+        (number, number + 1)
+        if sizes[0].semi_diameter < sizes[1].semi_diameter
+        else (
+            number + 1,
+            number,
+        )
+    )
+    ratio = max(size.semi_diameter for size in sizes) / min(size.semi_diameter for size in sizes)
+    if together and round_faces and ratio > 1.0 + 1e-9:
+        # The smaller face's rim, widened in its own plane.
+        edge = _edge(sizes[small - number])
+        rim = np.zeros((AZIMUTHS, 3))
+        rim[:, :2] = edge
+        sag, _, _, _ = sag_of(
+            system, small, torch.from_numpy(edge[:, 0]), torch.from_numpy(edge[:, 1])
+        )
+        rim[:, 2] = sag.numpy()
+        wide = rim * np.array([ratio, ratio, 1.0])
+        corner = _turned(system, small, wide, True)
+        flat = _turned(system, small, rim, True)
+        share = np.linspace(1.0 / ratio, 1.0, 8)[:, None]
+        outer = _edge(sizes[large - number])
+        beyond = _placed(system, large, share * outer[None, :, 0], share * outer[None, :, 1])
+        sense = 1.0 if large > small else -1.0
+        if float((sense * (beyond[..., 2] - corner[None, :, 2])).min()) >= 0.0:
+            other = back if large > small else front
+            ends = corner[[3 * AZIMUTHS // 4, AZIMUTHS // 4]]
+            return [
+                _mesh("side", np.stack([flat, corner])),
+                _mesh("side", np.stack([corner, other])),
+                _cap(system, number, ends),
+            ]
+    return [_mesh("side", np.stack([front, back])), _cap(system, number, None)]
+
+
+def _cap(system: OpticalSystem, number: int, corners: np.ndarray | None) -> Mesh:
+    """Return the section of the glass behind a surface, between the profiles of its faces.
+
+    Args:
+        system: the lens.
+        number: of the surface.
+        corners: (2, 3), mm, where the ground edge turns, below and above; None where it does not.
+    """
+    share = np.linspace(-1.0, 1.0, 2 * _RINGS + 1)
+    lines = []
+    for n in (number, number + 1):
+        y = share * system.surfaces[n - 1].aperture.edge.extent[1]
+        lines.append(_placed(system, n, np.zeros_like(y), y))
+    front, back = lines
+    if corners is not None:
+        # A triangle at either end, as quadrilaterals with two corners in one.
+        front = np.concatenate([corners[:1], front, corners[1:]])
+        back = np.concatenate([corners[:1], back, corners[1:]])
+    positions = np.stack([front, back]).astype("<f4")
+    normals = np.broadcast_to(np.array([-1.0, 0.0, 0.0], dtype="<f4"), positions.shape)
+    return Mesh("cap", positions, normals, closed=False)
+
+
+def _stop(system: OpticalSystem) -> Mesh:
+    """Return a ring around the stop's edge, in the plane of its rim."""
+    edge = _edge(system.surfaces[system.stop - 1].aperture.edge)
+    largest = max(surface.semi_diameter for surface in system.surfaces)
+    outer = edge * (1.0 + 0.22 * largest / np.linalg.norm(edge, axis=-1).max())
+    sag, _, _, _ = sag_of(
+        system, system.stop, torch.from_numpy(edge[:, 0]), torch.from_numpy(edge[:, 1])
+    )
+    rings = [np.concatenate([ring, sag.numpy()[:, None]], -1) for ring in (edge, outer)]
+    return _mesh("stop", _turned(system, system.stop, np.stack(rings), True))
+
+
+def _sensor(lens: Lens, rays: Sequence[Sequence[np.ndarray]]) -> Mesh:
+    """Return the sensor plane: the prescription's image circle, or what holds all rays."""
+    z = float(lens.system().vertices[-1])
+    ends = [np.hypot(*path[-1, :2]) for field in rays for path in field]
+    reach = 0.5 * lens.sensor_diameter if lens.sensor_diameter else 1.1 * max(ends, default=1.0)
+    angle = np.linspace(0.0, 2.0 * math.pi, AZIMUTHS, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(AZIMUTHS)], -1) * max(reach, 1e-6)
+    positions = np.stack([0.0 * ring, ring]) + np.array([0.0, 0.0, z])
+    return _mesh("sensor", positions, np.broadcast_to(np.array([0.0, 0.0, -1.0]), positions.shape))
+
+
+def _field_rays(lens: Lens, where: Conditions, number: int) -> list[np.ndarray]:
+    """Return rays on the edge of a field's beam, along two diameters and its middle."""
+    field = where.fields[number : number + 1]
+    pupils = VignettedPupils(lens, field, where.object_distance)
+    try:
+        centre = pupils.centres(torch.zeros(1, dtype=torch.bool))
+    except InputError:
+        return []
+    angle = torch.arange(_RIM, dtype=torch.float64) * (2.0 * math.pi / _RIM)
+    arms = torch.stack([angle.cos(), angle.sin()], -1)[None]
+    reach = pupils.boundary_radius(centre, arms)[..., None]
+    rim = centre[:, None] + _INSIDE * reach * arms
+    quarter = _RIM // 4
+    inner = [centre[:, None]]
+    inner += [centre[:, None] + part * reach[:, ::quarter] * arms[:, ::quarter] for part in _ALONG]
+    aimed = pupils.aim(torch.cat([rim, *inner], 1))
+    hit = lens.trace(Rays(aimed.position, aimed.direction, aimed.wavelength), record=True)
+    sensor = float(lens.system().vertices[-1])
+    points = torch.cat([hit.points, hit.position[None]])[:, 0].transpose(0, 1)
+    passing = (hit.valid & aimed.converged)[0]
+    start, along = aimed.position[0], aimed.direction[0]
+    front = min(0.0, float(points[passing][:, 0, 2].min())) if bool(passing.any()) else 0.0
+    lead = front - _LEAD * sensor
+    if where.object_distance is not None:
+        lead = max(lead, -where.object_distance)
+    begin = start + along * ((lead - start[:, 2:]) / along[:, 2:])
+    paths = torch.cat([begin[:, None], points], 1)
+    return [path.numpy().astype("<f4") for path in paths[passing]]

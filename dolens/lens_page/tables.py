@@ -1,0 +1,268 @@
+"""The tables of a lens: its prescription, first-order data, Seidel sums and spot radii."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.conditions import Conditions, field_scans, spectral_lines
+from dolens.analysis.spot_diagram import AIRY, SpotDiagram
+from dolens.errors import InputError
+from dolens.optics.elements import POSE, TILTS
+from dolens.optics.lens import Lens
+from dolens.optics.prescription_table import SurfaceRow, prescription_table
+from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.clear_aperture import Circle, Outline, Rectangle, Unlimited
+
+SEIDEL_HEADS = ("S I", "S II", "S III", "S IV", "S V", "C L", "C T")
+SEIDEL_NAMES = (
+    *("spherical", "coma", "astigm.", "Petzval", "distort."),
+    *("axial col.", "lateral col."),
+)
+# Columns of coefficients that a page is wide enough for.
+_MOST_TERMS = 8
+
+
+@dataclass(frozen=True)
+class Table:
+    """A `Table` holds cells as text, ready for a terminal or a page.
+
+    Attributes:
+        heads: of the columns.
+        rows: cells, as many in each as there are heads.
+        caption: what the numbers are, with units.
+        words: the columns that hold words; they are aligned left, and numbers right.
+        total: whether the last row is a total.
+        lit: numbers of rows that are set apart.
+        numbered: whether the first column numbers the rows.
+    """
+
+    heads: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    caption: str = ""
+    words: frozenset[int] = frozenset({0})
+    total: bool = False
+    lit: frozenset[int] = frozenset()
+    numbered: bool = False
+
+
+def number(value: float | Tensor, digits: int = 5) -> str:
+    """Return a number with so many significant digits, a true minus and the sign of infinity."""
+    value = float(value)
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0.0 else "−∞"
+    text = f"{value:.{digits}g}"
+    mantissa, e, exponent = text.partition("e")
+    if not e and abs(value) >= 1e-4:
+        # As many digits for 22.000 as for 22.014, without an exponent for large numbers.
+        mantissa = f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}"
+        mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
+    sign = f"e{int(exponent):d}" if e else ""
+    return (mantissa + sign).replace("-", "−")
+
+
+def prescription_tables(lens: Lens) -> list[Table]:
+    """Return the surfaces of a lens, one a row; its aspheric terms; and the poses of elements."""
+    found = prescription_table(lens)
+    conics = any(row.conic for row in found.surfaces)
+    # A name such as 1.5168/64.17 says nd and Vd already.
+    named = any(not row.material[:1].isdigit() and _is_glass(row) for row in found.surfaces)
+    rows = []
+    for row, surface in zip(found.surfaces, lens.surfaces.values(), strict=True):
+        cells = [str(row.number), row.kind.replace("_", " ") + " (stop)" * row.stop]
+        cells += ["" if row.radius is None else number(row.radius, 6), number(row.thickness, 6)]
+        cells.append("air" if row.material == "occluder" else row.material)
+        if named:
+            vd = "" if math.isinf(row.abbe_number) else f"{row.abbe_number:.2f}"
+            cells += [f"{row.index_d:.5f}", vd] if _is_glass(row) else ["", ""]
+        cells.append(_aperture(surface))
+        if conics:
+            cells.append(number(row.conic) if row.conic else "")
+        rows.append(tuple(cells))
+    size = number(0.5 * found.sensor_diameter) if found.sensor_diameter else ""
+    rows.append(("", "sensor", "∞", "", "", *[""] * (2 * named), size, *[""] * conics))
+    heads = ("#", "type", "radius", "thickness", "medium", *("nd", "Vd") * named)
+    heads += ("semi-diam.", *("conic",) * conics)
+    inside = (
+        [] if found.object_material == "air" else [f"The object is in {found.object_material}."]
+    )
+    caption = " ".join(["Lengths in mm; the medium is the one behind the surface.", *inside])
+    surfaces = Table(
+        heads, rows, caption, frozenset({1, 4}), lit=frozenset({lens.stop - 1}), numbered=True
+    )
+    more = [_terms_table(lens), elements_table(lens)]
+    return [surfaces, *(table for table in more if table is not None)]
+
+
+def _terms_table(lens: Lens) -> Table | None:
+    """Return coefficients beyond radius and conic, one surface a row; None where there are none."""
+    found = [(str(row.number), row.terms) for row in prescription_table(lens).surfaces if row.terms]
+    names = list(dict.fromkeys(name for _, terms in found for name in terms))
+    sized = {
+        n: ", ".join(
+            f"{name} ({' × '.join(map(str, value.shape))})"
+            for name, value in surface.named_parameters()
+            if value.ndim
+        )
+        for n, surface in lens.surfaces.items()
+    }
+    sized = {n: text for n, text in sized.items() if text}
+    if not found and not sized:
+        return None
+    if len(names) <= _MOST_TERMS and not sized:
+        rows = [
+            (n, *(number(terms[name]) if name in terms else "" for name in names))
+            for n, terms in found
+        ]
+        return Table(
+            ("#", *names), rows, "Coefficients, in powers of mm.", frozenset(), numbered=True
+        )
+    rows = []
+    for n in lens.surfaces:
+        terms = dict(found).get(n, {})
+        texts = [f"{name} {number(value)}" for name, value in terms.items() if value]
+        if n in sized:
+            texts.append(sized[n])
+        if terms or n in sized:
+            rows.append((n, ", ".join(texts) or "all zero"))
+    return Table(("#", "coefficients"), rows, "In powers of mm.", frozenset({1}), numbered=True)
+
+
+def elements_table(lens: Lens) -> Table | None:
+    """Return the poses of elements, one a row; None where a lens has none."""
+    if not lens.elements:
+        return None
+    rows = []
+    for name, element in lens.elements.items():
+        pose = {
+            key: math.degrees(value) if key in TILTS else float(value.detach())
+            for key, value in element.named_parameters()
+        }
+        pivot = ", ".join(number(entry) for entry in element.pivot)
+        cells = (number(pose[key]) for key in POSE)
+        rows.append((name, f"{element.first}–{element.last}", *cells, pivot))
+    heads = ("element", "surfaces", *(name.replace("_", " ") for name in POSE), "pivot")
+    return Table(heads, rows, "Tilts in degrees, lengths in mm.", frozenset({0, 1}))
+
+
+def first_order_table(lens: Lens, where: Conditions) -> Table:
+    """Return first-order data at the reference wavelength."""
+    wavelength, distance = where.reference_wavelength, where.object_distance
+    first = lens.first_order(wavelength, distance)
+    length = float(lens.system().vertices[-2])
+    sensor = float(lens.system().vertices[-1])
+    airy = AIRY * wavelength * 1e-3 * abs(float(first.working_f_number))
+    rows = [
+        ("effective focal length", first.efl, "mm"),
+        ("back focal distance", first.bfd, "mm behind the last vertex"),
+        ("front focal distance", first.ffd, "mm from the first vertex"),
+        ("F-number", first.f_number, "focal length over entrance pupil"),
+    ]
+    if distance is not None:
+        rows += [
+            ("working F-number", first.working_f_number, ""),
+            ("magnification", first.magnification, ""),
+            ("object distance", torch.tensor(distance), "mm in front of the first vertex"),
+        ]
+    rows += [
+        ("entrance pupil diameter", first.entrance_pupil.diameter, "mm"),
+        ("entrance pupil position", first.entrance_pupil.z, "mm from the first vertex"),
+        ("exit pupil diameter", first.exit_pupil.diameter, "mm"),
+        ("exit pupil position", first.exit_pupil.z, "mm from the first vertex"),
+        ("front principal plane", first.front_principal, "mm from the first vertex"),
+        ("rear principal plane", first.rear_principal, "mm from the first vertex"),
+        ("paraxial image", first.image - sensor, "mm behind the sensor"),
+        ("length of the lens", length, "mm, first to last vertex"),
+        ("total track", sensor, "mm, first vertex to sensor"),
+        ("Airy radius", airy, "µm on the sensor"),
+    ]
+    return Table(
+        ("first order", "value", "unit"),
+        [(name, number(value, 6), unit) for name, value, unit in rows],
+        f"At {wavelength:g} nm.",
+        frozenset({0, 2}),
+    )
+
+
+@torch.no_grad()
+def seidel_table(lens: Lens, where: Conditions) -> Table:
+    """Return Seidel sums in wavelengths, surface by surface, and their totals.
+
+    The field is the farthest of the lens's own, or its full field where all are on the axis.
+    """
+    wavelength, distance = where.reference_wavelength, where.object_distance
+    try:
+        edge = float(field_scans(lens, distance, count=2)[0].coordinate.abs().max())
+    except InputError:
+        edge = 0.0
+    lines = spectral_lines(lens)
+    short, long = min(lines), max(lines)
+    sums = lens.seidel(edge, wavelength, distance, (short, long))
+    waves = torch.stack(list(sums)).T / (1e-6 * wavelength)
+    rows = [(str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)]
+    rows.append(("total", *(_fixed(value) for value in waves.sum(0).tolist())))
+    unit = where.field_unit if where.field_unit == "°" else " mm"
+    posed = "  They are those of the centred lens, without poses." if lens.elements else ""
+    return Table(
+        ("#", *(f"{h}\n{n}" for h, n in zip(SEIDEL_HEADS, SEIDEL_NAMES, strict=True))),
+        rows,
+        f"In wavelengths of {wavelength:g} nm, at a field of {number(edge, 4)}{unit}; colours from "
+        f"{short:g} to {long:g} nm.{posed}",
+        frozenset(),
+        total=True,
+    )
+
+
+def spot_radii_table(spots: SpotDiagram, polychromatic: bool = True) -> Table:
+    """Return RMS spot radii in µm: a row for each field, a column for each wavelength."""
+    many = len(spots.wavelengths) > 1 and polychromatic
+    heads = ("field", *(f"{float(wave):g} nm" for wave in spots.wavelengths))
+    rows = []
+    for at, point in enumerate(spots.fields):
+        cells = [number(1e3 * value, 4) for value in spots.rms[at].tolist()]
+        if many:
+            cells.append(number(1e3 * float(spots.polychromatic_rms[at]), 4))
+        rows.append((field_text(point, spots.field_unit), *cells))
+    airy = [number(1e3 * value, 4) for value in spots.airy_radius.tolist()]
+    rows.append(("Airy radius", *airy, *[""] * many))
+    caption = "RMS radii in µm about the centroid of each spot"
+    caption += "; polychromatic: about that of all wavelengths together." if many else "."
+    if bool(spots.rms.isnan().any()):
+        caption += "  – : no light passes."
+    return Table(heads + ("polychromatic",) * many, rows, caption, total=True)
+
+
+def field_text(point: Sequence[float] | Tensor, unit: str) -> str:
+    """Return a field as text: `14°`, `(3, 14)°`, `−2 mm`."""
+    x, y = (number(value, 6) for value in point)
+    space = "" if unit == "°" else " "
+    return f"{y}{space}{unit}" if x == "0" else f"({x}, {y}){space}{unit}"
+
+
+def _fixed(value: float) -> str:
+    """Return a Seidel sum with four decimals at most, aligned by its point."""
+    text = f"{value:.4f}" if abs(value) < 1e3 else f"{value:.1f}"
+    return text.replace("-", "−") if float(text) else "0"
+
+
+def _aperture(surface: Surface) -> str:
+    inner = surface.aperture.obscuration
+    return _outline(surface.aperture.edge) + (f", obscured {_outline(inner)}" if inner else "")
+
+
+def _outline(outline: Outline) -> str:
+    match outline:
+        case Rectangle():
+            return f"{number(outline.half_width_x)} × {number(outline.half_width_y)}"
+        case Unlimited():
+            return f"({number(outline.semi_diameter)}, does not clip)"
+        case Circle():
+            return number(outline.semi_diameter)
+
+
+def _is_glass(row: SurfaceRow) -> bool:
+    return row.material not in ("air", "occluder")

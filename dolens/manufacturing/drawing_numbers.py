@@ -1,0 +1,213 @@
+"""The numbers of a drawing as text, per surface, glass and element."""
+
+import math
+import re
+
+import numpy as np
+
+from dolens.manufacturing.glass_elements import Face, GlassElement
+from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
+from dolens.optics.glass_catalog import Glass
+from dolens.optics.materials import abbe_number, index_d
+from dolens.optics.surfaces.b_spline import BSpline
+from dolens.optics.surfaces.clear_aperture import Circle, Rectangle
+from dolens.optics.surfaces.conic import Conic
+from dolens.optics.surfaces.xy_polynomial import XYPolynomial
+
+_EVEN = re.compile(r"a\d+")
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+EQUATIONS = {
+    "conic": r"$z=\dfrac{r^2/R}{1+\sqrt{1-(1+k)\,r^2/R^2}}$",
+    "asphere": r"$z=\dfrac{r^2/R}{1+\sqrt{1-(1+k)\,r^2/R^2}}+\sum_i a_i\,r^i$",
+    "polynomial": r"$z=\sum_{ij} a_{ij}\,x^i y^j$",
+    "implicit": r"$z=\sum_{ij} a_{ij}\,x^i y^j+b\,z^2$",
+}
+
+
+def length(value: float, least: int = 3, most: int = 6) -> str:
+    """Return a length in mm, with three to six decimals; a minus is a minus sign."""
+    text = number(value, most).rstrip("0")
+    whole, _, decimals = text.partition(".")
+    return f"{whole}.{decimals.ljust(least, '0')}"
+
+
+def number(value: float, decimals: int) -> str:
+    """Return a number with its decimals; a minus is a minus sign, and zero has none."""
+    text = f"{value:.{decimals}f}"
+    return text.replace("-", "" if float(text) == 0.0 else "−")
+
+
+def coefficient(value: float) -> str:
+    """Return a coefficient with nine digits."""
+    return f"{value:.8e}".replace("-", "−")
+
+
+def radius_text(face: Face, is_front: bool) -> str:
+    """Return `R 22.014 CX`, `R ∞ (plane)`, or what the surface is where it has no radius.
+
+    The radius is a magnitude: CX (convex) bulges out of the glass, CC (concave) into it.
+    """
+    if face.flat:
+        return "R ∞ (plane)"
+    if not issubclass(face.shape, Conic):
+        kind = "cubic B-spline" if issubclass(face.shape, BSpline) else face.shape.kind
+        return f"freeform: {kind.replace('_', ' ')}"
+    curvature = float(face.parameters["curvature"])
+    if curvature == 0.0:
+        return "R ∞, aspheric"
+    convex = (curvature > 0.0) == is_front
+    return f"R {length(abs(1.0 / curvature))} {'CX' if convex else 'CC'}"
+
+
+def signed_radius(face: Face) -> str:
+    """Return the radius with its sign, positive where the centre lies towards +z, or the kind."""
+    if face.flat:
+        return "∞"
+    if not issubclass(face.shape, Conic):
+        return "freeform"
+    c = float(face.parameters["curvature"])
+    return (length(1.0 / c) if c else "∞") + (" asphere" if is_aspheric(face) else "")
+
+
+def is_aspheric(face: Face) -> bool:
+    """Return whether a surface is neither a plane nor a sphere."""
+    if face.flat:
+        return False
+    further = [p for name, p in face.parameters.items() if name != "curvature"]
+    return not issubclass(face.shape, Conic) or any(bool((p != 0.0).any()) for p in further)
+
+
+def equation(face: Face) -> str | None:
+    """Return the equation of an aspheric surface's sag as mathematical text, or None."""
+    if not is_aspheric(face):
+        return None
+    if issubclass(face.shape, XYPolynomial):
+        return EQUATIONS["implicit" if "b" in face.parameters else "polynomial"]
+    if issubclass(face.shape, Conic):
+        higher = any(_EVEN.fullmatch(name) and float(p) for name, p in face.parameters.items())
+        return EQUATIONS["asphere" if higher else "conic"]
+    return None
+
+
+def coefficient_rows(face: Face) -> list[tuple[str, str]]:
+    """Return name and value of what shapes an aspheric surface, beside its radius."""
+    if not is_aspheric(face):
+        return []
+    if issubclass(face.shape, Conic):
+        c = float(face.parameters["curvature"])
+        side = "towards +z" if c > 0.0 else "towards −z"
+        rows = [("R, signed", f"{length(1.0 / c)} mm ({side})")] if c else []
+    else:
+        rows = []
+    for name, value in face.parameters.items():
+        if name == "curvature" or value.dim() > 0:
+            continue
+        symbol = "k" if name == "conic" else name
+        if symbol == "k":
+            rows.append((symbol, length(float(value))))
+            continue
+        power = _power(name)
+        unit = f" mm{str(power).translate(_RAISED)}" if power != 0 else ""
+        rows.append((symbol, coefficient(float(value)) + unit))
+    if issubclass(face.shape, BSpline):
+        count = "×".join(map(str, face.parameters["coefficients"].shape))
+        rows.append(("coefficients", f"{count}, in the design's YAML file"))
+    return rows
+
+
+def clear_aperture_text(face: Face) -> str:
+    """Return the clear aperture: `Ø 19.000`, or the sides of a rectangle."""
+    edge = face.aperture.edge
+    text = (
+        f"{length(2.0 * edge.half_width_x)} × {length(2.0 * edge.half_width_y)}"
+        if isinstance(edge, Rectangle)
+        else f"Ø {length(2.0 * edge.semi_diameter)}"
+    )
+    obscured = face.aperture.obscuration
+    if obscured is None:
+        return text
+    if isinstance(obscured, Circle):
+        return f"{text}, obscured to Ø {length(2.0 * obscured.semi_diameter)}"
+    return f"{text}, obscured in the middle"
+
+
+def surface_rows(
+    element: GlassElement, is_front: bool, tolerances: ShopTolerances
+) -> list[tuple[str, str]]:
+    """Return the rows of a surface's column: name and text."""
+    face = element.front if is_front else element.back
+    rows = [("", radius_text(face, is_front))]
+    if "curvature" in face.parameters:
+        name = f"surfaces.{face.number}.curvature"
+        rows.append(("ΔR" if not face.flat else "Δ(1/R)", tolerances.of(name)))
+    rows += coefficient_rows(face)
+    rows.append(
+        (
+            "Øe" if not isinstance(face.aperture.edge, Rectangle) else "clear",
+            clear_aperture_text(face).removeprefix("Ø "),
+        )
+    )
+    cemented = element.cemented[0 if is_front else 1]
+    rows += [
+        ("chamfer", tolerances.said("chamfer")),
+        ("coating", "cemented" if cemented else tolerances.said("coating")),
+        ("3/ form", tolerances.said("form")),
+        ("4/ centring", tolerances.said("centring")),
+        ("5/ imperfections", tolerances.said("imperfections")),
+    ]
+    if is_aspheric(face):
+        rows.append(("roughness", tolerances.said("roughness")))
+    return rows
+
+
+def material_rows(element: GlassElement, tolerances: ShopTolerances) -> list[tuple[str, str]]:
+    """Return the rows of the glass's column: name, maker, nd, Vd, code, and quality."""
+    medium = element.material
+    nd, vd = index_d(medium), abbe_number(medium)
+    if isinstance(medium, Glass):
+        maker, _, name = medium.name.partition(":")
+        rows = [("glass", name), ("maker", maker)]
+    else:
+        rows = [("glass", medium.name), ("maker", f"glass of these nd, Vd: {AGREE}")]
+    rows += [("nd", f"{nd:.5f}"), ("Vd", "∞" if math.isinf(vd) else f"{vd:.2f}")]
+    if not math.isinf(vd) and nd < 2.0:
+        rows.append(("code", f"{round(1000 * (nd - 1.0)):03d}{round(10 * vd):03d}"))
+    return [
+        *rows,
+        ("0/ stress", tolerances.said("stress")),
+        ("1/ bubbles", tolerances.said("bubbles")),
+        ("2/ striae", tolerances.said("striae")),
+    ]
+
+
+def sag_rows(face: Face, count: int = 13) -> list[tuple[str, str, str]]:
+    """Return r, sag (mm) and slope (degrees) of a rotational asphere, from vertex to aperture."""
+    r = np.linspace(0.0, face.semi_diameter, count)
+    sag, slope, _, _ = face.sag_and_slopes(r, np.zeros_like(r))
+    return [
+        (length(a), length(b, 6), number(math.degrees(math.atan(c)), 4))
+        for a, b, c in zip(r, sag, slope, strict=True)
+    ]
+
+
+def sag_grid(face: Face, count: int = 7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return x, y (mm) and the sag (mm) on a grid over a freeform's aperture, NaN outside it."""
+    half_x, half_y = face.aperture.edge.extent
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, count), np.linspace(-half_y, half_y, count))
+    sag = face.sag(x, y)
+    if not isinstance(face.aperture.edge, Rectangle):
+        sag = np.where(np.hypot(x, y) <= face.semi_diameter * (1.0 + 1e-12), sag, np.nan)
+    return x[0], y[:, 0], sag
+
+
+def _power(name: str) -> int:
+    """Return the power of mm that a coefficient's unit has: 1 less the powers of its lengths."""
+    if name == "b":
+        return -1
+    if _EVEN.fullmatch(name):
+        return 1 - int(name[1:])
+    total = 0
+    for part in re.findall(r"[xy]\d*", name):
+        total += int(part[1:] or 1)
+    return 1 - total

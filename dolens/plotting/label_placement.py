@@ -1,0 +1,95 @@
+"""Labels of points are put where they cover neither points nor one another."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+
+# Where a label may stand about its point: direction, and distance in points of 1/72 inch, the
+# nearest first.
+_DISTANCES = (5.0, 11.0, 18.0, 27.0, 38.0)
+_DIRECTIONS = ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
+_PLACES = np.array([(d * x, d * y) for d in _DISTANCES for x, y in _DIRECTIONS])
+# A label farther out than this gets a line to its point.
+_NEAR = 11.0
+# Half the size of a marker, and the gap between texts.
+_MARKER, _GAP = 4.0, 1.5
+# Steps along a line between two of its points.
+_STEPS = 40
+
+
+def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], size: float) -> None:
+    """Write labels beside their points, within the axes, without covering anything drawn there.
+
+    The limits of the axes must be final, and everything else drawn.  A label far from its point
+    gets a thin line to it.  Where there is no free place, the least covered one is taken.
+
+    Args:
+        axes: with points and lines; its figure lays itself out once.
+        labels: text, x and y of the point, colour.
+        size: of the text, points of 1/72 inch.
+    """
+    if not labels:
+        return
+    figure = axes.get_figure(root=True)
+    figure.draw_without_rendering()
+    scale = figure.dpi / 72.0
+    frame = np.array(axes.get_window_extent().extents)
+    drawn = _drawn_points(axes)
+    half = _MARKER * scale
+    taken = np.concatenate([drawn - half, drawn + half], 1)
+    texts = [t.get_window_extent().extents for t in axes.texts if t.get_text()]
+    if axes.get_legend() is not None:
+        texts.append(axes.get_legend().get_window_extent().extents)
+    taken = np.concatenate([taken, np.array(texts).reshape(-1, 4)])
+    for text, x, y, colour in labels:
+        note = axes.annotate(
+            text,
+            (x, y),
+            xytext=(0.0, 0.0),
+            textcoords="offset points",
+            fontsize=size,
+            color=colour,
+            ha="center",
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "shrinkB": 3.0},
+        )
+        note.set_in_layout(False)
+        extent = note.get_window_extent()
+        reach = 0.5 * np.array([extent.width, extent.height])
+        # The text's centre, so far off that its nearest corner or side is at the wanted distance.
+        centres = _PLACES * scale + np.sign(_PLACES) * reach
+        point = axes.transData.transform((x, y))
+        gap = reach + _GAP * scale
+        boxes = np.concatenate([point + centres - gap, point + centres + gap], 1)
+        outside = np.prod(2.0 * gap) - _shared(boxes, frame[None])[:, 0]
+        cost = _shared(boxes, taken).sum(1) + 2.0 * outside
+        best = int(cost.argmin())
+        note.set_position(tuple(centres[best] / scale))
+        note.arrow_patch.set_visible(bool(np.abs(_PLACES[best]).max() > _NEAR))
+        taken = np.concatenate([taken, boxes[[best]]])
+
+
+def _drawn_points(axes: Axes) -> np.ndarray:
+    """Return everything drawn as points, pixels, (N, 2): markers, and lines at small steps."""
+    found = [np.zeros((0, 2))]
+    share = np.linspace(0.0, 1.0, _STEPS)[:, None, None]
+    for line in axes.get_lines():
+        if line.get_transform() != axes.transData:
+            continue
+        places = axes.transData.transform(line.get_path().vertices)
+        places = places[np.isfinite(places).all(1)]
+        found.append(places)
+        if line.get_linestyle() not in ("None", "none", "", " ") and len(places) > 1:
+            found.append((places[:-1] * (1.0 - share) + places[1:] * share).reshape(-1, 2))
+    for drawn in axes.collections:
+        offsets = np.asarray(drawn.get_offsets(), dtype=float).reshape(-1, 2)
+        found.append(axes.transData.transform(offsets))
+    return np.concatenate(found)
+
+
+def _shared(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the areas that boxes (A, 4) share with others (B, 4), as x0 y0 x1 y1: (A, B)."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return (high - low).clip(min=0.0).prod(-1)
