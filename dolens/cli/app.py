@@ -8,6 +8,9 @@ import sys
 
 import typer
 
+from dolens.cli.compare import compare
+from dolens.cli.experiments import experiments
+from dolens.cli.train import PassedOn, train
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -35,3 +38,8 @@ def one_line(problem: object) -> str:
 @app.callback()
 def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
+
+
+app.command("train", cls=PassedOn, add_help_option=False)(train)
+app.command("experiments")(experiments)
+app.command("compare")(compare)

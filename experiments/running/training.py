@@ -184,4 +184,6 @@ def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
 
 def resume_command() -> str:
     """The command that started this run, for a notice."""
-    return shlex.join(["python", *sys.argv])
+    program, *arguments = sys.argv
+    command = shlex.join(["python", program]) if program.endswith(".py") else program
+    return f"{command} {shlex.join(arguments)}"
