@@ -11,6 +11,7 @@ import typer
 from dolens.cli.apply import apply
 from dolens.cli.convert import convert
 from dolens.cli.evaluate import evaluate
+from dolens.cli.export import export
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
@@ -49,4 +50,5 @@ def _dolens() -> None:
 
 app.command("evaluate")(evaluate)
 app.command("apply")(apply)
+app.command("export")(export)
 app.command("report", help=REPORT_HELP)(report)
