@@ -13,6 +13,7 @@ from dolens.cli.compare import compare
 from dolens.cli.convert import convert
 from dolens.cli.evaluate import evaluate
 from dolens.cli.experiments import experiments
+from dolens.cli.export import export
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
@@ -54,4 +55,5 @@ app.command("train", cls=PassedOn, add_help_option=False)(train)
 app.command("evaluate")(evaluate)
 app.command("apply")(apply)
 app.command("compare")(compare)
+app.command("export")(export)
 app.command("report", help=REPORT_HELP)(report)
