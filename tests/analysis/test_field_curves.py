@@ -1,7 +1,5 @@
 """Field curves, lateral colour and focal shift, against closed forms and another program."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -91,9 +89,8 @@ def test_a_plate_distorts_and_disperses_by_snell_s_law():
     ideal = (14.0 + 5.0 / index[587.5618]) * np.tan(fields)
     distortion = field_curves(lens, scan(lens, 40.0), LINES).distortion
     assert float(distortion[0]) == 0.0
-    np.testing.assert_allclose(
-        distortion[1:], 100.0 * (height(587.5618) / ideal - 1.0)[1:], atol=1e-9
-    )
+    expected = 100.0 * (height(587.5618)[1:] / ideal[1:] - 1.0)
+    np.testing.assert_allclose(distortion[1:], expected, atol=1e-9)
 
 
 def test_the_image_of_a_near_object_is_compared_with_its_magnification():
@@ -128,13 +125,11 @@ def test_a_lens_without_symmetry_is_scanned_along_both_axes(root):
 
 
 def test_chief_rays_that_do_not_arrive_leave_gaps():
-    lens = single_sphere()
-    lens.surfaces["1"].curvature.data.fill_(1.0 / 2.5)
-    found = field_curves(lens, scan(lens, 89.0, 3), [587.5618])
-    assert not torch.isnan(found.tangential[0]).any()
-    shallow = plate_behind_a_stop(GLASS)
-    shallow.materials = (shallow.materials[2], *shallow.materials[1:])
-    shallow.materials = (shallow.materials[0], shallow.materials[1], *shallow.materials[2:])
-    beyond = field_curves(shallow, scan(shallow, 80.0, 3), [587.5618])
-    assert torch.isnan(beyond.tangential[-1]).all() and torch.isnan(beyond.distortion[-1])
-    assert math.isfinite(float(beyond.distortion[0]))
+    """From glass into air, light beyond 41° is reflected totally."""
+    row = {"type": "plane", "semi_diameter": 1.0, "material": "air"}
+    lens = lens_from_prescription(
+        {"object_material": GLASS, "surfaces": {"1": row}, "sensor": {"distance": 5.0}}
+    )
+    found = field_curves(lens, scan(lens, 80.0, 3), [587.5618])
+    for values in (found.tangential[:, 0], found.sagittal[:, 0], found.distortion):
+        assert torch.isnan(values).tolist() == [False, False, True]
