@@ -246,21 +246,20 @@ class PageSections:
     def wavefront(self) -> Content:
         """List wavefront errors and Strehl ratios."""
         found = wavefront_errors(self.lens, *self.scene, self.distance)
-        heads = ["field"]
-        rows = [[field_text(point, found.field_unit)] for point in found.fields]
-        for column, wave in enumerate(found.wavelengths.tolist()):
-            for what, values, digits in (
-                ("RMS (waves)", found.rms, 3),
-                ("P–V (waves)", found.peak_to_valley, 3),
-                ("Strehl", found.strehl_ratio, 3),
-            ):
-                heads.append(f"{wave:g} nm\n{what}")
-                for row, value in zip(rows, values[:, column].tolist(), strict=True):
-                    row.append(number(value, digits))
+        numbers = (found.rms, found.peak_to_valley, found.strehl_ratio)
+        rows = [
+            (
+                field_text(point, found.field_unit),
+                f"{wave:g}",
+                *(number(values[row, column], 3) for values in numbers),
+            )
+            for row, point in enumerate(found.fields)
+            for column, wave in enumerate(found.wavelengths.tolist())
+        ]
         table = Table(
-            tuple(heads),
-            [tuple(row) for row in rows],
-            "On the sensor as it stands, tilt removed.  – : no light passes.",
+            ("field", "wavelength (nm)", "RMS (waves)", "peak to valley (waves)", "Strehl ratio"),
+            rows,
+            "On the sensor as it stands, tilt removed. – : no light passes.",
         )
         return Content(tables=[table])
 
