@@ -57,6 +57,32 @@ class PointSpread:
     reasons: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class PreparedPupils:
+    """The pupils of F fields, which several analyses may share.
+
+    Attributes:
+        wavefronts: of all fields and wavelengths.
+        pupils: of every field; None for a field without light.
+    """
+
+    wavefronts: FieldWavefronts
+    pupils: list[FieldPupil | None]
+
+
+@torch.no_grad()
+def prepare_pupils(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> PreparedPupils:
+    """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s."""
+    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    return PreparedPupils(found, field_pupils(lens, found, object_distance))
+
+
 @torch.no_grad()
 def point_spread(
     lens: Lens,
@@ -66,6 +92,7 @@ def point_spread(
     wavelength_weights: Sequence[float] | None = None,
     cells: int = _CELLS,
     half_width_um: float | None = None,
+    prepared: PreparedPupils | None = None,
 ) -> PointSpread:
     """Compute the point spread function of every field, by the Fourier transform of its pupil.
 
@@ -80,15 +107,21 @@ def point_spread(
         cells: M, along each side of the window.
         half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
 
+    Rarely needed:
+        prepared: `prepare_pupils` of the same arguments, where several analyses share it.
+
     Raises:
         InputError: no fields or wavelengths, weights that do not fit, or fewer than two cells.
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    prepared = prepared or prepare_pupils(
+        lens, fields, wavelengths, object_distance, wavelength_weights
+    )
+    found = prepared.wavefronts
     dark = torch.full((cells, cells), math.nan, dtype=torch.float64)
     rows = []
-    for pupil in field_pupils(lens, found, object_distance):
+    for pupil in prepared.pupils:
         if pupil is None:
             rows.append((math.nan, dark, math.nan, math.nan, False, "no light passes"))
             continue
@@ -121,6 +154,7 @@ def diffraction_encircled_energy(
     radii_um: Sequence[float] | Tensor | None = None,
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
+    prepared: PreparedPupils | None = None,
 ) -> EncircledEnergy:
     """Compute encircled energy with diffraction, by sums over the point spread function.
 
@@ -136,11 +170,16 @@ def diffraction_encircled_energy(
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of any sum; None for equal ones.
 
+    Rarely needed:
+        prepared: `prepare_pupils` of the same arguments, where several analyses share it.
+
     Raises:
         InputError: no fields or wavelengths, weights that do not fit, or radii that do not ascend.
     """
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
-    pupils = list(field_pupils(lens, found, object_distance))
+    prepared = prepared or prepare_pupils(
+        lens, fields, wavelengths, object_distance, wavelength_weights
+    )
+    found, pupils = prepared.wavefronts, prepared.pupils
     airy = _airy_um(lens, found, object_distance)
     if radii_um is None:
         reach = max((_half_width(pupil) for pupil in pupils if pupil), default=4e-3 * airy)

@@ -26,8 +26,10 @@ from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.diffraction.illumination import relative_illumination
 from dolens.diffraction.point_spread import (
     PointSpread,
+    PreparedPupils,
     diffraction_encircled_energy,
     point_spread,
+    prepare_pupils,
 )
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.diffraction.wavefront_error import wavefront_errors
@@ -49,7 +51,8 @@ from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
 from dolens.plotting.spots import spots_figure
 
-_MTF_RAYS = 6000
+# Of each field and wavelength.
+_MTF_RAYS, _RMS_RAYS = 6000, 2000
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,9 @@ class PageSections:
 
     def space(self) -> Content:
         """Describe the lens in space."""
-        found = solid(self.lens, self.where)
+        spots = self.overview.spots
+        lit = None if spots is None else spots.rms.isfinite().any(1).tolist()
+        found = solid(self.lens, self.where, lit)
         return Content(
             html=viewer_html(found, self.where),
             note="Drag to turn, pinch or scroll (after a click) to zoom, shift and drag to move. "
@@ -175,7 +180,9 @@ class PageSections:
     def mtf(self) -> Content:
         """Plot the MTF with diffraction, and that of rays alone."""
         frequencies = frequency_range(self.lens, *self.scene, self.distance)
-        wave = diffraction_modulation(self.lens, *self.scene, frequencies, self.distance)
+        wave = diffraction_modulation(
+            self.lens, *self.scene, frequencies, self.distance, prepared=self._pupils
+        )
         rays = modulation(self.lens, *self.scene, frequencies, _MTF_RAYS, self.distance)
         figure = modulation_comparison_figure(wave, rays, title="")
         return Content({"mtf": figure}, problems=self._by_rays(wave.diffraction, wave.reasons))
@@ -190,7 +197,11 @@ class PageSections:
 
     @cached_property
     def _spread(self) -> PointSpread:
-        return point_spread(self.lens, *self.scene, self.distance)
+        return point_spread(self.lens, *self.scene, self.distance, prepared=self._pupils)
+
+    @cached_property
+    def _pupils(self) -> PreparedPupils:
+        return prepare_pupils(self.lens, *self.scene, self.distance)
 
     def _by_rays(self, diffraction: Sequence[bool], reasons: Sequence[str]) -> list[str]:
         """Say of which fields rays alone make the image, and why."""
@@ -203,7 +214,9 @@ class PageSections:
 
     def energy(self) -> Content:
         """Plot encircled energy with diffraction, and that of rays."""
-        wave = diffraction_encircled_energy(self.lens, *self.scene, object_distance=self.distance)
+        wave = diffraction_encircled_energy(
+            self.lens, *self.scene, object_distance=self.distance, prepared=self._pupils
+        )
         rays = encircled_energy(
             self.lens, *self.scene, wave.radii_um, object_distance=self.distance
         )
@@ -233,21 +246,20 @@ class PageSections:
     def wavefront(self) -> Content:
         """List wavefront errors and Strehl ratios."""
         found = wavefront_errors(self.lens, *self.scene, self.distance)
-        heads = ["field"]
-        rows = [[field_text(point, found.field_unit)] for point in found.fields]
-        for column, wave in enumerate(found.wavelengths.tolist()):
-            for what, values, digits in (
-                ("RMS (waves)", found.rms, 3),
-                ("P–V (waves)", found.peak_to_valley, 3),
-                ("Strehl", found.strehl_ratio, 3),
-            ):
-                heads.append(f"{wave:g} nm\n{what}")
-                for row, value in zip(rows, values[:, column].tolist(), strict=True):
-                    row.append(number(value, digits))
+        numbers = (found.rms, found.peak_to_valley, found.strehl_ratio)
+        rows = [
+            (
+                field_text(point, found.field_unit),
+                f"{wave:g}",
+                *(number(values[row, column], 3) for values in numbers),
+            )
+            for row, point in enumerate(found.fields)
+            for column, wave in enumerate(found.wavelengths.tolist())
+        ]
         table = Table(
-            tuple(heads),
-            [tuple(row) for row in rows],
-            "On the sensor as it stands, tilt removed.  – : no light passes.",
+            ("field", "wavelength (nm)", "RMS (waves)", "peak to valley (waves)", "Strehl ratio"),
+            rows,
+            "On the sensor as it stands, tilt removed. – : no light passes.",
         )
         return Content(tables=[table])
 
@@ -258,12 +270,14 @@ class PageSections:
         against_field = None
         if any(reach):
             against_field = rms_against_field(
-                self.lens, where.wavelengths, reach, object_distance=self.distance
+                self.lens, where.wavelengths, reach, rays=_RMS_RAYS, object_distance=self.distance
             )
         against_wavelength = rms_against_wavelength(
             self.lens,
             where.fields,
             wavelength_interval(self.lens),
+            count=11,
+            rays=_RMS_RAYS,
             object_distance=self.distance,
         )
         figure = rms_curves_figure(against_field, against_wavelength, title="")
