@@ -6,7 +6,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+
+# Of a terminal that has room for what an experiment writes.
+_WIDE = 130
 
 
 def experiments(
@@ -32,11 +36,15 @@ def experiments(
     table.add_column("Experiment", no_wrap=True, style="bold")
     table.add_column("What it does", ratio=3)
     table.add_column("Cost", ratio=1)
+    wide = console.width >= _WIDE
+    if wide:
+        table.add_column("Writes", ratio=3, style="dim")
     for row in rows:
         label = f"{row.name} [green]yours[/]" if row.own else row.name
-        table.add_row(
-            label, row.summary or "[dim]its file has no comment[/]", row.cost or "[dim]not said[/]"
-        )
+        said = [row.summary or "its file has no comment", row.cost or "not said"]
+        if wide:
+            said.append(row.writes or "what every run writes")
+        table.add_row(label, *map(escape, said))
     console.print(table)
     console.print(
         "\nRun one: [bold]dolens train experiment=NAME[/].  "
@@ -63,7 +71,7 @@ def _show_one(name: str, folders: list[Path], as_json: bool) -> None:
     console = Console(highlight=False)
     console.print(f"\n[bold]{name}[/]{'  [green]yours[/]' if found.own else ''}")
     if found.summary:
-        console.print(found.summary)
+        console.print(escape(found.summary))
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style="bold", no_wrap=True)
     facts.add_column()

@@ -128,5 +128,5 @@ def read_experiment(path: Path, own: bool) -> ExperimentFile:
         elif key != "Summary" and not text.startswith("   "):
             key = "Notes"
         texts[key] = f"{texts.get(key, '')} {text.strip()}".strip()
-    summary = re.split(r"(?<=[.!?]) (?=[A-Z`])", texts["Summary"])[0]
+    summary = re.split(r"(?<=[.!?])\s+(?=\S)", texts["Summary"])[0]
     return ExperimentFile(path.stem, path, own, summary, texts["Cost"], texts["Writes"])
