@@ -185,7 +185,7 @@ class PictureCamera:
         figure = applied_figure(
             {"truth": taken.truth[0], "sensor": sensor[0], "restored": restored[0]},
             {"sensor": metrics["raw_psnr_db"], "restored": metrics["psnr_db"]},
-            f"{name}, {_label(depth)}",
+            f"{name.removesuffix(f'_{_label(depth)}')} at {depth / 1000.0:g} m",
         )
         save_figure(figure, folder / f"{name}_comparison.png")
         files.append(folder / f"{name}_comparison.png")
