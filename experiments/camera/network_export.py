@@ -137,9 +137,9 @@ def _checked(
 
 def _said(found: dict[str, float], program: str) -> dict[str, Any]:
     worst = max(found.values())
+    size = f"at most {worst:.1g} of the output's range" if worst else "none"
     return {
-        "error": f"at most {worst:.1g} of the output's range, by {program}, on images of "
-        + ", ".join(found),
+        "error": f"{size}, by {program}, on images of {', '.join(found)}",
         "largest_error": worst,
     }
 
