@@ -186,15 +186,15 @@ def frequency_range(
 ) -> Tensor:
     """Return frequencies (count,), cycles/mm, from zero to where the sharpest field leaves little.
 
-    A spot of Gaussian profile with the RMS radius r leaves a tenth of the contrast at 0.48/r; the
-    end is that frequency or the cut-off of diffraction where that is lower, rounded up to 1, 2 or 5
-    times a power of ten.
+    A spot of Gaussian profile with the RMS radius r leaves a hundredth of the contrast at 0.68/r;
+    the end is that frequency or the cut-off of diffraction where that is lower, rounded up to 1, 2
+    or 5 times a power of ten.
     """
     lens = in_double_precision(lens)
     spots = spot_diagram(lens, fields, wavelengths, 400, object_distance)
     cutoff = float((AIRY / spots.airy_radius).min())
     radius = float(spots.polychromatic_rms.nan_to_num(math.inf).min())
-    end = min(cutoff, 0.48 / max(radius, 1e-9))
+    end = min(cutoff, 0.68 / max(radius, 1e-9))
     power = 10.0 ** math.floor(math.log10(end))
     end = next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= 0.999 * end)
     return torch.linspace(0.0, end, count, dtype=torch.float64)

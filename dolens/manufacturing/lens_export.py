@@ -43,6 +43,7 @@ def export_lens(
     program: str = "dolens",
     tolerance_nm: float = TOLERANCE_NM,
     progress: Callable[[str], None] | None = None,
+    drawn: Lens | None = None,
 ) -> Exported:
     """Write a lens in several formats; a format that cannot hold it is refused, the others go on.
 
@@ -56,6 +57,9 @@ def export_lens(
         tolerance_nm: the largest error in sag of the STEP file.
         progress: called with the name of each format before it is written.
 
+    Rarely needed:
+        drawn: the lens of the drawings, where it alone has the elements that tolerances are of.
+
     Raises:
         InputError: a format of another name.
     """
@@ -64,14 +68,14 @@ def export_lens(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     exported = Exported()
-    drawn = tolerances or ShopTolerances()
+    known = tolerances or ShopTolerances()
     writers: dict[str, Callable[[], None]] = {
         "yaml": lambda: _design(exported, lens, folder / "lens.yaml"),
         "zmx": lambda: _design(exported, lens, folder / "lens.zmx"),
         "step": lambda: _solids(exported, lens, folder, tolerance_nm),
-        "drawing": lambda: _drawings(exported, lens, folder, drawn, design, program),
+        "drawing": lambda: _drawings(exported, drawn or lens, folder, known, design, program),
     }
-    for name in (known for known in FORMATS if known in formats):
+    for name in (each for each in FORMATS if each in formats):
         if progress is not None:
             progress(name)
         try:

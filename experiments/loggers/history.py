@@ -31,6 +31,7 @@ class History(Logger):
         self.path = Path(path)
         self._columns: list[str] = []
         self._row: dict[str, Any] = {}
+        self._written: int | None = None  # the last step in the table
 
     @property
     def name(self) -> str:
@@ -68,7 +69,11 @@ class History(Logger):
 
     def _write(self) -> None:
         row, self._row = self._row, {}
-        if not self._columns:
+        again, self._written = row[_STEP] == self._written, row[_STEP]
+        if again:  # as of a test behind the last step of a training
+            *before, last = _rows_before(self.path, None)
+            self._rewrite([*before, {**last, **row}])
+        elif not self._columns:
             self._rewrite([*_rows_before(self.path, row[_STEP]), row])
         elif row.keys() <= set(self._columns):
             with self.path.open("a", newline="", encoding="utf-8") as file:

@@ -192,4 +192,6 @@ def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
 
 def resume_command() -> str:
     """The command that started this run, for a notice."""
-    return shlex.join(["python", *sys.argv])
+    program, *arguments = sys.argv
+    command = shlex.join(["python", program]) if program.endswith(".py") else program
+    return f"{command} {shlex.join(arguments)}"

@@ -39,8 +39,11 @@ def test_a_table_has_a_row_a_step_with_what_was_logged_there(tmp_path):
     history.log_metrics({"train/loss": 0.01}, 14)
     history.log_metrics({"lens_step/accepted": 1.0}, 19)  # a new column
     history.finalize("success")
+    history.log_metrics({"test/psnr_db": 30.0}, 19)  # of the same step, when training is over
+    history.finalize("success")
     found = rows(tmp_path / "metrics.csv")
     assert [row["step"] for row in found] == ["4", "9", "14", "19"]
+    assert found[3]["test/psnr_db"] == "30.0"
     assert float(found[0]["train/loss"]) == 0.25 and found[1]["val/psnr_db"] == "29.0"
     assert found[2]["val/psnr_db"] == "" and found[3]["lens_step/accepted"] == "1.0"
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
