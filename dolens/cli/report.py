@@ -18,7 +18,7 @@ HELP = "\n\n".join(
         "printed number, ours, why they differ, cost, error, pictures and the command. At its top "
         "are checks against expected values.",
         "A system that is finished with the same settings and code is not run again; after Ctrl-C "
-        "the same command goes on. All systems together take about half an hour on two cores.",
+        "the same command goes on. All systems together take about twenty minutes on two cores.",
         "The exit status is 1 if a check does not hold or a run fails. Checks of systems that were "
         "not run do not count.",
     )
