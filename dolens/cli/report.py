@@ -108,23 +108,22 @@ class _Progress:
         self.console.print(f"{system.name}: finished before, {folder}", markup=False)
 
     def started(self, system: Any, number: int, count: int) -> None:
-        self.line = f"[{number}/{count}] {system.name}: {system.title}"
+        self.line = f"[{number}/{count}] {system.name}"
+        self.console.print(f"{self.line}: {system.title}", markup=False)
         if self.console.is_terminal:
-            self.status = self.console.status(_escaped(self.line))
+            self.status = self.console.status("")
             self.status.start()
-        else:
-            self.console.print(f"{self.line} …", markup=False)
 
     def tick(self, elapsed: float, remaining: float) -> None:
         if self.status is not None:
-            left = f"{_duration(elapsed)}, all: about {_duration(remaining)} left"
-            self.status.update(f"{_escaped(self.line)} · {left}")
+            left = _duration(float(round(remaining)))
+            self.status.update(f"{_duration(float(round(elapsed)))}; all runs: about {left} left")
 
     def ended(self, system: Any, finish: Any) -> None:
         self.stop()
         took = _duration(finish.wall_s)
         if finish.status == 0:
-            self.console.print(f"{self.line}: {took}", markup=False)
+            self.console.print(f"{self.line}: done in {took}", markup=False)
             return
         runner = import_extra(f"{_PACKAGE}.runner", "train", "dolens report")
         self.console.print(
@@ -178,9 +177,3 @@ def _summary(made: Any) -> bool:
 def _duration(seconds: float) -> str:
     numbers = import_extra(f"{_PACKAGE}.page.numbers", "train", "dolens report")
     return numbers.seconds_text(seconds)
-
-
-def _escaped(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)

@@ -222,7 +222,8 @@ def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     if not pupil.diffraction:
         return pupil.encircled_rays(radii)
     half = float(radii[-1]) + 1e-9
-    cells = min(max(2 * math.ceil(half * 2.0 * _STEPS / pupil.airy_radius), 2 * _CELLS), _MOST)
+    wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius)
+    cells = min(max(wanted, 2 * _CELLS), _MOST)
     step = 2.0 * half / cells
     grid = (torch.arange(cells).to(pupil.weights) + 0.5) * step - half
     light = pupil.irradiance(grid, grid)[0].flatten() * step * step

@@ -6,10 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+from torch import Tensor
 
 from dolens.analysis.conditions import FieldScan
 from dolens.analysis.field_curves import FieldCurves
-from dolens.plotting.style import SMALL, TITLE, ruled_axes, spectral_colour, wavelength_handles
+from dolens.plotting.style import PALETTE, SMALL, TITLE, ruled_axes, spectral_colour
 
 # Half widths of axes whose curves do not leave zero, mm and percent.
 _FLAT, _UNDISTORTED = 1e-4, 0.01
@@ -35,6 +37,8 @@ def field_curves_figure(
         left.set_ylabel(scan_label(row.scan), fontsize=SMALL + 1)
         for axes in (left, right):
             draw_field_limits(axes, row.scan)
+    for axes in grid[-1]:
+        axes.xaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
     _widen(grid[0, 0], _FLAT)
     _widen(grid[0, 1], _UNDISTORTED)
     grid[-1, 0].set_xlabel("focus from the sensor (mm)", fontsize=SMALL + 1)
@@ -47,7 +51,10 @@ def field_curves_figure(
     handles = [
         Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
         Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
-        *wavelength_handles(rows[0].wavelengths),
+        *(
+            Line2D([], [], color=colour, linewidth=1.4, label=f"{float(wave):g} nm")
+            for wave, colour in line_colours(rows[0].wavelengths).items()
+        ),
     ]
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
@@ -79,10 +86,19 @@ def note_if_empty(axes: Axes, values: np.ndarray, text: str) -> None:
         )
 
 
+def line_colours(wavelengths: Sequence[float] | Tensor) -> dict[float, str]:
+    """Return a colour for each wavelength (nm): its place in the spectrum, or blue for one alone,
+    because yellow is pale on white.
+    """
+    waves = [float(wave) for wave in wavelengths]
+    if len(waves) == 1:
+        return {waves[0]: PALETTE[0]}
+    return {wave: spectral_colour(wave) for wave in waves}
+
+
 def _foci(axes: Axes, curves: FieldCurves) -> None:
     field = curves.scan.coordinate.numpy()
-    for number, wavelength in enumerate(curves.wavelengths):
-        colour = spectral_colour(float(wavelength))
+    for number, colour in enumerate(line_colours(curves.wavelengths).values()):
         style = {"color": colour, "linewidth": 1.4, "zorder": 3}
         axes.plot(curves.tangential[:, number], field, gid="tangential", **style)
         axes.plot(curves.sagittal[:, number], field, gid="sagittal", linestyle="--", **style)
@@ -90,7 +106,8 @@ def _foci(axes: Axes, curves: FieldCurves) -> None:
 
 
 def _distortion(axes: Axes, curves: FieldCurves) -> None:
-    colour = spectral_colour(curves.reference_wavelength)
+    known = line_colours(curves.wavelengths)
+    colour = known.get(curves.reference_wavelength, PALETTE[0])
     field = curves.scan.coordinate.numpy()
     axes.plot(curves.distortion, field, color=colour, linewidth=1.4, gid="distortion", zorder=3)
     note_if_empty(axes, curves.distortion.numpy(), "no chief ray reaches the sensor")

@@ -85,8 +85,8 @@ def _draw_shift(axes: Axes, shift: FocalShift) -> None:
     axes.set_xlim(waves.min(), waves.max())
     axes.set_xlabel("wavelength (nm)", fontsize=SMALL + 1)
     axes.set_ylabel("paraxial focus (µm)", fontsize=SMALL + 1)
-    text = f"Focal shift from {shift.reference_wavelength:.4g} nm"
+    text = "Focal shift"
     if math.isfinite(depth):
-        text += f"; grey: ±2λN² = {depth:.3g} µm"
+        text += f" (grey: ±2λN² = {depth:.3g} µm)"
     axes.set_title(text, fontsize=SMALL + 1)
     ruled_axes(axes)

@@ -47,7 +47,7 @@ def with_overrides(record: RecordedRun, overrides: Sequence[str]) -> dict[str, A
         return dict(record.config)
     register_resolvers()
     with _composed(record, record.overrides) as cfg:
-        before = _resolved(without_dropped(_without_hydra(cfg)))
+        before = _resolved(without_dropped(OmegaConf.masked_copy(cfg, _but_hydra(cfg))))
     with _composed(record, [*record.overrides, *overrides]) as cfg:
         after = _resolved(checked(cfg))
     return _with_differences(record.config, before, after)
@@ -87,8 +87,8 @@ def _composed(record: RecordedRun, overrides: Sequence[str]) -> Iterator[DictCon
         HydraConfig.instance().cfg = job
 
 
-def _without_hydra(cfg: DictConfig) -> DictConfig:
-    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+def _but_hydra(cfg: DictConfig) -> list[str]:
+    return [str(key) for key in cfg if key != "hydra"]
 
 
 def _resolved(cfg: DictConfig) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """A run folder loaded again as objects: the trained module, its lens and its data."""
 
+import copy
 import logging
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.running.composition import with_overrides
 from dolens.experiments.running.extensions import import_extensions
+from dolens.experiments.running.perturbed_lens import perturbed_state
 from dolens.experiments.running.recorded_run import RecordedRun, read_record
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_settings import RunSettings
@@ -89,8 +91,12 @@ def load_run(
     checkpoint: str | Path = "last",
     overrides: Sequence[str] = (),
     output: str | Path | None = None,
+    with_loss: bool = True,
 ) -> FinishedRun:
     """Load a run folder as objects, in the state of a checkpoint.
+
+    Parameters of the lens are those of the checkpoint, except where an override sets one to another
+    value; whether overrides make another camera besides is not looked at here.
 
     The folder says which classes are made, a user's own among them, which are looked for in the
     working folder and where Python looks: load only runs that you trust.  The checkpoint is read as
@@ -101,21 +107,68 @@ def load_run(
         folder: of the run.
         checkpoint: `last`, `best`, or the path of a file.
         overrides: as of the command line, applied over the run's own; see `with_overrides`.
-            Whether they make another camera is not looked at here: parameters of the lens are those
-            of the checkpoint in any case.
         output: where paths of the configuration within the run folder lead to; None: the folder.
+        with_loss: whether the loss is needed: a perceptual one looks for a classifier's weights,
+            and may download them.
 
     Raises:
         InputError: the folder is none of a run; it has no such checkpoint; a class is not there; or
             the checkpoint is of another experiment, lens or network.
     """
     record = read_record(folder, output)
+    with working_folder_importable():
+        config = with_overrides(record, overrides)
+    return load_recorded(record, config, checkpoint, with_loss)
+
+
+def load_recorded(
+    record: RecordedRun,
+    config: Mapping[str, Any],
+    checkpoint: str | Path = "last",
+    with_loss: bool = True,
+) -> FinishedRun:
+    """Load a run as objects from its record; see `load_run`.
+
+    Args:
+        record: what the folder says.
+        config: the configuration, without interpolations: the record's, or changed.
+        checkpoint: as of `load_run`, and with_loss.
+        with_loss: likewise.
+
+    Raises:
+        InputError: as of `load_run`.
+    """
     register_resolvers()
     with working_folder_importable():
-        return _loaded(record, with_overrides(record, overrides), checkpoint)
+        return _loaded(record, config, checkpoint, with_loss)
 
 
-def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Path) -> FinishedRun:
+def _without_first_weights(config: Mapping[str, Any], with_loss: bool) -> dict[str, Any]:
+    """A configuration of a module that looks for no trained weights to begin with.
+
+    The checkpoint has all of the network's, and where the first ones came from need not be there.
+    Without the loss, its classifier's weights are not looked for either.
+    """
+    found = copy.deepcopy(dict(config))
+    network = _part(found, "reconstruction", "network")
+    if {"weights", "weights_file"} <= set(network):
+        network.update(weights="none", weights_file=None)
+    loss = _part(found, "reconstruction", "loss")
+    if "perceptual" in loss and not with_loss:
+        loss["perceptual"] = "none"
+    return found
+
+
+def _part(node: Any, *keys: str) -> dict[str, Any]:
+    """The mapping at a place; an empty one where there is none."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node if isinstance(node, dict) else {}
+
+
+def _loaded(
+    record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Path, with_loss: bool
+) -> FinishedRun:
     import_extensions(config.get("extensions"))
     try:
         refuse_unknown_keys(config, ("module",))
@@ -126,17 +179,20 @@ def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Pa
         ) from None
     cfg = OmegaConf.create(dict(config))
     settings = RunSettings.of(cfg)
+    made_of = OmegaConf.create(_without_first_weights(config["module"], with_loss))
     with torch.random.fork_rng(devices=()):
-        lens = lens_from_prescription(
-            settings.prescription(), settings.dtype, where="lens", backend=settings.backend
-        )
-        module = _made("module", settings.module)(lens=lens)
+        module = _made("module", made_of)(lens=_lens(settings.prescription(), settings))
     check_experiment(module, train=False)
     file, state = None, {}
     if module.trains:
         file = _checkpoint_file(record, checkpoint)
         state = read_checkpoint(file)
-        _take_up(module, state, file)
+        values = state["state_dict"]
+        if config["lens"] != record.config["lens"]:
+            wanted = _lens(settings.prescription(), settings)
+            recorded = _lens(record.config["lens"], settings)
+            values = perturbed_state(module, wanted, recorded, values)
+        _take_up(module, {**state, "state_dict": values}, file)
     elif str(checkpoint) != CHECKPOINTS[0]:
         raise InputError(
             f"{record.folder}: {type(module).__name__} trains nothing, and has no checkpoint"
@@ -144,6 +200,12 @@ def _loaded(record: RecordedRun, config: Mapping[str, Any], checkpoint: str | Pa
     module.eval()
     step, epoch = int(state.get("global_step", 0)), int(state.get("epoch", -1)) + 1
     return FinishedRun(record, cfg, settings, module, file, step, epoch)
+
+
+def _lens(prescription: Mapping[str, Any], settings: RunSettings) -> Lens:
+    return lens_from_prescription(
+        prescription, settings.dtype, where="lens", backend=settings.backend
+    )
 
 
 def _checkpoint_file(record: RecordedRun, checkpoint: str | Path) -> Path:
@@ -198,9 +260,20 @@ def _take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
     try:
         module.load_state_dict(state["state_dict"])
     except RuntimeError as error:
-        reason = " ".join(str(error).split())
+        reason = _misfit(state["state_dict"], module.state_dict()) or " ".join(str(error).split())
         raise InputError(f"{file} does not fit the run's configuration: {reason}") from None
     module.settle()
+
+
+def _misfit(found: Mapping[str, Any], own: Mapping[str, Any]) -> str:
+    """Return the first thing in which a state differs from what a module takes; nothing: ''."""
+    for name, value in own.items():
+        if name not in found:
+            return f"{name} is missing in the checkpoint"
+        if found[name].shape != value.shape:
+            shapes = tuple(found[name].shape), tuple(value.shape)
+            return f"{name} has shape {shapes[0]} in the checkpoint and {shapes[1]} here"
+    return next((f"there is no {name} here" for name in found if name not in own), "")
 
 
 def _made(key: str, config: DictConfig) -> Any:

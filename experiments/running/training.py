@@ -68,6 +68,7 @@ def run(cfg: DictConfig) -> float:
     module = instantiate(settings.module)(lens=lens)
     check_experiment(module, settings.train)
     checkpoint = settings.ckpt_path
+    refuse_untrained(settings, module)
     if checkpoint is not None:
         refuse_idle_checkpoint(settings, module)
         checkpoint = checked_checkpoint(checkpoint, module, written, settings.train)
@@ -138,6 +139,20 @@ def build_lens(settings: RunSettings) -> Lens:
     )
 
 
+def refuse_untrained(settings: RunSettings, module: Experiment) -> None:
+    """Refuse to judge what was never trained as if it had been.
+
+    Raises:
+        InputError: there is something to train, and it is neither trained nor loaded.
+    """
+    if module.trains and not settings.train and settings.ckpt_path is None:
+        raise InputError(
+            f"train: false leaves {type(module).__name__} untrained, and no ckpt_path gives it a "
+            "trained state; dolens evaluate RUN tests a finished run again, and "
+            "trainer.max_epochs=0 tests what training begins with"
+        )
+
+
 def refuse_idle_checkpoint(settings: RunSettings, module: Experiment) -> None:
     """Refuse a checkpoint that nothing would load.
 
@@ -177,4 +192,6 @@ def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
 
 def resume_command() -> str:
     """The command that started this run, for a notice."""
-    return shlex.join(["python", *sys.argv])
+    program, *arguments = sys.argv
+    command = shlex.join(["python", program]) if program.endswith(".py") else program
+    return f"{command} {shlex.join(arguments)}"

@@ -120,7 +120,7 @@ def test_a_checkpoint_of_another_camera_is_refused(copy, tiny_run):
     file = copy / ".hydra/resolved.yaml"
     whole = file.read_text()
     file.write_text(whole.replace("width: 4\n", "width: 8\n"))
-    assert "the checkpoint's network is" in refusal(copy)
+    assert "has shape (4, 6, 3, 3) in the checkpoint and (8, 6, 3, 3) here" in refusal(copy)
     file.write_text(whole.replace("name: Achromatic", "name: Other"))
     assert "the checkpoint's lens is 'Achromatic" in refusal(copy)
 

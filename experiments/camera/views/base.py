@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
+from dolens.errors import InputError
+from dolens.experiments.camera.views.whole import Placing, WholePicture
 from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
@@ -139,6 +141,25 @@ class Imaging(ABC):
     @abstractmethod
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Rays of spots that stand for what the views see, one entry for each object distance."""
+
+    def whole_picture(
+        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
+    ) -> WholePicture:
+        """Image a picture (3, h, w) of any size, linear light, as a plane at one depth.
+
+        Raises:
+            InputError: the views image no whole pictures.
+        """
+        raise InputError(f"views: {type(self).__name__} images no whole pictures")
+
+    def field_of(self, height: int, width: int) -> Tensor | None:
+        """Where each pixel of an image about the middle of the sensor lies, (2, H, W), x and y over
+        half the sensor's diagonal; None where the camera is the same all over.
+
+        Raises:
+            InputError: the image is larger than the sensor.
+        """
+        return None
 
     def reference_renderers(self) -> Sequence[str]:
         """Names of renderers that make the test images besides."""

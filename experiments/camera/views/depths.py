@@ -15,11 +15,20 @@ from dolens.experiments.camera.views.truth import (
     reference_chief_ray_map,
     sample_texture,
 )
+from dolens.experiments.camera.views.whole import (
+    Placing,
+    WholePicture,
+    at_depth,
+    axial_function,
+    convolved,
+    diffraction_of,
+    resized,
+)
 from dolens.optics.lens import Lens
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer
 from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.pupil.f_number import axial_f_number
-from dolens.scene.planar import pinhole_image
+from dolens.scene.planar import as_planes, pinhole_image
 from dolens.scene.scene import Scene
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
@@ -45,9 +54,11 @@ class DepthViews(Imaging):
         reference_renderers: make the test images besides, of the same sensor, by name.
         psf_diffraction: of the functions that networks ask for: `none`, or `limit`, blurred by a
             perfect pupil's diffraction, as a measurement would find them.
+        psf_depths: of the functions that networks ask for, mm; None: the scene's.  A camera that is
+            calibrated at its own depths is judged at others by it.
 
     Raises:
-        InputError: the renderers' sensors differ, or an unknown word.
+        InputError: the renderers' sensors differ, an unknown word, or no depths.
     """
 
     def __init__(
@@ -62,8 +73,12 @@ class DepthViews(Imaging):
         seed: int = 0,
         reference_renderers: Mapping[str, Renderer] | None = None,
         psf_diffraction: str = "none",
+        psf_depths: Sequence[float] | None = None,
     ) -> None:
         super().__init__(scene, renderer, readout, seed)
+        if psf_depths is not None and not len(psf_depths):
+            raise InputError("views.psf_depths: []; allowed: null, or depths in mm")
+        self.psf_depths = None if psf_depths is None else tuple(map(float, psf_depths))
         self.truth = check_truth(truth)
         if self.truth != "pinhole" and not scene.separate_planes:
             raise InputError(
@@ -96,8 +111,8 @@ class DepthViews(Imaging):
         return self.scene.labels()
 
     def psf_labels(self) -> list[str]:
-        """The planes' depths."""
-        return self.scene.plane_labels()
+        """The depths of the functions."""
+        return self._psf_scene(None).plane_labels()
 
     def expose(self, lens: Lens) -> None:
         """Set the exposure by the lens's aperture, where the readout has a reference F-number."""
@@ -161,7 +176,7 @@ class DepthViews(Imaging):
     ) -> Tensor:
         """(depths, 3, K, K), on the axis."""
         samples = pupil_samples or self.psf_pupil_samples
-        scene = self.scene if depths is None else replace(self.scene, depths=tuple(depths))
+        scene = self._psf_scene(depths)
         functions = axial_point_spread_functions(
             lens, scene, self.sensor, size or self.psf_size, samples, values
         )
@@ -170,6 +185,33 @@ class DepthViews(Imaging):
         f_number = self._f_number or axial_f_number(lens)
         pitch = self.sensor.pixel_pitch
         return with_diffraction_limit(functions, pitch, scene.wavelengths, f_number)
+
+    @torch.no_grad()
+    def whole_picture(
+        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
+    ) -> WholePicture:
+        """Image a picture with the blur on the axis everywhere: the camera's sensor is a small part
+        of the field, and a larger picture stands for many such parts side by side.
+        """
+        scale = placing.scale or 1.0
+        size = [max(1, round(length / scale)) for length in picture.shape[-2:]]
+        picture = resized(picture, *size).to(lens.device)
+        scene = at_depth(as_planes(self.scene), placing.depth, lens)
+        diffraction = placing.diffraction or diffraction_of(self.evaluation_renderer)
+        functions = axial_function(lens, values, scene, self.sensor, self.psf_size, diffraction)
+        mapping = (
+            f"{scale:g} pixel(s) of the picture to one of the sensor, {size[1]}×{size[0]} of "
+            f"{1000.0 * self.sensor.pixel_pitch:g} µm; the blur on the axis everywhere, in "
+            f"{functions.shape[-1]} pixels, diffraction: {diffraction} (the run's own sensor has "
+            f"{self.sensor.width}×{self.sensor.height})"
+        )
+        image = convolved(picture.to(lens.dtype), functions)
+        return WholePicture(linear_to_srgb(picture)[None], image[None], None, mapping)
+
+    def _psf_scene(self, depths: Sequence[float] | None) -> Scene:
+        """The scene with the depths that are asked for, else those of the functions."""
+        depths = self.psf_depths if depths is None else depths
+        return self.scene if depths is None else replace(self.scene, depths=tuple(depths))
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Return spots of each depth: on the axis, and towards the sensor's edges."""

@@ -17,10 +17,19 @@ from dolens.experiments.camera.views.truth import (
     reference_chief_ray_map,
     sample_texture,
 )
+from dolens.experiments.camera.views.whole import (
+    Placing,
+    WholePicture,
+    at_depth,
+    diffraction_of,
+    resized,
+)
 from dolens.optics.lens import Lens
+from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.protocol import GradientMeasure, Measure, Renderer, SensorWindow
 from dolens.rendering.psf_renderer import PsfRenderer
+from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.pixels import Sensor
@@ -29,6 +38,8 @@ from dolens.sensor.readout import Readout
 EVERYWHERE = "field"
 # Pixels along each side of point spread functions, where the training renderer has none.
 _PSF_SIZE = 65
+# Functions along each side of a whole sensor, at most; strata of the pupil, likewise, of rays.
+_MOST_FIELDS, _RAYS = 17, 10
 
 
 class FieldViews(Imaging):
@@ -200,6 +211,76 @@ class FieldViews(Imaging):
             functions = renderer.point_spread_functions(imaging, 0)
             found.append(functions.functions[0, 0])
         return torch.stack(found)
+
+    @torch.no_grad()
+    def whole_picture(
+        self, lens: Lens, values: Mapping[str, Tensor], picture: Tensor, placing: Placing
+    ) -> WholePicture:
+        """Image a picture that fills the sensor, as large as it fits on it, with the blur of each
+        place in the field.
+        """
+        lengths = picture.shape[-2:]
+        scale = placing.scale or max(lengths[0] / self.whole.height, lengths[1] / self.whole.width)
+        height, width = (max(1, round(length / scale)) for length in lengths)
+        if height > self.whole.height or width > self.whole.width:
+            raise InputError(
+                f"--scale: {scale:g} makes the picture {width}×{height} pixels, larger than the "
+                f"sensor, {self.whole.width}×{self.whole.height}"
+            )
+        picture = resized(picture, height, width).to(lens.device)
+        sensor = Sensor(height, width, self.whole.pixel_pitch)
+        scene = at_depth(self.scene, placing.depth, lens)
+        renderer = self._of_whole(sensor, placing.diffraction)
+        image = renderer.render(lens, scene, picture[None], placing.seed, values)[:, 0]
+        truth = linear_to_srgb(picture)
+        if self.truth != "pinhole":
+            # The distortion is part of the truth, as it is in training.
+            ((rows, columns),) = reference_chief_ray_map(lens, values, scene, self.whole, [sensor])
+            truth = linear_to_srgb(sample_texture(picture, rows[0], columns[0], (0.0, 0.0)))
+        mapping = (
+            f"{scale:.3g} pixel(s) of the picture to one of the sensor, {width}×{height} of "
+            f"{self.whole.width}×{self.whole.height} pixels of "
+            f"{1000.0 * self.whole.pixel_pitch:g} µm; the blur of each place in the field (by "
+            f"{'rays' if renderer.monte_carlo else 'point spread functions'}, diffraction: "
+            f"{diffraction_of(renderer)})"
+        )
+        return WholePicture(truth[None], image, self.field_of(height, width)[None], mapping)
+
+    def field_of(self, height: int, width: int) -> Tensor:
+        """The places of an image's pixels on the sensor; see `Imaging.field_of`."""
+        if height > self.whole.height or width > self.whole.width:
+            raise InputError(
+                f"an image of {width}×{height} pixels is larger than the sensor, "
+                f"{self.whole.width}×{self.whole.height}"
+            )
+        sensor = Sensor(height, width, self.whole.pixel_pitch)
+        return self.windows.coordinates(sensor, torch.zeros(()))
+
+    def _of_whole(self, sensor: Sensor, diffraction: str | None) -> Renderer:
+        """Return what makes test images, for a whole sensor."""
+        renderer = self.evaluation_renderer
+        if isinstance(renderer, AutoRenderer):
+            choice = renderer.choice
+            renderer = RayRenderer(sensor, _RAYS) if choice is None else choice.renderer
+        if diffraction not in (None, diffraction_of(renderer)) and not isinstance(
+            renderer, PsfRenderer
+        ):
+            size = self._training.psf_size or _PSF_SIZE
+            renderer = PsfRenderer(sensor, (2, 2), size=size, jitter=False)
+        if isinstance(renderer, PsfRenderer):
+            # As many functions for a stretch of the sensor as a window has, but no fewer than two.
+            fields = [
+                min(_MOST_FIELDS, max(2, math.ceil(length / own * (max(count, 2) - 1)) + 1))
+                for length, own, count in zip(
+                    (sensor.height, sensor.width),
+                    (self.windows.height, self.windows.width),
+                    renderer.fields,
+                    strict=True,
+                )
+            ]
+            kind = diffraction or renderer.diffraction
+            renderer = replace(renderer, fields=tuple(fields), pupil=None, diffraction=kind)
+        return renderer.on(sensor)
 
     def spots(self, lens: Lens, rings: int, arms: int) -> list[SpotRays]:
         """Return the spots of the zones."""

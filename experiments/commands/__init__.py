@@ -1,0 +1,1 @@
+"""What the commands about finished runs do; `dolens.cli` has their options."""

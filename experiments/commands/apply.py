@@ -1,0 +1,375 @@
+"""A finished run's camera on a user's own pictures: what its sensor sees, and what is restored."""
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError, check_choice
+from dolens.experiments.camera.base import Camera
+from dolens.experiments.camera.restored_windows import (
+    DEFAULT_WINDOW,
+    GRID,
+    margin_of,
+    restore_in_windows,
+)
+from dolens.experiments.camera.views.whole import Placing
+from dolens.experiments.commands.picture_files import (
+    read_array,
+    read_picture,
+    write_picture,
+)
+from dolens.experiments.running.finished_run import FinishedRun, load_run
+from dolens.experiments.running.run_folder import write_json
+from dolens.plotting import save_figure
+from dolens.plotting.applied_picture import applied_figure
+from dolens.reconstruction import psnr_db, structural_similarity
+from dolens.sensor.colour import linear_to_srgb
+from dolens.sensor.readout import Readout
+
+logger = logging.getLogger(__name__)
+
+_SMALLEST = 16
+# Copies of a picture that are held at once, float32 of three channels; and a warning from there on.
+_COPIES, _MUCH_MEMORY = 12, 4e9
+_FORMATS = ("png", "tif")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How pictures are applied to.
+
+    Attributes:
+        depths: mm in front of the first vertex; none: the run's middle depth.
+        scale: pixels of a picture to one of the sensor; None: as the run's views have it.
+        diffraction: `none`, `limit` or `wave`; None: as the run's test images have it.
+        seed: of the noise.
+        bits: of what is written, 8 or 16.
+        format: of what is written, `png` or `tif`.
+        window: pixels along each side of what is restored at once, a multiple of 64.
+        save_raw: whether the sensor's raw values are written too, as .npy.
+        raw: whether the files are what a real sensor gave.
+        black_level: of raw files, in their own numbers; None: the run's readout's.
+        white_level: likewise.
+
+    Raises:
+        InputError: a value that is not allowed.
+    """
+
+    depths: Sequence[float] = ()
+    scale: float | None = None
+    diffraction: str | None = None
+    seed: int = 0
+    bits: int = 8
+    format: str = "png"
+    window: int = DEFAULT_WINDOW
+    save_raw: bool = False
+    raw: bool = False
+    black_level: float | None = None
+    white_level: float | None = None
+
+    def __post_init__(self) -> None:
+        check_choice(self.bits, (8, 16), "--bits")
+        check_choice(self.format, _FORMATS, "--format")
+        if self.window < GRID or self.window % GRID:
+            raise InputError(f"--window: {self.window}; allowed: multiples of {GRID}, pixels")
+        if not self.raw and (self.black_level, self.white_level) != (None, None):
+            raise InputError("--black-level and --white-level are of raw files; give --raw too")
+        if self.raw and (self.depths or self.scale or self.diffraction or self.save_raw):
+            raise InputError(
+                "--raw: the files are images already; leave out --depth, --scale, --diffraction "
+                "and --save-raw"
+            )
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What became of one picture at one depth.
+
+    Attributes:
+        name: of the picture, with its depth where there are several.
+        files: that were written.
+        metrics: PSNR and SSIM of the sensor's image (`raw_…`) and of the restored one; empty where
+            there is no truth.
+        mapping: how the picture came to lie on the sensor, in words.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    metrics: Mapping[str, float]
+    mapping: str
+
+
+class PictureCamera:
+    """A finished run's camera, ready for pictures.
+
+    Args:
+        run: the run, of a camera.
+        options: see `Options`.
+
+    Attributes:
+        margin: pixels that the network looks beyond a window; None: it sees whole pictures.
+
+    Raises:
+        InputError: the run is of no camera.
+    """
+
+    def __init__(self, run: FinishedRun, options: Options) -> None:
+        if not isinstance(run.module, Camera):
+            raise InputError(
+                f"{run.folder}: experiment={run.experiment} has trained no camera that restores "
+                "images"
+            )
+        self.run, self.options = run, options
+        self.camera: Camera = run.module
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.camera.to(device)
+        self.device = device
+        with torch.no_grad():
+            self.values = {n: v.detach() for n, v in self.camera.variables().items()}
+            self.functions = self.camera.functions(self.values)
+        self.margin = margin_of(self.camera.network, self.functions, device)
+        if self.margin is None:
+            logger.warning(
+                "The network looks at more than a thousand pixels around each: pictures are "
+                "restored as a whole"
+            )
+
+    def depths(self) -> list[float]:
+        """The depths that pictures are put at, mm."""
+        return list(self.options.depths) or [self.camera.views.scene.middle_depth]
+
+    def apply(self, file: Path, folder: Path) -> list[Applied]:
+        """Image a picture at each depth, restore it, and write what is found into a folder.
+
+        Raises:
+            InputError: the file cannot be read, or is too small; or the depth lies in the lens.
+        """
+        picture = read_picture(file)
+        for note in picture.notes:
+            logger.warning("%s: %s", file, note)
+        _check_size(file, picture.linear.shape[-2:])
+        names = {depth: picture.name for depth in self.depths()}
+        if len(names) > 1:
+            names = {depth: f"{picture.name}_{_label(depth)}" for depth in names}
+        return [
+            self._at_depth(picture.linear, depth, name, folder) for depth, name in names.items()
+        ]
+
+    def _at_depth(self, linear: Tensor, depth: float, name: str, folder: Path) -> Applied:
+        views, options = self.camera.views, self.options
+        placing = Placing(depth, options.scale, options.diffraction, options.seed)
+        taken = views.whole_picture(self.camera.lens, self.values, linear, placing)
+        generator = torch.Generator(taken.image.device).manual_seed(options.seed)
+        with torch.no_grad():
+            signal = views.readout(taken.image, generator)
+            raw = views.readout.develop(signal)
+        restored = self._restored(raw, taken.field)
+        sensor = linear_to_srgb(raw)
+        metrics = _metrics(taken.truth, sensor, restored)
+        metrics |= {"depth_mm": float(depth)}
+        files = [
+            self._written(folder, f"{name}_sensor", sensor[0]),
+            self._written(folder, f"{name}_restored", restored[0]),
+        ]
+        if options.save_raw:
+            path = folder / f"{name}_raw.npy"
+            np.save(path, signal[0].permute(1, 2, 0).squeeze(-1).float().cpu().numpy())
+            files.append(path)
+        figure = applied_figure(
+            {"truth": taken.truth[0], "sensor": sensor[0], "restored": restored[0]},
+            {"sensor": metrics["raw_psnr_db"], "restored": metrics["psnr_db"]},
+            f"{name}, {_label(depth)}",
+        )
+        save_figure(figure, folder / f"{name}_comparison.png")
+        files.append(folder / f"{name}_comparison.png")
+        return Applied(name, tuple(files), metrics, taken.mapping)
+
+    def restore(self, file: Path, folder: Path) -> list[Applied]:
+        """Restore what a real sensor of this camera gave, and write the picture into a folder.
+
+        Raises:
+            InputError: the file cannot be read, or has other channels than the run's sensor.
+        """
+        array = read_array(file)
+        _check_size(file, array.shape[:2])
+        readout = self.camera.views.readout
+        signal = signal_of(array, readout, file, self.options.black_level, self.options.white_level)
+        raw = readout.develop(signal.to(self.device))
+        field = self.camera.views.field_of(*raw.shape[-2:])
+        restored = self._restored(raw, None if field is None else field[None].to(raw))
+        path = self._written(folder, f"{file.stem}_restored", restored[0])
+        mapping = f"{raw.shape[-1]}×{raw.shape[-2]} raw pixels, taken from the middle of the sensor"
+        return [Applied(file.stem, (path,), {}, mapping)]
+
+    def _restored(self, raw: Tensor, field: Tensor | None) -> Tensor:
+        found = restore_in_windows(
+            self.camera.network, raw, self.functions, field, self.options.window, self.margin
+        )
+        return found.clamp(0.0, 1.0)
+
+    def _written(self, folder: Path, name: str, encoded: Tensor) -> Path:
+        path = folder / f"{name}.{self.options.format}"
+        write_picture(path, encoded, self.options.bits)
+        return path
+
+
+def apply_run(
+    folder: str | Path,
+    files: Sequence[str | Path],
+    options: Options,
+    checkpoint: str | Path = "last",
+    out: str | Path | None = None,
+) -> tuple[Path, PictureCamera, list[Applied]]:
+    """Apply a finished run's camera to pictures.
+
+    A picture is the scene: a plane at a depth that shows it.  Where the run's views are of depths,
+    a pixel of the picture is one of the sensor, and the lens blurs it as on the axis; the run's
+    sensor is a small one, and a larger picture stands for many such fields side by side.  Where
+    they are of fields, the picture fills the sensor, and each place has the blur of its own.
+
+    Args:
+        folder: of the run.
+        files: pictures, or with `options.raw` what a real sensor gave.
+        options: see `Options`.
+        checkpoint: `last`, `best`, or the path of a file.
+        out: where files are written; None: `applied` in the run folder.
+
+    Returns:
+        The folder that was written to, the camera, and what was found, a picture after the other.
+
+    Raises:
+        InputError: the run, an option or a file cannot be used.
+    """
+    stems = [Path(file).stem for file in files]
+    for file in files:
+        if not Path(file).expanduser().is_file():
+            raise InputError(f"{file}: no such file")
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice is not None:
+        raise InputError(f"{twice}: two pictures of this name would write the same files")
+    run = load_run(folder, checkpoint, with_loss=False)
+    camera = PictureCamera(run, options)
+    into = run.folder / "applied" if out is None else Path(out).expanduser().resolve()
+    into.mkdir(parents=True, exist_ok=True)
+    found = []
+    for file in files:
+        each = camera.restore if options.raw else camera.apply
+        applied = each(Path(file).expanduser(), into)
+        found += applied
+        write_json(into / f"{Path(file).stem}.json", _record(camera, file, applied))
+    return into, camera, found
+
+
+def signal_of(
+    array: np.ndarray,
+    readout: Readout,
+    file: Path,
+    black_level: float | None = None,
+    white_level: float | None = None,
+) -> Tensor:
+    """Return raw numbers as a readout gives them: 0 without light and 1 at full scale.
+
+        signal = (number - black) / (white - black)
+
+    Args:
+        array: (height, width), or (height, width, 3).
+        readout: of the run: its colour filters, bits and black level.
+        file: named in messages.
+        black_level: the number of no light; None: that of the readout's codes, and 0 for numbers
+            with a fraction.
+        white_level: the number at full scale; None: the last of the readout's codes, without bits
+            that of the file, and 1 for numbers with a fraction.
+
+    Returns:
+        (1, 1 or 3, height, width), float32.
+
+    Raises:
+        InputError: other channels than the sensor has, or levels that are not in order.
+    """
+    if readout.pattern is not None and array.ndim != 2:
+        raise InputError(
+            f"{file}: {array.shape[-1]} channels; the run's sensor has {readout.pattern} filters: "
+            "give one number a pixel, as the sensor has it"
+        )
+    if readout.pattern is None and (array.ndim != 3 or array.shape[-1] != 3):
+        raise InputError(
+            f"{file}: of shape {array.shape}; the run's sensor sees all colours in each pixel: "
+            "give (height, width, 3)"
+        )
+    fraction = array.dtype.kind == "f"
+    top = 1.0 if fraction else float(np.iinfo(array.dtype).max)
+    codes = top if fraction or readout.bits is None else 2.0**readout.bits - 1.0
+    no_light = 0.0 if fraction or readout.bits is None else readout.black_level * codes
+    black = no_light if black_level is None else black_level
+    white = codes if white_level is None else white_level
+    if not (math.isfinite(black) and math.isfinite(white) and black < white):
+        raise InputError(
+            f"--black-level {black:g} and --white-level {white:g}: black must be below white"
+        )
+    numbers = torch.from_numpy(array.astype(np.float32))
+    numbers = numbers[None] if numbers.ndim == 2 else numbers.permute(2, 0, 1)
+    signal = ((numbers - black) / (white - black))[None]
+    if float(signal.max()) > 1.001:
+        logger.warning(
+            "%s: numbers up to %g lie above white, %g; is --white-level right?",
+            file,
+            float(numbers.max()),
+            white,
+        )
+    return signal
+
+
+def _metrics(truth: Tensor, sensor: Tensor, restored: Tensor) -> dict[str, float]:
+    truth = truth.to(restored)
+    found = {}
+    for prefix, image in (("raw_", sensor.to(restored)), ("", restored)):
+        found[f"{prefix}psnr_db"] = float(psnr_db(image, truth))
+        found[f"{prefix}ssim"] = float(structural_similarity(image, truth))
+    return found
+
+
+def _record(camera: PictureCamera, file: str | Path, applied: Sequence[Applied]) -> dict[str, Any]:
+    run, options = camera.run, camera.options
+    return {
+        "picture": str(file),
+        "run": str(run.folder),
+        "experiment": run.experiment,
+        "checkpoint": str(run.checkpoint),
+        "step": run.step,
+        "seed": options.seed,
+        "raw": options.raw,
+        "window": options.window,
+        "margin": camera.margin,
+        "images": {
+            entry.name: {
+                "mapping": entry.mapping,
+                "files": [path.name for path in entry.files],
+                **entry.metrics,
+            }
+            for entry in applied
+        },
+    }
+
+
+def _check_size(file: Path, size: Sequence[int]) -> None:
+    height, width = size
+    if min(height, width) < _SMALLEST:
+        raise InputError(
+            f"{file}: {width}×{height} pixels; allowed: {_SMALLEST} or more along each side"
+        )
+    memory = 4.0 * 3 * height * width * _COPIES
+    if memory > _MUCH_MEMORY:
+        logger.warning(
+            "%s: %d×%d pixels take about %.0f GB of memory", file, width, height, memory / 1e9
+        )
+
+
+def _label(depth: float) -> str:
+    return f"{depth / 1000.0:g}m"
