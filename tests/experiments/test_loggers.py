@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.validation_pictures import ValidationPictures, side_by_side
+from dolens.experiments.loggers import history as history_file
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, TakesPictures, TakesSummary, summarise
 from dolens.experiments.loggers.tensorboard import TensorBoard
@@ -31,7 +32,9 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-def test_a_table_has_a_row_a_step_with_what_was_logged_there(tmp_path):
+@pytest.mark.parametrize("wait_s", [0.0, 1e9], ids=["one by one", "together"])
+def test_a_table_has_a_row_a_step_with_what_was_logged_there(tmp_path, monkeypatch, wait_s):
+    monkeypatch.setattr(history_file, "_WAIT_S", wait_s)
     history = History(tmp_path / "metrics.csv")
     for step in (4, 9):
         history.log_metrics({"train/loss": 1.0 / step, "epoch": step // 5}, step)
