@@ -86,7 +86,7 @@ def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: floa
         left_over.numpy(), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest"
     )
     for picture, owners, name in (
-        (bright, line[:3], "over measured peak"),
+        (bright, line[:3], "over measured peak\n(no unit)"),
         (differing, line[3], "difference (%)"),
     ):
         bar = figure.colorbar(picture, ax=owners, fraction=0.05, pad=0.02)

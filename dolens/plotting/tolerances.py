@@ -17,6 +17,8 @@ from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, open_axes
 _CELL_WIDTH, _CELL_HEIGHT = 0.26, 0.14
 # Inches for the labels of rows, and for those of columns with titles and colour bars.
 _LEFT, _BOTTOM = 1.4, 2.3
+# Matrices that are wider than a page by this factor are squeezed; wider ones are stacked.
+_SQUEEZE = 1.4
 # White is zero: of numbers of both signs, and of positive ones.
 _BOTH_SIGNS, _POSITIVE = "RdBu_r", "Reds"
 # Two standard deviations of a share of n lenses, √(p·(1 - p)/n), are drawn as a band.
@@ -49,7 +51,7 @@ def matrix_figure(
                 f"the matrix is {tuple(matrix.shape)}"
             )
     widths = [max(len(columns), 5) * _CELL_WIDTH for _, columns in panels.values()]
-    beside = sum(widths) + 0.35 * len(panels) + _LEFT <= PAGE * 1.15
+    beside = sum(widths) + 0.35 * len(panels) + _LEFT <= _SQUEEZE * PAGE
     tall = len(rows) * _CELL_HEIGHT + _BOTTOM
     if beside:
         size = (min(sum(widths) + 0.35 * len(panels) + _LEFT, PAGE), tall + 0.3)
@@ -151,7 +153,7 @@ def yield_figure(
     figure.legend(
         handles=[*legend[0], band],
         loc="outside lower center",
-        ncols=3,
+        ncols=3 if len(panels) > 1 else 2,
         frameon=False,
         fontsize=SMALL,
     )
