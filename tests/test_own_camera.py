@@ -14,7 +14,9 @@ from tests.experiments.tiny_experiment import TINY
 
 TUTORIAL = Path(__file__).resolve().parents[1] / "docs/own_camera.md"
 # `my_camera/<path>`: and then the file, indented or fenced.
-FILE = re.compile(r"^`my_camera/([\w./]+)`:\n\n(?:```python\n((?s:.*?))^```|((?:    .*\n|\n)+))", re.M)
+FILE = re.compile(
+    r"^`my_camera/([\w./]+)`:\n\n(?:```python\n((?s:.*?))^```|((?:    .*\n|\n)+))", re.M
+)
 
 
 @pytest.fixture
