@@ -12,6 +12,9 @@ from dolens.diffraction.field_wavefronts import field_wavefronts
 from dolens.diffraction.point_spread import field_pupils
 from dolens.optics.lens import Lens
 
+# Samples across the pupil beyond which rays alone are used: a spot of some 300 Airy radii.
+_MOST_SAMPLES = 1024
+
 
 @dataclass(frozen=True)
 class DiffractionModulation:
@@ -73,7 +76,7 @@ def diffraction_modulation(
     frequency = torch.as_tensor(frequencies, dtype=torch.float64, device=lens.device).reshape(-1)
     dark = torch.full_like(frequency, math.nan).expand(4, -1)
     along = field_directions(found.fields, object_distance).to(lens.device)
-    pupils = field_pupils(lens, found, object_distance)
+    pupils = field_pupils(lens, found, object_distance, _MOST_SAMPLES)
     rows = []
     for pupil, tangential in zip(pupils, along, strict=True):
         if pupil is None:

@@ -9,7 +9,7 @@ from scipy.special import j0, j1
 
 from dolens.analysis.encircled_energy import EncircledEnergy
 from dolens.analysis.spot_diagram import AIRY
-from dolens.plotting.style import SMALL, TITLE, colours, field_label, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
 
 
 def encircled_energy_figure(
@@ -28,13 +28,13 @@ def encircled_energy_figure(
         title: above the axes.
     """
     given = [curves for curves in (with_diffraction, geometric) if curves is not None]
-    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+    figure = Figure(figsize=(PAGE, 4.0), layout="constrained")
     axes = figure.add_subplot()
     reach = max((float(curves.radii_um[-1]) for curves in given), default=1.0)
     handles = []
     for curves in given:
         solid = curves is with_diffraction
-        shades = colours(len(curves.fields))
+        shades = ordered_colours(len(curves.fields))
         for number, (field, colour) in enumerate(zip(curves.fields, shades, strict=True)):
             label = field_label(field, curves.field_unit)
             line = curves.energy[number].numpy()

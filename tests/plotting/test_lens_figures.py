@@ -127,11 +127,13 @@ def test_the_section_names_fields_in_the_lens_s_own_unit(triplet):
     # Light from below the axis rises.
     path = [line for line in figure.axes[0].lines if line.get_gid() == "ray"][-1]
     assert path.get_ydata()[0] < path.get_ydata()[-1]
-    assert "object at 500 mm" in figure.axes[0].get_title()
+    assert "object at 500 mm" in figure.axes[0].get_title().replace("\n", " ")
 
 
 def test_captions_name_lens_aperture_and_light(triplet):
     assert caption("Fans", triplet, LINES) == "Fans: Cooke triplet, F/4.93, 486.1, 587.6, 656.3 nm"
+    long = caption("Point spread functions", triplet, LINES)
+    assert long == "Point spread functions: Cooke triplet\nF/4.93, 486.1, 587.6, 656.3 nm"
     assert "working F/" in caption("Fans", triplet, LINES, 500.0)
     assert wavelengths_text([587.5618]) == "587.6 nm"
     assert wavelengths_text(range(400, 800, 100)) == "4 wavelengths from 400 to 700 nm"
