@@ -9,8 +9,8 @@ from torch import Tensor
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 
-# Longer names of lenses are cut, and longer captions take two lines.
-_LONGEST, _LINE = 60, 58
+# Longer names of lenses are cut; lines of a caption fit over a narrow figure.
+_LONGEST, _LINE = 50, 52
 
 
 @torch.no_grad()
@@ -20,7 +20,8 @@ def caption(
     wavelengths: Sequence[float] | Tensor,
     object_distance: float | None = None,
 ) -> str:
-    """Return a title such as `Spot diagram: Cooke triplet, F/4.93, 587.6 nm`, in two lines if long.
+    """Return a title such as `Spot diagram: Cooke triplet, F/4.93, 587.6 nm`; lines break where
+    one is too long for a narrow figure.
 
     Args:
         what: the figure shows.
@@ -37,12 +38,12 @@ def caption(
     parts.append(wavelengths_text(wavelengths))
     if object_distance is not None:
         parts.append(f"object at {object_distance:g} mm")
-    light = ", ".join(parts)
-    if not lens.name:
-        return f"{what}: {light}"
-    first_line = f"{what}: {plain_text(lens.name)}"
-    fits = len(first_line) + len(light) < _LINE
-    return f"{first_line}, {light}" if fits else f"{first_line}\n{light}"
+    name = [f"{plain_text(lens.name)},"] if lens.name else []
+    lines = [f"{what}:"]
+    for piece in (*name, ", ".join(parts)):
+        longer = f"{lines[-1]} {piece}"
+        lines[-1:] = [longer] if len(longer) <= _LINE else [lines[-1], piece]
+    return "\n".join(lines)
 
 
 def wavelengths_text(wavelengths: Sequence[float] | Tensor) -> str:

@@ -133,12 +133,12 @@ def test_the_section_names_fields_in_the_lens_s_own_unit(triplet):
 def test_captions_name_lens_aperture_and_light(triplet):
     assert caption("Fans", triplet, LINES) == "Fans: Cooke triplet, F/4.93, 486.1, 587.6, 656.3 nm"
     long = caption("Point spread functions", triplet, LINES)
-    assert long == "Point spread functions: Cooke triplet\nF/4.93, 486.1, 587.6, 656.3 nm"
+    assert long == "Point spread functions: Cooke triplet,\nF/4.93, 486.1, 587.6, 656.3 nm"
     assert "working F/" in caption("Fans", triplet, LINES, 500.0)
     assert wavelengths_text([587.5618]) == "587.6 nm"
     assert wavelengths_text(range(400, 800, 100)) == "4 wavelengths from 400 to 700 nm"
     assert plain_text("a\nb $c$") == r"a b \$c\$"
-    assert len(plain_text("x" * 100)) == 60
+    assert len(plain_text("x" * 100)) == 50
 
 
 def test_nothing_to_plot_is_refused():
