@@ -81,7 +81,8 @@ class FieldPupil:
         reason = found._obstacle(most_samples)
         if not reason:
             return replace(found, reason="Fourier transform of the pupil")
-        rays = pupil_wavefront(system, point, front.wavelength, front.centre, _RAYS)
+        # An infinite sphere is met by all rays, however far they land from its centre.
+        rays = pupil_wavefront(system, point, front.wavelength, front.centre, _RAYS, math.inf)
         return cls(rays, weights, None, f"rays alone: {reason}")
 
     @property
