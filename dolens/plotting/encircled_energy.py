@@ -38,15 +38,14 @@ def encircled_energy_figure(
         for number, (field, colour) in enumerate(zip(curves.fields, shades, strict=True)):
             label = field_label(field, curves.field_unit)
             line = curves.energy[number].numpy()
-            if np.isnan(line).all():
-                label = f"{label} (no light passes)"
-            elif solid and not curves.diffraction[number]:
-                label = f"{label} (rays alone)"
-            else:
+            alone = with_diffraction is not None and not with_diffraction.diffraction[number]
+            dark = bool(np.isnan(line).all())
+            if dark or alone:
+                label += " (no light passes)" if dark else " (rays alone)"
+            # Rays alone are drawn once.
+            if solid or not alone:
                 style = {"linestyle": "-" if solid else "--", "linewidth": 1.6 if solid else 1.1}
                 axes.plot(curves.radii_um, line, color=colour, gid="energy", zorder=3, **style)
-            if solid and not (np.isnan(line).all() or curves.diffraction[number]):
-                axes.plot(curves.radii_um, line, color=colour, gid="energy", linewidth=1.6)
             if curves is given[0]:
                 handles.append(Line2D([], [], color=colour, linewidth=1.6, label=label))
     if given and math.isfinite(given[0].airy_radius_um):
