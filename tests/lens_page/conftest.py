@@ -62,10 +62,15 @@ class Page(HTMLParser):
 def hostile_lens():
     data = copy.deepcopy(SINGLET)
     data["name"] = HOSTILE
-    data["elements"] = {HOSTILE.replace(".", ""): {"surfaces": [1, 2], "tilt_x": 0.01}}
+    data["elements"] = {HOSTILE.replace(".", ""): {"surfaces": [2, 3], "tilt_x": 0.01}}
     data["wavelengths"] = [587.5618]
     # No ray of the last field passes.
-    data["fields"] = {"angles": [[0, 0], [0, 3], [0, 75]]}
+    data["fields"] = {"angles": [[0, 0], [0, 3], [0, 40]]}
+    # A hole in front: the two faces of the glass follow, the first of them the stop.
+    hole = {"type": "aperture", "semi_diameter": 5, "thickness": 20.0, "material": "air"}
+    data["surfaces"] = {"1": hole, "2": data["surfaces"]["1"], "3": data["surfaces"]["2"]}
+    data["stop"] = 2
+    data["sensor"] = {"distance": 25.9, "diameter": 6.0}
     return lens_from_prescription(data)
 
 
