@@ -268,12 +268,19 @@ def _mean_irradiance(pupil: FieldPupil, half: float, cells: int) -> tuple[Tensor
     return means, peak, perfect
 
 
+# Windows of its own that a field's encircled energy is followed for.
+_FAR = 4.0
+
+
 def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     """Return the shares (Q,) of a field's light within radii in mm."""
     radii = radii.to(pupil.weights)
     if not pupil.diffraction:
         return pupil.encircled_rays(radii)
-    half = float(radii[-1]) + 1e-9
+    # Far beyond its window, as the spot of another field may need, a field's curve stays level.
+    widest = _FAR * _half_width(pupil)
+    half = min(float(radii[-1]), widest) + 1e-9
+    radii = radii.clamp(max=widest)
     wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius)
     cells = min(max(wanted, 2 * _CELLS), _MOST)
     step = 2.0 * half / cells
