@@ -105,11 +105,13 @@ class _Progress:
             self.status = None
 
     def taken(self, system: Any, folder: Path) -> None:
-        self.console.print(f"{system.name}: finished before, {folder}", markup=False)
+        self.console.print(
+            f"{system.name}: finished before, {folder}", markup=False, soft_wrap=True
+        )
 
     def started(self, system: Any, number: int, count: int) -> None:
         self.line = f"[{number}/{count}] {system.name}"
-        self.console.print(f"{self.line}: {system.title}", markup=False)
+        self.console.print(f"{self.line}: {system.title}", markup=False, soft_wrap=True)
         if self.console.is_terminal:
             self.status = self.console.status("")
             self.status.start()
@@ -123,14 +125,15 @@ class _Progress:
         self.stop()
         took = _duration(finish.wall_s)
         if finish.status == 0:
-            self.console.print(f"{self.line}: done in {took}", markup=False)
+            self.console.print(f"{self.line}: done in {took}", markup=False, soft_wrap=True)
             return
         runner = import_extra(f"{_PACKAGE}.runner", "train", "dolens report")
         self.console.print(
             f"{self.line}: FAILED after {took} with status {finish.status}; {finish.log} ends with",
             markup=False,
+            soft_wrap=True,
         )
-        self.console.print(runner.last_words(finish.log), markup=False)
+        self.console.print(runner.last_words(finish.log), markup=False, soft_wrap=True)
 
 
 def _list(plan: Any) -> None:

@@ -124,7 +124,7 @@ def _checks(material: Material, item: Item) -> Markup | None:
         return None
     rows: list[tuple[Child, ...]] = [
         (
-            outcome.check.what,
+            prose(outcome.check.what),
             expected_text(outcome.check),
             element("span", found_text(outcome), class_=css_class(outcome.state)),
             str(outcome.state),
