@@ -118,8 +118,8 @@ class _Progress:
 
     def tick(self, elapsed: float, remaining: float) -> None:
         if self.status is not None:
-            left = _duration(float(round(remaining)))
-            self.status.update(f"{_duration(float(round(elapsed)))}; all runs: about {left} left")
+            left = f"about {_duration(remaining)} left" if remaining >= 1.0 else "nearly done"
+            self.status.update(f"{_duration(elapsed)}; all runs: {left}")
 
     def ended(self, system: Any, finish: Any) -> None:
         self.stop()
