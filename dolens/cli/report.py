@@ -105,32 +105,35 @@ class _Progress:
             self.status = None
 
     def taken(self, system: Any, folder: Path) -> None:
-        self.console.print(f"{system.name}: finished before, {folder}", markup=False)
+        self.console.print(
+            f"{system.name}: finished before, {folder}", markup=False, soft_wrap=True
+        )
 
     def started(self, system: Any, number: int, count: int) -> None:
         self.line = f"[{number}/{count}] {system.name}"
-        self.console.print(f"{self.line}: {system.title}", markup=False)
+        self.console.print(f"{self.line}: {system.title}", markup=False, soft_wrap=True)
         if self.console.is_terminal:
             self.status = self.console.status("")
             self.status.start()
 
     def tick(self, elapsed: float, remaining: float) -> None:
         if self.status is not None:
-            left = _duration(float(round(remaining)))
-            self.status.update(f"{_duration(float(round(elapsed)))}; all runs: about {left} left")
+            left = f"about {_duration(remaining)} left" if remaining >= 1.0 else "nearly done"
+            self.status.update(f"{_duration(elapsed)}; all runs: {left}")
 
     def ended(self, system: Any, finish: Any) -> None:
         self.stop()
         took = _duration(finish.wall_s)
         if finish.status == 0:
-            self.console.print(f"{self.line}: done in {took}", markup=False)
+            self.console.print(f"{self.line}: done in {took}", markup=False, soft_wrap=True)
             return
         runner = import_extra(f"{_PACKAGE}.runner", "train", "dolens report")
         self.console.print(
             f"{self.line}: FAILED after {took} with status {finish.status}; {finish.log} ends with",
             markup=False,
+            soft_wrap=True,
         )
-        self.console.print(runner.last_words(finish.log), markup=False)
+        self.console.print(runner.last_words(finish.log), markup=False, soft_wrap=True)
 
 
 def _list(plan: Any) -> None:

@@ -82,7 +82,9 @@ def _row(outcome: Outcome) -> tuple[Child, ...]:
     return (
         joined(
             element("a", check.item, href=f"#{anchor(check.item)}"),
-            f": {check.what} ",
+            ": ",
+            prose(check.what),
+            " ",
             element("code", f"{check.run}: {check.metric}"),
         ),
         expected_text(check),
