@@ -3,6 +3,7 @@
 import sys
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -41,3 +42,17 @@ def test_figures_are_not_registered_anywhere():
     else:
         figure_to_image(history_figure([1.0, 0.1, 0.01]), dpi=20)
         assert "matplotlib.pyplot" not in sys.modules
+
+
+def test_a_figure_is_written_in_every_format_that_is_asked_for(tmp_path):
+    figure = history_figure([1.0, 0.1, 0.01])
+    paths = save_figures(figure, tmp_path / "deep" / "history.v2", ("png", "pdf", "svg"))
+    assert [path.name for path in paths] == ["history.v2.png", "history.v2.pdf", "history.v2.svg"]
+    png, pdf, svg = (path.read_bytes() for path in paths)
+    assert png[1:4] == b"PNG" and pdf[:4] == b"%PDF" and b"<svg" in svg
+    # Letters stay letters in PDF: fonts of type 42, not shapes of type 3.
+    assert b"/Type3" not in pdf and b"/CIDFontType2" in pdf
+    again = save_figures(figure, tmp_path / "again", ("svg",))[0].read_bytes()
+    assert again == svg
+    with pytest.raises(InputError, match="formats: 'gif' is unknown|formats.*gif"):
+        save_figures(figure, tmp_path / "history", ("gif",))
