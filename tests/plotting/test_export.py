@@ -7,7 +7,8 @@ import pytest
 import torch
 from PIL import Image
 
-from dolens.plotting import figure_to_image, history_figure, save_figure
+from dolens.errors import InputError
+from dolens.plotting import figure_to_image, history_figure, save_figure, save_figures
 
 
 def test_an_image_tensor_has_the_figures_size_and_colours():
@@ -54,5 +55,5 @@ def test_a_figure_is_written_in_every_format_that_is_asked_for(tmp_path):
     assert b"/Type3" not in pdf and b"/CIDFontType2" in pdf
     again = save_figures(figure, tmp_path / "again", ("svg",))[0].read_bytes()
     assert again == svg
-    with pytest.raises(InputError, match="formats: 'gif' is unknown|formats.*gif"):
+    with pytest.raises(InputError, match="gif"):
         save_figures(figure, tmp_path / "history", ("gif",))
