@@ -299,8 +299,13 @@ def _autocorrelation(
     size = 2 * function.shape[-1]
     line = torch.fft.fft(function, size, dim=dim)
     spread = (line.real.square() + line.imag.square()).sum(-2 if axis == 0 else -1)
+    # A cell that passes a share c has amplitude c, but flux c and not c²: the autocorrelation at
+    # zero, the mean of its transform, lacks the difference.
+    steps = pupil.cosines[..., 1] - pupil.cosines[..., 0]
+    square = function.real.square() + function.imag.square()
+    spread = spread + (pupil.flux / steps.prod(-1) - square.sum((-2, -1)))[:, None]
     spread = spread / spread.sum(-1, keepdim=True)
-    step = pupil.cosines[:, axis, 1] - pupil.cosines[:, axis, 0]
+    step = steps[:, axis]
     wave = MM_PER_NM * pupil.wavelength / pupil.index
     order = torch.fft.fftfreq(size, dtype=torch.float64, device=spread.device)
     # U(ρ) goes with exp(+ikρα), and the transform with exp(-i…): sample j lies at -j·λ/(n'·Δα).

