@@ -87,6 +87,5 @@ def test_figures_and_the_view_in_space_show_something(page, measured, chromium):
         assert part.std((0, 1)).max() > 4.0
     left, top, across, down = found["canvas"]
     part = pixels[top : top + down, left : left + across]
-    # The rays of the axis are blue, those of the second field orange.
-    assert ((part[..., 0] - part[..., 2]) > 60).sum() > 50
-    assert ((part[..., 2] - part[..., 0]) > 60).sum() > 50
+    # Glass is pale; rays are not.
+    assert ((part.max(-1) - part.min(-1)) > 90).sum() > 100
