@@ -41,8 +41,9 @@ def measured(page, chromium):
         outer = page[0].parent / f"frame{width}.html"
         outer.write_text(
             f'<iframe id="f" src="measured.html" style="width:{width}px;height:900px;border:0">'
-            '</iframe><pre id="out"></pre><script>setTimeout(() => { out.textContent = '
-            'f.contentDocument.getElementById("measured").textContent; }, 2000)</script>'
+            '</iframe><pre id="out"></pre><script>setInterval(() => {'
+            'const found = f.contentDocument && f.contentDocument.getElementById("measured");'
+            "if (found && found.textContent) out.textContent = found.textContent; }, 100)</script>"
         )
         dom = chromium(
             outer, "--dump-dom", "--allow-file-access-from-files", "--window-size=1400,1000"
