@@ -211,8 +211,10 @@ class PageSections:
         for point, waves, reason in zip(self.where.fields, diffraction, reasons, strict=True):
             if not waves:
                 text = field_text(point, self.where.field_unit)
-                found.setdefault(reason, []).append(text)
-        return [f"diffraction at {', '.join(fields)}: {reason}" for reason, fields in found.items()]
+                found.setdefault(reason.removeprefix("rays alone: "), []).append(text)
+        return [
+            f"diffraction at {', '.join(fields)} ({reason})" for reason, fields in found.items()
+        ]
 
     def energy(self) -> Content:
         """Plot encircled energy with diffraction, and that of rays."""

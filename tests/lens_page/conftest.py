@@ -107,7 +107,7 @@ def chromium(tmp_path_factory):
         quiet = (
             *("--disable-quic", "--no-first-run", "--disable-background-networking"),
             *("--disable-component-update", "--disable-sync", "--hide-scrollbars"),
-            *("--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=3000"),
+            *("--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=6000"),
         )
         done = subprocess.run(
             [program, *quiet, f"--user-data-dir={profile}", *options, path.as_uri()],

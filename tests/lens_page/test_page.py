@@ -66,7 +66,7 @@ def test_a_field_that_no_ray_passes_is_named_and_stops_nothing(parsed, page):
 
 
 def test_the_tables_say_the_lens_and_the_aperture_asked_for(parsed):
-    cells = {row[0]: row[1] for table in parsed.tables for row in table if len(row) > 1}
+    cells = {row[0]: row[1] for table in parsed.tables[::-1] for row in table if len(row) > 1}
     # Lensmaker's equation for R = 20 and -50 mm, 5 mm of glass of n = 1.5168.
     n, a, b, t = 1.5168, 20.0, -50.0, 5.0
     power = (n - 1.0) * (1.0 / a - 1.0 / b + (n - 1.0) * t / (n * a * b))

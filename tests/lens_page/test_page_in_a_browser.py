@@ -41,8 +41,9 @@ def measured(page, chromium):
         outer = page[0].parent / f"frame{width}.html"
         outer.write_text(
             f'<iframe id="f" src="measured.html" style="width:{width}px;height:900px;border:0">'
-            '</iframe><pre id="out"></pre><script>setTimeout(() => { out.textContent = '
-            'f.contentDocument.getElementById("measured").textContent; }, 2000)</script>'
+            '</iframe><pre id="out"></pre><script>setInterval(() => {'
+            'const found = f.contentDocument && f.contentDocument.getElementById("measured");'
+            "if (found && found.textContent) out.textContent = found.textContent; }, 100)</script>"
         )
         dom = chromium(
             outer, "--dump-dom", "--allow-file-access-from-files", "--window-size=1400,1000"
@@ -87,6 +88,5 @@ def test_figures_and_the_view_in_space_show_something(page, measured, chromium):
         assert part.std((0, 1)).max() > 4.0
     left, top, across, down = found["canvas"]
     part = pixels[top : top + down, left : left + across]
-    # The rays of the axis are blue, those of the second field orange.
-    assert ((part[..., 0] - part[..., 2]) > 60).sum() > 50
-    assert ((part[..., 2] - part[..., 0]) > 60).sum() > 50
+    # Glass is pale; rays are not.
+    assert ((part.max(-1) - part.min(-1)) > 90).sum() > 100
