@@ -98,7 +98,9 @@ def _show(module: Any, found: Any) -> None:
         for line in module.gain_cells(found):
             gains.add_row(*map(escape, line))
         console.print(gains)
-    console.print(f"[dim]{escape(module.explanation(found))}[/]")
+    explanation = module.explanation(found)
+    if explanation:
+        console.print(f"[dim]{escape(explanation)}[/]")
     hidden = [name for place, name in enumerate(cells[0]) if place not in shown]
     if hidden:
         console.print(

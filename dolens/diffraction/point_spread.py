@@ -20,8 +20,10 @@ from dolens.optics.lens import Lens
 # The window holds the rays and so many Airy radii around them.
 _BEYOND, _AIRY_RADII = 1.1, 3.5
 # Fewest steps of the irradiance's grid to an Airy radius, and most across a window.
-_STEPS, _MOST = 3.5, 1024
+_STEPS, _MOST = 3.5, 512
 _CELLS = 128
+# Samples across the pupil beyond which rays alone make the image: a spot of some 70 Airy radii.
+_MOST_SAMPLES = 512
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,14 @@ def prepare_pupils(
     wavelengths: Sequence[float] | Tensor,
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
+    most_samples: int = _MOST_SAMPLES,
 ) -> PreparedPupils:
-    """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s."""
+    """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s.
+
+    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
+    """
     found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
-    return PreparedPupils(found, field_pupils(lens, found, object_distance))
+    return PreparedPupils(found, field_pupils(lens, found, object_distance, most_samples))
 
 
 @torch.no_grad()
@@ -201,9 +207,15 @@ def diffraction_encircled_energy(
 
 
 def field_pupils(
-    lens: Lens, found: FieldWavefronts, object_distance: float | None
+    lens: Lens,
+    found: FieldWavefronts,
+    object_distance: float | None,
+    most_samples: int = _MOST_SAMPLES,
 ) -> list[FieldPupil | None]:
-    """Return the pupils of every field; None for a field without light."""
+    """Return the pupils of every field, None for a field without light.
+
+    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
+    """
     system = lens.system().double()
     count = len(found.wavelengths)
     weights = found.weights.to(system.device)
@@ -215,7 +227,8 @@ def field_pupils(
         which = torch.arange(number * count, (number + 1) * count, device=system.device)
         field = found.fields[number].to(system.device).expand(count, 2)
         point = object_points(field, object_distance)
-        pupils.append(FieldPupil.of(system, point, _part(found.wavefront, which), weights))
+        front = _part(found.wavefront, which)
+        pupils.append(FieldPupil.of(system, point, front, weights, most_samples))
     return pupils
 
 
@@ -255,12 +268,19 @@ def _mean_irradiance(pupil: FieldPupil, half: float, cells: int) -> tuple[Tensor
     return means, peak, perfect
 
 
+# Windows of its own that a field's encircled energy is followed for.
+_FAR = 4.0
+
+
 def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     """Return the shares (Q,) of a field's light within radii in mm."""
     radii = radii.to(pupil.weights)
     if not pupil.diffraction:
         return pupil.encircled_rays(radii)
-    half = float(radii[-1]) + 1e-9
+    # Far beyond its window, as the spot of another field may need, a field's curve stays level.
+    widest = _FAR * _half_width(pupil)
+    half = min(float(radii[-1]), widest) + 1e-9
+    radii = radii.clamp(max=widest)
     wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius)
     cells = min(max(wanted, 2 * _CELLS), _MOST)
     step = 2.0 * half / cells

@@ -11,6 +11,9 @@ from dolens.analysis.modulation_transfer import field_directions
 from dolens.diffraction.point_spread import PreparedPupils, prepare_pupils
 from dolens.optics.lens import Lens
 
+# Samples across the pupil beyond which rays alone are used: a spot of some 300 Airy radii.
+_MOST_SAMPLES = 1024
+
 
 @dataclass(frozen=True)
 class DiffractionModulation:
@@ -73,7 +76,7 @@ def diffraction_modulation(
         InputError: no fields or wavelengths, or weights that do not fit.
     """
     prepared = prepared or prepare_pupils(
-        lens, fields, wavelengths, object_distance, wavelength_weights
+        lens, fields, wavelengths, object_distance, wavelength_weights, _MOST_SAMPLES
     )
     found, pupils = prepared.wavefronts, prepared.pupils
     frequency = torch.as_tensor(frequencies, dtype=torch.float64, device=lens.device).reshape(-1)

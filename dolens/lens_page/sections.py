@@ -4,7 +4,7 @@ Every section is computed alone, so that one that fails leaves the others.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -53,6 +53,8 @@ from dolens.plotting.spots import spots_figure
 
 # Of each field and wavelength.
 _MTF_RAYS, _RMS_RAYS = 6000, 2000
+# Share of the brightest field's light that a field of tolerances has.
+_BRIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -285,9 +287,19 @@ class PageSections:
 
     def offenders(self) -> Content:
         """Find the worst offenders among tolerances."""
-        found = offenders(self.lens, self.where, self.tolerances)
+        where, problems = self.where, []
+        if self.overview.spots is not None:
+            # Where little of the stop is lit, tolerances say nothing of use.
+            light = self.overview.spots.valid.double().mean((1, 2))
+            bright = light >= _BRIGHT * light.max()
+            dim = [field_text(point, where.field_unit) for point in where.fields[~bright]]
+            if dim and bool(bright.any()):
+                where = replace(where, fields=where.fields[bright])
+                problems.append(f"tolerances at {', '.join(dim)}: too little light passes")
+        found = offenders(self.lens, where, self.tolerances)
         return Content(
             {"worst_offenders": found.figure()},
             [found.table()],
             " ".join([*found.notes, found.summary()]),
+            problems=problems,
         )

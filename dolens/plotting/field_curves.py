@@ -7,11 +7,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from torch import Tensor
 
 from dolens.analysis.conditions import FieldScan
 from dolens.analysis.field_curves import FieldCurves
-from dolens.plotting.style import PALETTE, SMALL, TITLE, ruled_axes, spectral_colour
+from dolens.plotting.style import (
+    PAGE,
+    SMALL,
+    TITLE,
+    ruled_axes,
+    spectral_colour,
+    wavelength_handles,
+)
 
 # Half widths of axes whose curves do not leave zero, mm and percent.
 _FLAT, _UNDISTORTED = 1e-4, 0.01
@@ -29,7 +35,7 @@ def field_curves_figure(
         title: above all.
     """
     rows = [curves] if isinstance(curves, FieldCurves) else list(curves)
-    figure = Figure(figsize=(7.6, 3.6 * len(rows) + 0.7), layout="constrained")
+    figure = Figure(figsize=(PAGE, 3.4 * len(rows) + 0.8), layout="constrained")
     grid = figure.subplots(len(rows), 2, squeeze=False, sharey="row", sharex="col")
     for (left, right), row in zip(grid, rows, strict=True):
         _foci(left, row)
@@ -51,10 +57,7 @@ def field_curves_figure(
     handles = [
         Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
         Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
-        *(
-            Line2D([], [], color=colour, linewidth=1.4, label=f"{float(wave):g} nm")
-            for wave, colour in line_colours(rows[0].wavelengths).items()
-        ),
+        *wavelength_handles(rows[0].wavelengths),
     ]
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
@@ -86,19 +89,10 @@ def note_if_empty(axes: Axes, values: np.ndarray, text: str) -> None:
         )
 
 
-def line_colours(wavelengths: Sequence[float] | Tensor) -> dict[float, str]:
-    """Return a colour for each wavelength (nm): its place in the spectrum, or blue for one alone,
-    because yellow is pale on white.
-    """
-    waves = [float(wave) for wave in wavelengths]
-    if len(waves) == 1:
-        return {waves[0]: PALETTE[0]}
-    return {wave: spectral_colour(wave) for wave in waves}
-
-
 def _foci(axes: Axes, curves: FieldCurves) -> None:
     field = curves.scan.coordinate.numpy()
-    for number, colour in enumerate(line_colours(curves.wavelengths).values()):
+    for number, wavelength in enumerate(curves.wavelengths):
+        colour = spectral_colour(float(wavelength))
         style = {"color": colour, "linewidth": 1.4, "zorder": 3}
         axes.plot(curves.tangential[:, number], field, gid="tangential", **style)
         axes.plot(curves.sagittal[:, number], field, gid="sagittal", linestyle="--", **style)
@@ -106,8 +100,7 @@ def _foci(axes: Axes, curves: FieldCurves) -> None:
 
 
 def _distortion(axes: Axes, curves: FieldCurves) -> None:
-    known = line_colours(curves.wavelengths)
-    colour = known.get(curves.reference_wavelength, PALETTE[0])
+    colour = spectral_colour(curves.reference_wavelength)
     field = curves.scan.coordinate.numpy()
     axes.plot(curves.distortion, field, color=colour, linewidth=1.4, gid="distortion", zorder=3)
     note_if_empty(axes, curves.distortion.numpy(), "no chief ray reaches the sensor")

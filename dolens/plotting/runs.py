@@ -53,7 +53,7 @@ def runs_figure(
     """
     texts = [_wrapped(label) for label in labels]
     lines = sum(text.count("\n") + 1 for text in texts)
-    figure = Figure(figsize=(7.5, 1.4 + 0.2 * lines + 0.18 * len(texts)), layout="constrained")
+    figure = Figure(figsize=(7.5, 1.3 + 0.16 * lines + 0.14 * len(texts)), layout="constrained")
     axes = figure.add_subplot()
     heights = range(len(points))
     for height, point in zip(heights, points, strict=True):

@@ -27,7 +27,7 @@ DEFAULT_WINDOW = 512
 _INFLUENCE = 1e-4
 _FIRST_PROBE, _LARGEST_PROBE = 256, 1024
 # Restored pixels that are looked at, from the middle of the probe: at several places of the grid.
-_LOOKED_AT = ((0, 0), (3, 7), (10, 5), (23, 31))
+_LOOKED_AT = ((0, 0), (3, 7), (10, 13))
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def margin_of(
     while size <= largest:
         reach = _reach(network, functions, size, device)
         # Near the probe's edge less is seen than there would be.
-        if reach < size // 2 - GRID:
+        if reach < size // 2 - GRID // 2:
             return max(GRID, GRID * math.ceil(reach / GRID))
         size *= 2
     return None

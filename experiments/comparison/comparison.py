@@ -27,6 +27,8 @@ from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
 from dolens.reconstruction.intervals import Interval
 
 NONE = "–"
+# So many experiments are named in a title.
+_FEW = 2
 GAIN_HEADING = ("row", "metric", "gain", "seeds", "photographs")
 
 
@@ -74,11 +76,12 @@ class Comparison:
 
     def title(self) -> str:
         """Return the experiments, and how many runs there are."""
-        names = dict.fromkeys(row.experiment for row in self.rows.rows)
+        names = list(dict.fromkeys(row.experiment for row in self.rows.rows))
+        what = ", ".join(names) if len(names) <= _FEW else f"{len(names)} experiments"
         runs = sum(len(row.runs) for row in self.rows.rows)
         failed = len(self.found.unfinished)
         count = f"{runs} run{'s' if runs > 1 else ''}"
-        return f"{', '.join(names)}: {count}{f', {failed} without results' if failed else ''}"
+        return f"{what}: {count}{f', {failed} without results' if failed else ''}"
 
 
 def compared(
@@ -112,17 +115,23 @@ def markdown_of(comparison: Comparison) -> str:
     if comparison.against is not None:
         lines += ["", f"Gains over row {comparison.against.number} ({comparison.against.label}):"]
         lines += ["", *_table(GAIN_HEADING, gain_cells(comparison))]
-    lines += ["", explanation(comparison)]
-    lines += [f"- {note}" for note in comparison.notes()]
+    for part in ([explanation(comparison)], [f"- {note}" for note in comparison.notes()]):
+        lines += ["", *part] if any(part) else []
     return "\n".join(lines) + "\n"
 
 
 def explanation(comparison: Comparison) -> str:
-    """Return a line that says how to read the numbers."""
-    text = "Several seeds: mean ± half their range. One run: [95 % interval over its photographs]"
+    """Return a line that says how to read the numbers; empty where they need no words."""
+    values = [value_of(r, m) for r in comparison.rows.rows for m in comparison.metrics]
+    known = [value for value in values if value is not None]
+    texts = []
+    if any(value.count > 1 for value in known):
+        texts.append("Several seeds: mean ± half their range.")
+    if any(value.low is not None for value in known):
+        texts.append("One run: [95 % interval over its photographs].")
     if comparison.against is not None:
-        text += ". Gains: estimate [95 % interval, paired over seeds and photographs]"
-    return f"{text}."
+        texts.append("Gains: estimate [95 % interval, paired over seeds and photographs].")
+    return " ".join(texts)
 
 
 def gain_cells(comparison: Comparison) -> list[list[str]]:
@@ -206,11 +215,11 @@ def plain(comparison: Comparison) -> dict[str, Any]:
 def figure_of(comparison: Comparison) -> Figure:
     """Draw the objective of every row; against the swept setting where a single number was swept.
 
-    Where runs have no objective in common, the first metric that is shown stands for it.
+    Where experiments have other objectives, it is that of the most rows.
     """
     rows = comparison.rows.rows
-    candidates = [*objectives(comparison.rows), *comparison.metrics]
-    metric = max(dict.fromkeys(candidates), key=lambda m: sum(bool(row.values(m)) for row in rows))
+    candidates = objectives(comparison.rows) or comparison.metrics
+    metric = max(candidates, key=lambda m: sum(bool(row.values(m)) for row in rows))
     names = list(comparison.rows.columns)
     swept = [name for name in names if _is_swept(rows, name)]
     title = comparison.title()

@@ -59,7 +59,7 @@ def digits_of(value: float) -> int | None:
     size = abs(value)
     if size != 0.0 and not 1e-3 <= size < 1e6:
         return None
-    return 0 if size >= 1000 else 1 if size >= 100 else 2 if size >= 2 else 3 if size >= 0.1 else 4
+    return 0 if size >= 1000 else 1 if size >= 100 else 2 if size >= 10 else 3 if size >= 0.1 else 4
 
 
 def value_of(row: Row, metric: str) -> Value | None:

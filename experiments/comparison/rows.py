@@ -74,7 +74,7 @@ def rows_of(runs: Sequence[Run]) -> Rows:
         rows.append(Row(number, run.experiment, settings, label or run.experiment, group))
         if len({run.code for run in group.values()}) > 1:
             codes = sorted({f"{r.code[0][:8]} on {r.code[1]}" for r in group.values()})
-            notes.append(f"row {number} ({rows[-1].label}) has runs of {', '.join(codes)}")
+            notes.append(f"row {number} has runs of several versions: {', '.join(codes)}")
     return Rows(tuple(rows), columns, tuple(notes))
 
 
@@ -101,9 +101,9 @@ def setting_names(runs: Sequence[Run]) -> list[str]:
 
 
 def _named(run: Run) -> dict[str, str]:
-    """Return what the command line set: leaves of the configuration, not choices."""
-    own = {name: value for name in run.overridden for name, value in _below(run.config, name)}
-    return {name: value for name, value in own.items() if name not in run.choices}
+    """Return the leaves of the configuration that the command line set, without its choices."""
+    named = [name for name in run.overridden if name not in run.choices]
+    return {name: value for part in named for name, value in _below(run.config, part)}
 
 
 def _below(config: Mapping[str, str], name: str) -> Iterable[tuple[str, str]]:

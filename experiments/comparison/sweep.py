@@ -38,7 +38,10 @@ class SweepComparison(Callback):
         jobs = run_folders(folder) if folder.is_dir() else []
         failed = [job for job in jobs if not (job / "metrics.json").is_file()]
         if failed:
-            reasons = [f"{run.folder}: {run.reason}" for run in map(read_unfinished, failed)]
+            of_reason: dict[str, list[str]] = {}
+            for run in map(read_unfinished, failed):
+                of_reason.setdefault(run.reason, []).append(run.folder.name)
+            reasons = [f"{', '.join(names)} ({reason})" for reason, names in of_reason.items()]
             sys.exit(f"error: {len(failed)} of {len(jobs)} jobs failed: {'; '.join(reasons)}")
 
 

@@ -71,8 +71,8 @@ def photons_figure(
         printed = "°" if unit == "deg" else unit
         axes.set_ylabel(f"error ({printed})", fontsize=SMALL + 1)
         ruled_axes(axes)
-        log_ticks(axes.xaxis)
-        log_ticks(axes.yaxis)
+        log_ticks(axes.xaxis, 3)
+        log_ticks(axes.yaxis, 5)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL
@@ -119,6 +119,8 @@ def rays_figure(
     floor = numbers["pose_error/reference_over_bound"]
     axes.axhspan(0.0, floor, color="0.92", label="noise of the reference", zorder=0)
     axes.set(xscale="log", yscale="log")
+    lowest = min([floor, *(min(line.get_ydata()) for line in axes.get_lines())])
+    axes.set_ylim(bottom=0.6 * lowest)
     axes.set_xlabel("rays of a source", fontsize=SMALL + 1)
     axes.set_ylabel("RMS error over bound (no unit)", fontsize=SMALL + 1)
     ruled_axes(axes)

@@ -51,7 +51,7 @@ def coverage_figure(
         )
     axes.set_xscale("symlog", linthresh=3.0)
     axes.set_yticks(range(len(errors)), [case.replace("_", " ") for case in errors])
-    axes.invert_yaxis()
+    axes.set_ylim(len(errors) - 0.5, -0.5)
     axes.set_xlabel("error over Cramér–Rao bound (no unit)", fontsize=SMALL + 1)
     axes.annotate(
         "within\n±1 | ±2",

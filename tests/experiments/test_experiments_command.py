@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from dolens.cli.app import app
 from dolens.experiments.running.catalogue import experiments, read_experiment
 
-COST = re.compile(r"(\d+ (seconds|minutes|hours)|hours|days) on (two cores|a GPU)")
+# "about": estimated from a part of the run, not measured whole.
+COST = re.compile(r"(about )?(\d+ (seconds|minutes|hours)|hours|days) on (two cores|a GPU)")
 
 
 def invoked(*arguments, width=110):

@@ -244,7 +244,8 @@ class FieldViews(Imaging):
             f"{'rays' if renderer.monte_carlo else 'point spread functions'}, diffraction: "
             f"{diffraction_of(renderer)})"
         )
-        return WholePicture(truth[None], image, self.field_of(height, width)[None], mapping)
+        field = self.field_of(height, width)[None].to(image)
+        return WholePicture(truth[None], image, field, mapping)
 
     def field_of(self, height: int, width: int) -> Tensor:
         """The places of an image's pixels on the sensor; see `Imaging.field_of`."""
