@@ -1,11 +1,43 @@
 """dolens: end-to-end co-design of optics and reconstruction."""
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from dolens.errors import InputError
-from dolens.optics.lens import Lens
-from dolens.optics.rays import Rays, Status
-from dolens.optics.surfaces import register_surface
-from dolens.prescriptions import load_lens, save_lens
+
+if TYPE_CHECKING:
+    from dolens.optics.lens import Lens
+    from dolens.optics.rays import Rays, Status
+    from dolens.optics.surfaces import register_surface
+    from dolens.prescriptions import load_lens, save_lens
 
 __version__ = "0.1.0"
 
 __all__ = ["InputError", "Lens", "Rays", "Status", "load_lens", "register_surface", "save_lens"]
+
+# Imported when they are first used, so that `dolens --help` need not wait for PyTorch.
+_HOMES = {
+    "Lens": "dolens.optics.lens",
+    "Rays": "dolens.optics.rays",
+    "Status": "dolens.optics.rays",
+    "load_lens": "dolens.prescriptions",
+    "register_surface": "dolens.optics.surfaces",
+    "save_lens": "dolens.prescriptions",
+}
+_PACKAGES = ("kernels", "optics", "prescriptions")
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name, or a package of the library, when it is first used."""
+    if name in _PACKAGES:
+        return importlib.import_module(f"dolens.{name}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'dolens' has no attribute '{name}'")
+    found = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """Return the public names, loaded or not."""
+    return sorted({*globals(), *__all__, *_PACKAGES})

@@ -10,7 +10,7 @@ validation at equal exposure time; the coded one has learned plate and focus at 
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -93,7 +93,17 @@ def figure_of(
                 points,
             )
         )
-    save_figure(coding_gain_figure(ranges), path)
+    title = "Gain over the best plain lens"
+    if trained:
+        title += f"; bars: 95 % intervals over {_range_of(g.interval.photographs for g in trained)}"
+        title += f" photographs, seeds: {_range_of(g.interval.seeds for g in trained)}"
+    save_figure(coding_gain_figure(ranges, title), path)
+
+
+def _range_of(counts: Iterable[int]) -> str:
+    """Return `42`, or `1 to 5` of counts that differ."""
+    found = sorted(set(counts))
+    return f"{found[0]}" if len(found) == 1 else f"{found[0]} to {found[-1]}"
 
 
 def train(folder: Path, lights: Sequence[float], seeds: int, others: Sequence[str]) -> None:

@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,24 +13,37 @@ FILES = sorted(p for top in ("dolens", "experiments") for p in (ROOT / top).rglo
 # What each part may import from dolens; siblings of one tier only in one direction, without cycles.
 ALLOWED = {
     "errors": set(),
+    "stages": set(),
     "packaged": {"errors"},
-    "kernels": {"errors"},
+    "kernels": {"errors", "stages"},
     "optics": {"errors", "kernels"},
     "prescriptions": {"errors", "packaged", "optics"},
     "sensor": {"errors", "optics"},
     "scene": {"errors", "optics", "sensor"},
     "analysis": {"errors", "optics", "scene", "sensor"},
     "diffraction": {"errors", "optics", "scene", "sensor", "analysis"},
-    "rendering": {"errors", "optics", "kernels", "scene", "sensor", "analysis", "diffraction"},
+    "rendering": {
+        *("errors", "stages", "optics", "kernels", "scene", "sensor", "analysis", "diffraction")
+    },
     "optimize": {"errors", "optics", "analysis", "rendering"},
     "tolerancing": {"errors", "optics", "analysis"},
     "alignment": {"errors", "optics", "sensor", "rendering", "analysis", "diffraction", "optimize"},
     "reconstruction": {"errors", "optics", "sensor"},
     "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
+    # A page about a lens shows what all of these find out.
+    "lens_page": {
+        *("errors", "optics", "prescriptions", "analysis", "diffraction"),
+        *("tolerancing", "plotting"),
+    },
     "manufacturing": {"errors", "optics", "prescriptions", "tolerancing", "plotting"},
 }
 # The command line stands above everything, the experiments too.
 ALLOWED["cli"] = {*ALLOWED, "experiments"}
+
+# A lens's methods for notebooks are one-line ways to what the floors above compute and draw.  This
+# one file may import them, inside functions only: tracing and training need none of them.
+VIEWS = ROOT / "dolens" / "optics" / "lens_views.py"
+VIEWS_MAY_CALL = {"analysis", "diffraction", "plotting"}
 
 
 def imports(path):
@@ -60,7 +75,16 @@ def test_imports_of_the_library(path):
         assert top not in {"hydra", "omegaconf", "lightning", "pytorch_lightning", "experiments"}
         if top == "dolens" and part != "__init__":
             assert rest, "import from the part, not from the whole"
-            assert rest[0] in ALLOWED[part] | {part}, module
+            above = VIEWS_MAY_CALL if path == VIEWS else set()
+            assert rest[0] in ALLOWED[part] | {part} | above, module
+
+
+def test_views_of_a_lens_import_upper_floors_only_when_called():
+    code = "import dolens.optics.lens, sys; print(*[m for m in sys.modules if 'dolens.' in m])"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout
+    assert "dolens.optics.lens_views" in loaded.split()
+    for part in VIEWS_MAY_CALL:
+        assert f"dolens.{part}" not in loaded.split()
 
 
 @pytest.mark.parametrize("path", FILES, ids=name)

@@ -7,7 +7,7 @@ import torch
 import yaml
 
 from dolens.experiments.camera.photograph_scores import scores_by_photograph, table_name
-from dolens.experiments.running.compared_runs import read_run
+from dolens.experiments.comparison.run import read_run
 from dolens.experiments.tables import write_table
 from scripts.coding.bound import bound_gains
 from scripts.coding.trained import trained_gains

@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SUPPLEMENT = (ROOT / "docs/supplement.md").read_text(encoding="utf-8")
 NAMES = sorted(
     {
@@ -23,7 +23,20 @@ NAMES = sorted(
         if not name.endswith((".py", ".txt"))
     }
 )
-COMMANDS = sorted(set(re.findall(r"`python train\.py ([^`]+)`", SUPPLEMENT)))
+COMMANDS = sorted(set(re.findall(r"`(?:python train\.py|dolens train) ([^`]+)`", SUPPLEMENT)))
+# Commands of the other documents that run packaged experiments: each a line of its own.
+TRAININGS = sorted(
+    {
+        line
+        for document in DOCUMENTS
+        for line in re.findall(
+            r"^    dolens train ([^#\n]*experiment=[^#\n]*)",
+            document.read_text(encoding="utf-8"),
+            re.MULTILINE,
+        )
+        if not re.search(r"\\|my_camera|near_field|mylens|-m\b|\.\.\.|NAME", line)
+    }
+)
 # Packages whose docstrings follow the rules of docs/glossary.md.
 PROSE = ("analysis", "sensor", "plotting", "reconstruction", "prescriptions")
 TITLES = re.compile(r"(Of|As|By|What|Where|Which|How|Whether)\b|\(|√|Σ")
@@ -60,6 +73,12 @@ def configuration():
 def test_an_experiment_of_the_supplement_composes(configuration, command):
     cfg = compose("train", shlex.split(command))
     assert cfg.module._target_.startswith("dolens.experiments.")
+
+
+@pytest.mark.parametrize("command", TRAININGS)
+def test_a_command_of_a_tutorial_composes(configuration, command):
+    overrides = [part for part in shlex.split(command) if not part.startswith("--")]
+    assert compose("train", overrides).module._target_.startswith("dolens.experiments.")
 
 
 def test_the_supplement_is_complete():

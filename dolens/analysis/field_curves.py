@@ -23,7 +23,8 @@ class FieldCurves:
         scan: the fields.
         wavelengths: (W,), nm.
         reference_wavelength: nm, of the distortion.
-        tangential: (F, W), mm: z of the tangential focus from the sensor, positive behind it.
+        tangential: (F, W), mm: z of the tangential focus from the sensor, positive behind it;
+            infinite where the light is parallel.
         sagittal: (F, W), mm: the same of the sagittal focus.
         distortion: (F,), percent of the ideal image height, positive where the image lies farther
             out (pincushion); zero on the axis.
@@ -84,7 +85,7 @@ def focus(pencils: ParabasalRays, displacement: Tensor) -> Tensor:
     slope = pencils.slope_rate @ displacement
     square = slope.square().sum(-1)
     # Parallel light has its focus at infinity.
-    return -(position * slope).sum(-1) / square.where(square > 0.0, 0.0)
+    return torch.where(square == 0.0, torch.inf, -(position * slope).sum(-1) / square)
 
 
 @dataclass(frozen=True)

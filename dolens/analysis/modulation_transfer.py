@@ -19,7 +19,7 @@ from dolens.analysis.ray_intercepts import (
     trace_ray_intercepts,
     uniform_pupil_points,
 )
-from dolens.analysis.spot_diagram import spectral_shares, working_f_numbers
+from dolens.analysis.spot_diagram import AIRY, spectral_shares, spot_diagram, working_f_numbers
 from dolens.errors import InputError
 from dolens.optics.aiming import field_tangents
 from dolens.optics.lens import Lens
@@ -174,6 +174,30 @@ def modulation(
         sagittal,
         spectrum @ limits,
     )
+
+
+@torch.no_grad()
+def frequency_range(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    count: int = 61,
+) -> Tensor:
+    """Return frequencies (count,), cycles/mm, from zero to where the sharpest field leaves little.
+
+    A spot of Gaussian profile with the RMS radius r leaves a hundredth of the contrast at 0.68/r;
+    the end is that frequency or the cut-off of diffraction where that is lower, rounded up to 1, 2
+    or 5 times a power of ten.
+    """
+    lens = in_double_precision(lens)
+    spots = spot_diagram(lens, fields, wavelengths, 400, object_distance)
+    cutoff = float((AIRY / spots.airy_radius).min())
+    radius = float(spots.polychromatic_rms.nan_to_num(math.inf).min())
+    end = min(cutoff, 0.68 / max(radius, 1e-9))
+    power = 10.0 ** math.floor(math.log10(end))
+    end = next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= 0.999 * end)
+    return torch.linspace(0.0, end, count, dtype=torch.float64)
 
 
 def field_directions(field: Tensor, object_distance: float | None) -> Tensor:

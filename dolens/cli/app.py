@@ -9,11 +9,15 @@ import sys
 import typer
 
 from dolens.cli.apply import apply
+from dolens.cli.compare import compare
 from dolens.cli.convert import convert
 from dolens.cli.evaluate import evaluate
+from dolens.cli.experiments import experiments
+from dolens.cli.export import export
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
+from dolens.cli.train import PassedOn, train
 from dolens.errors import InputError
 
 app = typer.Typer(
@@ -23,10 +27,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-
-app.command("show")(show)
-app.command("convert")(convert)
 
 
 def main() -> None:
@@ -47,6 +47,13 @@ def _dolens() -> None:
     """Keep `dolens` a group of commands, however few there are."""
 
 
+# In the order of `dolens --help`: a lens, an experiment, a run.
+app.command("show")(show)
+app.command("convert")(convert)
+app.command("experiments")(experiments)
+app.command("train", cls=PassedOn, add_help_option=False)(train)
 app.command("evaluate")(evaluate)
 app.command("apply")(apply)
+app.command("compare")(compare)
+app.command("export")(export)
 app.command("report", help=REPORT_HELP)(report)

@@ -18,7 +18,7 @@ HELP = "\n\n".join(
         "printed number, ours, why they differ, cost, error, pictures and the command. At its top "
         "are checks against expected values.",
         "A system that is finished with the same settings and code is not run again; after Ctrl-C "
-        "the same command goes on. All systems together take about half an hour on two cores.",
+        "the same command goes on. All systems together take about twenty minutes on two cores.",
         "The exit status is 1 if a check does not hold or a run fails. Checks of systems that were "
         "not run do not count.",
     )
@@ -105,33 +105,35 @@ class _Progress:
             self.status = None
 
     def taken(self, system: Any, folder: Path) -> None:
-        self.console.print(f"{system.name}: finished before, {folder}", markup=False)
+        self.console.print(
+            f"{system.name}: finished before, {folder}", markup=False, soft_wrap=True
+        )
 
     def started(self, system: Any, number: int, count: int) -> None:
-        self.line = f"[{number}/{count}] {system.name}: {system.title}"
+        self.line = f"[{number}/{count}] {system.name}"
+        self.console.print(f"{self.line}: {system.title}", markup=False, soft_wrap=True)
         if self.console.is_terminal:
-            self.status = self.console.status(_escaped(self.line))
+            self.status = self.console.status("")
             self.status.start()
-        else:
-            self.console.print(f"{self.line} …", markup=False)
 
     def tick(self, elapsed: float, remaining: float) -> None:
         if self.status is not None:
-            left = f"{_duration(elapsed)}, all: about {_duration(remaining)} left"
-            self.status.update(f"{_escaped(self.line)} · {left}")
+            left = f"about {_duration(remaining)} left" if remaining >= 1.0 else "nearly done"
+            self.status.update(f"{_duration(elapsed)}; all runs: {left}")
 
     def ended(self, system: Any, finish: Any) -> None:
         self.stop()
         took = _duration(finish.wall_s)
         if finish.status == 0:
-            self.console.print(f"{self.line}: {took}", markup=False)
+            self.console.print(f"{self.line}: done in {took}", markup=False, soft_wrap=True)
             return
         runner = import_extra(f"{_PACKAGE}.runner", "train", "dolens report")
         self.console.print(
             f"{self.line}: FAILED after {took} with status {finish.status}; {finish.log} ends with",
             markup=False,
+            soft_wrap=True,
         )
-        self.console.print(runner.last_words(finish.log), markup=False)
+        self.console.print(runner.last_words(finish.log), markup=False, soft_wrap=True)
 
 
 def _list(plan: Any) -> None:
@@ -178,9 +180,3 @@ def _summary(made: Any) -> bool:
 def _duration(seconds: float) -> str:
     numbers = import_extra(f"{_PACKAGE}.page.numbers", "train", "dolens report")
     return numbers.seconds_text(seconds)
-
-
-def _escaped(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)

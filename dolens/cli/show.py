@@ -65,6 +65,7 @@ def show(
     from dolens.errors import InputError
     from dolens.lens_page.overview import lens_overview
     from dolens.lens_page.preparation import prepared_lens
+    from dolens.optics.tables import printable
     from dolens.prescriptions import load_lens
 
     if tolerances is not None and html is None and figures is None:
@@ -82,7 +83,7 @@ def show(
     console = Console(highlight=False)
     overview = lens_overview(shown)
     console.print()
-    console.print(overview.name, style="bold", markup=False)
+    console.print(printable(overview.name), style="bold", markup=False)
     console.print(overview.summary, style="dim", markup=False)
     for section in overview.sections:
         console.print()
@@ -127,20 +128,20 @@ def _print_table(console: "Console", table: "Table") -> None:
     from rich.table import Table as RichTable
     from rich.text import Text
 
+    from dolens.optics.tables import printable
+
     shown = RichTable(
         box=box.SIMPLE_HEAD,
         pad_edge=False,
         show_edge=False,
         padding=(0, 1),
-        caption=Text(table.caption, style="dim"),
-        caption_justify="left",
     )
     for column, head in enumerate(table.heads):
         words = column in table.words
         shown.add_column(
             Text(head),
             justify="left" if words else "right",
-            no_wrap=not words,
+            no_wrap=not words or table.numbered,
             overflow="fold",
         )
     last = len(table.rows) - 1
@@ -149,8 +150,10 @@ def _print_table(console: "Console", table: "Table") -> None:
         if total:
             shown.add_section()
         style = "bold" if total or number in table.lit else None
-        shown.add_row(*(Text(cell) for cell in row), style=style)
+        shown.add_row(*(Text(printable(cell)) for cell in row), style=style)
     console.print(shown)
+    if table.caption:
+        console.print(printable(table.caption), style="dim", markup=False)
 
 
 def _write(

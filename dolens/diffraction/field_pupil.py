@@ -26,8 +26,8 @@ from dolens.diffraction.pupil_fit import (
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.optics.system import OpticalSystem
 
-# Samples across the pupil beyond which rays alone are used, and the fewest.
-MOST_SAMPLES, _FEWEST = 1024, 128
+# Fewest samples across the pupil.
+_FEWEST = 128
 _OVERSAMPLING = 1.5
 # Degrees of the fit that are tried, and the waves that the first may leave.
 _DEGREES, _RESIDUAL = (10, 16), 0.005
@@ -58,7 +58,12 @@ class FieldPupil:
 
     @classmethod
     def of(
-        cls, system: OpticalSystem, point: ObjectPoints, front: Wavefront, weights: Tensor
+        cls,
+        system: OpticalSystem,
+        point: ObjectPoints,
+        front: Wavefront,
+        weights: Tensor,
+        most_samples: int,
     ) -> "FieldPupil":
         """Choose how light is propagated, by wavefronts of 32 rays a side or more.
 
@@ -67,15 +72,17 @@ class FieldPupil:
             point: W times the field's.
             front: W wavefronts.
             weights: (W,).
+            most_samples: across the pupil, beyond which rays alone are used.
         """
         fit = fit_pupil(front, _DEGREES[0])
         if not bool((fit.residual <= _RESIDUAL).all()):
             fit = fit_pupil(front, _DEGREES[1])
         found = cls(front, weights, fit, "")
-        reason = found._obstacle()
+        reason = found._obstacle(most_samples)
         if not reason:
             return replace(found, reason="Fourier transform of the pupil")
-        rays = pupil_wavefront(system, point, front.wavelength, front.centre, _RAYS)
+        # An infinite sphere is met by all rays, however far they land from its centre.
+        rays = pupil_wavefront(system, point, front.wavelength, front.centre, _RAYS, math.inf)
         return cls(rays, weights, None, f"rays alone: {reason}")
 
     @property
@@ -120,10 +127,11 @@ class FieldPupil:
             return self._counted(x, y), math.nan
         samples = self.samples(float(torch.cat([x.abs(), y.abs()]).amax()))
         pupil = regular_pupil(self.fit, samples)
-        field = fourier_field(pupil, x, y)
+        # Phases are formed in double precision; sums in single precision err by 1e-6.
+        field = fourier_field(pupil, x, y, torch.float32)
         perfect = _unaberrated(pupil)
         total = self.weights @ pupil.flux
-        irradiance = field.real.square() + field.imag.square()
+        irradiance = field.real.double().square() + field.imag.double().square()
         mixed = torch.einsum("w,wyx->yx", self.weights, irradiance) / total
         return mixed, float(self.weights @ perfect / total)
 
@@ -201,11 +209,11 @@ class FieldPupil:
         away = self.front.intercept.abs().amax(-1)
         return float(torch.where(lit, away, 0.0).amax())
 
-    def _obstacle(self) -> str:
+    def _obstacle(self, most_samples: int) -> str:
         """Return why a Fourier transform does not hold; nothing where it does."""
         half = 1.1 * self.spot_radius + 4.0 * self.airy_radius
         needed = max(self.samples(half), self.samples(0.0, 2.0))
-        if needed > MOST_SAMPLES:
+        if needed > most_samples:
             return f"the wavefront needs {needed} samples across the pupil"
         pupil = regular_pupil(self.fit, self.samples(half))
         chosen = choose_propagation(self.fit, pupil.flux, half)
@@ -291,8 +299,13 @@ def _autocorrelation(
     size = 2 * function.shape[-1]
     line = torch.fft.fft(function, size, dim=dim)
     spread = (line.real.square() + line.imag.square()).sum(-2 if axis == 0 else -1)
+    # A cell that passes a share c has amplitude c, but flux c and not c²: the autocorrelation at
+    # zero, the mean of its transform, lacks the difference.
+    steps = pupil.cosines[..., 1] - pupil.cosines[..., 0]
+    square = function.real.square() + function.imag.square()
+    spread = spread + (pupil.flux / steps.prod(-1) - square.sum((-2, -1)))[:, None]
     spread = spread / spread.sum(-1, keepdim=True)
-    step = pupil.cosines[:, axis, 1] - pupil.cosines[:, axis, 0]
+    step = steps[:, axis]
     wave = MM_PER_NM * pupil.wavelength / pupil.index
     order = torch.fft.fftfreq(size, dtype=torch.float64, device=spread.device)
     # U(ρ) goes with exp(+ikρα), and the transform with exp(-i…): sample j lies at -j·λ/(n'·Δα).

@@ -1,5 +1,6 @@
 """Wavefronts of a lens's fields and wavelengths, from which its diffraction is computed."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -80,7 +81,8 @@ def field_wavefronts(
     wave = waves.repeat(len(field))
     beam = find_beam(system, points, wave)
     middle = field.new_zeros(len(every), 2)
-    coarse = pupil_wavefront(system, points, wave, middle, _COARSE, beam=beam)
+    # An infinite sphere is met by all rays, however far they land from its centre.
+    coarse = pupil_wavefront(system, points, wave, middle, _COARSE, math.inf, beam)
     light = (coarse.amplitude * coarse.weight).unflatten(0, shape) * spectrum[:, None, None]
     total = light.sum((1, 2, 3))
     landed = coarse.intercept.unflatten(0, shape)

@@ -20,8 +20,10 @@ from dolens.optics.lens import Lens
 # The window holds the rays and so many Airy radii around them.
 _BEYOND, _AIRY_RADII = 1.1, 3.5
 # Fewest steps of the irradiance's grid to an Airy radius, and most across a window.
-_STEPS, _MOST = 3.5, 1024
+_STEPS, _MOST = 3.5, 512
 _CELLS = 128
+# Samples across the pupil beyond which rays alone make the image: a spot of some 70 Airy radii.
+_MOST_SAMPLES = 512
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,36 @@ class PointSpread:
     reasons: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class PreparedPupils:
+    """The pupils of F fields, which several analyses may share.
+
+    Attributes:
+        wavefronts: of all fields and wavelengths.
+        pupils: of every field; None for a field without light.
+    """
+
+    wavefronts: FieldWavefronts
+    pupils: list[FieldPupil | None]
+
+
+@torch.no_grad()
+def prepare_pupils(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+    most_samples: int = _MOST_SAMPLES,
+) -> PreparedPupils:
+    """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s.
+
+    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
+    """
+    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    return PreparedPupils(found, field_pupils(lens, found, object_distance, most_samples))
+
+
 @torch.no_grad()
 def point_spread(
     lens: Lens,
@@ -66,6 +98,7 @@ def point_spread(
     wavelength_weights: Sequence[float] | None = None,
     cells: int = _CELLS,
     half_width_um: float | None = None,
+    prepared: PreparedPupils | None = None,
 ) -> PointSpread:
     """Compute the point spread function of every field, by the Fourier transform of its pupil.
 
@@ -80,15 +113,21 @@ def point_spread(
         cells: M, along each side of the window.
         half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
 
+    Rarely needed:
+        prepared: `prepare_pupils` of the same arguments, where several analyses share it.
+
     Raises:
         InputError: no fields or wavelengths, weights that do not fit, or fewer than two cells.
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    prepared = prepared or prepare_pupils(
+        lens, fields, wavelengths, object_distance, wavelength_weights
+    )
+    found = prepared.wavefronts
     dark = torch.full((cells, cells), math.nan, dtype=torch.float64)
     rows = []
-    for pupil in field_pupils(lens, found, object_distance):
+    for pupil in prepared.pupils:
         if pupil is None:
             rows.append((math.nan, dark, math.nan, math.nan, False, "no light passes"))
             continue
@@ -121,6 +160,7 @@ def diffraction_encircled_energy(
     radii_um: Sequence[float] | Tensor | None = None,
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
+    prepared: PreparedPupils | None = None,
 ) -> EncircledEnergy:
     """Compute encircled energy with diffraction, by sums over the point spread function.
 
@@ -136,11 +176,16 @@ def diffraction_encircled_energy(
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of any sum; None for equal ones.
 
+    Rarely needed:
+        prepared: `prepare_pupils` of the same arguments, where several analyses share it.
+
     Raises:
         InputError: no fields or wavelengths, weights that do not fit, or radii that do not ascend.
     """
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
-    pupils = list(field_pupils(lens, found, object_distance))
+    prepared = prepared or prepare_pupils(
+        lens, fields, wavelengths, object_distance, wavelength_weights
+    )
+    found, pupils = prepared.wavefronts, prepared.pupils
     airy = _airy_um(lens, found, object_distance)
     if radii_um is None:
         reach = max((_half_width(pupil) for pupil in pupils if pupil), default=4e-3 * airy)
@@ -162,9 +207,15 @@ def diffraction_encircled_energy(
 
 
 def field_pupils(
-    lens: Lens, found: FieldWavefronts, object_distance: float | None
+    lens: Lens,
+    found: FieldWavefronts,
+    object_distance: float | None,
+    most_samples: int = _MOST_SAMPLES,
 ) -> list[FieldPupil | None]:
-    """Return the pupils of every field; None for a field without light."""
+    """Return the pupils of every field, None for a field without light.
+
+    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
+    """
     system = lens.system().double()
     count = len(found.wavelengths)
     weights = found.weights.to(system.device)
@@ -176,7 +227,8 @@ def field_pupils(
         which = torch.arange(number * count, (number + 1) * count, device=system.device)
         field = found.fields[number].to(system.device).expand(count, 2)
         point = object_points(field, object_distance)
-        pupils.append(FieldPupil.of(system, point, _part(found.wavefront, which), weights))
+        front = _part(found.wavefront, which)
+        pupils.append(FieldPupil.of(system, point, front, weights, most_samples))
     return pupils
 
 
@@ -212,8 +264,17 @@ def _mean_irradiance(pupil: FieldPupil, half: float, cells: int) -> tuple[Tensor
     grid = (torch.arange(fine).to(pupil.weights) + 0.5) * (2.0 * half / fine) - half
     irradiance, perfect = pupil.irradiance(grid, grid)
     peak = float(irradiance.amax())
+    if pupil.diffraction:
+        # The highest point lies between the samples.
+        row, column = divmod(int(irradiance.argmax()), fine)
+        near = torch.linspace(-1.0, 1.0, 17).to(grid) * (2.0 * half / fine)
+        peak = float(pupil.irradiance(grid[column] + near, grid[row] + near)[0].amax())
     means = irradiance.unflatten(1, (cells, parts)).unflatten(0, (cells, parts)).mean((1, 3))
     return means, peak, perfect
+
+
+# Windows of its own that a field's encircled energy is followed for.
+_FAR = 4.0
 
 
 def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
@@ -221,8 +282,12 @@ def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     radii = radii.to(pupil.weights)
     if not pupil.diffraction:
         return pupil.encircled_rays(radii)
-    half = float(radii[-1]) + 1e-9
-    cells = min(max(2 * math.ceil(half * 2.0 * _STEPS / pupil.airy_radius), 2 * _CELLS), _MOST)
+    # Far beyond its window, as the spot of another field may need, a field's curve stays level.
+    widest = _FAR * _half_width(pupil)
+    half = min(float(radii[-1]), widest) + 1e-9
+    radii = radii.clamp(max=widest)
+    wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius)
+    cells = min(max(wanted, 2 * _CELLS), _MOST)
     step = 2.0 * half / cells
     grid = (torch.arange(cells).to(pupil.weights) + 0.5) * step - half
     light = pupil.irradiance(grid, grid)[0].flatten() * step * step

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.modulation_transfer import field_directions
-from dolens.diffraction.field_wavefronts import field_wavefronts
-from dolens.diffraction.point_spread import field_pupils
+from dolens.diffraction.point_spread import PreparedPupils, prepare_pupils
 from dolens.optics.lens import Lens
+
+# Samples across the pupil beyond which rays alone are used: a spot of some 300 Airy radii.
+_MOST_SAMPLES = 1024
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ def diffraction_modulation(
     frequencies: Sequence[float] | Tensor,
     object_distance: float | None = None,
     wavelength_weights: Sequence[float] | None = None,
+    prepared: PreparedPupils | None = None,
 ) -> DiffractionModulation:
     """Compute the polychromatic MTF with diffraction.
 
@@ -66,14 +69,19 @@ def diffraction_modulation(
         object_distance: mm in front of the first vertex; None for an object at infinity.
         wavelength_weights: (W,), of any sum; None for equal ones.
 
+    Rarely needed:
+        prepared: `prepare_pupils` of the same arguments, where several analyses share it.
+
     Raises:
         InputError: no fields or wavelengths, or weights that do not fit.
     """
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    prepared = prepared or prepare_pupils(
+        lens, fields, wavelengths, object_distance, wavelength_weights, _MOST_SAMPLES
+    )
+    found, pupils = prepared.wavefronts, prepared.pupils
     frequency = torch.as_tensor(frequencies, dtype=torch.float64, device=lens.device).reshape(-1)
     dark = torch.full_like(frequency, math.nan).expand(4, -1)
     along = field_directions(found.fields, object_distance).to(lens.device)
-    pupils = field_pupils(lens, found, object_distance)
     rows = []
     for pupil, tangential in zip(pupils, along, strict=True):
         if pupil is None:

@@ -35,6 +35,9 @@ def inline_svg(figure: Figure, name: str, label: str) -> str:
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", text)
     text = text.replace("xlink:href=", "href=")
+    used = set(re.findall(r"""(?:url\(#|href="#)([^")]+)""", text))
+    # Names of artists lead nowhere in a page, and may stand there twice.
+    text = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] in used else "", text)
     text = _IDS.sub(lambda found: f"{found[1]}{name}-", text)
     opening, _, rest = text.partition(">")
     box = re.search(r'viewBox="[^"]*"', opening)

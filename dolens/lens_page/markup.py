@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from importlib import metadata
 from importlib.resources import files
 
-from dolens import __version__
 from dolens.lens_page.tables import Table
 from dolens.lens_page.viewer import viewer_script
 
@@ -39,6 +39,7 @@ def page_html(
         command: what made the page.
         blocks: its sections.
     """
+    version = _version()
     css = (files("dolens.lens_page") / "page.css").read_text(encoding="utf-8")
     contents = "".join(
         f'<li><a href="#{escape(block.name)}">{escape(block.title)}</a></li>' for block in blocks
@@ -54,7 +55,7 @@ def page_html(
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="generator" content="{GENERATOR} {escape(__version__)}">
+<meta name="generator" content="{GENERATOR} {escape(version)}">
 <title>{escape(title)}</title>
 <style>
 {css}</style>
@@ -64,7 +65,7 @@ def page_html(
 <header>
 <h1>{escape(title)}</h1>
 <ul class="facts">{listed}</ul>
-<p class="made">{made}dolens {escape(__version__)}</p>
+<p class="made">{made}dolens {escape(version)}</p>
 </header>
 <nav aria-label="Contents"><details open><summary>Contents</summary><ol>{contents}</ol></details>
 </nav>
@@ -117,3 +118,11 @@ def problem_html(text: str) -> str:
 
 def _words(table: Table, column: int) -> str:
     return ' class="words"' if column in table.words else ""
+
+
+def _version() -> str:
+    """Return the version of dolens; nothing where it runs without being installed."""
+    try:
+        return metadata.version("dolens")
+    except metadata.PackageNotFoundError:
+        return ""

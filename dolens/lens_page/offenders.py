@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from matplotlib.figure import Figure
 from torch import nn
 
@@ -50,9 +49,10 @@ from dolens.tolerancing import (
 DEFAULT = "default"
 # Half-ranges: degrees, mm, a share of the curvature; and mm as a share of the largest diameter.
 _TILT, _LENGTH, _CURVATURE, _OF_DIAMETER = 0.05, 0.02, 0.001, 0.0025
-_RINGS, _ARMS = 4, 12
+_RINGS, _ARMS = 3, 8
 _MOST = 12
-_OWN_KEYS = ("tolerances", "tolerance_factor", "elements")
+# `drawing` is what `dolens export` writes on drawings besides.
+_OWN_KEYS = ("tolerances", "tolerance_factor", "elements", "drawing")
 
 
 @dataclass(frozen=True)

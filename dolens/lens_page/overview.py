@@ -10,11 +10,10 @@ from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
 from dolens.lens_page.tables import (
     Table,
-    elements_table,
     field_text,
     first_order_table,
     number,
-    prescription_table,
+    prescription_tables,
     seidel_table,
     spot_radii_table,
 )
@@ -77,10 +76,7 @@ def lens_overview(lens: Lens) -> Overview:
         )
         return spot_radii_table(found[0])
 
-    poses = elements_table(lens)
-    sections = [
-        TableSection("Prescription", [prescription_table(lens), *([poses] if poses else [])])
-    ]
+    sections = [TableSection("Prescription", prescription_tables(lens))]
     for title, make in (
         ("First-order data", lambda: first_order_table(lens, where)),
         ("Seidel sums", lambda: seidel_table(lens, where)),

@@ -1,4 +1,4 @@
-"""A lens is prepared for its page: with the fields, wavelengths and aperture that were asked for."""
+"""A lens is prepared for its page: with other fields, wavelengths or aperture than its own."""
 
 import copy
 import math

@@ -3,32 +3,58 @@
 Every section is computed alone, so that one that fails leaves the others.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-import torch
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from dolens.analysis.conditions import (
     FieldScan,
     field_scans,
+    spectral_lines,
     wavelength_interval,
 )
+from dolens.analysis.encircled_energy import encircled_energy
+from dolens.analysis.field_curves import field_curves
+from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
+from dolens.analysis.modulation_transfer import frequency_range, modulation
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
+from dolens.diffraction.illumination import relative_illumination
+from dolens.diffraction.point_spread import (
+    PointSpread,
+    PreparedPupils,
+    diffraction_encircled_energy,
+    point_spread,
+    prepare_pupils,
+)
+from dolens.diffraction.transfer import diffraction_modulation
+from dolens.diffraction.wavefront_error import wavefront_errors
 from dolens.errors import InputError
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
-from dolens.lens_page.tables import Table
+from dolens.lens_page.tables import Table, field_text, number
 from dolens.lens_page.viewer import viewer_html
 from dolens.optics.lens import Lens
-from dolens.plotting.layout import layout_figure
+from dolens.plotting.encircled_energy import encircled_energy_figure
+from dolens.plotting.field_curves import field_curves_figure
+from dolens.plotting.illumination import illumination_figure
+from dolens.plotting.lateral_colour import lateral_colour_figure
+from dolens.plotting.lens_section import lens_section_figure
+from dolens.plotting.modulation_comparison import modulation_comparison_figure
+from dolens.plotting.point_spread import point_spread_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
 from dolens.plotting.spots import spots_figure
+
+# Of each field and wavelength.
+_MTF_RAYS, _RMS_RAYS = 6000, 2000
+# Share of the brightest field's light that a field of tolerances has.
+_BRIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -83,15 +109,23 @@ class PageSections:
 
     def sections(self) -> list[Section]:
         """Return all sections in the order of the page."""
-        last = [] if self.tolerances is None else [Section("offenders", "Tolerances", self.offenders)]
+        last = (
+            [] if self.tolerances is None else [Section("offenders", "Tolerances", self.offenders)]
+        )
         return [
             Section("layout", "Section", self.layout),
             Section("space", "In space", self.space),
             Section("spots", "Spot diagram", self.spots),
             Section("fans", "Ray fans", self.fans),
             Section("mtf", "MTF", self.mtf),
+            Section("psf", "Point spread functions", self.psf),
             Section("rms", "RMS against field and wavelength", self.rms),
-            *last,
+            Section("energy", "Encircled energy", self.energy),
+            Section("field", "Field curvature and distortion", self.field_curves),
+            Section("colour", "Lateral colour and focal shift", self.colour),
+            Section("light", "Relative illumination", self.light),
+            Section("wavefront", "Wavefront error", self.wavefront),
+            *(last if self.tolerances is not None else ()),
         ]
 
     @cached_property
@@ -99,27 +133,34 @@ class PageSections:
         """Return fields along lines through the axis."""
         return field_scans(self.lens, self.distance)
 
+    @property
+    def scene(self) -> tuple[Tensor, Tensor]:
+        """Return fields and wavelengths, as most analyses take them."""
+        return self.where.fields, self.where.wavelengths
+
     def layout(self) -> Content:
         """Draw the lens in section."""
         where = self.where
-        meridional = [float(y) for x, y in where.fields.tolist() if x == 0.0]
-        if where.object_distance is not None:
-            slopes = torch.tensor(meridional) / -where.object_distance
-            meridional = torch.rad2deg(slopes.atan()).tolist()
-        left = len(where.fields) - len(meridional)
-        note = f"{left} field(s) beside the y-z plane are drawn in space only." if left else ""
-        figure = layout_figure(
+        beside = int((where.fields[:, 0] != 0.0).sum())
+        fields = where.fields if beside < len(where.fields) else where.fields.new_zeros(1, 2)
+        figure = lens_section_figure(
             self.lens,
-            where.reference_wavelength,
-            meridional or [0.0],
-            object_distance=where.object_distance,
+            fields,
+            where.wavelengths,
+            where.field_unit,
+            where.object_distance,
             title="",
         )
-        return Content({"layout": figure}, note=note)
+        note = f"Rays at {where.reference_wavelength:g} nm."
+        if beside:
+            note += " Fields beside the y-z plane are drawn in space only."
+        return Content({"section": figure}, note=note)
 
     def space(self) -> Content:
         """Describe the lens in space."""
-        found = solid(self.lens, self.where)
+        spots = self.overview.spots
+        lit = None if spots is None else spots.rms.isfinite().any(1).tolist()
+        found = solid(self.lens, self.where, lit)
         return Content(
             html=viewer_html(found, self.where),
             note="Drag to turn, pinch or scroll (after a click) to zoom, shift and drag to move. "
@@ -135,13 +176,96 @@ class PageSections:
 
     def fans(self) -> Content:
         """Plot ray fans."""
-        where = self.where
-        fans = ray_fans(self.lens, where.fields, where.wavelengths, object_distance=self.distance)
+        fans = ray_fans(self.lens, *self.scene, object_distance=self.distance)
         return Content({"ray_fans": ray_fans_figure(fans, title="")})
 
     def mtf(self) -> Content:
-        """Plot the MTF of rays, and that of waves."""
-        raise InputError("later")
+        """Plot the MTF with diffraction, and that of rays alone."""
+        frequencies = frequency_range(self.lens, *self.scene, self.distance)
+        wave = diffraction_modulation(
+            self.lens, *self.scene, frequencies, self.distance, prepared=self._pupils
+        )
+        rays = modulation(self.lens, *self.scene, frequencies, _MTF_RAYS, self.distance)
+        figure = modulation_comparison_figure(wave, rays, title="")
+        return Content({"mtf": figure}, problems=self._by_rays(wave.diffraction, wave.reasons))
+
+    def psf(self) -> Content:
+        """Show point spread functions."""
+        found = self._spread
+        return Content(
+            {"psf": point_spread_figure(found, title="")},
+            problems=self._by_rays(found.diffraction, found.reasons),
+        )
+
+    @cached_property
+    def _spread(self) -> PointSpread:
+        return point_spread(self.lens, *self.scene, self.distance, prepared=self._pupils)
+
+    @cached_property
+    def _pupils(self) -> PreparedPupils:
+        return prepare_pupils(self.lens, *self.scene, self.distance)
+
+    def _by_rays(self, diffraction: Sequence[bool], reasons: Sequence[str]) -> list[str]:
+        """Say of which fields rays alone make the image, and why."""
+        found: dict[str, list[str]] = {}
+        for point, waves, reason in zip(self.where.fields, diffraction, reasons, strict=True):
+            if not waves:
+                text = field_text(point, self.where.field_unit)
+                found.setdefault(reason.removeprefix("rays alone: "), []).append(text)
+        return [
+            f"diffraction at {', '.join(fields)} ({reason})" for reason, fields in found.items()
+        ]
+
+    def energy(self) -> Content:
+        """Plot encircled energy with diffraction, and that of rays."""
+        wave = diffraction_encircled_energy(
+            self.lens, *self.scene, object_distance=self.distance, prepared=self._pupils
+        )
+        rays = encircled_energy(
+            self.lens, *self.scene, wave.radii_um, object_distance=self.distance
+        )
+        return Content({"encircled_energy": encircled_energy_figure(wave, rays, title="")})
+
+    def field_curves(self) -> Content:
+        """Plot field curvature and distortion."""
+        waves = self.where.wavelengths
+        curves = [field_curves(self.lens, scan, waves, self.distance) for scan in self.scans]
+        return Content({"field_curves": field_curves_figure(curves, title="")})
+
+    def colour(self) -> Content:
+        """Plot lateral colour, and the focus against the wavelength."""
+        waves = spectral_lines(self.lens)
+        curves = [lateral_colour(self.lens, scan, waves, self.distance) for scan in self.scans]
+        shift = chromatic_focal_shift(self.lens, object_distance=self.distance)
+        return Content({"lateral_colour": lateral_colour_figure(curves, shift, title="")})
+
+    def light(self) -> Content:
+        """Plot relative illumination."""
+        found = [
+            relative_illumination(self.lens, scan, object_distance=self.distance)
+            for scan in self.scans
+        ]
+        return Content({"relative_illumination": illumination_figure(found, title="")})
+
+    def wavefront(self) -> Content:
+        """List wavefront errors and Strehl ratios."""
+        found = wavefront_errors(self.lens, *self.scene, self.distance)
+        numbers = (found.rms, found.peak_to_valley, found.strehl_ratio)
+        rows = [
+            (
+                field_text(point, found.field_unit),
+                f"{wave:g}",
+                *(number(values[row, column], 3) for values in numbers),
+            )
+            for row, point in enumerate(found.fields)
+            for column, wave in enumerate(found.wavelengths.tolist())
+        ]
+        table = Table(
+            ("field", "wavelength (nm)", "RMS (waves)", "peak to valley (waves)", "Strehl ratio"),
+            rows,
+            "On the sensor as it stands, tilt removed. – : no light passes.",
+        )
+        return Content(tables=[table])
 
     def rms(self) -> Content:
         """Plot RMS radii."""
@@ -150,12 +274,14 @@ class PageSections:
         against_field = None
         if any(reach):
             against_field = rms_against_field(
-                self.lens, where.wavelengths, reach, object_distance=self.distance
+                self.lens, where.wavelengths, reach, rays=_RMS_RAYS, object_distance=self.distance
             )
         against_wavelength = rms_against_wavelength(
             self.lens,
             where.fields,
             wavelength_interval(self.lens),
+            count=11,
+            rays=_RMS_RAYS,
             object_distance=self.distance,
         )
         figure = rms_curves_figure(against_field, against_wavelength, title="")
@@ -163,9 +289,19 @@ class PageSections:
 
     def offenders(self) -> Content:
         """Find the worst offenders among tolerances."""
-        found = offenders(self.lens, self.where, self.tolerances)
+        where, problems = self.where, []
+        if self.overview.spots is not None:
+            # Where little of the stop is lit, tolerances say nothing of use.
+            light = self.overview.spots.valid.double().mean((1, 2))
+            bright = light >= _BRIGHT * light.max()
+            dim = [field_text(point, where.field_unit) for point in where.fields[~bright]]
+            if dim and bool(bright.any()):
+                where = replace(where, fields=where.fields[bright])
+                problems.append(f"tolerances at {', '.join(dim)}: too little light passes")
+        found = offenders(self.lens, where, self.tolerances)
         return Content(
             {"worst_offenders": found.figure()},
             [found.table()],
             " ".join([*found.notes, found.summary()]),
+            problems=problems,
         )

@@ -21,7 +21,7 @@ _RINGS = 10
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.12
 # Azimuths of the rays on the edge of a beam, and how far inside of it they run.
-_RIM, _INSIDE = 16, 0.995
+_RIM, _INSIDE = 8, 0.995
 _ALONG = (0.33, 0.67)
 
 
@@ -59,15 +59,17 @@ class Solid:
 
 
 @torch.no_grad()
-def solid(lens: Lens, where: Conditions) -> Solid:
+def solid(lens: Lens, where: Conditions, lit: Sequence[bool] | None = None) -> Solid:
     """Describe a lens in space with rays of its fields at the reference wavelength.
 
     Args:
         lens: in double precision, on the CPU.
         where: fields and the object's distance.
+        lit: which fields' light passes; None: all.  Of a field in doubt no rays are drawn.
     """
     system = lens.system()
-    rays = [_field_rays(lens, where, number) for number in range(len(where.fields))]
+    lit = [True] * len(where.fields) if lit is None else list(lit)
+    rays = _field_rays(lens, where, lit)
     meshes: list[Mesh] = []
     rims: list[np.ndarray] = []
     count = len(system.surfaces)
@@ -240,31 +242,53 @@ def _sensor(lens: Lens, rays: Sequence[Sequence[np.ndarray]]) -> Mesh:
     return _mesh("sensor", positions, np.broadcast_to(np.array([0.0, 0.0, -1.0]), positions.shape))
 
 
-def _field_rays(lens: Lens, where: Conditions, number: int) -> list[np.ndarray]:
-    """Return rays on the edge of a field's beam, along two diameters and its middle."""
-    field = where.fields[number : number + 1]
-    pupils = VignettedPupils(lens, field, where.object_distance)
+def _field_rays(lens: Lens, where: Conditions, lit: Sequence[bool]) -> list[list[np.ndarray]]:
+    """Return rays on the edge of each field's beam, along two diameters and its middle."""
+    which = [number for number, passes in enumerate(lit) if passes]
+    rays: list[list[np.ndarray]] = [[] for _ in lit]
+    if not which:
+        return rays
     try:
-        centre = pupils.centres(torch.zeros(1, dtype=torch.bool))
+        found = _beams(lens, where, which)
     except InputError:
-        return []
+        # Of one field too little light passes to find its beam: each is tried alone.
+        if len(which) == 1:
+            return rays
+        for number in which:
+            alone = [other == number for other in range(len(lit))]
+            rays[number] = _field_rays(lens, where, alone)[number]
+        return rays
+    for number, paths in zip(which, found, strict=True):
+        rays[number] = paths
+    return rays
+
+
+def _beams(lens: Lens, where: Conditions, which: Sequence[int]) -> list[list[np.ndarray]]:
+    """Trace the rays of some fields together, since aiming costs by the call."""
+    pupils = VignettedPupils(lens, where.fields[list(which)], where.object_distance)
+    count = len(which)
+    centre = pupils.centres(torch.zeros(count, dtype=torch.bool))
     angle = torch.arange(_RIM, dtype=torch.float64) * (2.0 * math.pi / _RIM)
-    arms = torch.stack([angle.cos(), angle.sin()], -1)[None]
+    arms = torch.stack([angle.cos(), angle.sin()], -1).expand(count, -1, -1)
     reach = pupils.boundary_radius(centre, arms)[..., None]
     rim = centre[:, None] + _INSIDE * reach * arms
-    quarter = _RIM // 4
+    quarter = max(_RIM // 4, 1)
     inner = [centre[:, None]]
     inner += [centre[:, None] + part * reach[:, ::quarter] * arms[:, ::quarter] for part in _ALONG]
     aimed = pupils.aim(torch.cat([rim, *inner], 1))
     hit = lens.trace(Rays(aimed.position, aimed.direction, aimed.wavelength), record=True)
+    # (fields, rays, surfaces and sensor, 3)
+    points = torch.cat([hit.points, hit.position[None]]).movedim(0, 2)
+    passing = hit.valid & aimed.converged
     sensor = float(lens.system().vertices[-1])
-    points = torch.cat([hit.points, hit.position[None]])[:, 0].transpose(0, 1)
-    passing = (hit.valid & aimed.converged)[0]
-    start, along = aimed.position[0], aimed.direction[0]
     front = min(0.0, float(points[passing][:, 0, 2].min())) if bool(passing.any()) else 0.0
     lead = front - _LEAD * sensor
     if where.object_distance is not None:
         lead = max(lead, -where.object_distance)
-    begin = start + along * ((lead - start[:, 2:]) / along[:, 2:])
-    paths = torch.cat([begin[:, None], points], 1)
-    return [path.numpy().astype("<f4") for path in paths[passing]]
+    start, along = aimed.position, aimed.direction
+    begin = start + along * ((lead - start[..., 2:]) / along[..., 2:])
+    paths = torch.cat([begin[:, :, None], points], 2)
+    return [
+        [path.numpy().astype("<f4") for path in of_field[there]]
+        for of_field, there in zip(paths, passing, strict=True)
+    ]

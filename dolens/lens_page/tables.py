@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from dolens.analysis.spot_diagram import AIRY, SpotDiagram
 from dolens.errors import InputError
 from dolens.optics.elements import POSE, TILTS
 from dolens.optics.lens import Lens
-from dolens.optics.materials import abbe_number, index_d
+from dolens.optics.prescription_table import SurfaceRow, prescription_table
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import Circle, Outline, Rectangle, Unlimited
 
@@ -21,10 +21,8 @@ SEIDEL_NAMES = (
     *("spherical", "coma", "astigm.", "Petzval", "distort."),
     *("axial col.", "lateral col."),
 )
-# Parameters that have a column of their own.
-_COLUMNS = ("curvature", "conic")
-# Numbers of an array that a table cell may hold.
-_FEW = 4
+# Columns of coefficients that a page is wide enough for.
+_MOST_TERMS = 8
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,7 @@ class Table:
         words: the columns that hold words; they are aligned left, and numbers right.
         total: whether the last row is a total.
         lit: numbers of rows that are set apart.
+        numbered: whether the first column numbers the rows.
     """
 
     heads: tuple[str, ...]
@@ -45,7 +44,8 @@ class Table:
     caption: str = ""
     words: frozenset[int] = frozenset({0})
     total: bool = False
-    lit: frozenset[int] = field(default_factory=frozenset)
+    lit: frozenset[int] = frozenset()
+    numbered: bool = False
 
 
 def number(value: float | Tensor, digits: int = 5) -> str:
@@ -65,37 +65,71 @@ def number(value: float | Tensor, digits: int = 5) -> str:
     return (mantissa + sign).replace("-", "−")
 
 
-def prescription_table(lens: Lens) -> Table:
-    """Return the surfaces of a lens, one a row."""
+def prescription_tables(lens: Lens) -> list[Table]:
+    """Return the surfaces of a lens, one a row; its aspheric terms; and the poses of elements."""
+    found = prescription_table(lens)
+    conics = any(row.conic for row in found.surfaces)
+    # A name such as 1.5168/64.17 says nd and Vd already.
+    named = any(not row.material[:1].isdigit() and _is_glass(row) for row in found.surfaces)
     rows = []
-    gaps = [float(gap.detach()) for gap in lens.thicknesses.values()]
-    gaps.append(float(lens.sensor_distance.detach()))
-    surfaces = list(lens.surfaces.items())
-    conics = any(_value(surface, "conic") for _, surface in surfaces)
-    more = [_further(surface) for _, surface in surfaces]
-    for (n, surface), gap, medium, rest in zip(
-        surfaces, gaps, lens.materials[1:], more, strict=True
-    ):
-        stop = " (stop)" if int(n) == lens.stop else ""
-        row = [n, surface.kind.replace("_", " ") + stop, _radius(surface), number(gap, 6)]
-        row += [_medium(medium.name), *_glass(medium), _aperture(surface)]
+    for row, surface in zip(found.surfaces, lens.surfaces.values(), strict=True):
+        cells = [str(row.number), row.kind.replace("_", " ") + " (stop)" * row.stop]
+        cells += ["" if row.radius is None else number(row.radius, 6), number(row.thickness, 6)]
+        cells.append("air" if row.material == "occluder" else row.material)
+        if named:
+            vd = "" if math.isinf(row.abbe_number) else f"{row.abbe_number:.2f}"
+            cells += [f"{row.index_d:.5f}", vd] if _is_glass(row) else ["", ""]
+        cells.append(_aperture(surface))
         if conics:
-            row.append(number(_value(surface, "conic")) if _value(surface, "conic") else "")
-        if any(more):
-            row.append(rest)
-        rows.append(tuple(row))
-    size = number(0.5 * lens.sensor_diameter) if lens.sensor_diameter else ""
-    rows.append(("", "sensor", "∞", "", "", "", "", size, *[""] * (conics + any(more))))
-    heads = ("#", "type", "radius", "thickness", "medium", "nd", "Vd", "semi-diameter")
-    heads += ("conic",) * conics + ("coefficients",) * any(more)
-    words = {1, 4} | ({len(heads) - 1} if any(more) else set())
-    return Table(
-        heads,
-        rows,
-        "Lengths in mm; the medium is the one behind the surface.",
-        frozenset(words),
-        lit=frozenset({lens.stop - 1}),
+            cells.append(number(row.conic) if row.conic else "")
+        rows.append(tuple(cells))
+    size = number(0.5 * found.sensor_diameter) if found.sensor_diameter else ""
+    rows.append(("", "sensor", "∞", "", "", *[""] * (2 * named), size, *[""] * conics))
+    heads = ("#", "type", "radius", "thickness", "medium", *("nd", "Vd") * named)
+    heads += ("semi-diam.", *("conic",) * conics)
+    inside = (
+        [] if found.object_material == "air" else [f"The object is in {found.object_material}."]
     )
+    caption = " ".join(["Lengths in mm; the medium is the one behind the surface.", *inside])
+    surfaces = Table(
+        heads, rows, caption, frozenset({1, 4}), lit=frozenset({lens.stop - 1}), numbered=True
+    )
+    more = [_terms_table(lens), elements_table(lens)]
+    return [surfaces, *(table for table in more if table is not None)]
+
+
+def _terms_table(lens: Lens) -> Table | None:
+    """Return coefficients beyond radius and conic, one surface a row; None where there are none."""
+    found = [(str(row.number), row.terms) for row in prescription_table(lens).surfaces if row.terms]
+    names = list(dict.fromkeys(name for _, terms in found for name in terms))
+    sized = {
+        n: ", ".join(
+            f"{name} ({' × '.join(map(str, value.shape))})"
+            for name, value in surface.named_parameters()
+            if value.ndim
+        )
+        for n, surface in lens.surfaces.items()
+    }
+    sized = {n: text for n, text in sized.items() if text}
+    if not found and not sized:
+        return None
+    if len(names) <= _MOST_TERMS and not sized:
+        rows = [
+            (n, *(number(terms[name]) if name in terms else "" for name in names))
+            for n, terms in found
+        ]
+        return Table(
+            ("#", *names), rows, "Coefficients, in powers of mm.", frozenset(), numbered=True
+        )
+    rows = []
+    for n in lens.surfaces:
+        terms = dict(found).get(n, {})
+        texts = [f"{name} {number(value)}" for name, value in terms.items() if value]
+        if n in sized:
+            texts.append(sized[n])
+        if terms or n in sized:
+            rows.append((n, ", ".join(texts) or "all zero"))
+    return Table(("#", "coefficients"), rows, "In powers of mm.", frozenset({1}), numbered=True)
 
 
 def elements_table(lens: Lens) -> Table | None:
@@ -169,9 +203,7 @@ def seidel_table(lens: Lens, where: Conditions) -> Table:
     short, long = min(lines), max(lines)
     sums = lens.seidel(edge, wavelength, distance, (short, long))
     waves = torch.stack(list(sums)).T / (1e-6 * wavelength)
-    rows = [
-        (str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)
-    ]
+    rows = [(str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)]
     rows.append(("total", *(_fixed(value) for value in waves.sum(0).tolist())))
     unit = where.field_unit if where.field_unit == "°" else " mm"
     posed = "  They are those of the centred lens, without poses." if lens.elements else ""
@@ -217,30 +249,6 @@ def _fixed(value: float) -> str:
     return text.replace("-", "−") if float(text) else "0"
 
 
-def _value(surface: Surface, name: str) -> float:
-    parameters = dict(surface.named_parameters())
-    return float(parameters[name].detach()) if name in parameters else 0.0
-
-
-def _radius(surface: Surface) -> str:
-    curvature = _value(surface, "curvature")
-    return "∞" if curvature == 0.0 else number(1.0 / curvature, 6)
-
-
-def _further(surface: Surface) -> str:
-    """Return the parameters beyond radius and conic that are not zero."""
-    found = []
-    for name, value in surface.named_parameters():
-        if name in _COLUMNS:
-            continue
-        if value.numel() > _FEW:
-            found.append(f"{name}: {' × '.join(map(str, value.shape))} numbers")
-        elif bool((value != 0.0).any()):
-            numbers = ", ".join(number(entry) for entry in value.detach().flatten().tolist())
-            found.append(f"{name} {numbers}")
-    return ", ".join(found)
-
-
 def _aperture(surface: Surface) -> str:
     inner = surface.aperture.obscuration
     return _outline(surface.aperture.edge) + (f", obscured {_outline(inner)}" if inner else "")
@@ -256,12 +264,5 @@ def _outline(outline: Outline) -> str:
             return number(outline.semi_diameter)
 
 
-def _medium(name: str) -> str:
-    return "air" if name == "occluder" else name
-
-
-def _glass(medium: object) -> tuple[str, str]:
-    if medium.name in ("air", "occluder"):
-        return "", ""
-    vd = abbe_number(medium)
-    return f"{index_d(medium):.5f}", "" if math.isinf(vd) else f"{vd:.2f}"
+def _is_glass(row: SurfaceRow) -> bool:
+    return row.material not in ("air", "occluder")

@@ -10,7 +10,7 @@ import numpy as np
 from dolens.analysis.conditions import Conditions
 from dolens.lens_page.solid import Mesh, Solid
 from dolens.lens_page.tables import field_text
-from dolens.plotting.style import colours
+from dolens.plotting.style import ordered_colours
 
 
 def viewer_html(found: Solid, where: Conditions) -> str:
@@ -20,7 +20,7 @@ def viewer_html(found: Solid, where: Conditions) -> str:
         found: the lens in space.
         where: its fields, for the labels of rays.
     """
-    shades = colours(len(found.rays))
+    shades = ordered_colours(len(found.rays))
     labels = [field_text(point, where.field_unit) for point in where.fields]
     boxes = "".join(
         f'<label><input type="checkbox" data-field="{number}" checked>'

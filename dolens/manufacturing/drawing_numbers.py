@@ -4,6 +4,7 @@ import math
 import re
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from dolens.manufacturing.glass_elements import Face, GlassElement
 from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
@@ -182,8 +183,14 @@ def material_rows(element: GlassElement, tolerances: ShopTolerances) -> list[tup
 
 
 def sag_rows(face: Face, count: int = 13) -> list[tuple[str, str, str]]:
-    """Return r, sag (mm) and slope (degrees) of a rotational asphere, from vertex to aperture."""
-    r = np.linspace(0.0, face.semi_diameter, count)
+    """Return r, sag (mm) and slope (degrees) of a rotational asphere, from vertex to aperture.
+
+    The distances r are round numbers, about `count` of them, and the aperture's edge.
+    """
+    edge = face.semi_diameter
+    steps = MaxNLocator(count - 1, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, edge)
+    steps = steps[steps >= 0.0]
+    r = np.append(steps[steps < edge - 0.2 * (steps[1] - steps[0])], edge)
     sag, slope, _, _ = face.sag_and_slopes(r, np.zeros_like(r))
     return [
         (length(a), length(b, 6), number(math.degrees(math.atan(c)), 4))

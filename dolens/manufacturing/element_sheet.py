@@ -170,7 +170,7 @@ def _side_panel(figure: Figure, element: GlassElement, tolerances: ShopTolerance
             figure.text(left + 0.035, top - 0.018, formula, fontsize=TEXT + 1.0, va="center")
             top -= 0.048
         both = is_aspheric(element.front) and is_aspheric(element.back)
-        height = 0.125 if both else 0.24
+        height = 0.115 if both else 0.24
         _sag_table(figure, face, (left, top - height, width, height), both)
         top -= height + 0.012
     notes = [
@@ -191,15 +191,16 @@ def _side_panel(figure: Figure, element: GlassElement, tolerances: ShopTolerance
         notes.append("The obscuration is a stop and no hole in the glass.")
     if not tolerances.complete:
         notes.append(f"In italics: {AGREE} with the workshop before anything is made.")
+    step = min(0.018, (top - 0.54) / len(notes))
     for row, note in enumerate(notes[::-1]):
-        figure.text(left, 0.54 + 0.018 * row, note, fontsize=TEXT - 0.5, color="0.25", va="center")
+        figure.text(left, 0.538 + step * row, note, fontsize=TEXT - 0.5, color="0.25", va="center")
 
 
 def _sag_table(
     figure: Figure, face: Face, box: tuple[float, float, float, float], small: bool
 ) -> None:
     if face.shape.rotational:
-        rows = sag_rows(face, 7 if small else 13)
+        rows = sag_rows(face, 9 if small else 13)
         heading = ("r (mm)", "sag z (mm)", "slope (°)")
         grid_table(figure, box, f"Sag of S{face.number}, z towards the right", [heading, *rows])
         return

@@ -24,7 +24,7 @@ SHOP_KEYS = {
     "diameter": "diameter",
     "roughness": "roughness",
 }
-_FILE_KEYS = ("tolerances", "elements", "drawing")
+_FILE_KEYS = ("tolerances", "tolerance_factor", "elements", "drawing")
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,8 @@ def read_tolerances(lens: Lens, path: str) -> tuple[Lens, ShopTolerances]:
     labels = {}
     if data.get("tolerances"):
         try:
-            labels = drawn_labels(tolerances_from(lens, data["tolerances"]))
+            factor = data.get("tolerance_factor", 1.0)
+            labels = drawn_labels(tolerances_from(lens, data["tolerances"], factor))
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
     return lens, ShopTolerances(labels, {key: str(value) for key, value in shop.items()})

@@ -130,13 +130,14 @@ def aim(
     """
     tangents, near = field_tangents(field, object_distance)
     target = pupil * system.surfaces[system.stop - 1].semi_diameter
-    shape = torch.broadcast_shapes(tangents.shape, target.shape)
+    # Not torch.broadcast_shapes, whose first call imports SymPy: half a second.
+    tangents, target = torch.broadcast_tensors(tangents, target)
     if isinstance(wavelength, Tensor):
-        shape = (*torch.broadcast_shapes(shape[:-1], wavelength.shape), 2)
-    tangents, target = tangents.expand(shape), target.expand(shape)
+        every = torch.broadcast_tensors(tangents, wavelength[..., None])[0]
+        tangents, target = every, target.expand(every.shape)
     problem = _Problem(system, wavelength, near, tangents.detach(), target.detach())
     with torch.no_grad():
-        found_near = None if guess is None else _corrected(problem, guess.expand(shape))
+        found_near = None if guess is None else _corrected(problem, guess.expand(target.shape))
         q, slopes, found = found_near or _follow(problem)
     residual, reached = _miss(system, wavelength, near, tangents, target, q)
     with torch.no_grad():

@@ -1,11 +1,10 @@
 """The implementation that traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain
+from itertools import chain, zip_longest
 
 import torch
 from torch import Tensor
@@ -101,7 +100,11 @@ def is_few(system: OpticalSystem, rays: Rays) -> bool:
     shapes = [rays.position.shape[:-1], rays.direction.shape[:-1]]
     if isinstance(rays.wavelength, Tensor):
         shapes.append(rays.wavelength.shape)
-    return math.prod(torch.broadcast_shapes(*shapes)) * len(system.surfaces) < FEW
+    # Not torch.broadcast_shapes, whose first call imports SymPy: half a second.
+    rays_of_shape = 1
+    for sizes in zip_longest(*map(reversed, shapes), fillvalue=1):
+        rays_of_shape *= 0 if 0 in sizes else max(sizes)
+    return rays_of_shape * len(system.surfaces) < FEW
 
 
 def with_chosen_backend(system: OpticalSystem, others: Iterable[Tensor] = ()) -> OpticalSystem:

@@ -12,6 +12,7 @@ from dolens.optics.aiming import AimedRays, aim
 from dolens.optics.backend import check_backend, is_few, trace_rays
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
+from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.paraxial import FirstOrder, first_order, vergence
 from dolens.optics.paraxial_rays import ParaxialRays, paraxial_rays
@@ -21,7 +22,7 @@ from dolens.optics.surfaces.base import Surface, SurfaceState
 from dolens.optics.system import OpticalSystem
 
 
-class Lens(nn.Module):
+class Lens(LensViews, nn.Module):
     """Surfaces, gaps, media and a sensor plane.
 
     Parameters are named as users write them: `surfaces.1.curvature`, `surfaces.5.x2y`,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from dolens.optics.materials import abbe_number, index_d
+from dolens.optics.elements import TILTS, Element
+from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
 from dolens.optics.tables import html_table, printable, text_table
 
@@ -34,8 +35,8 @@ class SurfaceRow:
         radius: mm, `inf` for a plane; None for a shape without one.
         thickness: mm, to the next surface or the sensor.
         material: the medium behind the surface.
-        index_d: its index at the d line.
-        abbe_number: its Abbe number Vd, `inf` without dispersion.
+        index_d: its index at the d line; NaN of a glass that is specified elsewhere only.
+        abbe_number: its Abbe number Vd, `inf` without dispersion; NaN likewise.
         semi_diameter: mm, of the clear aperture's farthest point.
         aperture: `circle`, `rectangle` or `none`, and its obscuration where there is one.
         conic: None for a shape without one.
@@ -123,7 +124,10 @@ class PrescriptionTable:
         found = []
         for name, pose in self.elements.items():
             numbers = [row.number for row in self.surfaces if row.element == name]
-            values = ", ".join(f"{key} {_number(value)}" for key, value in pose.items())
+            values = ", ".join(
+                f"{key} {_number(value)}{'°' if key in TILTS else ' mm'}"
+                for key, value in pose.items()
+            )
             carried = f"surfaces {numbers[0]} to {numbers[-1]}"
             found.append(printable(f"element {name} ({carried}): {values or 'no tilt or shift'}"))
         return found
@@ -175,8 +179,7 @@ def prescription_table(lens: nn.Module) -> PrescriptionTable:
                 radius,
                 gap,
                 medium.name,
-                index_d(medium),
-                abbe_number(medium),
+                *_glass_numbers(medium),
                 surface.semi_diameter,
                 _aperture(surface.aperture),
                 conic,
@@ -193,13 +196,23 @@ def prescription_table(lens: nn.Module) -> PrescriptionTable:
         tuple(rows),
         gaps[-1],
         lens.sensor_diameter,
-        {
-            name: {
-                key: float(value) for key, value in element.named_parameters() if float(value) != 0
-            }
-            for name, element in lens.elements.items()
-        },
+        {name: _pose(element) for name, element in lens.elements.items()},
     )
+
+
+def _glass_numbers(medium: Medium) -> tuple[float, float]:
+    """Return nd and Vd; NaN where the catalogue's range ends short of lines F, d and C."""
+    first, last = getattr(medium, "wavelengths", (0.0, math.inf))
+    if first > LINE_F or last < LINE_C:
+        return math.nan, math.nan
+    return index_d(medium), abbe_number(medium)
+
+
+def _pose(element: Element) -> dict[str, float]:
+    """Return the pose's numbers that are not zero, tilts in degrees."""
+    pose = {name: float(value) for name, value in element.named_parameters()}
+    pose |= {name: math.degrees(pose[name]) for name in TILTS}
+    return {name: value for name, value in pose.items() if value != 0.0}
 
 
 def _aperture(aperture: ClearAperture) -> str:

@@ -10,10 +10,12 @@ from dolens.plotting.pareto import Point, pareto_figure, pareto_front
 from dolens.plotting.psf import psf_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
+from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
 from dolens.plotting.spots import spots_comparison_figure, spots_figure
 
 __all__ = [
     "Point",
+    "RunPoint",
     "before_after_figure",
     "comparison_figure",
     "figure_to_image",
@@ -25,6 +27,8 @@ __all__ = [
     "psf_figure",
     "ray_fans_figure",
     "rms_curves_figure",
+    "runs_curve",
+    "runs_figure",
     "save_figure",
     "save_figures",
     "spots_comparison_figure",

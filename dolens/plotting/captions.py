@@ -9,8 +9,8 @@ from torch import Tensor
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 
-# Longer names of lenses are cut.
-_LONGEST = 60
+# Longer names of lenses are cut; lines of a caption fit over a narrow figure.
+_LONGEST, _LINE = 50, 52
 
 
 @torch.no_grad()
@@ -20,7 +20,8 @@ def caption(
     wavelengths: Sequence[float] | Tensor,
     object_distance: float | None = None,
 ) -> str:
-    """Return a title such as `Spot diagram: Cooke triplet, F/4.93, 587.6 nm`.
+    """Return a title such as `Spot diagram: Cooke triplet, F/4.93, 587.6 nm`; lines break where
+    one is too long for a narrow figure.
 
     Args:
         what: the figure shows.
@@ -30,14 +31,19 @@ def caption(
     """
     first = first_order(lens.system(), lens.primary_wavelength, object_distance)
     number = abs(float(first.working_f_number))
-    parts = [plain_text(lens.name)] if lens.name else []
+    parts = []
     if math.isfinite(number):
         working = "" if object_distance is None else "working "
         parts.append(f"{working}F/{number:.3g}")
     parts.append(wavelengths_text(wavelengths))
     if object_distance is not None:
         parts.append(f"object at {object_distance:g} mm")
-    return f"{what}: {', '.join(parts)}"
+    name = [f"{plain_text(lens.name)},"] if lens.name else []
+    lines = [f"{what}:"]
+    for piece in (*name, ", ".join(parts)):
+        longer = f"{lines[-1]} {piece}"
+        lines[-1:] = [longer] if len(longer) <= _LINE else [lines[-1], piece]
+    return "\n".join(lines)
 
 
 def wavelengths_text(wavelengths: Sequence[float] | Tensor) -> str:

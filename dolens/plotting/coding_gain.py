@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.ticks import log_ticks
 
 
 @dataclass(frozen=True)
@@ -39,31 +40,42 @@ def coding_gain_figure(
         ranges: one or more.
         title: above all.
     """
-    figure = Figure(figsize=(3.6 * len(ranges) + 0.6, 3.6), layout="constrained")
+    figure = Figure(figsize=(max(PAGE * len(ranges) / 2.0, 4.6), 3.4), layout="constrained")
     grid = figure.subplots(1, len(ranges), squeeze=False, sharey=True, sharex=True)
     blue, orange, green = colours(3)
     for axes, found in zip(grid[0], ranges, strict=True):
         axes.axhline(0.0, color="0.3", linewidth=0.8)
         if len(found.lights):
-            axes.plot(found.lights, found.common_filter, color=blue, label="one linear filter")
+            axes.plot(
+                found.lights, found.common_filter, color=blue, label="bound, one linear filter"
+            )
             axes.plot(
                 found.lights,
                 found.filter_per_depth,
                 color=green,
                 ls="--",
-                label="a filter each depth",
+                label="bound, a filter for each depth",
             )
         if found.trained:
             light, gain, low, high = zip(*found.trained, strict=True)
             below = [g - bottom for g, bottom in zip(gain, low, strict=True)]
             above = [top - g for g, top in zip(gain, high, strict=True)]
             axes.errorbar(
-                light, gain, (below, above), fmt="o", color=orange, capsize=3, label="trained"
+                light,
+                gain,
+                (below, above),
+                fmt="o",
+                color=orange,
+                capsize=3,
+                label="trained cameras",
             )
         axes.set_xscale("log")
         axes.set_title(found.label, fontsize=SMALL + 1)
-        axes.set_xlabel("electrons in white, full aperture", fontsize=SMALL)
+        axes.set_xlabel("light (electrons of a white pixel, full aperture)", fontsize=SMALL)
         ruled_axes(axes)
+    for axes, letter in zip(grid[0], "abcdefgh", strict=False):
+        log_ticks(axes.xaxis)
+        axes.set_title(f"({letter})", loc="left", fontsize=SMALL + 1, fontweight="bold")
     grid[0, 0].set_ylabel("gain at the worst depth (dB)", fontsize=SMALL)
     handles = {}
     for axes in grid[0]:

@@ -7,15 +7,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dolens.errors import InputError
-from dolens.plotting.style import PALETTE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, TITLE, line_styles, ruled_axes
 
-_DASHES = ("-", "--", ":")
 # Up to here each iteration is worth a dot.
 _FEW = 40
+# Losses that change by a larger factor get logarithmic axes.
+_WIDE = 2.0
 
 
 def convergence_figure(
-    loss: Sequence[float],
+    loss: Sequence[float] | Mapping[str, Sequence[float]],
     values: Mapping[str, tuple[Sequence[float], str]],
     stages: Sequence[tuple[str, int]],
     truth: Mapping[str, float] | None = None,
@@ -29,18 +30,24 @@ def convergence_figure(
     others by their values, those of one unit in the same axes.
 
     Args:
-        loss: one value after each of n iterations; what is not positive leaves gaps.
+        loss: one value after each of n iterations; what is not positive leaves gaps.  Where stages
+            have losses of their own: name → such values, NaN where another one counts; each has
+            axes of its own.
         values: name → (n values, their unit).
         stages: optimizer and number of iterations of each, n in all.
         truth: name → value in the parameter's unit, where it is known.
         title: above.
-        loss_label: of the loss's axis.
+        loss_label: of the loss's axis, where there is one loss.
 
     Raises:
         InputError: numbers of values and iterations that differ.
     """
     count = sum(length for _, length in stages)
-    for name, found in (("loss", loss), *((name, found) for name, (found, _) in values.items())):
+    losses = dict(loss) if isinstance(loss, Mapping) else {loss_label: loss}
+    for name, found in (
+        *(("loss", one) for one in losses.values()),
+        *((name, found) for name, (found, _) in values.items()),
+    ):
         if len(found) != count or not count:
             raise InputError(f"{name}: {len(found)} values for {count} iterations of the stages")
     truth = truth or {}
@@ -49,22 +56,27 @@ def convergence_figure(
         known = name in truth
         shown = [abs(value - truth[name]) for value in found] if known else found
         panels.setdefault((known, unit), {})[name] = shown
-    figure = Figure(figsize=(7.6, 2.3 + 1.9 * len(panels)), layout="constrained")
-    grid = figure.subplots(1 + len(panels), 1, squeeze=False, sharex=True)[:, 0]
+    figure = Figure(figsize=(PAGE, 4.0), layout="constrained")
+    heights = [1.0] * len(losses) + [1.2] * len(panels)
+    figure.set_figheight(1.0 + 1.45 * sum(heights))
+    grid = figure.subplots(len(heights), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
     numbers = range(1, count + 1)
     style = {"linewidth": 1.4, "marker": "o" if count <= _FEW else None, "markersize": 3}
-    grid[0].plot(numbers, loss, color=PALETTE[0], **style)
-    grid[0].set_yscale("log", nonpositive="mask")
-    grid[0].set_ylabel(loss_label, fontsize=SMALL + 1)
-    for axes, ((known, unit), lines) in zip(grid[1:], panels.items(), strict=True):
-        for number, ((name, found), colour) in enumerate(
-            zip(lines.items(), colours(len(lines)), strict=True)
-        ):
-            dash = _DASHES[number // len(PALETTE) % len(_DASHES)]
-            axes.plot(numbers, found, linestyle=dash, color=colour, label=name, **style)
+    for axes, (name, found) in zip(grid, losses.items(), strict=False):
+        axes.plot(numbers, found, color="black", **style)
+        positive = [value for value in found if value > 0.0]
+        if positive and max(positive) > _WIDE * min(positive):
+            axes.set_yscale("log", nonpositive="mask")
+        axes.set_ylabel(name, fontsize=SMALL + 1)
+    for axes, ((known, unit), lines) in zip(grid[len(losses) :], panels.items(), strict=True):
+        for (name, found), look in zip(lines.items(), line_styles(len(lines)), strict=True):
+            axes.plot(numbers, found, label=name, **look, **style)
         if known:
             axes.set_yscale("log", nonpositive="mask")
-        axes.set_ylabel(f"|error|, {unit}" if known else f"value, {unit}", fontsize=SMALL + 1)
+        printed = "°" if unit == "deg" else unit
+        axes.set_ylabel(
+            f"|error| ({printed})" if known else f"value ({printed})", fontsize=SMALL + 1
+        )
         axes.legend(frameon=False, fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axes in grid:
         ruled_axes(axes)

@@ -1,5 +1,6 @@
 """A corner plot shows a covariance as ellipses, for every pair of parameters."""
 
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,12 +13,19 @@ from matplotlib.patches import Ellipse
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.plotting.style import PALETTE, SMALL, TITLE
+from dolens.plotting.number_text import MINUS, number_text, value_and_error
+from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE
 
 _SIGMAS = (1.0, 2.0)
 # Axes reach this far, in σ; further where points or the truth are, up to the second number.
 _REACH, _FURTHEST = 2.6, 6.0
 _CELL = 1.25
+# Cells larger than this have room for three numbers.
+_ROOMY = 1.0
+# Inches beside and below the cells, for labels.
+_BESIDE, _BELOW = 0.75, 1.1
+# Letters on colours of stronger correlations are white.
+_DARK = 0.8
 # Units of σ below 0.1 of them are divided by 1000.
 _THOUSANDTHS = {"mm": "µm", "deg": "mdeg", "°": "mdeg"}
 
@@ -35,6 +43,7 @@ def corner_figure(
     """Draw ellipses of 1σ and 2σ below the diagonal, correlations above it, and each σ on it.
 
     Axes count from the centre.  Mm and degrees become thousandths where σ is below 0.1 of them.
+    The values in the diagonal have the digits that σ allows.
 
     Args:
         covariance: (P, P), in the products of the units.
@@ -78,7 +87,8 @@ def corner_figure(
     far = np.abs(cross) > _FURTHEST * spread
     reach = _limits(dots, np.where(far, np.nan, cross), spread)
 
-    figure = Figure(figsize=(_CELL * count + 0.9, _CELL * count + 1.1), layout="constrained")
+    cell = min(_CELL, (PAGE - _BESIDE) / count)
+    figure = Figure(figsize=(cell * count + _BESIDE, cell * count + _BELOW), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
     grid = figure.subplots(count, count, squeeze=False)
     scaled_covariance = (matrix * torch.outer(factor, factor)).numpy()
@@ -91,15 +101,18 @@ def corner_figure(
                 _correlation(axes, correlations[row, column])
             elif column == row:
                 value = None if centre is None else float(shift[row])
-                _deviation(axes, labels[row], value, spread[row], scaled[row][1], units[row])
+                _deviation(axes, labels[row], value, float(sigma[row]), units[row], cell)
             else:
                 shown = scaled_covariance[np.ix_(pair, pair)]
-                _pair(axes, shown, dots[:, pair], cross[pair], reach[pair])
+                _pair(axes, shown, dots[:, pair], cross[pair], reach[pair], cell > _ROOMY)
             _ticks(axes, row, column, count)
             if row == count - 1 and column < row:
-                axes.set_xlabel(f"{labels[column]}\n{scaled[column][1]}", fontsize=SMALL)
+                axes.set_xlabel(
+                    _axis_label(labels[column], scaled[column][1], cell), fontsize=SMALL - 1
+                )
             if column == 0 and row > 0:
-                axes.set_ylabel(f"{labels[row]}\n{scaled[row][1]}", fontsize=SMALL)
+                name = _axis_label(labels[row], scaled[row][1], cell)
+                axes.set_ylabel(name, fontsize=SMALL - 1)
     figure.align_labels()
     # A cross takes two.
     crosses = int((np.isfinite(cross) & ~far).sum()) > 1
@@ -133,9 +146,14 @@ def _limits(dots: np.ndarray, cross: np.ndarray, spread: np.ndarray) -> np.ndarr
 
 
 def _pair(
-    axes: Axes, covariance: np.ndarray, dots: np.ndarray, cross: np.ndarray, reach: np.ndarray
+    axes: Axes,
+    covariance: np.ndarray,
+    dots: np.ndarray,
+    cross: np.ndarray,
+    reach: np.ndarray,
+    roomy: bool,
 ) -> None:
-    """Draw two parameters, the first along x."""
+    """Draw two parameters, the first along x; where there is no room, zero has no number."""
     values, vectors = np.linalg.eigh(covariance)
     lengths = np.sqrt(np.maximum(values, 0.0))
     angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
@@ -161,31 +179,62 @@ def _pair(
         # A round number either side, far enough from the ends that labels stay within the axes.
         power = 10.0 ** np.floor(np.log10(0.8 * length))
         step = power * max(factor for factor in (1, 2, 5) if factor * power <= 0.8 * length)
-        axis.set_ticks([-step, 0.0, step], [f"\N{MINUS SIGN}{step:g}", "0", f"{step:g}"])
+        axis.set_ticks([-step, 0.0, step], [f"{MINUS}{step:g}", "0" if roomy else "", f"{step:g}"])
 
 
 def _correlation(axes: Axes, correlation: float) -> None:
     """Write a correlation on a background coloured by its value."""
     axes.set_facecolor(colormaps["RdBu_r"](0.5 + 0.35 * correlation))
-    # As many digits as tell it from ±1.
-    digits = 2 if abs(correlation) < 0.995 else 4
+    # As many digits as tell it from ±1, and no more than four.
+    left = 1.0 - abs(correlation)
+    digits = 2 if left > 0.005 else 4
+    text = f"{correlation:+z.{digits}f}".replace("-", MINUS)
+    if left < 5e-5:
+        text = "> +0.9999" if correlation > 0.0 else f"< {MINUS}0.9999"
     axes.text(
         0.5,
         0.5,
-        f"{correlation:+z.{digits}f}".replace("-", "\N{MINUS SIGN}"),
+        text,
+        color="white" if abs(correlation) > _DARK else "black",
         transform=axes.transAxes,
         ha="center",
         va="center",
-        fontsize=SMALL + 1,
+        fontsize=SMALL,
     )
 
 
 def _deviation(
-    axes: Axes, label: str, value: float | None, sigma: float, unit: str, value_unit: str
+    axes: Axes, label: str, value: float | None, sigma: float, unit: str, cell: float
 ) -> None:
-    lines = [label] if value is None else [label, f"{value:.6g} {value_unit}"]
-    text = "\n".join([*lines, f"σ = {sigma:.2g} {unit}"]).replace("-", "\N{MINUS SIGN}")
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=SMALL)
+    """Write a parameter's name, value and standard deviation."""
+    if value is None:
+        factor, shown = _unit(sigma, unit)
+        text = f"{label}\nσ = {number_text(factor * sigma, 2)}{_spaced(shown)}"
+    else:
+        number, error = value_and_error(value, sigma)
+        text = f"{_wrapped(label, cell)}\n{number}\n± {error}{_spaced(unit)}"
+    axes.text(
+        0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=SMALL - 1
+    )
+
+
+def _axis_label(label: str, unit: str, cell: float) -> str:
+    return f"{_wrapped(label, cell)}\n({_printed(unit)})"
+
+
+def _wrapped(label: str, cell: float) -> str:
+    """Break a label where it is longer than a cell of so many inches."""
+    return textwrap.fill(label, max(round(14.0 * cell), 8))
+
+
+def _spaced(unit: str) -> str:
+    """Return a unit as it follows a number."""
+    return "°" if unit == "deg" else f" {_printed(unit)}"
+
+
+def _printed(unit: str) -> str:
+    """Return a unit as it is printed: degrees by their sign."""
+    return {"deg": "°", "mdeg": "0.001°"}.get(unit, unit)
 
 
 def _ticks(axes: Axes, row: int, column: int, count: int) -> None:

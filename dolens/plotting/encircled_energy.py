@@ -9,7 +9,7 @@ from scipy.special import j0, j1
 
 from dolens.analysis.encircled_energy import EncircledEnergy
 from dolens.analysis.spot_diagram import AIRY
-from dolens.plotting.style import SMALL, TITLE, colours, field_label, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
 
 
 def encircled_energy_figure(
@@ -28,25 +28,24 @@ def encircled_energy_figure(
         title: above the axes.
     """
     given = [curves for curves in (with_diffraction, geometric) if curves is not None]
-    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+    figure = Figure(figsize=(PAGE, 4.0), layout="constrained")
     axes = figure.add_subplot()
     reach = max((float(curves.radii_um[-1]) for curves in given), default=1.0)
     handles = []
     for curves in given:
         solid = curves is with_diffraction
-        shades = colours(len(curves.fields))
+        shades = ordered_colours(len(curves.fields))
         for number, (field, colour) in enumerate(zip(curves.fields, shades, strict=True)):
             label = field_label(field, curves.field_unit)
             line = curves.energy[number].numpy()
-            if np.isnan(line).all():
-                label = f"{label} (no light passes)"
-            elif solid and not curves.diffraction[number]:
-                label = f"{label} (rays alone)"
-            else:
+            alone = with_diffraction is not None and not with_diffraction.diffraction[number]
+            dark = bool(np.isnan(line).all())
+            if dark or alone:
+                label += " (no light passes)" if dark else " (rays alone)"
+            # Rays alone are drawn once.
+            if solid or not alone:
                 style = {"linestyle": "-" if solid else "--", "linewidth": 1.6 if solid else 1.1}
                 axes.plot(curves.radii_um, line, color=colour, gid="energy", zorder=3, **style)
-            if solid and not (np.isnan(line).all() or curves.diffraction[number]):
-                axes.plot(curves.radii_um, line, color=colour, gid="energy", linewidth=1.6)
             if curves is given[0]:
                 handles.append(Line2D([], [], color=colour, linewidth=1.6, label=label))
     if given and math.isfinite(given[0].airy_radius_um):

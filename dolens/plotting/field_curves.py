@@ -6,10 +6,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from dolens.analysis.conditions import FieldScan
 from dolens.analysis.field_curves import FieldCurves
-from dolens.plotting.style import SMALL, TITLE, ruled_axes, spectral_colour, wavelength_handles
+from dolens.plotting.style import (
+    PAGE,
+    SMALL,
+    TITLE,
+    ruled_axes,
+    spectral_colour,
+    wavelength_handles,
+)
 
 # Half widths of axes whose curves do not leave zero, mm and percent.
 _FLAT, _UNDISTORTED = 1e-4, 0.01
@@ -27,7 +35,7 @@ def field_curves_figure(
         title: above all.
     """
     rows = [curves] if isinstance(curves, FieldCurves) else list(curves)
-    figure = Figure(figsize=(7.6, 3.6 * len(rows) + 0.7), layout="constrained")
+    figure = Figure(figsize=(PAGE, 3.4 * len(rows) + 0.8), layout="constrained")
     grid = figure.subplots(len(rows), 2, squeeze=False, sharey="row", sharex="col")
     for (left, right), row in zip(grid, rows, strict=True):
         _foci(left, row)
@@ -35,6 +43,8 @@ def field_curves_figure(
         left.set_ylabel(scan_label(row.scan), fontsize=SMALL + 1)
         for axes in (left, right):
             draw_field_limits(axes, row.scan)
+    for axes in grid[-1]:
+        axes.xaxis.set_major_locator(MaxNLocator(5, steps=(1, 2, 2.5, 5, 10)))
     _widen(grid[0, 0], _FLAT)
     _widen(grid[0, 1], _UNDISTORTED)
     grid[-1, 0].set_xlabel("focus from the sensor (mm)", fontsize=SMALL + 1)

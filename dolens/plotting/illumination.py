@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from dolens.diffraction.illumination import Illumination
 from dolens.plotting.field_curves import note_if_empty, scan_label
-from dolens.plotting.style import PALETTE, SMALL, TITLE, ruled_axes
+from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, ruled_axes
 
 
 def illumination_figure(
@@ -20,7 +20,7 @@ def illumination_figure(
         title: above all.
     """
     panels = [illumination] if isinstance(illumination, Illumination) else list(illumination)
-    figure = Figure(figsize=(1.2 + 4.4 * len(panels), 3.6), layout="constrained")
+    figure = Figure(figsize=(PAGE if len(panels) > 1 else 5.4, 3.5), layout="constrained")
     grid = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
     for axes, curve in zip(grid, panels, strict=True):
         field = curve.scan.coordinate.numpy()

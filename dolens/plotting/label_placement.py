@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.text import Text
 
 # Where a label may stand about its point: direction, and distance in points of 1/72 inch, the
 # nearest first.
@@ -55,7 +56,8 @@ def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], si
             arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "shrinkB": 3.0},
         )
         note.set_in_layout(False)
-        extent = note.get_window_extent()
+        # Of the text without its line.
+        extent = Text.get_window_extent(note)
         reach = 0.5 * np.array([extent.width, extent.height])
         # The text's centre, so far off that its nearest corner or side is at the wanted distance.
         centres = _PLACES * scale + np.sign(_PLACES) * reach

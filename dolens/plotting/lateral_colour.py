@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.lateral_colour import FocalShift, LateralColour
 from dolens.plotting.field_curves import draw_field_limits, note_if_empty, scan_label
-from dolens.plotting.style import SMALL, TITLE, ruled_axes, spectral_colour
+from dolens.plotting.style import PAGE, SMALL, TITLE, ruled_axes, spectral_colour
 
 _BAND = "#E8E8E8"
 
@@ -30,7 +30,7 @@ def lateral_colour_figure(
     """
     scans = [colour] if isinstance(colour, LateralColour) else list(colour)
     panels = len(scans) + (focal_shift is not None)
-    figure = Figure(figsize=(0.6 + 3.6 * panels, 4.3), layout="constrained")
+    figure = Figure(figsize=(PAGE if panels > 1 else 4.2, 3.9), layout="constrained")
     grid = figure.subplots(1, panels, squeeze=False)[0]
     for axes, scan in zip(grid, scans, strict=False):
         _draw_lateral(axes, scan)
@@ -68,7 +68,7 @@ def _draw_lateral(axes: Axes, colour: LateralColour) -> None:
     draw_field_limits(axes, colour.scan)
     axes.set_ylabel(scan_label(colour.scan), fontsize=SMALL + 1)
     axes.set_xlabel("image shift (µm)", fontsize=SMALL + 1)
-    text = f"Lateral colour from {colour.reference_wavelength:.4g} nm"
+    text = f"Lateral colour\nfrom {colour.reference_wavelength:.4g} nm"
     axes.set_title(text, fontsize=SMALL + 1)
 
 
@@ -85,8 +85,8 @@ def _draw_shift(axes: Axes, shift: FocalShift) -> None:
     axes.set_xlim(waves.min(), waves.max())
     axes.set_xlabel("wavelength (nm)", fontsize=SMALL + 1)
     axes.set_ylabel("paraxial focus (µm)", fontsize=SMALL + 1)
-    text = f"Focal shift from {shift.reference_wavelength:.4g} nm"
+    text = "Focal shift"
     if math.isfinite(depth):
-        text += f"; grey: ±2λN² = {depth:.3g} µm"
+        text += f"\ngrey: ±2λN² = {depth:.3g} µm"
     axes.set_title(text, fontsize=SMALL + 1)
     ruled_axes(axes)

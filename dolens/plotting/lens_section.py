@@ -47,7 +47,8 @@ def lens_section_figure(
         away = object_distance + float(pupil.z)
         # Chief rays of a near object come down from a point above the axis.
         angles = [-math.degrees(math.atan(height / away)) + 0.0 for height in heights]
-    title = title or caption("Section", lens, [wave], object_distance)
+    if title is None:
+        title = caption("Section", lens, [wave], object_distance)
     figure = layout_figure(lens, wave, angles, rays, object_distance, title)
     legend = figure.axes[0].get_legend()
     if legend is not None:

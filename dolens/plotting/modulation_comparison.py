@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from dolens.analysis.modulation_transfer import Modulation
 from dolens.diffraction.transfer import DiffractionModulation
 from dolens.errors import InputError
-from dolens.plotting.style import SMALL, TITLE, colours, field_label, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
 
 
 def modulation_comparison_figure(
@@ -35,7 +35,7 @@ def modulation_comparison_figure(
     given = [curves for curves in (with_diffraction, geometric) if curves is not None]
     if not given:
         raise InputError("modulation_comparison_figure needs an MTF of one kind or the other")
-    figure = Figure(figsize=(1.6 + 3.9 * len(given), 4.2), layout="constrained")
+    figure = Figure(figsize=(PAGE if len(given) > 1 else 5.2, 3.7), layout="constrained")
     grid = figure.subplots(1, len(given), squeeze=False, sharey=True)[0]
     notes = [""] * len(given[0].fields)
     for axes, curves in zip(grid, given, strict=True):
@@ -50,7 +50,7 @@ def modulation_comparison_figure(
     handles = [
         Line2D([], [], color=colour, linewidth=1.6, label=label + note)
         for colour, label, note in zip(
-            colours(len(notes)),
+            ordered_colours(len(notes)),
             [field_label(field, given[0].field_unit) for field in given[0].fields],
             [" (no light passes)" if no else note for no, note in zip(dark, notes, strict=True)],
             strict=True,
@@ -74,7 +74,7 @@ def _draw(axes: Axes, curves: DiffractionModulation | Modulation) -> None:
     limit = _limit(curves)
     if limit is not None:
         axes.plot(frequency, limit, color="black", linewidth=0.9, gid="limit", zorder=2)
-    for number, colour in enumerate(colours(len(curves.fields))):
+    for number, colour in enumerate(ordered_colours(len(curves.fields))):
         style = {"color": colour, "linewidth": 1.5, "zorder": 3}
         axes.plot(frequency, curves.tangential[number], gid="tangential", **style)
         axes.plot(frequency, curves.sagittal[number], gid="sagittal", linestyle="--", **style)

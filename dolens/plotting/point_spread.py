@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dolens.diffraction.point_spread import PointSpread
-from dolens.plotting.style import SMALL, TITLE, field_label
+from dolens.plotting.style import PAGE, SMALL, TITLE, field_label
 
 # Lightness grows evenly, for colour-blind readers and in print too.
 _COLOURS = "inferno"
-_COLUMNS, _PANEL = 4, 2.3
+_COLUMNS = 4
 
 
 def point_spread_figure(psf: PointSpread, title: str | None = "Point spread functions") -> Figure:
@@ -32,7 +32,8 @@ def point_spread_figure(psf: PointSpread, title: str | None = "Point spread func
     columns = min(count, _COLUMNS)
     rows = math.ceil(count / columns)
     norm = PowerNorm(0.5, 0.0, 1.0)
-    size = max(_PANEL * columns + 1.1, 4.6), (_PANEL + 0.45) * rows + 0.5
+    width = PAGE if columns > 2 else 1.2 + 2.4 * columns
+    size = max(width, 4.2), ((width - 1.2) / columns + 0.55) * rows + 0.6
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for number, axes in enumerate(grid.flat):

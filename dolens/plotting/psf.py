@@ -55,7 +55,7 @@ def psf_figure(
     note = "each to its own peak, display-encoded (sRGB), not interpolated"
     heading = 0.2 * (2 + (title.count("\n") if title else 0))
     figure = Figure(
-        figsize=(max(panel * columns, 4.4), (panel + 0.6) * rows + heading), layout="constrained"
+        figsize=(max(panel * columns, 5.2), (panel + 0.6) * rows + heading), layout="constrained"
     )
     for number, (picture, label, peak) in enumerate(zip(pictures, labels, peaks, strict=True)):
         axes = figure.add_subplot(rows, columns, number + 1)

@@ -1,5 +1,7 @@
 """RMS spot radii are plotted against field and against wavelength."""
 
+from collections.abc import Sequence
+
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,6 +22,9 @@ from dolens.plotting.style import (
 # Lines that differ by less of the largest radius are one on paper.
 _SAME = 2e-3
 
+# Largest radii over the field and over the wavelength share a scale up to this ratio.
+_COMPARABLE = 10.0
+
 
 def rms_curves_figure(
     against_field: RMSCurves | None = None,
@@ -27,6 +32,8 @@ def rms_curves_figure(
     title: str | None = "RMS spot radius",
 ) -> Figure:
     """Plot RMS spot radii, µm: at the left over the field, at the right over the wavelength.
+
+    Both have one scale, unless one of them is ten times as large.
 
     Over the field every wavelength has a line, and all together a black one; over the wavelength
     every field has a line; fields whose lines are the same share one.  Airy's radius is grey: over
@@ -49,7 +56,7 @@ def rms_curves_figure(
         raise InputError("rms_curves_figure needs curves against field or against wavelength")
     figure = Figure(figsize=(PAGE if len(given) > 1 else 4.8, 3.9), layout="constrained")
     figure.get_layout_engine().set(wspace=0.06)
-    grid = figure.subplots(1, len(given), squeeze=False, sharey=True)
+    grid = figure.subplots(1, len(given), squeeze=False, sharey=_comparable(given))
     for axes, (curves, draw) in zip(grid[0], given, strict=True):
         draw(axes, curves)
         ruled_axes(axes)
@@ -60,12 +67,19 @@ def rms_curves_figure(
             frameon=False,
             fontsize=SMALL,
         )
-    # Both share one scale, which is known when both are drawn.
-    grid[0, 0].set_ylim(bottom=0.0)
+    # A scale that both share is known when both are drawn.
+    for axes in grid[0]:
+        axes.set_ylim(bottom=0.0)
     grid[0, 0].set_ylabel("RMS spot radius (µm)", fontsize=SMALL + 1)
     if title:
         figure.suptitle(title, fontsize=TITLE)
     return figure
+
+
+def _comparable(given: Sequence[tuple[RMSCurves, object]]) -> bool:
+    """Return whether all curves can be read on one scale."""
+    largest = [float(curves.rms.nan_to_num(0.0).max()) for curves, _ in given]
+    return max(largest) < _COMPARABLE * min(largest)
 
 
 def _over_field(axes: Axes, curves: RMSCurves) -> None:

@@ -5,20 +5,19 @@ from collections.abc import Sequence
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.plotting.style import SMALL, TITLE
+from dolens.plotting.scale_bar import scale_bar
+from dolens.plotting.style import PAGE, SMALL, TITLE
 
 _COLUMNS = ("measured", "initial", "final", "final \N{MINUS SIGN} measured")
 # Light left out beyond each edge of the window, as a share, before the margin is added.
 _BEYOND = 0.002
 _MARGIN = 0.12
 _SMALLEST_WINDOW = 8
-_PANEL = 1.9
-# White letters stay readable on bright pixels.
-_OUTLINE = [withStroke(linewidth=1.5, foreground="black")]
+# Inches, of an image with its heading and scale bar.
+_ROW = 1.75
 
 
 @torch.no_grad()
@@ -33,7 +32,8 @@ def spot_fit_figure(
     """Show one row for each image: measured, at the start of the fit, at its end, and the residual.
 
     Each row shows one square window where the light of its three images is, and is relative to the
-    largest pixel that was measured; an initial image may be brighter, its peak is written in it.
+    largest pixel that was measured.  The colours reach as far as the brightest of the three, so
+    that nothing is clipped; each one's peak is written above it.
     Differences are red where the model has too much light, blue where too little.
 
     Args:
@@ -55,7 +55,7 @@ def spot_fit_figure(
     if not bool((images[0].sum((-2, -1)) > 0.0).all()):
         raise InputError("a measured image has no light")
     figure = Figure(
-        figsize=(4 * _PANEL + 1.9, (_PANEL + 0.05) * count + (0.55 if title else 0.3)),
+        figsize=(PAGE, _ROW * count + (0.6 if title else 0.35)),
         layout="constrained",
     )
     grid = figure.subplots(count, 4, squeeze=False)
@@ -63,7 +63,8 @@ def spot_fit_figure(
         _row(figure, line, [found[number] for found in images], pixel_pitch)
         line[0].set_ylabel(label, fontsize=SMALL + 1)
     for axes, name in zip(grid[0], _COLUMNS, strict=True):
-        axes.set_title(name, fontsize=SMALL + 1)
+        below = f"\n{axes.get_title()}" if axes.get_title() else ""
+        axes.set_title(f"{name}{below}", fontsize=SMALL)
     if title:
         figure.suptitle(title, fontsize=TITLE)
     return figure
@@ -73,28 +74,20 @@ def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: floa
     top, left, size = _window(images)
     peak = images[0].max()
     shown = [i[top : top + size, left : left + size] / peak for i in images]
+    brightest = max(float(picture.max()) for picture in shown)
     for axes, picture in zip(line, shown, strict=False):
         bright = axes.imshow(
-            picture.numpy(), cmap="inferno", vmin=0.0, vmax=1.0, interpolation="nearest"
+            picture.numpy(), cmap="inferno", vmin=0.0, vmax=brightest, interpolation="nearest"
         )
-        axes.text(
-            0.04,
-            0.96,
-            f"peak {float(picture.max()):.2f}",
-            color="white",
-            va="top",
-            fontsize=SMALL - 1,
-            transform=axes.transAxes,
-            path_effects=_OUTLINE,
-        )
+        axes.set_title(f"peak {float(picture.max()):.2f}", fontsize=SMALL)
     left_over = 100.0 * (shown[2] - shown[0])
     reach = float(left_over.abs().max()) or 1.0
     differing = line[3].imshow(
         left_over.numpy(), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest"
     )
     for picture, owners, name in (
-        (bright, line[:3], "of measured peak"),
-        (differing, line[3], "% of measured peak"),
+        (bright, line[:3], "over measured peak\n(no unit)"),
+        (differing, line[3], "difference (%)"),
     ):
         bar = figure.colorbar(picture, ax=owners, fraction=0.05, pad=0.02)
         bar.set_label(name, fontsize=SMALL - 1)
@@ -102,7 +95,7 @@ def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: floa
         bar.outline.set_visible(False)
     for axes in line:
         axes.set(xticks=[], yticks=[])
-    _scale_bar(line[0], shown[0].shape[-1], pitch)
+    scale_bar(line[0], shown[0].shape[-1], pitch)
 
 
 def _window(images: list[Tensor]) -> tuple[int, int, int]:
@@ -131,22 +124,3 @@ def _window(images: list[Tensor]) -> tuple[int, int, int]:
         for (low, high), length in zip(ends, (height, width), strict=True)
     ]
     return starts[0], starts[1], side
-
-
-def _scale_bar(axes: Axes, size: int, pitch: float) -> None:
-    """Draw a bar of a round length, at most 0.4 of the window, at the lower left."""
-    lengths = [factor * 10.0**power for power in range(-5, 4) for factor in (1, 2, 5)]
-    length = max((step for step in lengths if step <= 0.4 * size * pitch), default=size * pitch)
-    left, bottom = -0.5 + 0.05 * size, -0.5 + 0.94 * size
-    ends = [left, left + length / pitch]
-    axes.plot(ends, [bottom, bottom], color="white", linewidth=2, solid_capstyle="butt")
-    text = f"{length:g} mm" if length >= 0.1 else f"{1e3 * length:g} µm"
-    axes.text(
-        left,
-        bottom - 0.025 * size,
-        text,
-        color="white",
-        va="bottom",
-        fontsize=SMALL - 1,
-        path_effects=_OUTLINE,
-    )

@@ -30,7 +30,7 @@ _SPECTRUM = {
     486.0: "#0072B2",
     546.0: "#00875F",
     588.0: "#C68400",
-    656.0: "#B5300B",
+    656.0: "#CC3300",
     700.0: "#701A00",
 }
 # The light end of the colour map would be lost on white.
@@ -52,7 +52,7 @@ def line_styles(count: int) -> list[dict[str, object]]:
     """Return `color` and `linestyle` of that many lines; no two are alike up to 28."""
     shades = colours(count)
     return [
-        {"color": shades[n], "linestyle": DASHES[(n + n // len(PALETTE)) % len(DASHES)]}
+        {"color": shades[n], "linestyle": DASHES[sum(divmod(n, len(PALETTE))) % len(DASHES)]}
         for n in range(count)
     ]
 

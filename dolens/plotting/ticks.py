@@ -11,11 +11,15 @@ _FEW_DECADES, _MANY = 2.5, 7.0
 _STEPS = {1.2: (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0), _FEW_DECADES: (1.0, 2.0, 5.0)}
 
 
-def log_ticks(axis: Axis) -> None:
+def log_ticks(axis: Axis, most: int = 8) -> None:
     """Put ticks on a logarithmic axis whose limits are final: 1, 2, 5, or whole decades.
 
     Numbers are plain where an axis covers few decades, and powers of ten where it covers many.
     An axis within a decade keeps at least two numbers.
+
+    Args:
+        axis: x or y.
+        most: numbers that it has room for.
     """
     low, high = sorted(axis.get_view_interval())
     if not 0.0 < low < high:
@@ -36,7 +40,7 @@ def log_ticks(axis: Axis) -> None:
     inside = [place for place in places if low * 0.9999 <= place <= high * 1.0001]
     if len(inside) < 2:
         inside = _evenly(low, high)
-    while len(inside) > 8:
+    while len(inside) > most:
         inside = inside[::2]
     axis.set_major_locator(FixedLocator(inside))
     axis.set_major_formatter(FuncFormatter(lambda value, _: number_text(value, 4)))

@@ -8,15 +8,21 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.plotting.style import PALETTE, SMALL, TITLE, open_axes
+from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, open_axes
 
-_CELL_WIDTH, _CELL_HEIGHT = 0.26, 0.17
+_CELL_WIDTH, _CELL_HEIGHT = 0.26, 0.14
 # Inches for the labels of rows, and for those of columns with titles and colour bars.
-_LEFT, _BOTTOM = 1.7, 2.3
-_COLOUR_MAP = "RdBu_r"
+_LEFT, _BOTTOM = 1.4, 2.3
+# Matrices that are wider than a page by this factor are squeezed; wider ones are stacked.
+_SQUEEZE = 1.4
+# White is zero: of numbers of both signs, and of positive ones.
+_BOTH_SIGNS, _POSITIVE = "RdBu_r", "Reds"
+# Two standard deviations of a share of n lenses, √(p·(1 - p)/n), are drawn as a band.
+_BAND = 2.0
 
 
 def matrix_figure(
@@ -25,8 +31,9 @@ def matrix_figure(
     groups: Sequence[tuple[str, int]] = (),
     title: str | None = None,
 ) -> Figure:
-    """Draw matrices side by side, red where positive and blue where negative, each on its own
-    scale.
+    """Draw matrices, red where positive and blue where negative, each on its own scale.
+
+    They stand side by side where a page is wide enough for them, else one above the other.
 
     Args:
         panels: title with unit → matrix (R, C) and names of its columns.
@@ -44,23 +51,36 @@ def matrix_figure(
                 f"the matrix is {tuple(matrix.shape)}"
             )
     widths = [max(len(columns), 5) * _CELL_WIDTH for _, columns in panels.values()]
-    size = (sum(widths) + 0.35 * len(panels) + _LEFT, len(rows) * _CELL_HEIGHT + _BOTTOM)
+    beside = sum(widths) + 0.35 * len(panels) + _LEFT <= _SQUEEZE * PAGE
+    tall = len(rows) * _CELL_HEIGHT + _BOTTOM
+    if beside:
+        size = (min(sum(widths) + 0.35 * len(panels) + _LEFT, PAGE), tall + 0.3)
+    else:
+        size = (min(max(widths) + 0.35 + _LEFT, PAGE), len(panels) * tall + 0.3)
     figure = Figure(figsize=size, layout="constrained")
-    grid = figure.add_gridspec(1, len(panels), width_ratios=widths)
+    shape = {"width_ratios": widths} if beside else {}
+    grid = figure.add_gridspec(*((1, len(panels)) if beside else (len(panels), 1)), **shape)
     for place, (name, (matrix, columns)) in enumerate(panels.items()):
-        axes = figure.add_subplot(grid[0, place])
+        axes = figure.add_subplot(grid[0, place] if beside else grid[place, 0])
+        named = place == 0 or not beside
         values = matrix.detach().cpu().double().numpy()
         limit = float(np.abs(values).max()) or 1.0
+        signed = bool((values < -1e-3 * limit).any()) or not values.any()
         image = axes.imshow(
-            values, cmap=_COLOUR_MAP, vmin=-limit, vmax=limit, aspect="auto", interpolation="none"
+            values,
+            cmap=_BOTH_SIGNS if signed else _POSITIVE,
+            vmin=-limit if signed else 0.0,
+            vmax=limit,
+            aspect="auto",
+            interpolation="none",
         )
-        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=SMALL)
-        axes.set_yticks(range(len(rows)), rows if place == 0 else [], fontsize=SMALL - 1)
+        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=SMALL - 1)
+        axes.set_yticks(range(len(rows)), rows if named else [], fontsize=SMALL - 1)
         axes.tick_params(length=0)
         axes.set_xticks(np.arange(1, len(columns)) - 0.5, minor=True)
         axes.grid(True, which="minor", axis="x", color="0.85", linewidth=0.4)
         axes.tick_params(which="minor", length=0)
-        _part(axes, groups, place == 0)
+        _part(axes, groups, named)
         # `pad` is a share of the matrix's height; the gap is to be the same for few rows and many.
         gap = 0.16 / (len(rows) * _CELL_HEIGHT)
         bar = figure.colorbar(
@@ -88,7 +108,7 @@ def yield_figure(
         nominal: kind of radius → that of the designed lens, mm.
         title: above all.
     """
-    figure = Figure(figsize=(4.6 * len(panels), 4.2), layout="constrained")
+    figure = Figure(figsize=(max(PAGE * len(panels) / 2.0, 4.6), 4.2), layout="constrained")
     legend = None
     for place, (name, series) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), place + 1)
@@ -103,32 +123,39 @@ def yield_figure(
                 linewidth=1.1 if turn % 2 else 2.2,
                 alpha=1.0 if turn % 2 else 0.6,
             )
+            if not turn % 2:
+                spread = _BAND * (shares * (1.0 - shares) / len(radii)).sqrt()
+                low, high = ((100.0 * (shares + s * spread)).clamp(0, 100) for s in (-1.0, 1.0))
+                there = radii.isfinite()
+                axes.fill_between(
+                    *(1e3 * radii[there], low[there], high[there]),
+                    color=PALETTE[turn // 2],
+                    alpha=0.18,
+                    linewidth=0.0,
+                )
             finite = radii[radii.isfinite()]
             if len(finite):
                 far = max(far, 1e3 * float(finite[min(int(0.998 * len(radii)), len(finite) - 1)]))
-        axes.axvline(1e3 * nominal[name], color="0.3", linewidth=0.9, linestyle=":")
-        axes.annotate(
-            "as designed, refocused ",
-            (1e3 * nominal[name], 50.0),
-            rotation=90,
-            ha="right",
-            va="center",
-            fontsize=SMALL - 1,
-            color="0.3",
-        )
+        look = {"color": "0.3", "linewidth": 0.9, "linestyle": ":"}
+        axes.axvline(1e3 * nominal[name], label="as designed, refocused", **look)
         near = 1e3 * nominal[name]
         if far > near:
             axes.set_xlim(near - 0.1 * (far - near), far)
         axes.set_ylim(0.0, 101.0)
-        axes.set_yticks([0, 20, 40, 60, 80, 90, 100])
-        axes.set_xlabel(f"{name}, µm", fontsize=SMALL + 1)
-        axes.set_ylabel("lenses within, %" if place == 0 else "", fontsize=SMALL + 1)
+        axes.set_yticks([0, 20, 40, 60, 80, 100])
+        axes.set_xlabel(f"{name} (µm)", fontsize=SMALL + 1)
+        axes.set_ylabel("lenses within (%)" if place == 0 else "", fontsize=SMALL + 1)
         axes.grid(True, axis="y", color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
         open_axes(axes)
         legend = axes.get_legend_handles_labels()
+    band = Patch(facecolor="0.5", alpha=0.3, label="±2σ of the share, by the number of lenses")
     figure.legend(
-        *legend, loc="outside lower center", ncols=len(legend[1]), frameon=False, fontsize=SMALL
+        handles=[*legend[0], band],
+        loc="outside lower center",
+        ncols=3 if len(panels) > 1 else 2,
+        frameon=False,
+        fontsize=SMALL,
     )
     if title:
         figure.suptitle(title, fontsize=TITLE)
@@ -149,11 +176,11 @@ def offenders_figure(
         increases: label → growth of the RMS radius by a whole tolerance, mm.
         title: above all.
     """
-    figure = Figure(figsize=(8.6, 0.27 * len(names) + 1.6), layout="constrained")
+    figure = Figure(figsize=(PAGE, 0.25 * len(names) + 1.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(names))
     left.barh(places, 100.0 * np.asarray(shares), height=0.7, color=PALETTE[0])
-    left.set_xlabel("share of the average rise of RMS²\n(refocused), %", fontsize=SMALL + 1)
+    left.set_xlabel("share of the average rise of RMS²,\nrefocused (%)", fontsize=SMALL + 1)
     height = 0.8 / max(len(increases), 1)
     for turn, (label, values) in enumerate(increases.items()):
         right.barh(
@@ -161,9 +188,12 @@ def offenders_figure(
             1e3 * np.asarray(values),
             height=0.95 * height,
             color=PALETTE[turn],
+            hatch="////" if turn % 2 else None,
+            edgecolor="white",
+            linewidth=0.0,
             label=label,
         )
-    right.set_xlabel("growth of the RMS radius\nby the whole tolerance, µm", fontsize=SMALL + 1)
+    right.set_xlabel("growth of the RMS radius\nby the whole tolerance (µm)", fontsize=SMALL + 1)
     handles, labels = right.get_legend_handles_labels()
     figure.legend(
         handles, labels, frameon=False, fontsize=SMALL, loc="outside lower right", ncols=len(labels)
@@ -203,7 +233,7 @@ def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:
                 name,
                 (0.0, row + 0.5 * (count - 1)),
                 xycoords=("axes fraction", "data"),
-                xytext=(-88, 0),
+                xytext=(-84, 0),
                 textcoords="offset points",
                 ha="center",
                 va="center",

@@ -7,14 +7,17 @@ from typing import Any
 import torch
 import yaml
 
-from dolens.errors import InputError
+from dolens.errors import InputError, did_you_mean
 from dolens.optics.lens import Lens
+from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
 
+# Lenses that come with dolens lie in this folder of its configuration.
+_LENSES = "lens"
 _SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
 
 
@@ -33,17 +36,44 @@ class _UniqueKeyLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def lens_names() -> list[str]:
+    """Return the names of the lenses that come with dolens, as `load_lens` takes them."""
+    return sorted(path.stem for path in (packaged_configuration() / _LENSES).glob("*.yaml"))
+
+
+def find_lens(path: str | Path) -> Path:
+    """Return the file of a lens: the path itself, or that of a lens that comes with dolens.
+
+    Args:
+        path: a file, or a bare name without suffix, such as `cooke_triplet`, that is no file here.
+
+    Raises:
+        InputError: a bare name that is neither; the message offers near ones and lists all.
+    """
+    path = Path(path)
+    if path.suffix or path.name != str(path) or path.is_file():
+        return path
+    names = lens_names()
+    if path.name not in names:
+        raise InputError(
+            f"lens '{path}': no such file, and no lens of that name comes with dolens"
+            f"{did_you_mean(path.name, names)} (allowed: {', '.join(names)})"
+        )
+    return packaged_configuration() / _LENSES / f"{path.name}.yaml"
+
+
 def load_prescription(path: str | Path) -> Any:
     """Read a lens file as plain data.
 
     Args:
-        path: a file in YAML (.yaml, .yml), the diffoptics format (.txt) or Zemax's (.zmx).
+        path: a file in YAML (.yaml, .yml), the diffoptics format (.txt) or Zemax's (.zmx), or the
+            name of a lens that comes with dolens (`lens_names`).
 
     Raises:
         InputError: the file is missing, of another kind, or not valid; the message is one line
             that names the file, and the line, surface and key where there is one.
     """
-    path = Path(path)
+    path = find_lens(path)
     _suffix(path)
     try:
         data = path.read_bytes()
@@ -126,7 +156,8 @@ def load_lens(
     """Read a lens from a prescription in YAML, diffoptics's `.txt` or Zemax's `.zmx`.
 
     Args:
-        path: the file; its suffix says which format it is in.
+        path: the file; its suffix says which format it is in.  A bare name without suffix that is
+            no file means the lens of that name that comes with dolens: `load_lens("nikon")`.
         dtype: precision of the lens.
         index_model: dfc, do or paper, instead of the file's own.
 
@@ -137,6 +168,7 @@ def load_lens(
         InputError: the file is missing, not valid, or no prescription; the message is one line
             that names the file, and the surface and key where there is one.
     """
+    path = find_lens(path)
     return lens_from_prescription(load_prescription(path), dtype, index_model, str(path), backend)
 
 

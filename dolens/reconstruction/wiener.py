@@ -53,21 +53,44 @@ def wiener_deconvolve(
     """
     channels, height, width = image.shape[-3:]
     _check(channels, point_spread_function, margin)
-    size = point_spread_function.shape[-1]
-    rows = next_fast_len(max(height + 2 * margin, size), real=True)
-    columns = next_fast_len(max(width + 2 * margin, size), real=True)
-
-    point_spread_function = point_spread_function.to(image.dtype)
-    ratio = torch.as_tensor(noise_to_signal, dtype=image.dtype, device=image.device)
-    transfer = _transfer_function(point_spread_function, rows, columns)
-    prior = _squared_frequency(rows, columns, image) * ratio.reshape(-1, 1, 1)
-    power = transfer.real**2 + transfer.imag**2
-    # A floor and not a sum, so that the gain at f = 0 stays exact.
-    weight = transfer.conj() / (power + prior).clamp(min=torch.finfo(image.dtype).eps)
-
-    spectrum = torch.fft.rfft2(_close_periodically(image, rows, columns))
+    rows, columns = padded_lengths(height, width, margin, point_spread_function.shape[-1])
+    weight = wiener_filter(point_spread_function.to(image), noise_to_signal, rows, columns)
+    spectrum = torch.fft.rfft2(close_periodically(image, rows, columns))
     restored = torch.fft.irfft2(spectrum * weight, s=(rows, columns))
     return restored[..., :height, :width]
+
+
+def padded_lengths(height: int, width: int, margin: int, size: int) -> tuple[int, int]:
+    """Return rows and columns of the transform of an image.
+
+    Args:
+        height: of the image, pixels.
+        width: of the image, pixels.
+        margin: pixels added at each edge, at least.
+        size: side of the point spread function, pixels.
+    """
+    rows = next_fast_len(max(height + 2 * margin, size), real=True)
+    return rows, next_fast_len(max(width + 2 * margin, size), real=True)
+
+
+def wiener_filter(
+    point_spread_function: Tensor, noise_to_signal: Tensor | float, rows: int, columns: int
+) -> Tensor:
+    """Return W(f) on the grid of `torch.fft.rfft2`, (C, rows, columns//2 + 1), complex.
+
+    Args:
+        point_spread_function: (C, K, K), K odd; its dtype is computed in.
+        noise_to_signal: r > 0, one number or one a channel, (C,).
+        rows: of the padded image.
+        columns: of the padded image.
+    """
+    like = point_spread_function
+    ratio = torch.as_tensor(noise_to_signal, dtype=like.dtype, device=like.device)
+    transfer = _transfer_function(point_spread_function, rows, columns)
+    prior = _squared_frequency(rows, columns, like) * ratio.reshape(-1, 1, 1)
+    power = transfer.real**2 + transfer.imag**2
+    # A floor and not a sum, so that the gain at f = 0 stays exact.
+    return transfer.conj() / (power + prior).clamp(min=torch.finfo(like.dtype).eps)
 
 
 def _check(channels: int, point_spread_function: Tensor, margin: int) -> None:
@@ -97,8 +120,11 @@ def _squared_frequency(rows: int, columns: int, like: Tensor) -> Tensor:
     return vertical[:, None] ** 2 + horizontal[None, :] ** 2
 
 
-def _close_periodically(image: Tensor, rows: int, columns: int) -> Tensor:
-    # The bridge is appended after the last row; being periodic, it also lies before the first.
+def close_periodically(image: Tensor, rows: int, columns: int) -> Tensor:
+    """Extend an image (..., H, W) to (..., rows, columns) so that opposite edges meet.
+
+    The bridge is appended after the last row; being periodic, it also lies before the first.
+    """
     for dimension, length in ((-2, rows), (-1, columns)):
         gap = length - image.shape[dimension]
         step = torch.arange(1, gap + 1, dtype=image.dtype, device=image.device) / (gap + 1)

@@ -1,16 +1,17 @@
 """Figures of an experiment, saved and logged."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import lightning
 from matplotlib.figure import Figure
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_choice
 from dolens.experiments.experiment import Experiment, Figures
 from dolens.experiments.loggers.protocol import TakesPictures
-from dolens.plotting import figure_to_image, save_figure
+from dolens.plotting import figure_to_image, save_figures
+from dolens.plotting.export import FORMATS
 from dolens.stages import stage
 
 logger = logging.getLogger(__name__)
@@ -19,24 +20,40 @@ logger = logging.getLogger(__name__)
 class SaveFigures(lightning.Callback):
     """Saves the figures of an experiment after its test, and logs those of its training.
 
-    `Experiment.figures` are saved as PNG files, and logged as `figures/<name>`, when the test ends;
+    `Experiment.figures` are saved as files, and logged as `figures/<name>`, when the test ends;
     `Experiment.training_figures` are logged after the validation of every n-th epoch and of the
     last.  A figure that has the name of one of training is logged as `figures/test_<name>`.  One
     that cannot be drawn is named in the log, and the others are drawn.
 
     Args:
-        folder: the folder for PNG files; it is made when needed.
+        folder: the folder for files; it is made when needed.
         every_n_epochs: the interval between epochs whose figures are logged.
+        formats: of the files: `png`, `pdf`, `svg`, one or more.
+        dpi: pixels per inch of a figure's size; in PDF and SVG, of the images in it.
 
     Raises:
-        InputError: an interval below 1.
+        InputError: an interval below 1, an unknown format or none, or a resolution that is not
+            positive.
     """
 
-    def __init__(self, folder: str | Path, every_n_epochs: int = 1) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        every_n_epochs: int = 1,
+        formats: Sequence[str] = ("png",),
+        dpi: float = 200.0,
+    ) -> None:
         if every_n_epochs < 1:
             raise InputError(f"every_n_epochs: {every_n_epochs}; allowed: 1 or more")
+        if isinstance(formats, str) or not len(formats):
+            raise InputError(f"formats: {formats!r}; allowed: a list of {', '.join(FORMATS)}")
+        for name in formats:
+            check_choice(name, FORMATS, "formats")
+        if not dpi > 0.0:
+            raise InputError(f"dpi: {dpi}; allowed: more than 0")
         self.folder = Path(folder)
         self.every_n_epochs = every_n_epochs
+        self.formats, self.dpi = tuple(formats), dpi
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: Experiment) -> None:
         """Log the figures of training, if it is their turn."""
@@ -49,7 +66,7 @@ class SaveFigures(lightning.Callback):
         """Save and log the figures of the test."""
 
         def keep(name: str, figure: Figure) -> None:
-            save_figure(figure, self.folder / f"{name}.png")
+            save_figures(figure, self.folder / name, self.formats, self.dpi)
             of_training = name in pl_module.training_figures()
             _log(trainer, f"test_{name}" if of_training else name, figure)
 
@@ -65,7 +82,7 @@ def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -
         return
     for name, draw in functions.items():
         try:
-            with stage(f"figure {name}"):
+            with stage(f"drawing: {name}"):
                 keep(name, draw())
         except InputError as problem:
             logger.warning("No figure '%s': %s", name, problem)

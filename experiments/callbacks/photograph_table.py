@@ -12,7 +12,7 @@ class PhotographTable(lightning.Callback):
     """Writes `test_photographs.csv`, a row of scores for each test photograph and view.
 
     Every judge has a table of its own besides, such as `test_wave_photographs.csv`.
-    `scripts/compare.py` pairs runs by these tables.
+    `dolens compare` pairs runs by these tables.
 
     Args:
         folder: the run folder.

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from dolens.experiments.loggers.protocol import RunSummary
 from dolens.experiments.tables import write_table
 
 _STEP = "step"
+# Seconds that rows may wait to be written together: the iterations of a design take less.
+_WAIT_S = 1.0
 
 
 class History(Logger):
@@ -20,7 +23,8 @@ class History(Logger):
 
     A row has the numbers of training and of validation at its step; what was not logged there is
     empty.  Where the table exists already, as of a run that is resumed in its own folder, its rows
-    before the first new step stay.
+    before the first new step stay.  A row is written when a later one begins, all of a second
+    together, and when the run ends or fails.
 
     Args:
         path: of the table.
@@ -30,7 +34,9 @@ class History(Logger):
         super().__init__()
         self.path = Path(path)
         self._columns: list[str] = []
-        self._row: dict[str, Any] = {}
+        self._written: int | None = None  # the last step in the table
+        self._waiting: list[dict[str, Any]] = []
+        self._last_write = float("-inf")
 
     @property
     def name(self) -> str:
@@ -48,34 +54,41 @@ class History(Logger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Add numbers to the row of a step; a row is written when another one begins."""
+        """Add numbers to the row of a step."""
         step = 0 if step is None else int(step)
-        if self._row and step != self._row[_STEP]:
-            self._write()
-        if not self._row:
-            self._row = {_STEP: step}
-        self._row |= {name: value for name, value in metrics.items() if name != _STEP}
+        if not self._waiting or step != self._waiting[-1][_STEP]:
+            if time.monotonic() - self._last_write > _WAIT_S:
+                self._write()
+            self._waiting.append({_STEP: step})
+        self._waiting[-1] |= {name: value for name, value in metrics.items() if name != _STEP}
 
     def log_summary(self, summary: RunSummary) -> None:
-        """Write the last row; metrics.json has the summary."""
+        """Write the last rows; metrics.json has the summary."""
         self.finalize("success")
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
-        """Write the last row."""
-        if self._row:
-            self._write()
+        """Write the last rows."""
+        self._write()
 
     def _write(self) -> None:
-        row, self._row = self._row, {}
-        if not self._columns:
-            self._rewrite([*_rows_before(self.path, row[_STEP]), row])
-        elif row.keys() <= set(self._columns):
+        """Write the rows that wait."""
+        rows, self._waiting, self._last_write = self._waiting, [], time.monotonic()
+        if not rows:
+            return
+        first = not self._columns
+        known = all(row.keys() <= set(self._columns) for row in rows)
+        if known and rows[0][_STEP] != self._written:
             with self.path.open("a", newline="", encoding="utf-8") as file:
-                csv.DictWriter(file, self._columns, lineterminator="\n").writerow(row)
+                csv.DictWriter(file, self._columns, lineterminator="\n").writerows(rows)
         else:
             # A number that was not there before, as of the first validation, is a new column.
-            self._rewrite([*_rows_before(self.path, None), row])
+            before = _rows_before(self.path, rows[0][_STEP] if first else None)
+            if before and int(before[-1][_STEP]) == rows[0][_STEP]:
+                # As of a test behind the last step of a training.
+                rows[0] = {**before.pop(), **rows[0]}
+            self._rewrite([*before, *rows])
+        self._written = rows[-1][_STEP]
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         """Write the whole table aside, and put it in its place at once."""

@@ -127,7 +127,9 @@ class PoseAccuracyModule(Analysis):
         name = self.lens.name
         title = f"{name}: error and light, {self.by_photons.measurements} measurements each"
         figures = {
-            "photons": lambda: photons_figure(self.rows, self.true, title),
+            "photons": lambda: photons_figure(
+                self.rows, self.true, title, self.by_photons.measurements
+            ),
             "rays": lambda: rays_figure(
                 self.numbers,
                 self.imagers,

@@ -11,44 +11,68 @@ from dolens.alignment.pose import Pose
 from dolens.experiments.poses.basin import Basin
 from dolens.experiments.poses.labels import variable_label
 from dolens.experiments.tables import Row
-from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.number_text import number_text
+from dolens.plotting.style import PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.ticks import log_ticks
 from dolens.rendering.spot_image import SpotImager
 
 _LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}
 _MARKERS = {"noise_weighted": "o", "s21": "s"}
+# Panels side by side.
+_PANELS = 3
 _LINES = {"noise_weighted": "-", "s21": "--"}
 
 
-def photons_figure(rows: Sequence[Row], true: Pose, title: str) -> Figure:
+def photons_figure(
+    rows: Sequence[Row], true: Pose, title: str, measurements: int | None = None
+) -> Figure:
     """Draw a panel for each variable: RMS errors of both estimates, and the bound.
+
+    Bars are standard errors: an RMS value of n normal errors has one of itself over √(2n).
 
     Args:
         rows: of accuracy.csv.
         true: the pose whose variables are fitted.
         title: the title.
+        measurements: n, of each RMS error; None for no bars.
     """
     names = true.names
-    figure = Figure(figsize=(2.6 * len(names), 3.3), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(names)))
+    rows_of_panels = -(-len(names) // _PANELS)
+    columns = -(-len(names) // rows_of_panels)
+    size = (max(PAGE * columns / _PANELS, 4.0), 2.4 * rows_of_panels + 0.9)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows_of_panels, columns, squeeze=False).flatten()
+    for axes in grid[len(names) :]:
+        axes.set_visible(False)
+    panels = grid[: len(names)]
     for axes, name, unit in zip(panels, names, true.unit_names, strict=True):
         own = [r for r in rows if r["part"] == "photons" and r["variable"] == name]
         for estimator, colour in zip(_LABELS, colours(2), strict=True):
             mine = [r for r in own if r["estimator"] == estimator]
             counts = [r["count"] for r in mine]
-            axes.plot(
+            found = [float(r["rms_error"]) for r in mine]
+            share = (2.0 * measurements) ** -0.5 if measurements else 0.0
+            spread = [share * value for value in found] if measurements else None
+            axes.errorbar(
                 counts,
-                [r["rms_error"] for r in mine],
-                _MARKERS[estimator],
+                found,
+                spread,
+                fmt=_MARKERS[estimator],
                 color=colour,
                 label=f"RMS error, {_LABELS[estimator]}",
                 markersize=5,
+                capsize=2,
+                linewidth=1.0,
             )
         axes.plot(counts, [r["bound"] for r in mine], color="0.3", linewidth=1.0, label="bound")
         axes.set(xscale="log", yscale="log")
         axes.set_title(variable_label(name), fontsize=SMALL + 1)
-        axes.set_xlabel("photons", fontsize=SMALL + 1)
-        axes.set_ylabel(unit, fontsize=SMALL + 1)
+        axes.set_xlabel("photons of a source", fontsize=SMALL + 1)
+        printed = "°" if unit == "deg" else unit
+        axes.set_ylabel(f"error ({printed})", fontsize=SMALL + 1)
         ruled_axes(axes)
+        log_ticks(axes.xaxis, 3)
+        log_ticks(axes.yaxis, 5)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL
@@ -73,7 +97,7 @@ def rays_figure(
         photons: of a source, that the bound is of.
         name: the name of the lens, for the title.
     """
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    figure = Figure(figsize=(PAGE, 4.6), layout="constrained")
     axes = figure.subplots(1, 1)
     for (imager, settings), colour in zip(imagers.items(), colours(len(imagers)), strict=True):
         for estimator in _LABELS:
@@ -91,22 +115,21 @@ def rays_figure(
                 linewidth=1.2,
                 label=f"{_LABELS[estimator]}, rim {settings.rim:g}, {settings.subpixels} subpixels",
             )
-    axes.axhline(1.0, color="0.3", linewidth=1.0)
-    axes.text(
-        ray_counts[0],
-        1.08,
-        f"bound of {photons:.3g} photons",
-        fontsize=SMALL,
-        color="0.3",
-        va="bottom",
-    )
+    axes.axhline(1.0, color="0.3", linewidth=1.0, label=f"bound of {number_text(photons)} photons")
     floor = numbers["pose_error/reference_over_bound"]
     axes.axhspan(0.0, floor, color="0.92", label="noise of the reference", zorder=0)
     axes.set(xscale="log", yscale="log")
+    lowest = min([floor, *(min(line.get_ydata()) for line in axes.get_lines())])
+    axes.set_ylim(bottom=0.6 * lowest)
     axes.set_xlabel("rays of a source", fontsize=SMALL + 1)
-    axes.set_ylabel("RMS error over bound", fontsize=SMALL + 1)
+    axes.set_ylabel("RMS error over bound (no unit)", fontsize=SMALL + 1)
     ruled_axes(axes)
-    axes.legend(frameon=False, fontsize=SMALL)
+    log_ticks(axes.xaxis)
+    log_ticks(axes.yaxis)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=SMALL
+    )
     figure.suptitle(f"{name}: error that the model's rays make", fontsize=TITLE)
     return figure
 
@@ -115,7 +138,7 @@ def basin_figure(basin: Basin, name: str) -> Figure:
     """Draw a map of final errors against errors of the start, for each centroid weight."""
     shares = basin.summary()
     weights = basin.centroid_weights
-    figure = Figure(figsize=(1.2 + 4.2 * len(weights), 4.0), layout="constrained")
+    figure = Figure(figsize=(PAGE, 3.6), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(weights), sharey=True))
     units = dict(zip(basin.true.names, basin.true.unit_names, strict=True))
     across, up = basin.along
@@ -137,20 +160,21 @@ def basin_figure(basin: Basin, name: str) -> Figure:
         axes.set_title(f"μ = {weight:g} /mm²: {100.0 * share:.0f} % converge", fontsize=SMALL + 1)
     panels[0].set_ylabel(_start(up, units), fontsize=SMALL + 1)
     bar = figure.colorbar(shown, ax=list(panels), pad=0.01, extend="both")
-    bar.set_label("RMS error of the fit over bound", fontsize=SMALL)
+    bar.set_label("RMS error of the fit over bound (no unit)", fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
     figure.suptitle(f"{name}: from where a fit converges", fontsize=TITLE)
     return figure
 
 
 def _start(name: str, units: dict[str, str]) -> str:
-    return f"error of the start, {variable_label(name)}, {units[name]}"
+    unit = "°" if units[name] == "deg" else units[name]
+    return f"error of the start, {variable_label(name)} ({unit})"
 
 
 def _write(axes: Axes, table: np.ndarray) -> None:
     """Write the number into each cell."""
     for row, column in np.ndindex(*table.shape):
         value = table[row, column]
-        text = f"{value:.2g}" if value < 100.0 else f"{value:.0e}".replace("e+0", "e")
+        text = number_text(value, 2 if value < 100.0 else 1)
         pale = "white" if value > 100.0 else "black"
         axes.text(column, row, text, ha="center", va="center", fontsize=SMALL - 2, color=pale)

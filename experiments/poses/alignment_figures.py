@@ -10,9 +10,10 @@ from torch import Tensor
 
 from dolens.alignment.pixel_moments import Pixels
 from dolens.experiments.poses.alignment_result import COLUMNS, Alignment
-from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.style import DASHES, PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.ticks import log_ticks
 
-_PANELS = (("tilt", slice(0, 2), "degrees"), ("decentre", slice(2, 4), "µm"))
+_PANELS = (("tilt", slice(0, 2), "°"), ("decentre", slice(2, 4), "µm"))
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,17 @@ def alignment_figure(found: Alignment, setup: Setup) -> Figure:
     Where the place of the sensor is unknown, its own errors are beside them.
     """
     unknown = bool(setup.sensor)
-    figure = Figure(figsize=(14.0 if unknown else 11.0, 3.6), layout="constrained")
-    left, *others = figure.subplots(1, 3 + unknown, width_ratios=(0.8, *[1.0] * (2 + unknown)))
-    _confusion(left, found)
-    for axes, (name, columns, unit) in zip(others, _PANELS, strict=False):
+    figure = Figure(figsize=(PAGE, 6.4), layout="constrained")
+    grid = figure.subplots(2, 2).flatten()
+    _confusion(grid[0], found)
+    for axes, (name, columns, unit) in zip(grid[1:], _PANELS, strict=False):
         _errors(axes, found, name, columns, unit, unknown)
     if unknown:
-        _sensor_errors(others[-1], found, setup.sensor)
-    photons = f"{setup.photons:_.0f}".replace("_", " ")
+        _sensor_errors(grid[3], found, setup.sensor)
+    grid[3].set_visible(unknown)
+    for axes, letter in zip(grid, "abcd", strict=True):
+        axes.set_title(f"({letter})", loc="left", fontsize=SMALL + 1, fontweight="bold")
+    photons = f"{setup.photons:_.0f}".replace("_", "\N{NARROW NO-BREAK SPACE}")
     figure.suptitle(
         f"{setup.lens}: {len(found.element) - 1} misalignments from {setup.fields} fields"
         f", {photons} photons a spot{_sensor(setup)}",
@@ -61,11 +65,11 @@ def _sensor(setup: Setup) -> str:
     pixels, unknown = setup.pixels, setup.sensor
     text = ""
     if pixels is not None:
-        text = f"; {1e3 * pixels.pitch:.3g} µm pixels, {pixels.read_noise:.3g} e⁻ read noise"
+        text = f"\n{1e3 * pixels.pitch:.3g} µm pixels, {pixels.read_noise:.3g} e⁻ read noise"
     if unknown:
         shift, focus = "sensor_x" in unknown, "sensor_distance" in unknown
         what = " and ".join(["shift"] * shift + ["focus"] * focus)
-        text += f"; sensor's {what} unknown"
+        text += f"{', ' if text else chr(10)}sensor's {what} unknown"
     return text
 
 
@@ -103,11 +107,11 @@ def _errors(
         mine = batch & (found.element == number)
         if not bool(mine.any()):
             continue
-        _spread(axes, errors[mine], bound[mine], colour, element)
+        _spread(axes, errors[mine], bound[mine], colour, element, DASHES[number % 2 * 3])
         if sensor_unknown:
             median = float(known[mine].median())
             axes.axvline(median, color=colour, linewidth=1.0, linestyle="--")
-    _finish(axes, f"error of the {name}, {unit}", sensor_unknown)
+    _finish(axes, f"error of the {name} ({unit})", sensor_unknown)
 
 
 def _sensor_errors(axes: Axes, found: Alignment, sensor: Sequence[str]) -> None:
@@ -120,14 +124,18 @@ def _sensor_errors(axes: Axes, found: Alignment, sensor: Sequence[str]) -> None:
         if bool(chosen.any()):
             errors = difference[:, chosen].norm(dim=1)
             _spread(axes, errors, bound[:, chosen].norm(dim=1), colour, name)
-    _finish(axes, "error of the sensor's place, µm", False)
+    _finish(axes, "error of the sensor's place (µm)", False)
 
 
-def _spread(axes: Axes, errors: Tensor, bound: Tensor, colour: str, label: str) -> None:
+def _spread(
+    axes: Axes, errors: Tensor, bound: Tensor, colour: str, label: str, dashes: object = "-"
+) -> None:
     """Draw how many of (K,) errors are below each, and the median of their bounds."""
     ordered = errors.sort().values.clamp(min=1e-12)
     share = 100.0 * torch.arange(1, len(ordered) + 1) / len(ordered)
-    axes.plot(ordered.numpy(), share.numpy(), color=colour, linewidth=1.5, label=label)
+    axes.plot(
+        ordered.numpy(), share.numpy(), color=colour, linestyle=dashes, linewidth=1.5, label=label
+    )
     axes.axvline(float(bound.median()), color=colour, linewidth=1.0, linestyle=":")
 
 
@@ -138,7 +146,10 @@ def _finish(axes: Axes, label: str, known: bool) -> None:
     axes.set_xscale("log")
     axes.set_ylim(0.0, 101.0)
     axes.set_xlabel(label, fontsize=SMALL + 1)
-    axes.set_ylabel("share of misalignments, %", fontsize=SMALL + 1)
+    axes.set_ylabel("share of misalignments (%)", fontsize=SMALL + 1)
     ruled_axes(axes)
-    # Lines of bounds pass behind it.
-    axes.legend(framealpha=0.9, edgecolor="none", fontsize=SMALL, loc="upper left")
+    log_ticks(axes.xaxis)
+    # Below the axes: lines of bounds cross all of them.
+    axes.legend(
+        frameon=False, fontsize=SMALL, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2
+    )

@@ -7,14 +7,16 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from dolens.experiments.experiment import Figures
 from dolens.experiments.poses.arrangement import UNSEEN, Arrangement
 from dolens.experiments.poses.labels import variable_label
 from dolens.plotting.corner import corner_figure
-from dolens.plotting.style import SMALL, TITLE, colours, ruled_axes
-
-_MARKERS = "osD^vP*X"
+from dolens.plotting.number_text import MINUS, number_text
+from dolens.plotting.style import DASHES, MARKERS, PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.ticks import log_ticks
 
 
 def bounds_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:
@@ -33,15 +35,28 @@ def bounds_figures(arrangements: Sequence[Arrangement], name: str, photons: floa
 
 
 def _overview(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figure:
-    figure = Figure(figsize=(11.5, 7.4), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.8))
-    left, right = above.subplots(1, 2, width_ratios=(1.5, 1.0))
-    _bounds(left, arrangements)
-    _spectrum(right, arrangements)
-    axes = below.subplots(1, 1)
-    _worst(axes, arrangements, below)
+    rows = len(_names(arrangements))
+    heights = (0.36 * rows + 0.7, 3.0, 0.42 * len(arrangements) + 1.2)
+    figure = Figure(figsize=(PAGE, sum(heights) + 1.1), layout="constrained")
+    top, middle, bottom = figure.subplots(3, 1, height_ratios=heights)
+    _bounds(top, arrangements)
+    _spectrum(middle, arrangements)
+    _worst(bottom, arrangements, figure)
+    for axes, letter in zip((top, middle, bottom), "abc", strict=True):
+        axes.set_title(f"({letter})", loc="left", fontsize=SMALL + 1, fontweight="bold")
+    handles, labels = middle.get_legend_handles_labels()
+    unseen = Line2D([], [], color="0.3", marker=">", markerfacecolor="none", linestyle="none")
+    figure.legend(
+        [*handles, unseen],
+        [*labels, "cannot be seen"],
+        loc="outside lower center",
+        ncols=2,
+        frameon=False,
+        fontsize=SMALL,
+    )
     figure.suptitle(
-        f"{name}: what images of {photons:.3g} photons in all tell of its pose",
+        f"{name}: Cramér–Rao bounds of its pose from images of {number_text(photons)} photons "
+        "in all",
         fontsize=TITLE,
     )
     return figure
@@ -69,21 +84,24 @@ def _bounds(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
                 continue
             share = float(found.bounds[found.pose.names.index(name)]) / scales[name]
             seen = share < UNSEEN
-            offset = 0.13 * (number - 0.5 * (len(arrangements) - 1))
+            offset = 0.17 * (number - 0.5 * (len(arrangements) - 1))
             axes.plot(
                 share if seen else 8.0 * far,
                 row + offset,
-                _MARKERS[number % len(_MARKERS)] if seen else ">",
+                MARKERS[number % len(MARKERS)] if seen else ">",
                 color=colour,
                 markersize=5 if seen else 7,
                 markerfacecolor=colour if seen else "none",
             )
-    labels = [f"{variable_label(name)}\n(1 = {scales[name]:g} {units[name]})" for name in names]
+    labels = [
+        f"{variable_label(name)}\n(scale {scales[name]:g}{_unit(units[name])})" for name in names
+    ]
     axes.set_yticks(range(len(names)), labels, fontsize=SMALL)
     axes.set_xscale("log")
-    axes.invert_yaxis()
-    axes.set_xlabel("bound over scale (▷: cannot be seen)", fontsize=SMALL + 1)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlabel("bound over the scale of the variable (no unit)", fontsize=SMALL + 1)
     ruled_axes(axes)
+    log_ticks(axes.xaxis)
 
 
 def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
@@ -96,17 +114,18 @@ def _spectrum(axes: Axes, arrangements: Sequence[Arrangement]) -> None:
         axes.plot(
             np.arange(1, len(spread) + 1),
             spread.numpy(),
-            marker=_MARKERS[number % len(_MARKERS)],
+            marker=MARKERS[number % len(MARKERS)],
             color=colour,
             linewidth=1.0,
+            linestyle=DASHES[number % len(DASHES)],
             markersize=5,
             label=label,
         )
     axes.set_yscale("log")
-    axes.set_xlabel("eigenvector, from the largest variance to the smallest", fontsize=SMALL + 1)
-    axes.set_ylabel("standard deviation, of scales", fontsize=SMALL + 1)
+    axes.set_xlabel("number of the eigenvector, from the largest variance", fontsize=SMALL + 1)
+    axes.set_ylabel("standard deviation\n(in scales, no unit)", fontsize=SMALL + 1)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     ruled_axes(axes)
-    axes.legend(frameon=False, fontsize=SMALL)
 
 
 def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> None:
@@ -123,9 +142,9 @@ def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> N
     for row, column in np.argwhere(np.isfinite(table)):
         value = table[row, column]
         if abs(value) >= 0.005:
-            text = f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
+            text = f"{value:+.2f}".replace("-", MINUS)
             pale = "white" if abs(value) > 0.6 else "black"
-            axes.text(column, row, text, ha="center", va="center", fontsize=SMALL, color=pale)
+            axes.text(column, row, text, ha="center", va="center", fontsize=SMALL - 1, color=pale)
     axes.set_facecolor("0.93")
     labels = []
     for found in arrangements:
@@ -134,9 +153,15 @@ def _worst(axes: Axes, arrangements: Sequence[Arrangement], figure: Figure) -> N
             f"{_label(found)}\nσ = {spread:.2g}" if spread < UNSEEN else f"{_label(found)}\n∞"
         )
     axes.set_yticks(range(len(labels)), labels, fontsize=SMALL)
-    axes.set_xticks(range(len(names)), [variable_label(n) for n in names], fontsize=SMALL)
-    axes.set_title("the eigenvector of largest variance", fontsize=SMALL + 1)
-    figure.colorbar(shown, ax=axes, pad=0.01).ax.tick_params(labelsize=SMALL)
+    axes.set_xticks(
+        range(len(names)),
+        [variable_label(n).replace(" ", "\n", 1) for n in names],
+        fontsize=SMALL - 1,
+    )
+    axes.set_xlabel("parts of the eigenvector of largest variance (no unit)", fontsize=SMALL + 1)
+    bar = figure.colorbar(shown, ax=axes, pad=0.01)
+    bar.ax.tick_params(labelsize=SMALL)
+    bar.set_label("part (no unit)", fontsize=SMALL)
 
 
 def _corner(found: Arrangement, name: str) -> Figure:
@@ -149,8 +174,12 @@ def _corner(found: Arrangement, name: str) -> Figure:
         values,
         found.estimates,
         values if found.estimates is not None else None,
-        f"{name}, {_label(found)}: Cramér–Rao",
+        f"{name}, {_label(found)}: Cramér–Rao bounds",
     )
+
+
+def _unit(unit: str) -> str:
+    return "°" if unit == "deg" else f" {unit}"
 
 
 def _label(found: Arrangement) -> str:

@@ -6,7 +6,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from dolens.plotting.style import SMALL, TITLE, colours, open_axes
+from dolens.plotting.number_text import number_text
+from dolens.plotting.style import PAGE, SMALL, TITLE, colours, open_axes
 
 
 def coverage_figure(
@@ -21,7 +22,7 @@ def coverage_figure(
         names: all fits, also those that no case has.
         title: the title.
     """
-    figure = Figure(figsize=(7.6, 1.2 + 0.75 * len(errors)), layout="constrained")
+    figure = Figure(figsize=(PAGE, 1.7 + 0.7 * len(errors)), layout="constrained")
     axes = figure.add_subplot()
     for times, shade in ((2.0, "0.93"), (1.0, "0.86")):
         axes.axvspan(-times, times, color=shade, zorder=0)
@@ -36,12 +37,13 @@ def coverage_figure(
                 ".",
                 color=colours(len(names))[place],
                 markersize=3,
+                markeredgewidth=0.0,
                 alpha=0.6,
                 label=f"fit {fit}" if row == 0 else None,
             )
         shares = [100.0 * float((every < times).double().mean()) for times in (1.0, 2.0)]
         axes.annotate(
-            f"{shares[0]:.0f} %, {shares[1]:.0f} %",
+            f"{shares[0]:.0f} % | {shares[1]:.0f} %",
             (1.01, row),
             xycoords=("axes fraction", "data"),
             va="center",
@@ -49,9 +51,30 @@ def coverage_figure(
         )
     axes.set_xscale("symlog", linthresh=3.0)
     axes.set_yticks(range(len(errors)), [case.replace("_", " ") for case in errors])
-    axes.invert_yaxis()
-    axes.set_xlabel("error over bound (Cramér–Rao); at the right: within one, within two")
-    axes.legend(frameon=False, fontsize=SMALL, loc="lower left", ncols=len(names))
+    axes.set_ylim(len(errors) - 0.5, -0.5)
+    axes.set_xlabel("error over Cramér–Rao bound (no unit)", fontsize=SMALL + 1)
+    axes.annotate(
+        "within\n±1 | ±2",
+        (1.01, 1.0),
+        xycoords="axes fraction",
+        va="bottom",
+        fontsize=SMALL,
+    )
     axes.set_title(title, fontsize=TITLE)
     open_axes(axes)
+    reach = max(abs(limit) for limit in axes.get_xlim())
+    powers = [10.0**power for power in range(1, 9) if 10.0**power <= reach]
+    ticks = [-p for p in reversed(powers)] + [-2.0, -1.0, 0.0, 1.0, 2.0] + powers
+    axes.set_xticks(ticks, [number_text(tick) for tick in ticks])
+    axes.set_xticks([], minor=True)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(len(names), 6),
+        frameon=False,
+        fontsize=SMALL,
+        markerscale=2.0,
+    )
     return figure

@@ -25,6 +25,8 @@ from dolens.plotting.spot_fit import spot_fit_figure
 from dolens.rendering.spot_image import SpotImage
 from dolens.sensor.pixels import Sensor
 
+_LOSS_LABELS = {"s21": "loss S21 (no unit)", "noise_weighted": "χ² per pixel (no unit)"}
+
 
 class FittedPoses(Protocol):
     """Describes poses that were fitted to measurements, one fit after another.
@@ -91,7 +93,7 @@ def _spots(fitted: FittedPoses) -> Figure:
         torch.cat(final),
         labels,
         fitted.sensor.pixel_pitch,
-        f"{fitted.lens.name}: measured and modelled images",
+        f"{fitted.lens.name}: images of point sources, measured and modelled",
     )
 
 
@@ -109,15 +111,26 @@ def _convergence(fitted: FittedPoses, number: int) -> Figure:
         for name, unit in zip(pose.names, pose.unit_names, strict=True)
     }
     truth = fitted.truth(number)
-    losses = {stage.loss for stage in fitted.stages}
     return convergence_figure(
-        [float(row["loss"]) for row in rows],
+        _losses(fitted, rows),
         values,
         stages,
         {variable_label(name): truth[name] for name in pose.names if name in truth},
         f"{fitted.lens.name}: convergence of fit {fit.name}",
-        "loss: S21, then χ² of a pixel" if len(losses) > 1 else "loss",
     )
+
+
+def _losses(fitted: FittedPoses, rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Return the losses by name, NaN in stages of another one."""
+    # Stages count from 1 in the history.
+    of_stage = [str(fitted.stages[int(row["stage"]) - 1].loss) for row in rows]
+    found = [float(row["loss"]) for row in rows]
+    return {
+        _LOSS_LABELS.get(name, name): [
+            value if own == name else math.nan for value, own in zip(found, of_stage, strict=True)
+        ]
+        for name in dict.fromkeys(of_stage)
+    }
 
 
 def _corner(fitted: FittedPoses, number: int) -> Figure:

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from dolens.errors import InputError, call_with_settings, check_choice
+from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -182,7 +182,7 @@ class Plan:
 
 @cache
 def load_plan() -> Plan:
-    """Read systems.yaml and supplement.yaml.
+    """Read systems.yaml and the files in supplement/, a section each.
 
     Raises:
         InputError: an unknown or missing key, or a system that there is not.
@@ -190,10 +190,7 @@ def load_plan() -> Plan:
     runs = read_yaml(FOLDER / "systems.yaml")
     systems = _made(System, runs["systems"], "systems.yaml: systems")
     comparisons = _made(Comparison, runs["comparisons"], "systems.yaml: comparisons")
-    sections = tuple(
-        Section(entry["title"], tuple(_item(item) for item in entry["items"]))
-        for entry in read_yaml(FOLDER / "supplement.yaml")["sections"]
-    )
+    sections = tuple(_section(path) for path in sorted((FOLDER / "supplement").glob("*.yaml")))
     plan = Plan(systems, comparisons, sections)
     names = [system.name for system in systems]
     for comparison in comparisons:
@@ -201,10 +198,10 @@ def load_plan() -> Plan:
             check_choice(name, names, f"comparison '{comparison.name}'")
     for item in plan.items():
         for name in (*item.runs, *(picture.run for picture in item.pictures)):
-            check_choice(name, names, f"supplement.yaml: {item.item}")
+            check_choice(name, names, f"supplement: {item.item}")
         for row in item.rows:
             allowed = [*names, *(comparison.name for comparison in comparisons)]
-            check_choice(row.run, allowed, f"supplement.yaml: {item.item}: '{row.what}'")
+            check_choice(row.run, allowed, f"supplement: {item.item}: '{row.what}'")
     return plan
 
 
@@ -218,8 +215,14 @@ def _made(kind: type, entries: Sequence[Mapping[str, Any]], where: str) -> tuple
     return tuple(call_with_settings(kind, entry, where) for entry in entries)
 
 
-def _item(entry: Mapping[str, Any]) -> Item:
-    where = f"supplement.yaml: {entry.get('item')}"
+def _section(path: Path) -> Section:
+    entry = read_yaml(path)
+    check_keys(entry, ("title", "items"), path.name)
+    return Section(entry["title"], tuple(_item(item, path.name) for item in entry["items"]))
+
+
+def _item(entry: Mapping[str, Any], file: str) -> Item:
+    where = f"{file}: {entry.get('item')}"
     settings = dict(entry)
     for key in ("code", "tests", "runs"):
         settings[key] = tuple(settings.get(key, ()))

@@ -37,7 +37,10 @@ class Result:
     record: Mapping[str, Any]
 
     def lens_value(self, place: str) -> float | None:
-        """Return a number of lens/final.yaml by its place, as `surfaces.1.radius`, or None."""
+        """Return a number of lens/final.yaml by its place, as `surfaces.1.radius`, or None.
+
+        A radius is found where the file has a curvature in its place, too.
+        """
         path = self.folder / "lens" / "final.yaml"
         if not path.is_file():
             return None
@@ -45,7 +48,10 @@ class Result:
         for key in place.split("."):
             if not isinstance(found, Mapping):
                 return None
-            found = {str(name): value for name, value in found.items()}.get(key)
+            named = {str(name): value for name, value in found.items()}
+            found = named.get(key)
+            if key == "radius" and found is None and named.get("curvature"):
+                found = 1.0 / named["curvature"]
         return float(found) if isinstance(found, int | float) else None
 
     def figure(self, names: str) -> Path | None:

@@ -35,6 +35,6 @@ def import_extensions(modules: Sequence[str] | None) -> None:
             if error.name is None or not f"{name}.".startswith(f"{error.name}."):
                 raise
             raise InputError(
-                f"extensions: no module named '{name}' (Python looks in the folder of train.py and "
-                "in those of PYTHONPATH)"
+                f"extensions: no module named '{name}' (Python looks in the working folder and in "
+                "those of PYTHONPATH)"
             ) from None

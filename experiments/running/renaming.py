@@ -82,6 +82,13 @@ def explained(error: HydraException, overrides: Sequence[str], renamed: Renamed 
         new = renamed.options.get(group, {}).get(option)
         if new is not None:
             return f"{group}={option} is called {group}={new} now"
+        if group and error.options:
+            return (
+                f"{group}={option}: there is no such file{did_you_mean(option, error.options)} "
+                f"(there are: {', '.join(error.options)})"
+            )
+    if "You must specify 'experiment'" in str(error):
+        return "no experiment is named: give experiment=NAME; `dolens experiments` lists them"
     for override in overrides:
         try:
             notes = translated([override], renamed)[1]

@@ -63,7 +63,10 @@ def peak_memory_mb(device: torch.device) -> float:
 
 
 def _git_state() -> dict[str, Any]:
+    """The commit of the checkout that dolens runs from; None where it is an installed package."""
     root = Path(__file__).resolve().parents[2]
+    if not (root / "train.py").is_file():  # a repository around it would be someone else's
+        return {"commit": None, "dirty": None}
     try:
         commit = _git(root, "rev-parse", "HEAD")
         return {"commit": commit, "dirty": bool(_git(root, "status", "--porcelain"))}

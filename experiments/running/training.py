@@ -10,7 +10,6 @@ from typing import Any
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
@@ -25,9 +24,9 @@ from dolens.experiments.running.checkpoints import (
     checked_checkpoint,
     settings_of,
 )
+from dolens.experiments.running.compared_settings import all_settings, choices_of
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.extensions import import_extensions
-from dolens.experiments.running.plain_values import flat
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_folder import (
     describe_run,
@@ -40,14 +39,6 @@ from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
 
 logger = logging.getLogger(__name__)
-
-# The groups whose options tell runs from each other.
-_COMPARED = (
-    *("experiment", "lens", "scene", "renderer", "evaluation_renderer", "views", "readout"),
-    *("network", "discriminator", "loss", "optimizer", "data"),
-)
-# Keys that say where files go, not what is computed.
-_PLACES = ("callbacks", "logger", "hydra")
 
 register_resolvers()
 
@@ -122,7 +113,7 @@ def run(cfg: DictConfig) -> float:
     write_json(folder / "metrics.json", numbers)
     summary = RunSummary(
         choices=choices_of(cfg),
-        settings=hyperparameters(cfg),
+        settings=all_settings(cfg),
         objective=settings.objective,
         numbers=numbers,
         step=trainer.global_step,
@@ -199,50 +190,8 @@ def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
         raise InputError("trainer.strategy: ddp starts processes and cannot be swept with -m")
 
 
-def hyperparameters(cfg: DictConfig) -> dict[str, Any]:
-    """Return all settings of a run as flat plain values."""
-    # What `module` holds refers to the other groups and would only repeat them; the others say
-    # where files go.
-    left_out = ("module", "views", "callbacks", "logger")
-    whole = OmegaConf.to_container(cfg, resolve=True)
-    leaves = flat({key: value for key, value in whole.items() if key not in left_out})
-    return {
-        "experiment": HydraConfig.get().runtime.choices.get("experiment"),
-        **{name: _plain(leaf) for name, leaf in leaves if leaf != {}},
-    }
-
-
-def choices_of(cfg: DictConfig) -> dict[str, Any]:
-    """Return the few settings that tell a run from others.
-
-    These are the experiment and the seed, the options that were chosen, and each key that the
-    command line gave or a sweep varied, `lens.*` and `trainer.*` too, with its value.
-    """
-    hydra = HydraConfig.get()
-    options = {
-        group: str(option)
-        for group, option in hydra.runtime.choices.items()
-        if group in _COMPARED and option is not None
-    }
-    found: dict[str, Any] = {**options, "seed": cfg.seed}
-    for override in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
-        key = override.key_or_group
-        if override.is_delete() or key in found or key.partition(".")[0] in _PLACES:
-            continue
-        value = OmegaConf.select(cfg, key)
-        if not OmegaConf.is_config(value):
-            found[key] = _plain(value)
-        elif OmegaConf.is_list(value) or key not in hydra.runtime.choices:
-            found[key] = str(OmegaConf.to_container(value, resolve=True))
-        else:
-            found[key] = str(hydra.runtime.choices[key])
-    return found
-
-
-def _plain(value: Any) -> bool | int | float | str:
-    return value if isinstance(value, bool | int | float | str) else str(value)
-
-
 def resume_command() -> str:
     """The command that started this run, for a notice."""
-    return shlex.join(["python", *sys.argv])
+    program, *arguments = sys.argv
+    command = shlex.join(["python", program]) if program.endswith(".py") else program
+    return f"{command} {shlex.join(arguments)}"

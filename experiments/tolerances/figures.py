@@ -17,7 +17,7 @@ from dolens.plotting.tolerances import (
 from dolens.tolerancing import ToleranceAnalysis
 
 _MOST_OFFENDERS = 20
-_UNIT_WORDS = {"deg": "µm per degree", "mm": "µm per mm", "%": "µm per %", "1/mm": "µm per 1/mm"}
+_UNIT_WORDS = {"deg": "µm/°", "mm": "µm/mm", "%": "µm/%", "1/mm": "µm/mm⁻¹"}
 
 
 def tolerance_figures(
@@ -48,7 +48,7 @@ def tolerance_figures(
             f"{name}: how spots move (Jacobian of their centroids)",
         ),
         "centroid_by_tolerance": lambda: matrix_figure(
-            {"µm": (1e3 * motion * s.steps, with_tolerance)},
+            {"motion (µm)": (1e3 * motion * s.steps, with_tolerance)},
             spots * 2,
             blocks,
             f"{name}: how far a whole tolerance moves spots",
@@ -60,11 +60,11 @@ def tolerance_figures(
         ),
         "rms_by_tolerance": lambda: matrix_figure(
             {
-                "growth of RMS to first order, not refocused, µm": (
+                "growth of RMS to first order, not refocused (µm)": (
                     1e3 * s.rms_jacobian * s.steps,
                     with_tolerance,
                 ),
-                "RMS² at the worse end less that as designed, refocused, µm²": (
+                "RMS² at the worse end less that as designed, refocused (µm²)": (
                     1e6 * ends.amax(0).T,
                     with_tolerance,
                 ),

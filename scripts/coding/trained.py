@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dolens.errors import InputError
-from dolens.experiments.running.compared_runs import Run, read_run
+from dolens.experiments.comparison.gains import gain
+from dolens.experiments.comparison.run import Run, read_run
 from dolens.reconstruction.intervals import Interval
-from scripts.compare import gain
 
 CODED = "wavefront_coding"
 PLAIN = ("wavefront_coding_refocused", "wavefront_coding_stopped_down")

@@ -1,44 +1,81 @@
-"""Titles of a design's figures say which rays they are of."""
+"""Figures of a design are over the rays of its headline number, and say which those are."""
 
+import math
+
+import numpy as np
 import pytest
 from hydra.utils import instantiate
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from overlaps import flaws
 
-from dolens.experiments.design.figures import pupil_note
+from dolens.analysis.spot_diagram import spot_diagram
+from dolens.experiments.design.merit_rays import rays_text, reference_text
+from dolens.experiments.design.tables import spot_table
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
+from dolens.optics.paraxial import first_order
 from dolens.optimize import MeritSettings
 
 
 @pytest.fixture
-def figures(composed):
-    """Of the aspheric singlet as it begins; its merit has another pupil than its stop."""
+def module(composed):
+    """The aspheric singlet as it begins; its merit has another pupil than its stop."""
     cfg = composed("experiment=asphere")
-    return instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg))).figures()
+    return instantiate(cfg.module)(lens=build_lens(RunSettings.of(cfg)))
 
 
-def title_of(figure):
-    return figure.get_suptitle() or figure.axes[0].get_title()
+def test_the_spots_are_of_the_very_rays_of_the_headline(module):
+    """31×31 rays over ±15 mm, although the stop is wider; the title has both numbers."""
+    figure = module.figures()["spots"]()
+    (drawn,) = (line for line in figure.axes[0].get_lines() if line.get_gid() == "spot")
+    points = np.stack(drawn.get_data(), -1)
+    assert len(points) == 31 * 31
+    rms = math.sqrt(((points - points.mean(0)) ** 2).sum(-1).mean())
+    headline = spot_table(module.lens, module.evaluation).mean
+    assert rms == pytest.approx(headline, rel=1e-9)
+    title = figure.get_suptitle()
+    assert f"mean RMS radius {headline:.4g} µm, 31×31 rays over ±15 mm" in title
+    whole = spot_diagram(module.lens, [(0.0, 0.0)], [532.8]).rms
+    printed = float(title.partition("over the whole stop: ")[2].partition(" ")[0])
+    assert printed == pytest.approx(1e3 * float(whole), rel=5e-3)
+    far = np.linalg.norm(points, axis=1).max()
+    assert figure.axes[0].get_title().endswith(f"RMS {headline:.3g}, max {far:.3g} µm")
 
 
-@pytest.mark.parametrize("name", ["spots", "ray_fans", "modulation", "rms_curves"])
-def test_figures_of_another_pupil_than_the_headline_say_so(figures, name):
-    title = title_of(figures[name]())
-    assert "the whole stop" in title
-    assert "(rms_spot_um: 31×31 rays over ±15 mm)" in title
+def test_curves_and_contrast_are_of_the_headline_s_pupil(module):
+    figures = module.figures()
+    curve = figures["rms_curves"]().axes[0].get_lines()[0]
+    at = np.interp(532.8, *curve.get_data())
+    assert at == pytest.approx(spot_table(module.lens, module.evaluation).mean, rel=0.02)
+    figure = figures["modulation"]()
+    assert "a square of ±15 mm" in figure.get_suptitle()
+    limits = [
+        line for line in figure.axes[0].get_lines() if line.get_label() == "diffraction limit"
+    ]
+    # A square of 30 mm has the triangle 1 - ν·λ·f/D (Goodman).
+    frequency, limit = limits[0].get_data()
+    efl = float(first_order(module.lens.system(), 532.8).efl)
+    np.testing.assert_allclose(limit, 1.0 - frequency * 532.8e-6 * efl / 30.0, atol=1e-3)
 
 
-def test_the_title_of_a_narrow_figure_is_not_cut_off(figures):
-    figure = figures["spots"]()
-    FigureCanvasAgg(figure).draw()
-    title = figure._suptitle.get_window_extent()
-    assert 0.0 < title.x0 < title.x1 < figure.bbox.width
+def test_before_and_after_are_in_one_figure_on_one_scale(module):
+    figures = module.figures()
+    for name in ("layout", "spots_before_after", "modulation"):
+        before, after = figures[name]().axes[:2]
+        assert before.get_xlim() == after.get_xlim() and before.get_ylim() == after.get_ylim()
 
 
-def test_only_other_rays_and_centres_are_worth_a_line():
-    assert pupil_note(MeritSettings()) == ""
-    assert "the first surface" in pupil_note(MeritSettings(sampling="square_grid"))
-    assert "one centroid for all colours" in pupil_note(
+@pytest.mark.parametrize(
+    "name", ["layout", "spots", "spots_before_after", "ray_fans", "modulation", "rms_curves"]
+)
+def test_figures_of_a_design_can_be_printed(module, name):
+    assert not flaws(module.figures()[name]())
+
+
+def test_other_rays_and_references_are_named():
+    assert rays_text(MeritSettings()) == "rays over the whole stop"
+    assert reference_text(MeritSettings()) == ""
+    assert "the first surface" in rays_text(MeritSettings(sampling="square_grid"))
+    assert "one centroid for all wavelengths" in reference_text(
         MeritSettings(reference_spectrum="polychromatic")
     )
-    assert "chief ray" in pupil_note(MeritSettings(reference="chief"))
+    assert "chief rays" in reference_text(MeritSettings(reference="chief"))

@@ -119,3 +119,24 @@ def test_an_experiment_without_figures_has_none(trainer, tmp_path):
 def test_the_interval_is_at_least_one_epoch(tmp_path):
     with pytest.raises(InputError, match="every_n_epochs: 0; allowed: 1 or more"):
         SaveFigures(tmp_path, every_n_epochs=0)
+
+
+def test_figures_are_saved_in_the_formats_of_the_configuration(trainer, tmp_path):
+    module = Drawn(["layout"])
+    SaveFigures(tmp_path / "figures", formats=["png", "pdf"]).on_test_end(trainer, module)
+    assert saved(tmp_path / "figures") == {"layout.png", "layout.pdf"}
+    assert set(logged(trainer, tmp_path)) == {"layout"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"formats": ["gif"]}, "formats"),
+        ({"formats": []}, "allowed: a list of png, pdf, svg"),
+        ({"formats": "png"}, "allowed: a list of png, pdf, svg"),
+        ({"dpi": 0.0}, "dpi: 0.0; allowed: more than 0"),
+    ],
+)
+def test_formats_and_resolutions_that_cannot_be_are_refused(tmp_path, settings, message):
+    with pytest.raises(InputError, match=message):
+        SaveFigures(tmp_path, **settings)

@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.validation_pictures import ValidationPictures, side_by_side
+from dolens.experiments.loggers import history as history_file
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, TakesPictures, TakesSummary, summarise
 from dolens.experiments.loggers.tensorboard import TensorBoard
@@ -31,7 +32,9 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-def test_a_table_has_a_row_a_step_with_what_was_logged_there(tmp_path):
+@pytest.mark.parametrize("wait_s", [0.0, 1e9], ids=["one by one", "together"])
+def test_a_table_has_a_row_a_step_with_what_was_logged_there(tmp_path, monkeypatch, wait_s):
+    monkeypatch.setattr(history_file, "_WAIT_S", wait_s)
     history = History(tmp_path / "metrics.csv")
     for step in (4, 9):
         history.log_metrics({"train/loss": 1.0 / step, "epoch": step // 5}, step)
@@ -39,8 +42,11 @@ def test_a_table_has_a_row_a_step_with_what_was_logged_there(tmp_path):
     history.log_metrics({"train/loss": 0.01}, 14)
     history.log_metrics({"lens_step/accepted": 1.0}, 19)  # a new column
     history.finalize("success")
+    history.log_metrics({"test/psnr_db": 30.0}, 19)  # of the same step, when training is over
+    history.finalize("success")
     found = rows(tmp_path / "metrics.csv")
     assert [row["step"] for row in found] == ["4", "9", "14", "19"]
+    assert found[3]["test/psnr_db"] == "30.0"
     assert float(found[0]["train/loss"]) == 0.25 and found[1]["val/psnr_db"] == "29.0"
     assert found[2]["val/psnr_db"] == "" and found[3]["lens_step/accepted"] == "1.0"
     assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
@@ -161,11 +167,12 @@ def test_a_resumed_run_goes_on_at_its_step(composed, tmp_path):
     settings = (*TINY_CAMERA, "test=false", "objective=train/loss", "callbacks.best=null")
     run(composed(*settings, "callbacks.validation_pictures=null", "+trainer.max_steps=2"))
     first = [int(row["step"]) for row in rows(tmp_path / "run" / "metrics.csv")]
-    assert first == [0, 1, 2]
+    assert first == [0, 1]
     checkpoint = f"ckpt_path={tmp_path / 'run' / 'checkpoints' / 'last.ckpt'}"
     run(composed(*settings, "callbacks.validation_pictures=null", checkpoint))
     table = rows(tmp_path / "run" / "metrics.csv")
-    assert [int(row["step"]) for row in table] == [0, 1, 2, 3, 4]
+    assert [int(row["step"]) for row in table] == [0, 1, 2, 3]
     log = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
     log.Reload()
-    assert [point.step for point in log.Scalars("train/loss")] == [0, 1, 2, 3, 4]
+    steps = [point.step for point in log.Scalars("train/loss")]
+    assert steps == sorted(steps) and set(steps) == {0, 1, 2, 3, 4}

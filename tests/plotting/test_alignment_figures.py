@@ -44,8 +44,9 @@ def test_rows_show_measured_initial_final_and_what_is_left_over():
     assert np.allclose(pictures[7], 100.0 * (pictures[6] - pictures[4]))
     low, high = panels[7].images[0].get_clim()
     assert -low == high == pytest.approx(100.0)
-    length = float(np.ptp(panels[0].get_lines()[0].get_xdata())) * 0.1
-    assert panels[0].texts[-1].get_text() == f"{length:g} mm"
+    (bar,) = panels[0].get_lines()
+    length = float(np.ptp(bar.get_xdata())) * pictures[0].shape[1] * 0.1
+    assert panels[0].texts[-1].get_text().startswith(f"{length:g} mm")
     figure.draw_without_rendering()
 
 
@@ -80,7 +81,7 @@ def test_stages_part_where_the_optimizer_changes_and_errors_are_against_the_trut
     ]
     assert list(tilt.get_lines()[0].get_ydata()) == pytest.approx([1.0, 0.5, 0.2, 0.1, 0.0])
     assert [axes.get_yscale() for axes in figure.axes] == ["log", "log", "log", "linear"]
-    assert [shift.get_ylabel(), z.get_ylabel()] == ["|error|, mm", "value, mm"]
+    assert [shift.get_ylabel(), z.get_ylabel()] == ["|error| (mm)", "value (mm)"]
     assert list(z.get_lines()[0].get_ydata()) == values["z"][0]
     figure.draw_without_rendering()
     with pytest.raises(InputError, match="loss: 5 values for 4 iterations"):
@@ -105,7 +106,7 @@ def test_ellipses_lie_along_the_eigenvectors_of_the_covariance():
             assert abs(along @ vectors[:, 1]) == pytest.approx(1.0)
     assert grid[0, 1].texts[0].get_text() == "+0.50"
     assert grid[0, 2].texts[0].get_text() == "−0.08"
-    assert grid[2, 2].texts[0].get_text() == "c\nσ = 3 deg"
+    assert grid[2, 2].texts[0].get_text() == "c\nσ = 3°"
     figure.draw_without_rendering()
 
 
@@ -124,8 +125,8 @@ def test_points_and_truth_count_from_the_centre_and_small_units_become_thousandt
     assert ellipses(grid[1, 0])[0].width == pytest.approx(
         ellipses(corner_figure(COVARIANCE, LABELS, UNITS).axes[3])[0].width, rel=1e-5
     )
-    assert grid[0, 0].texts[0].get_text() == "a\n2 mm\nσ = 2 µm"
-    assert grid[2, 2].texts[0].get_text() == "c\n30 deg\nσ = 30 mdeg"
+    assert grid[0, 0].texts[0].get_text() == "a\n2.000\n± 0.002 mm"
+    assert grid[2, 2].texts[0].get_text() == "c\n30.00\n± 0.03°"
     # That of c is far beyond the ellipses.
     assert len(grid[2, 0].get_lines()) == 1
     assert figure.get_suptitle() == "Title\ntruth more than 6σ off, not drawn: c"

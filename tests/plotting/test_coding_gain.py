@@ -9,12 +9,12 @@ def test_points_bars_and_bounds_are_where_the_numbers_say():
     figure = coding_gain_figure([near, far])
     left, right = figure.axes
     lines = {line.get_label(): line.get_xydata().tolist() for line in left.lines}
-    assert lines["one linear filter"] == [[10.0, 0.1], [100.0, 0.2]]
-    assert lines["a filter each depth"] == [[10.0, 0.5], [100.0, 0.9]]
+    assert lines["bound, one linear filter"] == [[10.0, 0.1], [100.0, 0.2]]
+    assert lines["bound, a filter for each depth"] == [[10.0, 0.5], [100.0, 0.9]]
     (bars,) = left.containers
     (segment,) = bars.lines[2][0].get_segments()
     assert segment.round(12).tolist() == [[100.0, 0.1], [100.0, 0.8]]
     assert left.get_xscale() == "log" and left.get_title() == "near"
     # A range without a bound has its points alone.
-    assert "one linear filter" not in {line.get_label() for line in right.lines}
+    assert "bound, one linear filter" not in {line.get_label() for line in right.lines}
     assert len(figure.legends) == 1

@@ -3,10 +3,12 @@
 import sys
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
-from dolens.plotting import figure_to_image, history_figure, save_figure
+from dolens.errors import InputError
+from dolens.plotting import figure_to_image, history_figure, save_figure, save_figures
 
 
 def test_an_image_tensor_has_the_figures_size_and_colours():
@@ -41,3 +43,17 @@ def test_figures_are_not_registered_anywhere():
     else:
         figure_to_image(history_figure([1.0, 0.1, 0.01]), dpi=20)
         assert "matplotlib.pyplot" not in sys.modules
+
+
+def test_a_figure_is_written_in_every_format_that_is_asked_for(tmp_path):
+    figure = history_figure([1.0, 0.1, 0.01])
+    paths = save_figures(figure, tmp_path / "deep" / "history.v2", ("png", "pdf", "svg"))
+    assert [path.name for path in paths] == ["history.v2.png", "history.v2.pdf", "history.v2.svg"]
+    png, pdf, svg = (path.read_bytes() for path in paths)
+    assert png[1:4] == b"PNG" and pdf[:4] == b"%PDF" and b"<svg" in svg
+    # Letters stay letters in PDF: fonts of type 42, not shapes of type 3.
+    assert b"/Type3" not in pdf and b"/CIDFontType2" in pdf
+    again = save_figures(figure, tmp_path / "again", ("svg",))[0].read_bytes()
+    assert again == svg
+    with pytest.raises(InputError, match="gif"):
+        save_figures(figure, tmp_path / "history", ("gif",))

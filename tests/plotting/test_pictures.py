@@ -26,41 +26,43 @@ def texts(axes):
 
 def test_psfs_are_cropped_alike_to_the_window_of_the_widest():
     figure = psf_figure(spots(), ["1m", "2m", "8m"], 0.00345, "spots")
-    assert [axes.get_title() for axes in figure.axes] == ["1m", "2m", "8m"]
-    assert [picture.shape for picture in pictures(figure)] == [(9, 9, 3)] * 3
+    assert [axes.get_title().partition("\n")[0] for axes in figure.axes] == ["1m", "2m", "8m"]
+    assert [picture.shape for picture in pictures(figure)] == [(11, 11, 3)] * 3
     assert all(axes.images[0].get_interpolation() == "nearest" for axes in figure.axes)
 
 
-def test_a_faint_halo_beyond_half_a_percent_widens_the_window():
+def test_a_faint_halo_beyond_a_fifth_of_a_percent_widens_the_window():
     def window(halo):
         psfs = spots()
         psfs[0] *= 1.0 - halo
         psfs[0, 0, 0, 0] = halo
         return pictures(psf_figure(psfs, "abc", 0.01))[0].shape[0]
 
-    assert (window(0.004), window(0.006)) == (9, 41)
+    # To the corner where the halo is, and a pixel about it on the other sides.
+    assert (window(0.0015), window(0.0025)) == (11, 27)
 
 
 def test_each_psf_is_normalised_to_its_own_printed_peak():
     figure = psf_figure(spots(), "abc", 0.00345)
     for depth, picture in enumerate(pictures(figure)):
         assert picture.max() == pytest.approx(1.0)
-        assert picture[4, 4].tolist() == pytest.approx([float(c == depth) for c in range(3)])
-    assert [texts(axes)[0] for axes in figure.axes] == ["peak 1", "peak 0.11", "peak 0.012"]
+        assert picture[5, 5].tolist() == pytest.approx([float(c == depth) for c in range(3)])
+    peaks = [axes.get_title().partition("\n")[2] for axes in figure.axes]
+    assert peaks == ["peak 1", "peak 0.11", "peak 0.012"]
 
 
 def test_psfs_are_encoded_for_display():
     psfs = spots()
     psfs[2, :, 20, 20] *= 2.0
     picture = pictures(psf_figure(psfs, "abc", 0.01))[2]
-    assert picture[4, 5, 2] == pytest.approx(0.735357, abs=1e-5)  # sRGB of one half
+    assert picture[5, 6, 2] == pytest.approx(0.735357, abs=1e-5)  # sRGB of one half
 
 
 def test_the_scale_bar_is_as_long_as_it_says():
     axes = psf_figure(spots(), "abc", 0.00345).axes[0]
     (bar,) = axes.get_lines()
-    assert np.ptp(bar.get_xdata()) == pytest.approx(2.0)
-    assert texts(axes)[1] == "2 px = 6.9 µm"
+    assert 11.0 * 3.45 * np.ptp(bar.get_xdata()) == pytest.approx(10.0)
+    assert texts(axes) == ["10 µm"]
 
 
 def test_a_dark_psf_is_black_and_many_depths_wrap():

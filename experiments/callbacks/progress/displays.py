@@ -207,7 +207,7 @@ def logging_above(console: Console) -> Iterator[None]:
     handlers = [
         handler
         for handler in dict.fromkeys(h for each in loggers for h in each.handlers)
-        if isinstance(handler, logging.StreamHandler) and handler.stream.isatty()
+        if isinstance(handler, logging.StreamHandler) and _is_terminal(handler.stream)
     ]
     streams = [handler.setStream(_Above(console, handler.stream)) for handler in handlers]
     try:
@@ -215,6 +215,11 @@ def logging_above(console: Console) -> Iterator[None]:
     finally:
         for handler, stream in zip(handlers, streams, strict=True):
             handler.setStream(stream)
+
+
+def _is_terminal(stream: Any) -> bool:
+    """Return whether a stream, which a handler may lack, is a terminal."""
+    return getattr(stream, "isatty", lambda: False)()
 
 
 class _Above(io.TextIOBase):

@@ -75,7 +75,9 @@ def cost_text(result: Result) -> str:
     if "cpu_s" in record:
         parts[-1] += f" ({seconds_text(record['cpu_s'])} of processor time)"
     if "cost/step_s" in metrics:
-        parts.append(f"{number_text(1e3 * metrics['cost/step_s'], 3)} ms a step")
+        step = metrics["cost/step_s"]
+        of_step = seconds_text(step) if step >= 1.0 else f"{number_text(1e3 * step, 2)} ms"
+        parts.append(f"{of_step} a step")
     if "cost/rays" in metrics:
         parts.append(f"{count_text(metrics['cost/rays'])} rays")
     if "cost/peak_memory_mb" in metrics:
@@ -124,7 +126,7 @@ def _checks(material: Material, item: Item) -> Markup | None:
         return None
     rows: list[tuple[Child, ...]] = [
         (
-            outcome.check.what,
+            prose(outcome.check.what),
             expected_text(outcome.check),
             element("span", found_text(outcome), class_=css_class(outcome.state)),
             str(outcome.state),

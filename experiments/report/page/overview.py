@@ -1,7 +1,8 @@
 """The top of the page: what holds and what does not."""
 
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from dolens.experiments.report.checks import SOURCES, Check, Outcome, State
 from dolens.experiments.report.page.html import Child, Markup, element, joined, prose, table
@@ -34,6 +35,7 @@ def overview(material: Material) -> Markup:
         element("p", *_spaced(badges)),
         element("p", f"Sources: {_legend()}.", class_="quiet"),
         *(_of_state(material, state) for state in _ORDER),
+        _gains(material),
         _runs_that_failed(material),
         _not_compared(material),
         id="checks",
@@ -80,7 +82,9 @@ def _row(outcome: Outcome) -> tuple[Child, ...]:
     return (
         joined(
             element("a", check.item, href=f"#{anchor(check.item)}"),
-            f": {check.what} ",
+            ": ",
+            prose(check.what),
+            " ",
             element("code", f"{check.run}: {check.metric}"),
         ),
         expected_text(check),
@@ -97,6 +101,46 @@ def _of_state(material: Material, state: State) -> Markup | None:
     return element(
         "details", summary, checks_table(found), open=None if state is State.NOT_RUN else ""
     )
+
+
+def gain_sentence(numbers: Mapping[str, float]) -> str:
+    """Say in words what a comparison shows at the worst view, and whether it is significant.
+
+    Args:
+        numbers: of `gain_numbers`.
+    """
+    worst = numbers.get("gain/psnr_db/worst")
+    if worst is None:
+        return "The two runs were tested on other photographs, so there is no gain to speak of."
+    low, high = (numbers.get(f"gain/psnr_db/worst/{end}", math.nan) for end in ("low", "high"))
+    found = f"{_signed(worst)} dB at the worst view (95 %: {_signed(low)} to {_signed(high)} dB"
+    over = f"over {numbers['gain/photographs']:.0f} photographs, one seed)"
+    if low > 0.0:
+        verdict = "The interval lies above zero: a gain on these photographs, with this seed."
+    elif high < 0.0:
+        verdict = "The interval lies below zero: a loss."
+    else:
+        verdict = "The interval includes zero: this run does not show a gain."
+    return f"{found}, {over}. {verdict}"
+
+
+def _gains(material: Material) -> Markup | None:
+    sentences = [
+        element(
+            "li",
+            element("b", comparison.title),
+            f": {gain_sentence(material.comparisons[comparison.name])}",
+        )
+        for comparison in material.plan.comparisons
+        if comparison.name in material.comparisons
+    ]
+    if not sentences:
+        return None
+    return joined(element("h3", "Gains of learned optics"), element("ul", *sentences))
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
 
 
 def _runs_that_failed(material: Material) -> Markup | None:

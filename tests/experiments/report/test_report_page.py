@@ -12,6 +12,7 @@ from dolens.experiments.report.gains import gain_numbers
 from dolens.experiments.report.page.html import element, prose
 from dolens.experiments.report.page.material import Material
 from dolens.experiments.report.page.numbers import number_text, seconds_text, value_text
+from dolens.experiments.report.page.overview import gain_sentence
 from dolens.experiments.report.page.page import page
 from dolens.experiments.report.results import assigned, read_result, same_overrides
 from tests.experiments.report.report_runs import CHECKS, PLAN, finished_run
@@ -146,6 +147,16 @@ def test_a_gain_is_paired_over_photographs(tmp_path):
         assert numbers[f"gain/psnr_db{end}"] == pytest.approx(1.0)
     assert numbers["gain/photographs"] == 3.0
     assert gain_numbers(*results) == {}  # the test's own renderer left no scores
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [(0.1, 0.9, "a gain"), (-0.9, -0.1, "a loss"), (-0.1, 0.9, "does not show a gain")],
+)
+def test_a_gain_is_said_with_its_interval(low, high, verdict):
+    key = "gain/psnr_db/worst"
+    numbers = {key: 0.5, f"{key}/low": low, f"{key}/high": high, "gain/photographs": 3.0}
+    assert verdict in gain_sentence(numbers) and "3 photographs" in gain_sentence(numbers)
 
 
 def test_the_fingerprint_is_short_and_stable():

@@ -1,0 +1,159 @@
+"""A metric of several runs is plotted: by row, or against a setting that was swept."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
+
+from dolens.plotting.style import PALETTE, SMALL, TITLE, colours, ruled_axes
+
+# Characters of a row's label, and so many in a line of it.
+_LONGEST, _LINE = 110, 44
+# Settings that span this ratio are drawn on a logarithmic axis.
+_DECADES = 30.0
+
+
+class RunPoint(NamedTuple):
+    """A `RunPoint` is a metric of the runs that differ only in the seed.
+
+    Attributes:
+        mean: over the seeds.
+        seeds: the value of each.
+        low: lower end of an interval; None: the seeds' own range is drawn.
+        high: upper end likewise.
+    """
+
+    mean: float
+    seeds: Sequence[float]
+    low: float | None = None
+    high: float | None = None
+
+    def ends(self) -> tuple[float, float]:
+        """Return the ends of the error bar."""
+        if self.low is None or self.high is None:
+            return min(self.seeds), max(self.seeds)
+        return self.low, self.high
+
+
+def runs_figure(
+    labels: Sequence[str], points: Sequence[RunPoint], metric: str, title: str | None = None
+) -> Figure:
+    """Plot a metric of each row: its mean with an error bar, and the seeds as dots.
+
+    Args:
+        labels: of the rows, from above.
+        points: likewise.
+        metric: label of the axis, with its unit.
+        title: above the axes.
+
+    Returns:
+        A figure with the rows from above to below.
+    """
+    texts = [_wrapped(label) for label in labels]
+    lines = sum(text.count("\n") + 1 for text in texts)
+    figure = Figure(figsize=(7.5, 1.3 + 0.16 * lines + 0.14 * len(texts)), layout="constrained")
+    axes = figure.add_subplot()
+    heights = range(len(points))
+    for height, point in zip(heights, points, strict=True):
+        low, high = point.ends()
+        bar = [[max(point.mean - low, 0.0)], [max(high - point.mean, 0.0)]]
+        axes.errorbar(
+            point.mean, height, xerr=bar, fmt="o", color=PALETTE[0], capsize=3, markersize=5
+        )
+        if len(point.seeds) > 1:
+            _dots(axes, point.seeds, [height] * len(point.seeds), PALETTE[1])
+    axes.set_yticks(list(heights), texts)
+    axes.set_ylim(len(points) - 0.5, -0.5)
+    axes.margins(x=0.08)
+    axes.set_xlabel(metric, fontsize=SMALL + 1)
+    _finish(figure, axes, points, title)
+    return figure
+
+
+def runs_curve(
+    lines: Mapping[str, Sequence[tuple[float, RunPoint]]],
+    setting: str,
+    metric: str,
+    title: str | None = None,
+) -> Figure:
+    """Plot a metric against a setting: a line for each of some names, with error bars and seeds.
+
+    Args:
+        lines: name (empty for a single line) → values of the setting with their points.
+        setting: label of the x axis, with its unit.
+        metric: label of the y axis, with its unit.
+        title: above the axes.
+
+    Returns:
+        A figure; the x axis is logarithmic where the settings are positive and span a factor of
+        more than 30.
+    """
+    figure = Figure(figsize=(6.8, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for (name, line), colour in zip(lines.items(), colours(len(lines)), strict=True):
+        ordered = sorted(line, key=lambda pair: pair[0])
+        x, points = [value for value, _ in ordered], [point for _, point in ordered]
+        means = [point.mean for point in points]
+        below = [max(point.mean - point.ends()[0], 0.0) for point in points]
+        above = [max(point.ends()[1] - point.mean, 0.0) for point in points]
+        axes.errorbar(
+            x,
+            means,
+            (below, above),
+            fmt="o-",
+            color=colour,
+            capsize=3,
+            markersize=5,
+            linewidth=1.2,
+            label=_wrapped(name),
+        )
+        for value, point in ordered:
+            if len(point.seeds) > 1:
+                _dots(axes, [value] * len(point.seeds), point.seeds, colour)
+    settings = [value for line in lines.values() for value, _ in line]
+    if min(settings) > 0.0 and max(settings) > _DECADES * min(settings):
+        axes.set_xscale("log")
+    else:
+        axes.set_xticks(sorted(set(settings)) if len(set(settings)) <= 8 else axes.get_xticks())
+        axes.margins(x=0.06)
+    axes.set_xlabel(setting, fontsize=SMALL + 1)
+    axes.set_ylabel(metric, fontsize=SMALL + 1)
+    if len(lines) > 1:
+        figure.legend(loc="outside lower center", frameon=False, fontsize=SMALL, ncols=2)
+    _finish(figure, axes, [point for line in lines.values() for _, point in line], title)
+    return figure
+
+
+def _dots(axes: Axes, x: Sequence[float], y: Sequence[float], colour: str) -> None:
+    axes.plot(x, y, "o", markersize=3.5, markerfacecolor="white", markeredgecolor=colour, zorder=3)
+
+
+def _finish(figure: Figure, axes: Axes, points: Sequence[RunPoint], title: str | None) -> None:
+    for axis in (axes.xaxis, axes.yaxis):
+        if isinstance(axis.get_major_formatter(), ScalarFormatter):
+            axis.get_major_formatter().set_useOffset(False)
+    ruled_axes(axes)
+    notes = []
+    if any(len(point.seeds) > 1 for point in points):
+        notes.append("bars: range over seeds, open dots: seeds")
+    if any(point.low is not None for point in points):
+        notes.append("bars of single runs: 95 % interval over photographs")
+    heading = "\n".join(text for text in (title, "; ".join(notes)) if text)
+    if heading:
+        axes.set_title(heading, fontsize=TITLE if not notes else SMALL + 1)
+
+
+def _wrapped(label: str) -> str:
+    """Return a label in lines, broken behind commas; its end is left out where it is too long."""
+    text = label if len(label) <= _LONGEST else f"{label[: _LONGEST - 1]}…"
+    lines = [""]
+    for part in text.split(", "):
+        joined = f"{lines[-1]}, {part}" if lines[-1] else part
+        if len(joined) > _LINE and lines[-1]:
+            lines[-1] += ","
+            lines.append(part)
+        else:
+            lines[-1] = joined
+    return "\n".join(lines)

@@ -1,0 +1,213 @@
+"""A run folder read back: its settings, its metrics, or why it has none."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dolens.errors import InputError
+from dolens.experiments.camera.photograph_scores import PhotographScores, read_scores
+from dolens.experiments.running.plain_values import flat
+from dolens.experiments.running.resolvers import register_resolvers
+
+# How fast a run is changes nothing in what it finds; Hydra's own part says where it is written.
+_PASSED_OVER = ("seed", "threads", "hydra")
+_ERROR = re.compile(r"^\[.*?\] (?:ERROR|CRITICAL) [\w.]+: (.*)$")
+_LONGEST_REASON = 300
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        folder: of the run.
+        experiment: its name.
+        seed: of its random numbers.
+        choices: Hydra's choices, group → option.
+        config: the composed configuration less the seed, `a.b.c` → value as JSON; interpolations
+            stay as they are written, so that values that follow the seed or the folder are the same
+            in all runs.
+        values: the same settings with interpolations resolved, for a reader.
+        overridden: the settings that the command line named.
+        objective: the name of the metric that the run returned.
+        metrics: those of metrics.json.
+        scores: of each test photograph, or None where the run kept none.
+        code: the git commit, and the device, as run.json has them.
+    """
+
+    folder: Path
+    experiment: str
+    seed: int
+    choices: Mapping[str, str]
+    config: Mapping[str, str]
+    values: Mapping[str, Any]
+    overridden: tuple[str, ...]
+    objective: str
+    metrics: Mapping[str, float]
+    scores: PhotographScores | None
+    code: tuple[str, str]
+
+    def key(self) -> tuple:
+        """Return what two runs share that differ in nothing but the seed."""
+        return self.experiment, frozenset(self.choices.items()), frozenset(self.config.items())
+
+
+@dataclass(frozen=True)
+class UnfinishedRun:
+    """A run without results.
+
+    Attributes:
+        folder: of the run.
+        status: `failed`, `interrupted` or `unfinished`.
+        reason: the last error in its log, or what else is known.
+    """
+
+    folder: Path
+    status: str
+    reason: str
+
+
+def read_run(folder: Path, judge: str | None = None) -> Run:
+    """Read the folder of a finished run.
+
+    With a judge of the views, as `wave`, its metrics `test_wave/…` stand for `test/…`.
+
+    Settings are those of the composed configuration.  `threads` is left out, and so is the
+    `ckpt_path` of a run that went on from a run of the same settings: it equals an uninterrupted
+    one.
+
+    Raises:
+        InputError: the run is not finished, or the folder is none of a run.
+    """
+    for name in ("metrics.json", ".hydra/hydra.yaml", ".hydra/config.yaml"):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder} is no finished run folder: {name} is missing")
+    hydra = yaml.safe_load((folder / ".hydra" / "hydra.yaml").read_text(encoding="utf-8"))["hydra"]
+    config = yaml.safe_load((folder / ".hydra" / "config.yaml").read_text(encoding="utf-8"))
+    choices = hydra["runtime"]["choices"]
+    values = _resolved(folder, config)
+    own = _settings(config, values)
+    if _continues(config, own, hydra):
+        own.pop("ckpt_path")
+    metrics = _judged(json.loads((folder / "metrics.json").read_text(encoding="utf-8")), judge)
+    overrides = hydra.get("overrides", {}).get("task") or []
+    return Run(
+        folder,
+        str(choices.get("experiment")),
+        int(values.get("seed", config["seed"])),
+        {
+            group: "null" if option is None else str(option)
+            for group, option in choices.items()
+            if group != "experiment" and not group.startswith("hydra/")
+        },
+        own,
+        values,
+        tuple(override.lstrip("+~").partition("=")[0] for override in overrides),
+        str(values.get("objective", "")),
+        metrics,
+        read_scores(folder, f"test_{judge}" if judge else "test"),
+        _code(folder),
+    )
+
+
+def read_unfinished(folder: Path) -> UnfinishedRun:
+    """Read why a run has no results.
+
+    Args:
+        folder: of a run without metrics.json.
+    """
+    info = _json(folder / "run.json")
+    status = info.get("status", "failed")
+    lines = _log(folder)
+    errors = [match[1] for line in lines if (match := _ERROR.match(line))]
+    if errors:
+        reason = errors[-1]
+    elif status == "running":
+        last = f"; its log ends with: {lines[-1]}" if lines else ""
+        reason = f"it is still running, or was killed{last}"
+    elif status == "interrupted":
+        reason = "by Ctrl-C or a signal"
+    elif status == "finished":
+        reason = "metrics.json is missing"
+    else:
+        reason = f"its log says no error{'; it ends with: ' + lines[-1] if lines else ''}"
+    known = {"running": "unfinished", "finished": "unfinished"}
+    return UnfinishedRun(folder, known.get(status, status), reason[:_LONGEST_REASON])
+
+
+def _settings(config: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the leaves of a configuration by their dotted names, as JSON."""
+    kept = {key: value for key, value in config.items() if key not in _PASSED_OVER}
+    found = {}
+    for name, leaf in flat(kept):
+        # What the environment gives is a setting of this run, whatever is written.
+        outside = isinstance(leaf, str) and "${oc.env:" in leaf
+        value = values.get(name, leaf) if outside else leaf
+        found[name] = json.dumps(value, sort_keys=True, default=str)
+    if config.get("ckpt_path") is None:
+        found.pop("ckpt_path", None)  # a run of before may not have the key at all
+    return found
+
+
+def _continues(config: Mapping[str, Any], own: Mapping[str, str], hydra: Mapping[str, Any]) -> bool:
+    """Return whether a run trained on from the checkpoint of a run with the same settings."""
+    path = config.get("ckpt_path")
+    if not isinstance(path, str) or not config.get("train", True):
+        return False
+    started_in = Path(hydra["runtime"].get("cwd", "."))
+    file = (started_in / path).resolve().parent.parent / ".hydra" / "config.yaml"
+    if not file.is_file():
+        return False
+    before = yaml.safe_load(file.read_text(encoding="utf-8"))
+    mine = {key: value for key, value in own.items() if key != "ckpt_path"}
+    theirs = {k: v for k, v in _settings(before, {}).items() if k != "ckpt_path"}
+    return theirs == mine and before.get("seed") == config.get("seed")
+
+
+def _resolved(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all settings with interpolations resolved, as far as they can be."""
+    file = folder / ".hydra" / "resolved.yaml"
+    if file.is_file():
+        return dict(flat(yaml.safe_load(file.read_text(encoding="utf-8"))))
+    register_resolvers()
+    cfg = OmegaConf.create(dict(config))
+    found = {}
+    for name, leaf in flat(dict(config)):
+        try:
+            value = OmegaConf.select(cfg, name) if isinstance(leaf, str) else leaf
+            found[name] = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+        except OmegaConfBaseException:
+            found[name] = leaf
+    return found
+
+
+def _judged(metrics: Mapping[str, float], judge: str | None) -> dict[str, float]:
+    """Return the metrics with those of a judge in place of the test's own."""
+    if judge is None:
+        return dict(metrics)
+    kept = {name: value for name, value in metrics.items() if not name.startswith("test/")}
+    own = f"test_{judge}/"
+    found = {name: value for name, value in metrics.items() if name.startswith(own)}
+    return kept | {name.replace(own, "test/", 1): value for name, value in found.items()}
+
+
+def _code(folder: Path) -> tuple[str, str]:
+    info = _json(folder / "run.json")
+    return str((info.get("git") or {}).get("commit")), str(info.get("device"))
+
+
+def _json(file: Path) -> dict[str, Any]:
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+
+
+def _log(folder: Path) -> list[str]:
+    file = folder / "log.txt"
+    text = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
+    return [line for line in text.splitlines() if line.strip()]

@@ -1,0 +1,86 @@
+"""From the arguments of a command line to runs: Hydra composes the configuration of each."""
+
+import logging
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from dolens.errors import InputError
+from dolens.experiments.running.renaming import explained
+from dolens.experiments.running.training import run
+from dolens.experiments.running.user_configuration import make_importable, use_working_folder
+from dolens.packaged import packaged_configuration
+
+logger = logging.getLogger(__name__)
+
+
+def main(arguments: Sequence[str], program: str) -> None:
+    """Run what the arguments ask for: one run, a sweep (`-m`), or another option of Hydra's.
+
+    Args:
+        arguments: overrides and options, as Hydra takes them.
+        program: how the user called it, as `dolens train` or `train.py`; messages repeat it.
+
+    Raises:
+        SystemExit: with one line that names a user's mistake.
+    """
+    # Let errors through to here: a user's mistake is one line, a fault keeps its whole traceback.
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    sys.argv = [program, *arguments]
+    use_working_folder()
+    start = hydra.main(str(packaged_configuration()), "train", version_base="1.3")(job)
+    try:
+        start()
+    except HydraException as error:
+        sys.exit(one_line(explained(error, arguments)))
+    except OmegaConfBaseException as error:
+        sys.exit(one_line(error))
+
+
+def job(cfg: DictConfig) -> float:
+    """Run one composed experiment and return its objective; launchers bring it to processes.
+
+    In a sweep a job that fails does not end the others: it returns NaN, and the sweep's comparison
+    names it.  The log of a run that fails ends with the reason.
+    """
+    make_importable(Path(HydraConfig.get().runtime.cwd))
+    swept = HydraConfig.get().mode == RunMode.MULTIRUN
+    try:
+        return run(cfg)
+    except (InputError, HydraException, OmegaConfBaseException) as error:
+        # Hydra reports a class that could not be made; the reason is what the user can mend.
+        reason = error.__cause__ if isinstance(error.__cause__, InputError) else error
+        line = " ".join(str(reason).split())
+        _record(line, to_all=swept)
+        if not swept:
+            # Exiting here, within the job, keeps Hydra from adding lines of its own.
+            sys.exit(f"error: {line}")
+    except Exception as error:
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+        _record(line, to_all=swept, with_traceback=True)
+        if not swept:
+            raise
+    return math.nan
+
+
+def _record(line: str, to_all: bool, with_traceback: bool = False) -> None:
+    """Write an error into the run's log.txt; to the terminal too, where nothing else would."""
+    trace = sys.exc_info() if with_traceback else None
+    record = logger.makeRecord(logger.name, logging.ERROR, __file__, 0, line, (), trace)
+    for handler in logging.getLogger().handlers:
+        if to_all or isinstance(handler, logging.FileHandler):
+            handler.handle(record)
+
+
+def one_line(problem: object) -> str:
+    """The message of a user's mistake, on one line."""
+    return "error: " + " ".join(str(problem).split())

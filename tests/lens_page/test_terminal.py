@@ -1,0 +1,55 @@
+"""The page in the terminal gives the numbers that are known of a lens."""
+
+import math
+import re
+
+import pytest
+from typer.testing import CliRunner
+
+from dolens import InputError
+from dolens.cli.app import app
+
+
+def show(*arguments):
+    return CliRunner().invoke(app, ["show", *map(str, arguments)], env={"COLUMNS": "110"})
+
+
+def test_the_triplet_as_published(root, reference):
+    found = show(root / "conf/lens/cooke_triplet.yaml", "--wavelength", 587.5618)
+    assert found.exit_code == 0, found.output
+    text = found.output
+    exact = reference("first_order.json")["data"]["triplet"]["dfc"]["587.5618"]
+    for name, key in (("effective focal length", "efl"), ("back focal distance", "bfd")):
+        value = float(re.search(rf"{name} +(\S+)", text)[1])
+        assert math.isclose(value, float(exact[key]), rel_tol=1e-5)
+    # The supplement calls it F/4.9.
+    assert round(float(re.search(r"F-number +(\S+)", text)[1]), 1) == 4.9
+    for words in ("Cooke triplet", "sphere (stop)", "1.6204/60.31", "Seidel sums", "20°"):
+        assert words in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--field", "1,2,3"], "--field: must be a number (y) or two (x,y), not '1,2,3'"),
+        (["--field", "95"], "fields must be within ±90 degrees"),
+        (["--tolerances", "default"], "--tolerances needs --html or --figures"),
+        (["--html", "page.pdf"], "--html: a page's file ends in .html, not 'page.pdf'"),
+        (["--html", "nowhere/page.html"], "--html: there is no folder 'nowhere'"),
+        (["--index-model", "mine"], "index_model 'mine' is unknown"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_options_that_make_no_sense_take_one_line(arguments, said, root):
+    found = show(root / "conf/lens/lb1757.yaml", *arguments)
+    assert isinstance(found.exception, InputError)
+    assert said in str(found.exception)
+    assert "\n" not in str(found.exception)
+
+
+def test_a_file_that_is_no_page_is_not_overwritten(root, tmp_path):
+    mine = tmp_path / "mine.html"
+    mine.write_text("mine")
+    found = show(root / "conf/lens/lb1757.yaml", "--html", mine)
+    assert "is no page of dolens; --force overwrites it" in str(found.exception)
+    assert mine.read_text() == "mine"
