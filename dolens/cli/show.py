@@ -151,7 +151,9 @@ def _print_table(console: "Console", table: "Table") -> None:
             shown.add_section()
         style = "bold" if total or number in table.lit else None
         shown.add_row(*(Text(printable(cell)) for cell in row), style=style)
-    console.print(shown)
+    # Where the terminal is too narrow lines break: a cut number would look like another one.
+    least = console.measure(shown, options=console.options.update(max_width=1000)).minimum
+    console.print(shown, width=max(console.width, least), crop=False, no_wrap=True)
     if table.caption:
         console.print(printable(table.caption), style="dim", markup=False)
 

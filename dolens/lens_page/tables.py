@@ -19,7 +19,7 @@ from dolens.optics.surfaces.clear_aperture import Circle, Outline, Rectangle, Un
 SEIDEL_HEADS = ("S I", "S II", "S III", "S IV", "S V", "C L", "C T")
 SEIDEL_NAMES = (
     *("spherical", "coma", "astigm.", "Petzval", "distort."),
-    *("axial col.", "lateral col."),
+    *("axial", "lateral"),
 )
 # Columns of coefficients that a page is wide enough for.
 _MOST_TERMS = 8
@@ -244,8 +244,8 @@ def field_text(point: Sequence[float] | Tensor, unit: str) -> str:
 
 
 def _fixed(value: float) -> str:
-    """Return a Seidel sum with four decimals at most, aligned by its point."""
-    text = f"{value:.4f}" if abs(value) < 1e3 else f"{value:.1f}"
+    """Return a Seidel sum with three decimals at most, aligned by its point."""
+    text = f"{value:.3f}" if abs(value) < 1e3 else f"{value:.1f}"
     return text.replace("-", "−") if float(text) else "0"
 
 
