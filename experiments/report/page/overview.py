@@ -109,19 +109,27 @@ def gain_sentence(numbers: Mapping[str, float]) -> str:
     Args:
         numbers: of `gain_numbers`.
     """
-    worst = numbers.get("gain/psnr_db/worst")
-    if worst is None:
+    if "gain/psnr_db/worst" not in numbers:
         return "The two runs were tested on other photographs, so there is no gain to speak of."
     low, high = (numbers.get(f"gain/psnr_db/worst/{end}", math.nan) for end in ("low", "high"))
-    found = f"{_signed(worst)} dB at the worst view (95 %: {_signed(low)} to {_signed(high)} dB"
-    over = f"over {numbers['gain/photographs']:.0f} photographs, one seed)"
+    found = f"{_gain_text(numbers, 'gain/psnr_db/worst')} at the worst view"
+    # The field's own quality where the run has it, else the mean of the views.
+    whole = "gain/psnr_db/field" if "gain/psnr_db/field" in numbers else "gain/psnr_db"
+    if whole in numbers:
+        found += f" and {_gain_text(numbers, whole)} over all views"
+    over = f"over {numbers['gain/photographs']:.0f} photographs with one seed"
     if low > 0.0:
-        verdict = "The interval lies above zero: a gain on these photographs, with this seed."
+        verdict = "At the worst view the interval lies above zero: a gain on these photographs."
     elif high < 0.0:
-        verdict = "The interval lies below zero: a loss."
+        verdict = "At the worst view the interval lies below zero: a loss."
     else:
-        verdict = "The interval includes zero: this run does not show a gain."
+        verdict = "The interval at the worst view includes zero: this run does not show a gain."
     return f"{found}, {over}. {verdict}"
+
+
+def _gain_text(numbers: Mapping[str, float], key: str) -> str:
+    low, high = (_signed(numbers.get(f"{key}/{end}", math.nan)) for end in ("low", "high"))
+    return f"{_signed(numbers[key])} dB (95 %: {low} to {high} dB)"
 
 
 def _gains(material: Material) -> Markup | None:
