@@ -24,7 +24,7 @@ GRID = 64
 DEFAULT_WINDOW = 512
 # Of full scale: how much raw pixels beyond the margin may change a restored value, to first order,
 # where all of them change by full scale, alike or each by itself.
-_INFLUENCE = 1e-4
+_INFLUENCE = 2e-5
 _FIRST_PROBE, _LARGEST_PROBE = 256, 512
 # Restored pixels that are looked at, from the middle of the probe: at several places of the grid.
 _LOOKED_AT = ((0, 0), (3, 7), (10, 13))

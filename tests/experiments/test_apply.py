@@ -36,8 +36,11 @@ def blur(size=9, width=2.0):
 
 def networks():
     torch.manual_seed(1)
-    for network in (UNetRestoration(width=4, depth=2), WienerUNetRestoration(4, 2, margin=16)):
-        nn.init.normal_(network.network.output.weight, std=20.0)  # it begins as zero
+    for network in (
+        UNetRestoration(width=4, depth=2),
+        WienerUNetRestoration(4, 2, margin=16, noise_to_signal=0.5),
+    ):
+        nn.init.normal_(network.network.output.weight, std=5.0)  # it begins as zero
         yield network
 
 
@@ -46,13 +49,13 @@ def networks():
 
 @pytest.mark.parametrize("network", list(networks()), ids=["unet", "wiener_unet"])
 def test_a_restored_picture_does_not_depend_on_its_windows(network):
-    raw = torch.rand(1, 3, 150, 290)
+    raw = torch.rand(1, 3, 100, 150)
     functions = blur() if network.needs_point_spread_function else None
     margin = margin_of(network, functions, CPU)
     assert margin is not None
     whole, some, many = (
         restore_in_windows(network, raw, functions, None, window, margin)
-        for window in (512, 128, 64)
+        for window in (256, 128, 64)
     )
     assert (some - whole).abs().max() < 1e-4 and (many - whole).abs().max() < 1e-4
     assert (whole - linear_to_srgb(raw)).abs().max() > 0.1  # it is no identity

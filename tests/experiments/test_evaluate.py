@@ -70,16 +70,20 @@ def test_at_other_depths_the_network_has_the_functions_of_its_own(trained):
 
 
 def test_rays_and_point_spread_functions_judge_alike(trained, own):
-    """A single ray a stratum is noise; many are the functions' image."""
+    """Many rays a pixel make the image of the functions."""
     rays, functions = (
         evaluate(trained, [*judge, UNPICTURED], name=name).metrics["test/raw_psnr_db"]
         for name, judge in {
             "rays": ["evaluation_renderer.pupil_samples=16"],
-            "psf": ["evaluation_renderer=psf", "evaluation_renderer.fields=[1,1]"],
+            "psf": [
+                "evaluation_renderer=psf",
+                "evaluation_renderer.fields=[1,1]",
+                "evaluation_renderer.pupil_samples=32",  # the run itself has set it to 2
+            ],
         }.items()
     )
     assert rays == pytest.approx(functions, abs=0.1)
-    assert rays > own["test/raw_psnr_db"] + 1.0  # that of four rays a pixel
+    assert rays > own["test/raw_psnr_db"]  # that of four rays a pixel, with their noise
 
 
 def test_a_lens_that_was_made_a_little_differently_keeps_what_was_trained(trained, own):
