@@ -95,6 +95,21 @@ def installed(root, tmp_path_factory) -> Path:
     return target
 
 
+def test_the_wheel_holds_every_file_of_the_library_the_experiments_and_the_configuration(
+    installed, root
+):
+    tracked = subprocess.run(
+        ["git", "-C", root, "ls-files", "dolens", "experiments", "conf"],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout.split()
+    assert len(tracked) > 500
+    for path in tracked:
+        assert (installed / "dolens" / path.removeprefix("dolens/")).is_file(), path
+    assert not (installed / "experiments").exists()
+
+
 def test_a_user_s_experiment_lens_and_surfaces_run_with_the_wheel(installed, root, tmp_path):
     write_own(tmp_path, root)
     done = subprocess.run(
