@@ -1,4 +1,4 @@
-"""What a Zemax `.zmx` file says besides the lens, and a prescription does not hold, is listed."""
+"""List the operands of a Zemax `.zmx` file that a prescription does not hold."""
 
 from collections.abc import Callable
 

@@ -43,7 +43,9 @@ def choices_of(cfg: DictConfig) -> dict[str, Any]:
         if group in _COMPARED and option is not None
     }
     found: dict[str, Any] = {**options, "seed": cfg.seed}
-    for override in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+    # As they were typed: `${...}` in one of them is part of its text.
+    typed = OmegaConf.to_container(hydra.overrides.task, resolve=False)
+    for override in OverridesParser.create().parse_overrides(typed):
         key = override.key_or_group
         if override.is_delete() or key in found or key.partition(".")[0] in _PLACES:
             continue

@@ -1,5 +1,6 @@
 """Spots, ray fans, modulation and RMS curves, against closed forms and other routes."""
 
+import copy
 import math
 
 import numpy as np
@@ -245,10 +246,12 @@ def test_the_lens_s_own_field_and_spectrum_are_the_defaults(root, triplet):
     assert curves.fields[-1].tolist() == [0.0, 22.0]
     curves = rms_against_wavelength(lens, [(0.0, 0.0)], count=3, rays=8)
     assert curves.wavelengths[[0, -1]].tolist() == [486.1327, 656.2725]
+    bare = copy.copy(triplet)
+    bare.fields = bare.wavelengths = None
     with pytest.raises(InputError, match="edge"):
-        rms_against_field(triplet, LINES)
+        rms_against_field(bare, LINES)
     with pytest.raises(InputError, match="interval"):
-        rms_against_wavelength(triplet, [(0.0, 0.0)])
+        rms_against_wavelength(bare, [(0.0, 0.0)])
 
 
 @pytest.mark.parametrize(

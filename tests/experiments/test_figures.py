@@ -125,7 +125,7 @@ def test_figures_are_saved_in_the_formats_of_the_configuration(trainer, tmp_path
     module = Drawn(["layout"])
     SaveFigures(tmp_path / "figures", formats=["png", "pdf"]).on_test_end(trainer, module)
     assert saved(tmp_path / "figures") == {"layout.png", "layout.pdf"}
-    assert set(logged(trainer, tmp_path)) == {"layout"}
+    assert set(logged(trainer, tmp_path)) == {"figures/layout"}
 
 
 @pytest.mark.parametrize(

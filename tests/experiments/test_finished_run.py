@@ -143,4 +143,4 @@ def test_overrides_that_cannot_be_applied_are_refused(tiny_run):
     assert "nothing in experiment=wavefront_coding reads" in refusal(
         tiny_run, overrides=["+nonsense=3"]
     )
-    assert "Could not find 'data/nowhere'" in refusal(tiny_run, overrides=["data=nowhere"])
+    assert "data=nowhere: there is no such file" in refusal(tiny_run, overrides=["data=nowhere"])

@@ -67,7 +67,7 @@ UNKNOWN = {
         "+module.reconstruction.view_nrom=2",
         "module.reconstruction: unknown key 'view_nrom'; did you mean 'view_norm'?",
     ),
-    "of a callback": ("+callbacks.pictures.dpi=9", "callbacks.pictures: unknown key 'dpi'"),
+    "of a callback": ("+callbacks.pictures.size=9", "callbacks.pictures: unknown key 'size'"),
     "of an optimizer": (
         "+optimizer.network.beta=1",
         "optimizer.network: unknown key 'beta'; did you mean 'betas'?",
