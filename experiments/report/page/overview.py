@@ -85,7 +85,7 @@ def _row(outcome: Outcome) -> tuple[Child, ...]:
             ": ",
             prose(check.what),
             " ",
-            element("code", f"{check.run}: {check.metric}"),
+            element("code", f"{check.run}: {check.metric}", class_="metric"),
         ),
         expected_text(check),
         element("span", found_text(outcome), class_=css_class(outcome.state)),
