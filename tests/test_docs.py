@@ -34,7 +34,7 @@ TRAININGS = sorted(
             document.read_text(encoding="utf-8"),
             re.MULTILINE,
         )
-        if not re.search(r"\\|my_camera|near_field|mylens|-m\b|\.\.\.|NAME", line)
+        if not re.search(r"\\|my_camera|near_field|mylens|quartet|-m\b|\.\.\.|NAME", line)
     }
 )
 # Packages whose docstrings follow the rules of docs/glossary.md.
