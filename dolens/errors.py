@@ -20,6 +20,11 @@ class InputError(ValueError):
     """
 
 
+def one_line(problem: object) -> str:
+    """Return a message on one line, as every message of a user's mistake is."""
+    return " ".join(str(problem).split())
+
+
 def check_keys(given: Iterable[object], allowed: Iterable[str], where: str) -> None:
     """Refuse the first key that is not allowed.
 

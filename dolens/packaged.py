@@ -1,5 +1,6 @@
-"""The configuration that comes with dolens: lenses, experiments and their parts, as YAML files."""
+"""What comes with the installation: versions of packages, and the configuration as YAML files."""
 
+from importlib import metadata
 from pathlib import Path
 
 from dolens.errors import InputError
@@ -23,3 +24,11 @@ def packaged_configuration() -> Path:
         "the configuration of dolens is missing: there is no train.yaml in "
         f"{' or '.join(map(str, candidates))}; install dolens again"
     )
+
+
+def installed_version(package: str) -> str | None:
+    """Return the version of an installed package; None where it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -32,10 +32,10 @@ ALLOWED = {
     "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
     # A page about a lens shows what all of these find out.
     "lens_page": {
-        *("errors", "optics", "prescriptions", "analysis", "diffraction"),
+        *("errors", "packaged", "optics", "prescriptions", "analysis", "diffraction"),
         *("tolerancing", "plotting"),
     },
-    "manufacturing": {"errors", "optics", "prescriptions", "tolerancing", "plotting"},
+    "manufacturing": {"errors", "packaged", "optics", "prescriptions", "tolerancing", "plotting"},
 }
 # The command line stands above everything, the experiments too.
 ALLOWED["cli"] = {*ALLOWED, "experiments"}

@@ -18,7 +18,7 @@ from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
 from dolens.cli.train import PassedOn, train
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 
 app = typer.Typer(
     name="dolens",
@@ -34,12 +34,7 @@ def main() -> None:
     try:
         app()
     except InputError as error:
-        sys.exit(one_line(error))
-
-
-def one_line(problem: object) -> str:
-    """The message of a user's mistake, on one line."""
-    return "error: " + " ".join(str(problem).split())
+        sys.exit(f"error: {one_line(error)}")
 
 
 @app.callback()

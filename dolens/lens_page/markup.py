@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib import metadata
 from importlib.resources import files
 
 from dolens.lens_page.tables import Table
 from dolens.lens_page.viewer import viewer_script
+from dolens.packaged import installed_version
 
 # Every page says by this what it is, so that only pages are overwritten unasked.
 GENERATOR = "dolens show"
@@ -39,7 +39,7 @@ def page_html(
         command: what made the page.
         blocks: its sections.
     """
-    version = _version()
+    version = installed_version("dolens") or ""
     css = (files("dolens.lens_page") / "page.css").read_text(encoding="utf-8")
     contents = "".join(
         f'<li><a href="#{escape(block.name)}">{escape(block.title)}</a></li>' for block in blocks
@@ -118,11 +118,3 @@ def problem_html(text: str) -> str:
 
 def _words(table: Table, column: int) -> str:
     return ' class="words"' if column in table.words else ""
-
-
-def _version() -> str:
-    """Return the version of dolens; nothing where it runs without being installed."""
-    try:
-        return metadata.version("dolens")
-    except metadata.PackageNotFoundError:
-        return ""

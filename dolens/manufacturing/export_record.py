@@ -3,13 +3,13 @@
 import datetime
 import json
 import platform
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from dolens.manufacturing.design_files import design_hash, file_hash
 from dolens.manufacturing.lens_export import Exported
 from dolens.optics.lens import Lens
+from dolens.packaged import installed_version
 
 RECORD = "export.json"
 _PACKAGES = (
@@ -20,7 +20,7 @@ _PACKAGES = (
 
 def program_name() -> str:
     """Return `dolens` and its version."""
-    return f"dolens {_version('dolens') or ''}".strip()
+    return f"dolens {installed_version('dolens') or ''}".strip()
 
 
 def write_record(
@@ -49,16 +49,13 @@ def write_record(
         "notes": exported.notes,
         "versions": {
             "python": platform.python_version(),
-            **{name: version for name in _PACKAGES if (version := _version(name)) is not None},
+            **{
+                name: version
+                for name in _PACKAGES
+                if (version := installed_version(name)) is not None
+            },
         },
     }
     path = folder / RECORD
     path.write_text(json.dumps(record, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return path
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import yaml
 
-from dolens.errors import InputError, did_you_mean
+from dolens.errors import InputError, did_you_mean, one_line
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
@@ -115,7 +115,7 @@ def decode_yaml(data: bytes, where: str | Path) -> Any:
         # A subclass of the safe loader: it builds plain values only.
         return yaml.load(text, Loader=_UniqueKeyLoader)
     except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(f"{where}: is not valid YAML ({reason})") from None
 
 

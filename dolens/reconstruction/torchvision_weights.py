@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 
 logger = logging.getLogger(__name__)
 
@@ -133,7 +133,7 @@ class PublishedWeights:
                 self.url, str(destination), hash_prefix=digest, progress=False
             )
         except (OSError, HTTPException, RuntimeError) as error:  # network, disk, or a wrong hash
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = one_line(error) or type(error).__name__
             raise PretrainedWeightsUnavailable(
                 f"no {self.network} weights for {self.purpose}: give {self.key}=FILE; or put "
                 f"{self.file_name} into {destination.parent}; or allow the download of {self.url} "

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.camera.exportable import Exportable
 from dolens.experiments.camera.reconstruction import evaluating
 
@@ -75,7 +75,7 @@ def export_onnx(network: Exportable, path: Path) -> ExportedNetwork:
                 output_names=[_OUTPUT],
             )
         except torch.onnx.errors.OnnxExporterError as error:
-            reason = " ".join(str(error.__cause__ or error).split())[:200]
+            reason = one_line(error.__cause__ or error)[:200]
             raise InputError(f"{path.name}: ONNX cannot hold the network ({reason})") from None
         program.model.metadata_props["dolens"] = json.dumps(network.facts())
         program.save(path)
@@ -104,7 +104,7 @@ def _program(network: Exportable, module: nn.Module) -> torch.export.ExportedPro
                 module, network.example(), dynamic_shapes=network.dynamic_shapes()
             )
     except (RuntimeError, torch._dynamo.exc.TorchDynamoException, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)[:200]
         raise InputError(f"torch.export cannot trace the network ({reason})") from None
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.reconstruction import Restoration
 from dolens.sensor.colour import linear_to_srgb
 
@@ -172,7 +172,7 @@ def _tried(key: str, name: str, raw: Tensor, call: Callable[[], Any]) -> Any:
     except InputError:
         raise
     except Exception as error:
-        message = " ".join(str(error).split())
+        message = one_line(error)
         raise InputError(
             f"{key}: {name} fails on an image of shape {tuple(raw.shape)}: "
             f"{type(error).__name__}: {message}{_place(error)}"

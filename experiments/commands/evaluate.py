@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from omegaconf import OmegaConf
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.running.composition import changed_places, with_overrides
 from dolens.experiments.running.finished_run import (
     FinishedRun,
@@ -160,7 +160,7 @@ def _refuse_other_work(overrides: Sequence[str]) -> None:
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
-        raise InputError(" ".join(str(error).split())) from None
+        raise InputError(one_line(error)) from None
     for override in parsed:
         key = override.key_or_group
         if override.is_sweep_override():

@@ -23,6 +23,7 @@ from dolens.experiments.comparison.metrics import (
     value_of,
 )
 from dolens.experiments.comparison.rows import Row, Rows, chosen_row, rows_of, text_of
+from dolens.plotting.number_text import with_minus
 from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
 from dolens.reconstruction.intervals import Interval
 
@@ -144,7 +145,7 @@ def gain_cells(comparison: Comparison) -> list[list[str]]:
                 continue
             text = format_interval(interval, max(digits_of(interval.estimate) or 0, 2))
             photographs = str(interval.photographs) if interval.photographs else "not paired"
-            text = text.replace("-", "\N{MINUS SIGN}")
+            text = with_minus(text)
             lines.append([str(row.number), metric, text, str(interval.seeds), photographs])
     return lines
 

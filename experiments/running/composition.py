@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.dropped_entries import without_dropped
 from dolens.experiments.running.recorded_run import RecordedRun
@@ -77,9 +77,9 @@ def _composed(record: RecordedRun, overrides: Sequence[str]) -> Iterator[DictCon
             HydraConfig.instance().set_config(cfg)
             yield cfg
     except HydraException as error:
-        raise InputError(" ".join(explained(error, overrides).split())) from error
+        raise InputError(one_line(explained(error, overrides))) from error
     except OmegaConfBaseException as error:
-        raise InputError(" ".join(str(error).split())) from error
+        raise InputError(one_line(error)) from error
     finally:
         GlobalHydra.instance().clear()
         if hydra is not None:

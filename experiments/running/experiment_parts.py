@@ -11,7 +11,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.running.catalogue import configuration_folders, meanings
 from dolens.experiments.running.plain_values import flat
 from dolens.experiments.running.resolvers import register_resolvers
@@ -56,7 +56,7 @@ def parts_of(name: str) -> ExperimentParts:
             loader = GlobalHydra.instance().config_loader()
             chosen = loader.compute_defaults_list("train", [override], RunMode.RUN)
     except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(" ".join(str(error).split())) from None
+        raise InputError(one_line(error)) from None
     choices = {
         str(group): str(option)
         for group, option in reversed(list(cfg.hydra.runtime.choices.items()))

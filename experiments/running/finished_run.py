@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.running.composition import with_overrides
 from dolens.experiments.running.extensions import import_extensions
@@ -243,7 +243,7 @@ def read_checkpoint(file: Path) -> Mapping[str, Any]:
     try:
         found = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)[:200]
         raise InputError(f"{file} is not a safe checkpoint ({reason})") from None
     if not isinstance(found, Mapping) or "state_dict" not in found:
         raise InputError(f"{file} holds no state of a module")
@@ -260,7 +260,7 @@ def _take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
     try:
         module.load_state_dict(state["state_dict"])
     except RuntimeError as error:
-        reason = _misfit(state["state_dict"], module.state_dict()) or " ".join(str(error).split())
+        reason = _misfit(state["state_dict"], module.state_dict()) or one_line(error)
         raise InputError(f"{file} does not fit the run's configuration: {reason}") from None
     module.settle()
 

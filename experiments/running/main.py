@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
@@ -41,9 +41,9 @@ def main(arguments: Sequence[str], program: str) -> None:
     try:
         start()
     except HydraException as error:
-        sys.exit(one_line(explained(error, arguments)))
+        sys.exit(f"error: {one_line(explained(error, arguments))}")
     except OmegaConfBaseException as error:
-        sys.exit(one_line(error))
+        sys.exit(f"error: {one_line(error)}")
 
 
 def job(cfg: DictConfig) -> float:
@@ -59,13 +59,13 @@ def job(cfg: DictConfig) -> float:
     except (InputError, HydraException, OmegaConfBaseException) as error:
         # Hydra reports a class that could not be made; the reason is what the user can mend.
         reason = error.__cause__ if isinstance(error.__cause__, InputError) else error
-        line = " ".join(str(reason).split())
+        line = one_line(reason)
         _record(line, to_all=swept)
         if not swept:
             # Exiting here, within the job, keeps Hydra from adding lines of its own.
             sys.exit(f"error: {line}")
     except Exception as error:
-        line = " ".join(f"{type(error).__name__}: {error}".split())
+        line = one_line(f"{type(error).__name__}: {error}")
         _record(line, to_all=swept, with_traceback=True)
         if not swept:
             raise
@@ -79,8 +79,3 @@ def _record(line: str, to_all: bool, with_traceback: bool = False) -> None:
     for handler in logging.getLogger().handlers:
         if to_all or isinstance(handler, logging.FileHandler):
             handler.handle(record)
-
-
-def one_line(problem: object) -> str:
-    """The message of a user's mistake, on one line."""
-    return "error: " + " ".join(str(problem).split())

@@ -11,7 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.running.renaming import translated, with_targets_of_now
 
 _RECORDS = (".hydra/resolved.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml", "run.json")
@@ -82,7 +82,7 @@ def read_record(folder: str | Path, output: str | Path | None = None) -> Recorde
     try:
         now, notes = translated([str(override) for override in overrides])
     except HydraException as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise InputError(f"{folder}: .hydra/overrides.yaml cannot be read ({reason})") from None
     return RecordedRun(
         folder,

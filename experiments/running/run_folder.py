@@ -7,11 +7,12 @@ import resource
 import subprocess
 import sys
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from dolens.packaged import installed_version
 
 _PACKAGES = (
     "dolens",
@@ -43,7 +44,7 @@ def describe_run(seed: int, device: str, dtype: str, command: list[str]) -> dict
         "python": sys.version.split()[0],
         "seed": seed,
         "threads": torch.get_num_threads(),
-        "versions": {name: _version(name) for name in _PACKAGES},
+        "versions": {name: installed_version(name) for name in _PACKAGES},
     }
 
 
@@ -79,10 +80,3 @@ def _git(root: Path, *arguments: str) -> str:
         ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True
     )
     return done.stdout.strip()
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None

@@ -8,6 +8,7 @@ from dolens.experiments.report.checks import SOURCES, Check, Outcome, State
 from dolens.experiments.report.page.html import Child, Markup, element, joined, prose, table
 from dolens.experiments.report.page.material import Material
 from dolens.experiments.report.page.numbers import limit_text, number_text, value_text
+from dolens.plotting.number_text import with_minus
 
 _ORDER = (State.FAILS, State.NOT_RUN, State.HOLDS)
 _TITLES = {
@@ -148,7 +149,7 @@ def _gains(material: Material) -> Markup | None:
 
 
 def _signed(value: float) -> str:
-    return f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
+    return with_minus(f"{value:+.2f}")
 
 
 def _runs_that_failed(material: Material) -> Markup | None:
