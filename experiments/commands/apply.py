@@ -26,7 +26,7 @@ from dolens.experiments.commands.picture_files import (
     write_picture,
 )
 from dolens.experiments.running.finished_run import FinishedRun, load_run
-from dolens.experiments.running.run_folder import write_json
+from dolens.experiments.running.run_files import write_json
 from dolens.plotting import save_figure
 from dolens.plotting.applied_picture import applied_figure
 from dolens.reconstruction import psnr_db, structural_similarity

@@ -1,6 +1,5 @@
 """The camera of a run again, without training: on other photographs, depths, noise."""
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,11 +25,18 @@ from dolens.experiments.running.finished_run import (
     working_folder_importable,
 )
 from dolens.experiments.running.recorded_run import RecordedRun, read_record
+from dolens.experiments.running.run_files import (
+    INFO,
+    METRICS,
+    OVERRIDES,
+    RESOLVED,
+    metrics_of,
+    write_json,
+)
 from dolens.experiments.running.run_folder import (
     describe_run,
     peak_memory_mb,
     plain_metrics,
-    write_json,
 )
 from dolens.experiments.running.training import summary_of
 from dolens.prescriptions import save_lens
@@ -114,7 +120,7 @@ def evaluate(
         config = with_overrides(record, overrides)
     changed = changed_places(record.config, config)
     _refuse_another_camera(changed, config, perturb_lens)
-    own = _metrics_of(record.folder)
+    own = metrics_of(record.folder)
     # A run that found no classifier for its loss had none; it is not looked for again.
     with_loss = own.get("loss/perceptual_available") != 0.0
     run = load_recorded(record, config, checkpoint, with_loss)
@@ -123,27 +129,22 @@ def evaluate(
         for note in record.notes:
             logger.warning("%s", note)
         _say(run, changed)
-        OmegaConf.save(run.cfg, output / ".hydra" / "resolved.yaml")
+        OmegaConf.save(run.cfg, output / RESOLVED)
         written = [*record.overrides, *overrides]
-        OmegaConf.save(OmegaConf.create(written), output / ".hydra" / "overrides.yaml")
+        OmegaConf.save(OmegaConf.create(written), output / OVERRIDES)
         metrics = _tested(run, output, _evaluated(run, given, changed), command)
         if "network/pretrained" in own:  # of where the run began
             metrics["network/pretrained"] = own["network/pretrained"]
         metrics["cost/wall_s"] = time.perf_counter() - started
         numbers = plain_metrics(metrics)
-        write_json(output / "metrics.json", numbers)
+        write_json(output / METRICS, numbers)
         logger.info("Evaluation: %s", output)
     return Evaluated(output, numbers, run.settings.objective, run)
 
 
 def own_metrics(found: Evaluated) -> dict[str, float]:
     """Return the metrics of the run itself; none where it has not come to its end."""
-    return _metrics_of(found.run.folder)
-
-
-def _metrics_of(folder: Path) -> dict[str, float]:
-    file = folder / "metrics.json"
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return metrics_of(found.run.folder)
 
 
 def _new_folder(folder: Path, name: str | None) -> Path:
@@ -270,7 +271,7 @@ def _tested(
     device = trainer.strategy.root_device
     info = describe_run(settings.seed, str(device), settings.lens_dtype, list(command))
     info["evaluated"] = dict(evaluated)
-    write_json(output / "run.json", {**info, "status": "running"})
+    write_json(output / INFO, {**info, "status": "running"})
     status = "failed"
     try:
         trainer.test(run.module, run.data, verbose=False)
@@ -279,7 +280,7 @@ def _tested(
         status = "interrupted"
         raise
     finally:
-        write_json(output / "run.json", {**info, "status": status})
+        write_json(output / INFO, {**info, "status": status})
     (output / "lens").mkdir(exist_ok=True)
     save_lens(run.lens, output / "lens" / "final.yaml")
     metrics = dict(trainer.callback_metrics) | summary_of(run.module)
