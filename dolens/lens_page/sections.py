@@ -34,6 +34,7 @@ from dolens.diffraction.point_spread import (
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.diffraction.wavefront_error import wavefront_errors
 from dolens.errors import InputError
+from dolens.html import Markup
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
@@ -65,14 +66,14 @@ class Content:
         figures: file name without suffix → figure.
         tables: below the figures.
         note: a sentence above them.
-        html: elements above them, already escaped.
+        html: elements above them.
         problems: what could not be computed, and why, a sentence each.
     """
 
     figures: dict[str, Figure] = field(default_factory=dict)
     tables: list[Table] = field(default_factory=list)
     note: str = ""
-    html: str = ""
+    html: Markup | None = None
     problems: list[str] = field(default_factory=list)
 
 

@@ -1,7 +1,8 @@
 """Tables of plain text cells are laid out for a terminal and for a notebook."""
 
-import html
 from collections.abc import Sequence
+
+from dolens.html import Markup, element
 
 Cells = Sequence[Sequence[str]]
 
@@ -36,17 +37,18 @@ def html_table(headings: Sequence[str], rows: Cells, caption: str = "", left: in
         left: columns from the first that are flush left; the others are flush right.
     """
 
-    def line(tag: str, cells: Sequence[str]) -> str:
-        side = ["left" if number < left else "right" for number in range(len(cells))]
-        written = (
-            f'<{tag} style="text-align:{where}">{html.escape(printable(cell))}</{tag}>'
-            for where, cell in zip(side, cells, strict=True)
-        )
-        return f"<tr>{''.join(written)}</tr>"
+    sides = [f"text-align:{'left' if n < left else 'right'}" for n in range(len(headings))]
 
-    head = f"<caption>{html.escape(printable(caption))}</caption>" if caption else ""
-    body = "".join(line("td", [minus(cell) for cell in row]) for row in rows)
-    return f"<table>{head}<thead>{line('th', headings)}</thead><tbody>{body}</tbody></table>"
+    def line(tag: str, cells: Sequence[str]) -> Markup:
+        pairs = zip(cells, sides, strict=True)
+        return element("tr", *(element(tag, printable(cell), style=side) for cell, side in pairs))
+
+    return element(
+        "table",
+        element("caption", printable(caption)) if caption else None,
+        element("thead", line("th", headings)),
+        element("tbody", *(line("td", [minus(cell) for cell in row]) for row in rows)),
+    )
 
 
 def printable(text: str) -> str:
