@@ -20,7 +20,8 @@ from dolens.lens_page.markup import (
 from dolens.lens_page.overview import Overview, lens_overview
 from dolens.lens_page.preparation import prepared_lens
 from dolens.lens_page.sections import Content, PageSections, Section
-from dolens.lens_page.tables import field_text, number
+from dolens.lens_page.tables import number
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.export import save_figure
 
@@ -160,7 +161,7 @@ def _facts(lens: Lens, overview: Overview) -> list[tuple[str, str]]:
         facts.append(("object at", f"{number(where.object_distance)} mm"))
         facts.append(("working F-number", number(abs(float(first.working_f_number)), 4)))
     facts.append(
-        ("fields", ", ".join(field_text(point, where.field_unit) for point in where.fields))
+        ("fields", ", ".join(field_label(point, where.field_unit) for point in where.fields))
     )
     waves = [
         f"{float(wave):g}{'*' if float(wave) == where.reference_wavelength else ''}"

@@ -38,8 +38,9 @@ from dolens.html import Markup
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
-from dolens.lens_page.tables import Table, field_text, number
+from dolens.lens_page.tables import Table, number
 from dolens.lens_page.viewer import viewer_html
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.encircled_energy import encircled_energy_figure
 from dolens.plotting.field_curves import field_curves_figure
@@ -211,7 +212,7 @@ class PageSections:
         found: dict[str, list[str]] = {}
         for point, waves, reason in zip(self.where.fields, diffraction, reasons, strict=True):
             if not waves:
-                text = field_text(point, self.where.field_unit)
+                text = field_label(point, self.where.field_unit)
                 found.setdefault(reason.removeprefix("rays alone: "), []).append(text)
         return [
             f"diffraction at {', '.join(fields)} ({reason})" for reason, fields in found.items()
@@ -254,7 +255,7 @@ class PageSections:
         numbers = (found.rms, found.peak_to_valley, found.strehl_ratio)
         rows = [
             (
-                field_text(point, found.field_unit),
+                field_label(point, found.field_unit),
                 f"{wave:g}",
                 *(number(values[row, column], 3) for values in numbers),
             )
@@ -295,7 +296,7 @@ class PageSections:
             # Where little of the stop is lit, tolerances say nothing of use.
             light = self.overview.spots.valid.double().mean((1, 2))
             bright = light >= _BRIGHT * light.max()
-            dim = [field_text(point, where.field_unit) for point in where.fields[~bright]]
+            dim = [field_label(point, where.field_unit) for point in where.fields[~bright]]
             if dim and bool(bright.any()):
                 where = replace(where, fields=where.fields[bright])
                 problems.append(f"tolerances at {', '.join(dim)}: too little light passes")

@@ -9,7 +9,7 @@ import numpy as np
 from dolens.analysis.conditions import Conditions
 from dolens.html import Markup, element
 from dolens.lens_page.solid import Mesh, Solid
-from dolens.lens_page.tables import field_text
+from dolens.optics.fields import field_label
 from dolens.plotting.style import ordered_colours
 
 
@@ -21,7 +21,7 @@ def viewer_html(found: Solid, where: Conditions) -> Markup:
         where: its fields, for the labels of rays.
     """
     shades = ordered_colours(len(found.rays))
-    labels = [field_text(point, where.field_unit) for point in where.fields]
+    labels = [field_label(point, where.field_unit) for point in where.fields]
     boxes = (
         element(
             "label",

@@ -9,7 +9,8 @@ from scipy.special import j0, j1
 
 from dolens.analysis.encircled_energy import EncircledEnergy
 from dolens.analysis.spot_diagram import AIRY
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL, TITLE, ordered_colours, ruled_axes
 
 
 def encircled_energy_figure(

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dolens.analysis.modulation_transfer import Modulation
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL, TITLE, ordered_colours, ruled_axes
 
 _TANGENTIAL, _SAGITTAL = "-", (0, (1, 1.2))
 # Curves that differ by less are one on paper.

@@ -10,7 +10,8 @@ from matplotlib.lines import Line2D
 from dolens.analysis.modulation_transfer import Modulation
 from dolens.diffraction.transfer import DiffractionModulation
 from dolens.errors import InputError
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL, TITLE, ordered_colours, ruled_axes
 
 
 def modulation_comparison_figure(

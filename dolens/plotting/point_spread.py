@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dolens.diffraction.point_spread import PointSpread
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL, TITLE
 
 # Lightness grows evenly, for colour-blind readers and in print too.
 _COLOURS = "inferno"

@@ -4,12 +4,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dolens.analysis.ray_fans import RayFans
+from dolens.optics.fields import field_label
 from dolens.plotting.style import (
     DASHES,
     PAGE,
     SMALL,
     TITLE,
-    field_label,
     ruled_axes,
     spectral_colour,
     wavelength_handles,

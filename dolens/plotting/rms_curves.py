@@ -8,12 +8,12 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.rms_curves import RMSCurves
 from dolens.errors import InputError
+from dolens.optics.fields import field_label
 from dolens.plotting.style import (
     DASHES,
     PAGE,
     SMALL,
     TITLE,
-    field_label,
     ordered_colours,
     ruled_axes,
     spectral_colour,

@@ -12,12 +12,12 @@ from matplotlib.ticker import MaxNLocator
 
 from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.errors import InputError
+from dolens.optics.fields import field_label
 from dolens.plotting.number_text import number_text
 from dolens.plotting.style import (
     PAGE,
     SMALL,
     TITLE,
-    field_label,
     ruled_axes,
     spectral_colour,
     wavelength_handles,

@@ -31,11 +31,11 @@ from dolens.analysis.spot_diagram import (
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.errors import InputError
 from dolens.experiments.design.tables import SQUARE_GRID_COUNT, spot_table
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 from dolens.optimize import MeritSettings
 from dolens.optimize.image_quality import ImageQuality, QualityValues
-from dolens.plotting.style import field_label
 
 _CURVE_POINTS = 15
 # Rays along each side of a grid for transfer functions.
