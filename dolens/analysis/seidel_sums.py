@@ -6,7 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions, full_field, wavelength_interval
+from dolens.analysis.conditions import Conditions, wavelength_interval
+from dolens.analysis.full_field import full_field
 from dolens.analysis.ray_intercepts import in_double_precision
 from dolens.optics.lens import Lens
 from dolens.optics.seidel import Seidel

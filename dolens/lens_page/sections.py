@@ -24,13 +24,8 @@ from dolens.analysis.modulation_transfer import frequency_range, modulation
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.diffraction.illumination import relative_illumination
-from dolens.diffraction.point_spread import (
-    PointSpread,
-    PreparedPupils,
-    diffraction_encircled_energy,
-    point_spread,
-    prepare_pupils,
-)
+from dolens.diffraction.point_spread import PointSpread, diffraction_encircled_energy, point_spread
+from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.diffraction.wavefront_error import wavefront_errors
 from dolens.errors import InputError

@@ -9,16 +9,18 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, aim
-from dolens.optics.backend import check_backend, is_few, trace_rays
+from dolens.optics.backend import check_backend, is_few
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.paraxial import FirstOrder, first_order, vergence
 from dolens.optics.paraxial_rays import ParaxialRays, paraxial_rays
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.seidel import Seidel, seidel
-from dolens.optics.surfaces.base import Surface, SurfaceState
+from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
 
 

@@ -11,20 +11,23 @@ from typing import Any
 
 import lightning
 import torch
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from omegaconf import OmegaConf
 
-from dolens.errors import InputError, one_line
+from dolens.errors import InputError
+from dolens.experiments.commands.evaluation_overrides import (
+    refuse_another_camera,
+    refuse_other_work,
+    with_own_calibration,
+)
 from dolens.experiments.running.composition import changed_places, with_overrides
 from dolens.experiments.running.finished_run import (
     FinishedRun,
     load_recorded,
     working_folder_importable,
 )
-from dolens.experiments.running.recorded_run import RecordedRun, read_record
+from dolens.experiments.running.recorded_run import read_record
 from dolens.experiments.running.run_files import (
     INFO,
     METRICS,
@@ -43,22 +46,6 @@ from dolens.prescriptions import save_lens
 
 logger = logging.getLogger(__name__)
 
-# What decides the work of a run, and not what is evaluated.
-_OF_THE_RUN = {
-    "experiment": "another experiment is another run: train it",
-    "module": "another module is another run: train it",
-    "train": "an evaluation does not train",
-    "test": "an evaluation is a test",
-    "ckpt_path": "name the checkpoint by --checkpoint",
-}
-# Places of the configuration whose change makes another camera, or changes training alone.
-_CAMERA = (
-    ("network",),
-    ("variables",),
-    ("module", "variables"),
-    ("module", "reconstruction", "network"),
-)
-_TRAINING = ("optimizer", "scheduler", "learning_rates", "operands", "discriminator")
 _FORMAT = "[%(asctime)s] %(levelname)s %(name)s: %(message)s"
 
 
@@ -114,12 +101,12 @@ def evaluate(
     started = time.perf_counter()
     output = _new_folder(Path(folder), name)
     record = read_record(folder, output)
-    _refuse_other_work(overrides)
-    given, overrides = list(overrides), _with_own_calibration(record, overrides)
+    refuse_other_work(overrides)
+    given, overrides = list(overrides), with_own_calibration(record, overrides)
     with working_folder_importable():
         config = with_overrides(record, overrides)
     changed = changed_places(record.config, config)
-    _refuse_another_camera(changed, config, perturb_lens)
+    refuse_another_camera(changed, config, perturb_lens)
     own = metrics_of(record.folder)
     # A run that found no classifier for its loss had none; it is not looked for again.
     with_loss = own.get("loss/perceptual_available") != 0.0
@@ -155,63 +142,6 @@ def _new_folder(folder: Path, name: str | None) -> Path:
     if found.exists():
         raise InputError(f"--name: {found} is there already; give another name")
     return found
-
-
-def _refuse_other_work(overrides: Sequence[str]) -> None:
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException as error:
-        raise InputError(one_line(error)) from None
-    for override in parsed:
-        key = override.key_or_group
-        if override.is_sweep_override():
-            raise InputError(
-                f"{override.input_line}: an evaluation is one; give one value at a time"
-            )
-        if key.startswith("hydra"):
-            raise InputError(f"{key}: Hydra has no job here; --name names the folder")
-        if key in _OF_THE_RUN:
-            raise InputError(f"{key}: {_OF_THE_RUN[key]}")
-
-
-def _with_own_calibration(record: RecordedRun, overrides: Sequence[str]) -> list[str]:
-    """The overrides, with the depths that the run's network has its functions of.
-
-    A camera does not know the depth of what it looks at: were its functions those of the scene that
-    it is judged by, a scene of one depth would tell it.
-    """
-    found, views = list(overrides), (record.config["module"] or {}).get("views")
-    if not found or not isinstance(views, Mapping) or "psf_size" not in views:
-        return found
-    depths = views.get("psf_depths") or views["scene"].get("depths")
-    asked = any(text.lstrip("+").startswith("views.psf_depths=") for text in found)
-    if depths is None or asked:
-        return found
-    return [f"views.psf_depths={list(depths)}", *found]
-
-
-def _refuse_another_camera(
-    changed: Sequence[tuple[Any, ...]], config: Mapping[str, Any], perturb_lens: bool
-) -> None:
-    for place in changed:
-        name = ".".join(map(str, place))
-        if any(place[: len(part)] == part for part in _CAMERA):
-            raise InputError(
-                f"{name}: another value makes another camera than the run has trained; train it"
-            )
-        if place[0] in _TRAINING:
-            raise InputError(f"{name}: this setting is of training alone, and nothing is trained")
-        if place[0] == "lens" and not perturb_lens:
-            raise InputError(
-                f"{name}: another value makes another lens than the run has trained; "
-                "--perturb-lens evaluates the camera with it all the same"
-            )
-        judged = config.get("evaluation_renderer") is not None
-        if judged and place[0] == "renderer" and place[1:2] != ("sensor",):
-            raise InputError(
-                f"{name}: renderer makes images for training; test images are made by "
-                "evaluation_renderer"
-            )
 
 
 def _say(run: FinishedRun, changed: Sequence[tuple[Any, ...]]) -> None:

@@ -7,16 +7,18 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.spot_diagram import working_f_numbers
-from dolens.experiments.design.merit_rays import (
-    merit_modulation,
-    merit_rms_against_field,
-    merit_rms_against_wavelength,
-    merit_spots,
+from dolens.experiments.design.merit_pupil import (
     pupil_share,
     pupil_text,
     rays_text,
     reference_text,
     whole_stop_rms,
+)
+from dolens.experiments.design.merit_rays import (
+    merit_modulation,
+    merit_rms_against_field,
+    merit_rms_against_wavelength,
+    merit_spots,
 )
 from dolens.experiments.design.tables import spot_table
 from dolens.experiments.experiment import Figures
