@@ -10,7 +10,8 @@ from matplotlib.lines import Line2D
 
 from dolens.analysis.modulation_transfer import Modulation
 from dolens.optics.fields import field_label
-from dolens.plotting.style import PAGE, SMALL, TITLE, ordered_colours, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, ordered_colours, ruled_axes
+from dolens.plotting.titles import draw_title
 
 _TANGENTIAL, _SAGITTAL = "-", (0, (1, 1.2))
 # Curves that differ by less are one on paper.
@@ -55,8 +56,7 @@ def modulation_figure(
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

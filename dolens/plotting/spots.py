@@ -17,11 +17,11 @@ from dolens.plotting.number_text import number_text
 from dolens.plotting.style import (
     PAGE,
     SMALL,
-    TITLE,
     ruled_axes,
     spectral_colour,
     wavelength_handles,
 )
+from dolens.plotting.titles import draw_title
 
 _PANEL = 1.75
 # Fields of an overlaid diagram stand side by side, up to so many in a row.
@@ -85,8 +85,7 @@ def spots_figure(
         grid[field, 0].set_ylabel(f"{label}\ny (µm)", fontsize=SMALL + 1)
     _label(grid, fields, drawn.reach, overlaid)
     _legend(figure, spots, overlaid)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 
@@ -139,8 +138,7 @@ def spots_comparison_figure(
         for axes, (_, _, half) in zip(grid[row, 1:], columns[1:], strict=True):
             axes.tick_params(labelleft=half != reach)
     _legend(figure, diagrams[0], True)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

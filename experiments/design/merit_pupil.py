@@ -12,6 +12,9 @@ from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
 from dolens.optimize import MeritSettings
 
+COMMON_CENTROID = "about one centroid for all wavelengths"
+COMMON_CHIEF_RAY = "about one chief ray for all wavelengths"
+
 # A quadrature of the whole stop that holds for large aberrations too.
 _WHOLE_STOP = {"rings": 20, "arms": 24}
 
@@ -40,9 +43,8 @@ def rays_text(settings: MeritSettings) -> str:
 
 def reference_text(settings: MeritSettings) -> str:
     """Return what radii count from, where that is not each spot's own centroid; else nothing."""
-    point = "chief ray" if settings.reference == "chief" else "centroid"
     if settings.reference_spectrum == "polychromatic":
-        return f"about one {point} for all wavelengths"
+        return COMMON_CHIEF_RAY if settings.reference == "chief" else COMMON_CENTROID
     return "about the chief rays" if settings.reference == "chief" else ""
 
 

@@ -37,7 +37,8 @@ from dolens.optics.lens import Lens
 from dolens.optimize import MeritSettings
 from dolens.optimize.image_quality import ImageQuality, QualityValues
 
-_CURVE_POINTS = 15
+# Of an RMS curve; an odd number, so that the middle of the interval is among them.
+_CURVE_POINTS = 31
 # Rays along each side of a grid for transfer functions.
 _DENSE_GRID = 121
 # Airy radii beyond which a mean RMS radius leaves diffraction without a say.
@@ -164,11 +165,21 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
 
 
 def merit_rms_against_field(
-    lens: Lens, settings: MeritSettings, edge: Sequence[float]
+    lens: Lens,
+    settings: MeritSettings,
+    edge: Sequence[float],
+    start: Sequence[float] = (0.0, 0.0),
 ) -> RMSCurves:
-    """Return RMS radii from the axis to a field, by the sampling and reference of `rms_spot_um`."""
-    steps = torch.linspace(0.0, 1.0, _CURVE_POINTS, dtype=torch.float64)
-    fields = [(float(s * edge[0]), float(s * edge[1])) for s in steps]
+    """Return RMS radii between two fields, by the sampling and reference of `rms_spot_um`.
+
+    Args:
+        lens: the lens.
+        settings: the rays, and what radii count from.
+        edge: the last field, (x, y) in degrees or mm.
+        start: the first one; the axis, or the field opposite to the edge.
+    """
+    steps = torch.linspace(0.0, 1.0, _CURVE_POINTS, dtype=torch.float64).tolist()
+    fields = [tuple(a + s * (b - a) for a, b in zip(start, edge, strict=True)) for s in steps]
     return _curves(lens, settings, fields, settings.wavelengths_of(lens))
 
 
