@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dolens.diffraction.autocorrelation import transfer_functions
 from dolens.diffraction.field import fourier_field
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.propagation import choose_propagation
@@ -138,9 +139,7 @@ class FieldPupil:
     def transfer(self, frequencies: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the optical transfer function along and across a direction of the sensor.
 
-        The transfer function is the pupil's autocorrelation (Goodman, Introduction to Fourier
-        Optics, section 6.3).  It comes from the line spread function, whose samples are the squared
-        moduli of Fourier transforms of the pupil's rows, summed.
+        See `autocorrelation.transfer_functions`; rays alone are counted on a fine line.
 
         Args:
             frequencies: (Q,), cycles/mm.
@@ -155,13 +154,11 @@ class FieldPupil:
         pupil = self._on_grid(self.samples(0.0, 2.0), direction)
         share = self.weights * pupil.flux
         share = (share / share.sum())[:, None]
-        turns = pupil.opd / (MM_PER_NM * pupil.wavelength)[:, None, None]
-        function = torch.polar(pupil.amplitude, 2.0 * torch.pi * turns)
-        perfect = pupil.amplitude.to(function.dtype)
         found, limit = [], []
         for axis in range(2):
-            found.append((share * _autocorrelation(function, pupil, axis, frequencies)).sum(0))
-            limit.append((share * _autocorrelation(perfect, pupil, axis, frequencies)).sum(0).abs())
+            aberrated, perfect = transfer_functions(pupil, axis, frequencies)
+            found.append((share * aberrated).sum(0))
+            limit.append((share * perfect).sum(0).abs())
         return torch.stack(found), torch.stack(limit)
 
     def _transfer_of_rays(self, frequencies: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -215,7 +212,8 @@ class FieldPupil:
         needed = max(self.samples(half), self.samples(0.0, 2.0))
         if needed > most_samples:
             return f"the wavefront needs {needed} samples across the pupil"
-        pupil = regular_pupil(self.fit, self.samples(half))
+        # Edges are smooth in `coverage`: few samples give the flux to far less than its limit.
+        pupil = regular_pupil(self.fit, _FEWEST)
         chosen = choose_propagation(self.fit, pupil.flux, half)
         reasons = zip(chosen.fourier.tolist(), chosen.reasons, strict=True)
         return next((reason.removeprefix("direct: ") for good, reason in reasons if not good), "")
@@ -287,33 +285,3 @@ def _unaberrated(pupil: RegularPupil) -> Tensor:
     cell = (pupil.cosines[..., 1] - pupil.cosines[..., 0]).prod(-1)
     wave = MM_PER_NM * pupil.wavelength / pupil.index
     return (pupil.amplitude.sum((-2, -1)) * cell / wave).square()
-
-
-def _autocorrelation(
-    function: Tensor, pupil: RegularPupil, axis: int, frequencies: Tensor
-) -> Tensor:
-    """Return the transfer function (W, Q) of pupil functions (W, G, G), along the last dimension
-    (axis 0 of `cosines`) or the one before.
-    """
-    dim = -1 if axis == 0 else -2
-    size = 2 * function.shape[-1]
-    line = torch.fft.fft(function, size, dim=dim)
-    spread = (line.real.square() + line.imag.square()).sum(-2 if axis == 0 else -1)
-    # A cell that passes a share c has amplitude c, but flux c and not c²: the autocorrelation at
-    # zero, the mean of its transform, lacks the difference.
-    steps = pupil.cosines[..., 1] - pupil.cosines[..., 0]
-    square = function.real.square() + function.imag.square()
-    spread = spread + (pupil.flux / steps.prod(-1) - square.sum((-2, -1)))[:, None]
-    spread = spread / spread.sum(-1, keepdim=True)
-    step = steps[:, axis]
-    wave = MM_PER_NM * pupil.wavelength / pupil.index
-    order = torch.fft.fftfreq(size, dtype=torch.float64, device=spread.device)
-    # U(ρ) goes with exp(+ikρα), and the transform with exp(-i…): sample j lies at -j·λ/(n'·Δα).
-    place = -(wave / step)[:, None] * order
-    phase = -2.0 * torch.pi * frequencies[:, None] * place[:, None]
-    found = torch.complex(
-        (spread[:, None] * phase.cos()).sum(-1), (spread[:, None] * phase.sin()).sum(-1)
-    )
-    # Beyond the autocorrelation's support only its periodic copies are left.
-    beyond = (frequencies * wave[:, None]).abs() >= (step * function.shape[-1])[:, None]
-    return found.masked_fill(beyond, 0.0)

@@ -108,6 +108,7 @@ ARCHITECTURES = {
             url=MobileNet_V2_Weights.IMAGENET1K_V1.url,
             megabytes=14,
             key="network.weights_file",
+            choice="network.weights",
             prefix="features.",
         ),
     ),
@@ -125,6 +126,7 @@ ARCHITECTURES = {
             url=GoogLeNet_Weights.IMAGENET1K_V1.url,
             megabytes=50,
             key="network.weights_file",
+            choice="network.weights",
         ),
     ),
 }

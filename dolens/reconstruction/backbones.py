@@ -9,12 +9,12 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from dolens.errors import InputError
 from dolens.reconstruction.backbone_architectures import ARCHITECTURES, Architecture
-from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable
+from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailable, PublishedWeights
 
 logger = logging.getLogger(__name__)
 
 COLORS = 3
-WEIGHTS_CHOICES = ("auto", "imagenet", "none")
+WEIGHTS_CHOICES = ("auto", "imagenet", "download", "none")
 
 
 class Backbone(nn.Module):
@@ -131,8 +131,9 @@ def load_backbone(
     Args:
         name: "mobilenet_v2" or "googlenet".
         in_channels, stages, width_multiplier: see `Backbone`.
-        weights: "imagenet" requires trained weights; "auto" starts at random, with a warning,
-            where they are not available; "none" starts at random.
+        weights: "imagenet" requires trained weights, from a file or the torch cache; "auto" starts
+            at random, with a warning, where there are none; "download" requires them, and downloads
+            them where there are none; "none" starts at random.  Only "download" uses the network.
 
     Rarely needed:
         weights_file: file of trained weights; see `PublishedWeights.load`.
@@ -140,7 +141,7 @@ def load_backbone(
     Raises:
         InputError: another word for `name` or `weights`, a number out of range, a wrong file,
             or a file with `weights="none"`.
-        PretrainedWeightsUnavailable: `weights="imagenet"` and none were found.
+        PretrainedWeightsUnavailable: `weights` requires them and none were found.
     """
     if name not in ARCHITECTURES:
         raise InputError(f"backbone={name}: allowed are {', '.join(ARCHITECTURES)}")
@@ -152,25 +153,24 @@ def load_backbone(
     found = None
     if weights != "none":
         try:
-            found = _trained_weights(architecture, stages, width_multiplier, weights_file)
+            expected = architecture.trained_parameters(stages, width_multiplier)
+            if weights_file is None and width_multiplier != 1:
+                raise _unpublished(architecture.published, width_multiplier)
+            found = architecture.published.load(weights_file, expected, weights == "download")
         except PretrainedWeightsUnavailable as error:
-            if weights == "imagenet":
+            if weights != "auto":
                 raise
             logger.warning("THE BACKBONE STARTS FROM RANDOM WEIGHTS: %s", error)
     return Backbone(architecture, in_channels, stages, width_multiplier, found)
 
 
-def _trained_weights(
-    architecture: Architecture, stages: int, width_multiplier: float, weights_file: str | None
-) -> dict[str, Tensor]:
-    expected = architecture.trained_parameters(stages, width_multiplier)
-    published = architecture.published
-    if weights_file is None and width_multiplier != 1:
-        raise PretrainedWeightsUnavailable(
-            f"no {published.network} weights are published for width_multiplier="
-            f"{width_multiplier}: give {published.key}=FILE or width_multiplier=1"
-        )
-    return published.load(weights_file, expected)
+def _unpublished(
+    published: PublishedWeights, width_multiplier: float
+) -> PretrainedWeightsUnavailable:
+    return PretrainedWeightsUnavailable(
+        f"no {published.network} weights are published for width_multiplier="
+        f"{width_multiplier}: give {published.key}=FILE or width_multiplier=1"
+    )
 
 
 def _column(values: tuple[float, ...]) -> Tensor:

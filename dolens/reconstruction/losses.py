@@ -16,7 +16,7 @@ from dolens.reconstruction.torchvision_weights import PretrainedWeightsUnavailab
 
 logger = logging.getLogger(__name__)
 
-PERCEPTUAL_CHOICES = ("auto", "vgg16", "vgg16_edges", "none")
+PERCEPTUAL_CHOICES = ("auto", "vgg16", "download", "vgg16_edges", "none")
 
 
 def mean_squared_error(restored: Tensor, truth: Tensor) -> Tensor:
@@ -68,9 +68,11 @@ class RestorationLoss(nn.Module):
         mse_weight: α₁.
         tv_weight: α₂.
         perceptual_weight: α₃; at 0 no VGG-16 weights are looked for.
-        perceptual: "vgg16" requires the perceptual term; "auto" leaves it out, with a warning,
-            where VGG-16's weights are not available; "vgg16_edges" requires it with weights
-            that were trained further to find edges, whose features are larger; "none" omits it.
+        perceptual: "vgg16" requires the perceptual term, with VGG-16's weights from a file or the
+            torch cache; "auto" leaves it out, with a warning, where there are none; "download"
+            requires it, and downloads the weights where there are none; "vgg16_edges" requires it
+            with weights that were trained further to find edges, whose features are larger;
+            "none" omits it.  Only "download" uses the network.
         vgg16_weights: file of VGG-16's weights; see `load_vgg16_weights`, `load_edge_weights`.
         l1_weight: of the mean absolute error; at 0 it is not computed.
 
@@ -164,9 +166,10 @@ def _find_features(perceptual: str, vgg16_weights: str | None) -> tuple[VGG16Fea
         )
         return (VGG16Features(weights, MEAN, STANDARD_DEVIATION),)
     try:
-        return (VGG16Features(load_vgg16_weights(vgg16_weights)),)
+        weights = load_vgg16_weights(vgg16_weights, download=perceptual == "download")
     except PretrainedWeightsUnavailable as error:
-        if perceptual == "vgg16":
+        if perceptual != "auto":
             raise
         logger.warning("TRAINING WITHOUT THE PERCEPTUAL TERM: %s", error)
         return ()
+    return (VGG16Features(weights),)

@@ -20,6 +20,7 @@ VGG16 = PublishedWeights(
     url=VGG16_Weights.IMAGENET1K_V1.url,
     megabytes=528,
     key="loss.vgg16_weights",
+    choice="loss.perceptual",
     prefix="features.",
 )
 
@@ -78,21 +79,24 @@ def perceptual_loss(features: VGG16Features, restored: Tensor, truth: Tensor) ->
     return functional.mse_loss(features(restored), features(truth))
 
 
-def load_vgg16_weights(path: str | None) -> dict[str, Tensor]:
+def load_vgg16_weights(path: str | None, download: bool = False) -> dict[str, Tensor]:
     """Load the weights of VGG-16's first 15 layers; see `PublishedWeights.load`.
 
     Args:
         path: a file saved by `torch.save` with a state dict of the whole VGG-16
-            (`features.0.weight`, …) or of its features alone (`0.weight`, …); or None.
+            (`features.0.weight`, …) or of its features alone (`0.weight`, …); or None, for the
+            torch cache.
+        download: whether 528 MB may be downloaded where there is no file.
 
     Returns:
         Layer parameters by name, `0.weight`, `0.bias`, `2.weight`, …, on the CPU.
 
     Raises:
         InputError: `path`, or the file in the cache, is missing, unreadable or not VGG-16.
-        PretrainedWeightsUnavailable: no path is given, the cache is empty, the download failed.
+        PretrainedWeightsUnavailable: no path is given, the cache is empty, and the download is not
+            allowed or failed.
     """
-    return VGG16.load(path, _empty_layers().state_dict())
+    return VGG16.load(path, _empty_layers().state_dict(), download)
 
 
 def _empty_layers() -> nn.Sequential:

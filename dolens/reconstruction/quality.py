@@ -7,6 +7,8 @@ from torchmetrics.functional.image import (
 )
 
 _WINDOW = 11
+# Pixels of all images that are compared at a time: each takes some 700 bytes.
+_PIXELS = 1 << 19
 
 
 def psnr_db(restored: Tensor, truth: Tensor) -> Tensor:
@@ -36,7 +38,8 @@ def structural_similarity(restored: Tensor, truth: Tensor) -> Tensor:
     """Return the structural similarity (SSIM) of each image.
 
     Gaussian window of 11 pixels, σ = 1.5 pixels, K₁ = 0.01, K₂ = 0.03 (Wang et al. 2004), mean
-    over channels and over the windows that lie inside the image.
+    over channels and over windows about every pixel; beyond its edges an image is mirrored, as in
+    torchmetrics.  Large images are compared in strips of rows, for memory.
 
     Args:
         restored: sRGB values, (B, C, H, W), clamped to [0, 1]; H and W at least 11.
@@ -54,10 +57,23 @@ def structural_similarity(restored: Tensor, truth: Tensor) -> Tensor:
             f"images of {restored.shape[-2]}×{restored.shape[-1]} pixels: structural similarity "
             f"needs at least {_WINDOW}×{_WINDOW}"
         )
-    similarity = structural_similarity_index_measure(
-        restored.clamp(0.0, 1.0), truth.clamp(0.0, 1.0), reduction="none", data_range=1.0
-    )
-    return similarity.reshape(restored.shape[0])
+    batch, _, height, width = restored.shape
+    strip, reach = max(_WINDOW, _PIXELS // (batch * width)), _WINDOW // 2
+    total = restored.new_zeros(batch)
+    for first in range(0, height, strip):
+        # Rows on both sides, as far as a window reaches; a mirror needs some at the image's end.
+        low = max(0, min(first, height - _WINDOW) - reach)
+        high = min(first + strip + reach, height)
+        _, similarity = structural_similarity_index_measure(
+            restored[..., low:high, :].clamp(0.0, 1.0),
+            truth[..., low:high, :].clamp(0.0, 1.0),
+            reduction="none",
+            data_range=1.0,
+            return_full_image=True,
+        )
+        own = similarity[..., first - low : first - low + strip, :]
+        total = total + own.mean((1, 3)).sum(-1)
+    return total / height
 
 
 def _check_shapes(restored: Tensor, truth: Tensor) -> None:

@@ -130,16 +130,17 @@ class FeaturePyramidRestoration(ResidualRestoration):
         stages: of the backbone, from 2 to 5; 5, as in the original, sees at 1/32.
         pyramid_channels: of the pyramid, a multiple of 4; see `FeaturePyramid`.
         field_coordinates: whether it is told where on the sensor a pixel lies.
-        weights: "imagenet" requires trained weights for the backbone; "auto" starts at random,
-            with a warning, where they are not available; "none" starts at random.
+        weights: "imagenet" requires trained weights for the backbone, from a file or the torch
+            cache; "auto" starts at random, with a warning, where there are none; "download"
+            requires them, and downloads them where there are none; "none" starts at random.
 
     Rarely needed:
         width_multiplier: of a MobileNetV2's channels; trained weights are published for 1.
-        weights_file: a file of them; None for the torch cache, then torchvision's download.
+        weights_file: a file of them; None for the torch cache.
 
     Raises:
         InputError: a word or a number that is not allowed, or a wrong file.
-        PretrainedWeightsUnavailable: `weights="imagenet"` and none were found.
+        PretrainedWeightsUnavailable: `weights` requires them and none were found.
     """
 
     def __init__(

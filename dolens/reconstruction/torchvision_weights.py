@@ -1,5 +1,5 @@
-"""Weights that torchvision publishes are read from a file, the torch cache or one announced
-download.
+"""Weights that torchvision publishes are read from a file or the torch cache, and downloaded only
+where the configuration says so.
 """
 
 import logging
@@ -24,8 +24,8 @@ IMAGENET_STANDARD_DEVIATION = (0.229, 0.224, 0.225)
 
 
 class PretrainedWeightsUnavailable(InputError):
-    """Weights were not given, are not cached and cannot be downloaded; the message says what to
-    do.
+    """Weights were not given, are not cached, and were not or could not be downloaded; the message
+    says what to do.
     """
 
 
@@ -39,6 +39,7 @@ class PublishedWeights:
         url: torchvision's address of the file.
         megabytes: size of the download.
         key: the configuration key that names a file of one's own, `group.argument`.
+        choice: the configuration key whose value `download` allows the download.
         prefix: beginning of the wanted parameters' names in the whole network's state dict.
     """
 
@@ -47,6 +48,7 @@ class PublishedWeights:
     url: str
     megabytes: int
     key: str
+    choice: str
     prefix: str = ""
 
     @property
@@ -54,18 +56,22 @@ class PublishedWeights:
         """Return the file's name in the torch cache."""
         return self.url.rsplit("/", 1)[-1]
 
-    def load(self, path: str | None, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def load(
+        self, path: str | None, expected: Mapping[str, Tensor], download: bool = False
+    ) -> dict[str, Tensor]:
         """Find the weights.
 
         In order: the file `path`, if one is given; torchvision's file in the torch cache
-        (`torch.hub.get_dir()`/checkpoints); torchvision's download into that cache, announced
-        as a warning and tried once, with 10 s for each connection and each read.
+        (`torch.hub.get_dir()`/checkpoints); and, with `download` alone, torchvision's download
+        into that cache, announced as a warning and tried once, with 10 s for each connection and
+        each read.  The file that is read is logged.
 
         Args:
             path: a file saved by `torch.save` with a state dict of the whole network or, where
                 there is a prefix, of that part alone, without it; or None.
             expected: tensors of the wanted names, without the prefix, and shapes; values are
                 not looked at, so that they may be on the meta device.
+            download: whether the network may be used where no file is found.
 
         Returns:
             Tensors of exactly the names and shapes of `expected`, on the CPU.
@@ -73,8 +79,8 @@ class PublishedWeights:
         Raises:
             InputError: `path`, or the file in the cache, is missing, unreadable or of another
                 network.
-            PretrainedWeightsUnavailable: no path is given, the cache is empty, the download
-                failed.
+            PretrainedWeightsUnavailable: no path is given, the cache is empty, and the download
+                is not allowed or failed.
         """
         if path is not None:
             file = Path(path).expanduser()
@@ -83,6 +89,11 @@ class PublishedWeights:
             return self._select(file, expected)
         cached = Path(torch.hub.get_dir()).expanduser() / "checkpoints" / self.file_name
         if not cached.is_file():
+            if not download:
+                raise PretrainedWeightsUnavailable(
+                    f"{self._missing(cached)}; or allow the download of {self.url} "
+                    f"({self.megabytes} MB) by {self.choice}=download"
+                )
             self._download(cached)
         return self._select(cached, expected)
 
@@ -111,7 +122,14 @@ class PublishedWeights:
                     f"in {self.network} it is {tuple(wanted.shape)}"
                 )
             weights[name] = value
+        logger.info("%s weights for %s: %s", self.network, self.purpose, file)
         return weights
+
+    def _missing(self, cached: Path) -> str:
+        return (
+            f"no {self.network} weights for {self.purpose}: give {self.key}=FILE; or put "
+            f"{self.file_name} into {cached.parent}"
+        )
 
     def _download(self, destination: Path) -> None:
         logger.warning(
@@ -135,9 +153,7 @@ class PublishedWeights:
         except (OSError, HTTPException, RuntimeError) as error:  # network, disk, or a wrong hash
             reason = one_line(error) or type(error).__name__
             raise PretrainedWeightsUnavailable(
-                f"no {self.network} weights for {self.purpose}: give {self.key}=FILE; or put "
-                f"{self.file_name} into {destination.parent}; or allow the download of {self.url} "
-                f"(it failed: {reason})"
+                f"{self._missing(destination)}; the download of {self.url} failed: {reason}"
             ) from error
         finally:
             socket.setdefaulttimeout(previous)

@@ -28,6 +28,9 @@ _RESTORED = (
 )
 # No picture is larger than this, in multiples of what the network needs.
 _MOST = 4096
+# Rows and columns that a network of any size is traced and checked with: a sensor's million pixels
+# would take minutes and gigabytes, and show no more.
+_TRACED = 256
 
 
 class _WithFunctions(nn.Module):
@@ -139,7 +142,8 @@ def exportable(
 
     Args:
         camera: as trained.
-        size: rows and columns; None: the camera's sensor.
+        size: rows and columns; None: the camera's sensor, or at most 256 pixels of it where the
+            network takes any size.
         multiple: that the sides of images must be of; None: what is known of the network.  Of a
             network of one's own nothing is known, and it takes images of one size only.
 
@@ -163,6 +167,8 @@ def exportable(
         assert functions is not None
         functions = functions.detach().cpu().to(network.dtype)
     if multiple is not None:
+        if size is None:
+            rows, columns = min(rows, _TRACED), min(columns, _TRACED)
         # Traced with a size that the network's own padding leaves alone.
         rows, columns = (max(least, -(-side // multiple)) * multiple for side in (rows, columns))
     inputs = {"raw": _RAW, **({"field": _FIELD} if network.needs_field else {})}

@@ -112,8 +112,7 @@ def load_run(
         checkpoint: `last`, `best`, or the path of a file.
         overrides: as of the command line, applied over the run's own; see `with_overrides`.
         output: where paths of the configuration within the run folder lead to; None: the folder.
-        with_loss: whether the loss is needed: a perceptual one looks for a classifier's weights,
-            and may download them.
+        with_loss: whether the loss is needed: a perceptual one looks for a classifier's weights.
 
     Raises:
         InputError: the folder is none of a run; it has no such checkpoint; a class is not there; or

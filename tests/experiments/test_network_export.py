@@ -67,6 +67,14 @@ def test_a_u_net_takes_any_multiple_of_its_strides_in_both_formats(tmp_path):
     assert torch.equal(loaded(raw, field), expected)
 
 
+def test_a_large_sensor_is_not_what_a_network_of_any_size_is_traced_with(blur):
+    free = camera_of(UNetRestoration(width=2, depth=2), (1142, 100))
+    assert exportable(free).shapes_to_check()[0] == (1, 256, 100)
+    assert exportable(free, (512, 300)).size == (512, 300)  # but for those who ask
+    bound = camera_of(WienerUNetRestoration(width=2, depth=1, margin=4), (300, 40), blur)
+    assert exportable(bound).size == (300, 40)
+
+
 def test_a_deconvolving_network_has_its_lens_built_in(blur, tmp_path):
     network = WienerUNetRestoration(width=2, depth=1, margin=4, noise_to_signal=0.02)
     found = exportable(camera_of(network, (21, 16), blur))

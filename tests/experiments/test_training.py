@@ -342,7 +342,10 @@ BAD_INPUT = {
     "objective without its test": (["test=false"], "needs test=true"),
     "unknown precision": (["lens_dtype=float16"], "allowed: float32, float64"),
     "missing checkpoint": (["ckpt_path=nowhere.ckpt"], "nowhere.ckpt does not exist"),
-    "unknown perceptual loss": (["loss.perceptual=vgg"], "auto, vgg16, vgg16_edges, none"),
+    "unknown perceptual loss": (
+        ["loss.perceptual=vgg"],
+        "auto, vgg16, download, vgg16_edges, none",
+    ),
     "missing weights": (
         ["loss.perceptual=vgg16", "loss.vgg16_weights=nowhere.pth"],
         "nowhere.pth",

@@ -171,19 +171,26 @@ def test_the_torch_cache_serves_without_a_word(classifiers, torch_cache, caplog)
 
 
 @pytest.mark.parametrize("name", CHANNELS)
-def test_auto_without_weights_announces_the_download_and_the_random_start(name, caplog):
+def test_auto_without_weights_announces_the_random_start_and_downloads_nothing(name, caplog):
     with caplog.at_level(logging.WARNING, logger="dolens.reconstruction"):
         backbone = load_backbone(name, stages=2, weights="auto")
     assert not backbone.pretrained
-    announced, missing = (record.getMessage() for record in caplog.records)
-    assert announced.startswith("downloading")
+    (missing,) = (record.getMessage() for record in caplog.records)
     assert missing.startswith("THE BACKBONE STARTS FROM RANDOM WEIGHTS")
-    assert "give network.weights_file=FILE" in missing and "no network in tests" in missing
+    assert "give network.weights_file=FILE" in missing
+    assert missing.endswith("by network.weights=download")
 
 
-def test_imagenet_without_weights_refuses():
+def test_imagenet_without_weights_refuses_and_downloads_nothing(caplog):
     with pytest.raises(PretrainedWeightsUnavailable, match="no MobileNetV2 weights"):
         load_backbone("mobilenet_v2", weights="imagenet")
+    assert caplog.records == []
+
+
+def test_download_announces_itself_and_refuses_where_it_fails(caplog):
+    with pytest.raises(PretrainedWeightsUnavailable, match="no network in tests"):
+        load_backbone("mobilenet_v2", weights="download")
+    assert "downloading MobileNetV2 weights for the network's backbone (14 MB)" in caplog.text
 
 
 def test_none_is_random_in_silence(caplog):
@@ -208,7 +215,7 @@ def test_a_given_file_that_is_missing_or_another_network_s_is_an_error(weights, 
 
 WRONG = {
     "backbone=resnet: allowed are mobilenet_v2, googlenet": {"name": "resnet"},
-    "weights=vgg: allowed are auto, imagenet, none": {"weights": "vgg"},
+    "weights=vgg: allowed are auto, imagenet, download, none": {"weights": "vgg"},
     "stages=1: must be from 2 to 5": {"stages": 1},
     "stages=6: must be from 2 to 5": {"stages": 6},
     "width_multiplier=0": {"width_multiplier": 0},

@@ -142,8 +142,18 @@ def test_auto_without_weights_warns_once_and_trains(caplog):
     torch.testing.assert_close(terms["total"], terms["mse"] + 1e-4 * terms["tv"])
 
 
+def test_only_the_word_download_uses_the_network(caplog):
+    RestorationLoss(perceptual="auto")
+    with pytest.raises(PretrainedWeightsUnavailable):
+        RestorationLoss(perceptual="vgg16")
+    assert "downloading" not in caplog.text
+    with pytest.raises(PretrainedWeightsUnavailable, match="no network in tests"):
+        RestorationLoss(perceptual="download")
+    assert "downloading VGG-16 weights for the perceptual loss (528 MB)" in caplog.text
+
+
 def test_vgg16_without_weights_refuses():
-    with pytest.raises(PretrainedWeightsUnavailable, match="no VGG-16 weights"):
+    with pytest.raises(PretrainedWeightsUnavailable, match=r"by loss\.perceptual=download"):
         RestorationLoss(perceptual="vgg16")
 
 
@@ -155,7 +165,8 @@ def test_a_given_file_that_is_missing_is_an_error_in_every_mode(perceptual):
 
 def test_another_word_gets_the_allowed_ones_and_the_nearest():
     with pytest.raises(
-        InputError, match=r"vgg19: .* auto, vgg16, vgg16_edges, none; did you mean vgg16\?"
+        InputError,
+        match=r"vgg19: .* auto, vgg16, download, vgg16_edges, none; did you mean vgg16\?",
     ):
         RestorationLoss(perceptual="vgg19")
 

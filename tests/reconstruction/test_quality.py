@@ -2,8 +2,9 @@ import math
 
 import pytest
 import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
 
-from dolens.reconstruction import psnr_db, structural_similarity
+from dolens.reconstruction import psnr_db, quality, structural_similarity
 
 
 def truth(batch=2):
@@ -44,6 +45,19 @@ def test_the_worse_image_of_a_batch_scores_lower():
     for measure in (psnr_db, structural_similarity):
         good, bad = measure(restored, truth())
         assert good > bad
+
+
+def test_strips_of_rows_give_the_same_similarity_as_the_whole(monkeypatch):
+    generator = torch.Generator().manual_seed(2)
+    restored = truth() + 0.1 * torch.randn(truth().shape, generator=generator).double()
+    whole = structural_similarity(restored, truth())
+    expected = structural_similarity_index_measure(
+        restored.clamp(0, 1), truth(), reduction="none", data_range=1.0
+    )
+    torch.testing.assert_close(whole, expected)
+    for pixels in (1, 13 * 2 * 20, 23 * 2 * 20):
+        monkeypatch.setattr(quality, "_PIXELS", pixels)
+        torch.testing.assert_close(structural_similarity(restored, truth()), whole)
 
 
 def test_sizes_that_cannot_be_compared_are_refused():
