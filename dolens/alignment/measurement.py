@@ -12,9 +12,9 @@ from torch import Tensor
 from dolens.alignment.diffracted_light import diffracted_light, on_disc
 from dolens.alignment.unmodelled import Unmodelled
 from dolens.errors import InputError
-from dolens.optics.backend import trace_rays
 from dolens.optics.elements import Axes, from_lens_axes, to_lens_axes
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays
 from dolens.rendering.spot_image import SpotImage
 from dolens.sensor.pixels import Sensor

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
-from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays
 
 

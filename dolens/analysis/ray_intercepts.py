@@ -16,9 +16,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, field_tangents, launch
-from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, Status
 
 _DEGREE = 8

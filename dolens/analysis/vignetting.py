@@ -5,8 +5,8 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays
-from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import trace_rays
 
 # Stop coordinates are searched for the edge of the light on so many radii, twice.
 _RADII = 48

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.optics.aiming import launch
-from dolens.optics.backend import trace_rays
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.paraxial import entrance_pupil
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status, TracedRays
 from dolens.optics.system import OpticalSystem
 

@@ -10,10 +10,8 @@ from torch import Tensor
 from dolens.analysis.encircled_energy import EncircledEnergy, checked_radii
 from dolens.analysis.spot_diagram import AIRY, working_f_numbers
 from dolens.diffraction.field_pupil import FieldPupil
-from dolens.diffraction.field_wavefronts import FieldWavefronts, field_wavefronts, object_points
-from dolens.diffraction.pupil_edges import coverage
-from dolens.diffraction.pupil_fit import dilated
-from dolens.diffraction.wavefront import Wavefront
+from dolens.diffraction.field_wavefronts import FieldWavefronts
+from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
@@ -22,8 +20,6 @@ _BEYOND, _AIRY_RADII = 1.1, 3.5
 # Fewest steps of the irradiance's grid to an Airy radius, and most across a window.
 _STEPS, _MOST = 3.5, 512
 _CELLS = 128
-# Samples across the pupil beyond which rays alone make the image: a spot of some 70 Airy radii.
-_MOST_SAMPLES = 512
 
 
 @dataclass(frozen=True)
@@ -57,36 +53,6 @@ class PointSpread:
     airy_radius_um: float
     diffraction: tuple[bool, ...]
     reasons: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class PreparedPupils:
-    """The pupils of F fields, which several analyses may share.
-
-    Attributes:
-        wavefronts: of all fields and wavelengths.
-        pupils: of every field; None for a field without light.
-    """
-
-    wavefronts: FieldWavefronts
-    pupils: list[FieldPupil | None]
-
-
-@torch.no_grad()
-def prepare_pupils(
-    lens: Lens,
-    fields: Sequence[Sequence[float]] | Tensor,
-    wavelengths: Sequence[float] | Tensor,
-    object_distance: float | None = None,
-    wavelength_weights: Sequence[float] | None = None,
-    most_samples: int = _MOST_SAMPLES,
-) -> PreparedPupils:
-    """Trace the wavefronts of every field and fit its pupils; arguments as `point_spread`'s.
-
-    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
-    """
-    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
-    return PreparedPupils(found, field_pupils(lens, found, object_distance, most_samples))
 
 
 @torch.no_grad()
@@ -204,49 +170,6 @@ def diffraction_encircled_energy(
         airy,
         tuple(pupil is not None and pupil.diffraction for pupil in pupils),
     )
-
-
-def field_pupils(
-    lens: Lens,
-    found: FieldWavefronts,
-    object_distance: float | None,
-    most_samples: int = _MOST_SAMPLES,
-) -> list[FieldPupil | None]:
-    """Return the pupils of every field, None for a field without light.
-
-    Wavefronts that need more samples across the pupil than `most_samples` are left to rays.
-    """
-    system = lens.system().double()
-    count = len(found.wavelengths)
-    weights = found.weights.to(system.device)
-    pupils = []
-    for number, lit in enumerate(found.lit.any(1).tolist()):
-        if not lit:
-            pupils.append(None)
-            continue
-        which = torch.arange(number * count, (number + 1) * count, device=system.device)
-        field = found.fields[number].to(system.device).expand(count, 2)
-        point = object_points(field, object_distance)
-        front = _part(found.wavefront, which)
-        pupils.append(FieldPupil.of(system, point, front, weights, most_samples))
-    return pupils
-
-
-def _part(front: Wavefront, which: Tensor) -> Wavefront:
-    """Return some of the wavefronts, with the apertures that clip these."""
-    values = {
-        name: value[which] if isinstance(value, Tensor) else value
-        for name, value in vars(front).items()
-    }
-    passing = dilated(values["coverage"] > 0.0, 2)
-    kept = {}
-    for number, crossing in front.crossings.items():
-        x, y = crossing[which].unbind(-1)
-        if bool((coverage(front.clipping[number].aperture, x, y)[passing] < 1.0).any()):
-            kept[number] = crossing[which]
-    values["crossings"] = kept
-    values["clipping"] = {number: front.clipping[number] for number in kept}
-    return Wavefront(**values)
 
 
 def _half_width(pupil: FieldPupil) -> float:

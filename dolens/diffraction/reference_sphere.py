@@ -11,8 +11,8 @@ from torch import Tensor
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.errors import InputError
 from dolens.optics.aiming import aim
-from dolens.optics.backend import trace_rays
 from dolens.optics.paraxial import exit_pupil
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.system import OpticalSystem
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.modulation_transfer import field_directions
-from dolens.diffraction.point_spread import PreparedPupils, prepare_pupils
+from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
 from dolens.optics.lens import Lens
 
 # Samples across the pupil beyond which rays alone are used: a spot of some 300 Airy radii.

@@ -12,10 +12,10 @@ from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.pupil_edges import coverage
 from dolens.diffraction.reference_sphere import chief_ray_intercepts, sphere_curvature, to_sphere
 from dolens.errors import InputError
-from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays
-from dolens.optics.surfaces.base import SurfaceState
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
 
 MM_PER_NM = 1e-6

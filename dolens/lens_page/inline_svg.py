@@ -2,6 +2,7 @@
 
 import io
 import re
+from html import escape
 
 from matplotlib import rc_context
 from matplotlib.collections import Collection
@@ -9,13 +10,15 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
+from dolens.html import Markup
+
 # More markers than this in one artist become a picture: as vectors they would take megabytes.
 _MANY = 120
 _DOTS_PER_INCH = 200
 _IDS = re.compile(r"""(\bid="|url\(#|href="#)""")
 
 
-def inline_svg(figure: Figure, name: str, label: str) -> str:
+def inline_svg(figure: Figure, name: str, label: str) -> Markup:
     """Return a figure as an SVG element.
 
     Text is drawn as outlines, so that it looks the same everywhere.
@@ -23,7 +26,7 @@ def inline_svg(figure: Figure, name: str, label: str) -> str:
     Args:
         figure: its dense scatters are rasterised; nothing else of it changes.
         name: letters and digits, of this figure alone in its page; its ids begin with it.
-        label: what the figure shows, for readers who do not see it; must be escaped already.
+        label: what the figure shows, for readers who do not see it.
     """
     rasterise(figure)
     buffer = io.StringIO()
@@ -43,8 +46,8 @@ def inline_svg(figure: Figure, name: str, label: str) -> str:
     box = re.search(r'viewBox="[^"]*"', opening)
     # The width in points that the figure has, at most; a narrow screen shrinks it.
     width = figure.get_size_inches()[0] * 96.0
-    return (
-        f'<svg {box[0] if box else ""} role="img" aria-label="{label}" '
+    return Markup(
+        f'<svg {box[0] if box else ""} role="img" aria-label="{escape(label)}" '
         f'style="max-width:{width:.0f}px">{rest.strip()}'
     )
 

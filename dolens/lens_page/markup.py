@@ -1,10 +1,10 @@
-"""A page is assembled: text is escaped, figures stand in it, and nothing is fetched."""
+"""The parts of a page, and the page that is made of them; nothing is fetched."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from importlib.resources import files
 
+from dolens.html import Markup, document, element, joined, table
 from dolens.lens_page.tables import Table
 from dolens.lens_page.viewer import viewer_script
 from dolens.packaged import installed_version
@@ -31,12 +31,12 @@ class Block:
     Attributes:
         name: in addresses within the page.
         title: its heading.
-        body: its elements, escaped.
+        body: its elements.
     """
 
     name: str
     title: str
-    body: str
+    body: Markup
 
 
 def page_html(
@@ -52,81 +52,59 @@ def page_html(
     """
     version = installed_version("dolens") or ""
     css = (files("dolens.lens_page") / "page.css").read_text(encoding="utf-8")
-    contents = "".join(
-        f'<li><a href="#{escape(block.name)}">{escape(block.title)}</a></li>' for block in blocks
+    header = element(
+        "header",
+        element("h1", title),
+        element(
+            "ul",
+            *(element("li", f"{what} ", element("b", value)) for what, value in facts),
+            class_="facts",
+        ),
+        element(
+            "p",
+            *((element("code", command), " · ") if command else ()),
+            f"dolens {version}",
+            class_="made",
+        ),
     )
-    sections = "\n".join(
-        f'<section id="{escape(block.name)}"><h2>{escape(block.title)}</h2>\n{block.body}</section>'
+    links = (element("li", element("a", block.title, href=f"#{block.name}")) for block in blocks)
+    contents = element(
+        "nav",
+        element("details", element("summary", "Contents"), element("ol", *links), open=""),
+        aria_label="Contents",
+    )
+    sections = (
+        element("section", element("h2", block.title), block.body, id=block.name)
         for block in blocks
     )
-    listed = "".join(f"<li>{escape(what)} <b>{escape(value)}</b></li>" for what, value in facts)
-    made = f"<code>{escape(command)}</code> · " if command else ""
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="generator" content="{GENERATOR} {escape(version)}">
-<title>{escape(title)}</title>
-<style>
-{css}</style>
-</head>
-<body>
-{_NIGHT}
-<div class="page">
-<header>
-<h1>{escape(title)}</h1>
-<ul class="facts">{listed}</ul>
-<p class="made">{made}dolens {escape(version)}</p>
-</header>
-<nav aria-label="Contents"><details open><summary>Contents</summary><ol>{contents}</ol></details>
-</nav>
-<main>
-{sections}
-</main>
-</div>
-<script>
-{viewer_script()}</script>
-</body>
-</html>
-"""
+    page = element("div", header, contents, element("main", *sections), class_="page")
+    script = element("script", Markup(viewer_script()))
+    return document(title, css, [Markup(_NIGHT), page, script], f"{GENERATOR} {version}")
 
 
-def table_html(table: Table) -> str:
+def table_html(shown: Table) -> Markup:
     """Return a table as elements."""
-    heads = "".join(
-        f'<th scope="col"{_words(table, column)}>{escape(head)}</th>'
-        for column, head in enumerate(table.heads)
+    last = len(shown.rows) - 1
+    found = table(
+        shown.heads,
+        shown.rows,
+        column_kinds=dict.fromkeys(shown.words, "words"),
+        row_kinds=({last: "total"} if shown.total else {}) | dict.fromkeys(shown.lit, "lit"),
     )
-    rows = []
-    for at, row in enumerate(table.rows):
-        kind = "total" if table.total and at == len(table.rows) - 1 else ""
-        kind = "lit" if at in table.lit else kind
-        cells = "".join(
-            f"<td{_words(table, column)}>{escape(cell)}</td>" for column, cell in enumerate(row)
-        )
-        rows.append(f"<tr{f' class={chr(34)}{kind}{chr(34)}' if kind else ''}>{cells}</tr>")
-    caption = f'<p class="caption">{escape(table.caption)}</p>' if table.caption else ""
-    return (
-        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(rows)}</tbody>'
-        f"</table></div>{caption}\n"
-    )
+    caption = element("p", shown.caption, class_="caption") if shown.caption else None
+    return joined(element("div", found, class_="scroll"), caption)
 
 
-def figure_html(svg: str, picture: bool) -> str:
+def figure_html(svg: Markup, picture: bool) -> Markup:
     """Return a figure as an element; the colours of a picture stay as they are."""
-    return f'<figure class="{"picture" if picture else "drawn"}">{svg}</figure>\n'
+    return element("figure", svg, class_="picture" if picture else "drawn")
 
 
-def note_html(text: str) -> str:
-    """Return a sentence as an element."""
-    return f"<p>{escape(text)}</p>\n" if text else ""
+def note_html(text: str) -> Markup | None:
+    """Return a sentence as an element; None where there is none."""
+    return element("p", text) if text else None
 
 
-def problem_html(text: str) -> str:
+def problem_html(text: str) -> Markup:
     """Return why something is missing, as an element."""
-    return f'<p class="problem">Not computed: {escape(text)}</p>\n'
-
-
-def _words(table: Table, column: int) -> str:
-    return ' class="words"' if column in table.words else ""
+    return element("p", f"Not computed: {text}", class_="problem")

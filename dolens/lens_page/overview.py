@@ -10,13 +10,13 @@ from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
 from dolens.lens_page.tables import (
     Table,
-    field_text,
     first_order_table,
     number,
     prescription_tables,
     seidel_table,
     spot_radii_table,
 )
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 
 # Of each spot; RMS radii err by 1e-4 of themselves or so.
@@ -95,7 +95,7 @@ def summary(lens: Lens, where: Conditions) -> str:
     parts = [f"f = {number(efl)} mm" if abs(efl) < 1e9 else "afocal", f"F/{number(f_number, 3)}"]
     if where.object_distance is not None:
         parts.append(f"object at {number(where.object_distance)} mm")
-    fields = ", ".join(field_text(point, where.field_unit) for point in where.fields)
+    fields = ", ".join(field_label(point, where.field_unit) for point in where.fields)
     waves = ", ".join(f"{float(wave):g}" for wave in where.wavelengths)
     many = len(where.wavelengths) > 1
     parts.append(f"field{'s' * (len(where.fields) > 1)} {fields}")

@@ -3,10 +3,10 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
 
 from dolens.errors import InputError
+from dolens.html import Child, Markup, joined
 from dolens.lens_page.inline_svg import holds_pictures, inline_svg, rasterise
 from dolens.lens_page.markup import (
     GENERATOR,
@@ -20,7 +20,8 @@ from dolens.lens_page.markup import (
 from dolens.lens_page.overview import Overview, lens_overview
 from dolens.lens_page.preparation import prepared_lens
 from dolens.lens_page.sections import Content, PageSections, Section
-from dolens.lens_page.tables import field_text, number
+from dolens.lens_page.tables import number
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.export import save_figure
 
@@ -105,9 +106,7 @@ def is_page(path: str | Path) -> bool:
 def _overview_blocks(overview: Overview, written: Written) -> list[Block]:
     blocks = []
     for section in overview.sections:
-        body = "".join(map(problem_html, section.problems)) + "".join(
-            map(table_html, section.tables)
-        )
+        body = joined(*map(problem_html, section.problems), *map(table_html, section.tables))
         written.problems += [(section.title, problem) for problem in section.problems]
         name = re.sub(r"[^a-z]+", "-", section.title.lower())
         blocks.append(Block(name, section.title, body))
@@ -132,12 +131,12 @@ def _block(section: Section, drawn: bool, folder: str | Path | None, written: Wr
 
 def _body(
     section: Section, content: Content, drawn: bool, folder: str | Path | None, written: Written
-) -> str:
-    parts = [note_html(content.note), content.html]
+) -> Markup:
+    parts: list[Child] = [note_html(content.note), content.html]
     for name, figure in content.figures.items():
         written.figures += 1
         if drawn:
-            label = escape(f"{section.title}: {name.replace('_', ' ')}")
+            label = f"{section.title}: {name.replace('_', ' ')}"
             svg = inline_svg(figure, re.sub(r"\W", "", name), label)
             parts.append(figure_html(svg, holds_pictures(figure)))
         if folder is not None:
@@ -147,7 +146,7 @@ def _body(
     written.problems += [(section.title, problem) for problem in content.problems]
     parts += [problem_html(problem) for problem in content.problems]
     parts += [table_html(table) for table in content.tables]
-    return "".join(parts)
+    return joined(*parts)
 
 
 def _facts(lens: Lens, overview: Overview) -> list[tuple[str, str]]:
@@ -162,7 +161,7 @@ def _facts(lens: Lens, overview: Overview) -> list[tuple[str, str]]:
         facts.append(("object at", f"{number(where.object_distance)} mm"))
         facts.append(("working F-number", number(abs(float(first.working_f_number)), 4)))
     facts.append(
-        ("fields", ", ".join(field_text(point, where.field_unit) for point in where.fields))
+        ("fields", ", ".join(field_label(point, where.field_unit) for point in where.fields))
     )
     waves = [
         f"{float(wave):g}{'*' if float(wave) == where.reference_wavelength else ''}"

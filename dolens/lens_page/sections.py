@@ -24,21 +24,18 @@ from dolens.analysis.modulation_transfer import frequency_range, modulation
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.rms_curves import rms_against_field, rms_against_wavelength
 from dolens.diffraction.illumination import relative_illumination
-from dolens.diffraction.point_spread import (
-    PointSpread,
-    PreparedPupils,
-    diffraction_encircled_energy,
-    point_spread,
-    prepare_pupils,
-)
+from dolens.diffraction.point_spread import PointSpread, diffraction_encircled_energy, point_spread
+from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.diffraction.wavefront_error import wavefront_errors
 from dolens.errors import InputError
+from dolens.html import Markup
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
-from dolens.lens_page.tables import Table, field_text, number
+from dolens.lens_page.tables import Table, number
 from dolens.lens_page.viewer import viewer_html
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.encircled_energy import encircled_energy_figure
 from dolens.plotting.field_curves import field_curves_figure
@@ -65,14 +62,14 @@ class Content:
         figures: file name without suffix → figure.
         tables: below the figures.
         note: a sentence above them.
-        html: elements above them, already escaped.
+        html: elements above them.
         problems: what could not be computed, and why, a sentence each.
     """
 
     figures: dict[str, Figure] = field(default_factory=dict)
     tables: list[Table] = field(default_factory=list)
     note: str = ""
-    html: str = ""
+    html: Markup | None = None
     problems: list[str] = field(default_factory=list)
 
 
@@ -210,7 +207,7 @@ class PageSections:
         found: dict[str, list[str]] = {}
         for point, waves, reason in zip(self.where.fields, diffraction, reasons, strict=True):
             if not waves:
-                text = field_text(point, self.where.field_unit)
+                text = field_label(point, self.where.field_unit)
                 found.setdefault(reason.removeprefix("rays alone: "), []).append(text)
         return [
             f"diffraction at {', '.join(fields)} ({reason})" for reason, fields in found.items()
@@ -253,7 +250,7 @@ class PageSections:
         numbers = (found.rms, found.peak_to_valley, found.strehl_ratio)
         rows = [
             (
-                field_text(point, found.field_unit),
+                field_label(point, found.field_unit),
                 f"{wave:g}",
                 *(number(values[row, column], 3) for values in numbers),
             )
@@ -294,7 +291,7 @@ class PageSections:
             # Where little of the stop is lit, tolerances say nothing of use.
             light = self.overview.spots.valid.double().mean((1, 2))
             bright = light >= _BRIGHT * light.max()
-            dim = [field_text(point, where.field_unit) for point in where.fields[~bright]]
+            dim = [field_label(point, where.field_unit) for point in where.fields[~bright]]
             if dim and bool(bright.any()):
                 where = replace(where, fields=where.fields[bright])
                 problems.append(f"tolerances at {', '.join(dim)}: too little light passes")

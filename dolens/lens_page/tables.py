@@ -1,26 +1,21 @@
 """The tables of a lens: its prescription, first-order data, Seidel sums and spot radii."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
-from dolens.analysis.conditions import Conditions, field_scans, spectral_lines
-from dolens.analysis.spot_diagram import AIRY, SpotDiagram
-from dolens.errors import InputError
+from dolens.analysis.conditions import Conditions
+from dolens.analysis.first_order_numbers import first_order_numbers
+from dolens.analysis.seidel_sums import ABERRATIONS, seidel_sums
+from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.optics.elements import POSE, TILTS
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.prescription_table import SurfaceRow, prescription_table
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import Circle, Outline, Rectangle, Unlimited
 
-SEIDEL_HEADS = ("S I", "S II", "S III", "S IV", "S V", "C L", "C T")
-SEIDEL_NAMES = (
-    *("spherical", "coma", "astigm.", "Petzval", "distort."),
-    *("axial", "lateral"),
-)
 # Columns of coefficients that a page is wide enough for.
 _MOST_TERMS = 8
 
@@ -158,67 +153,32 @@ def elements_table(lens: Lens) -> Table | None:
 
 def first_order_table(lens: Lens, where: Conditions) -> Table:
     """Return first-order data at the reference wavelength."""
-    wavelength, distance = where.reference_wavelength, where.object_distance
-    first = lens.first_order(wavelength, distance)
-    length = float(lens.system().vertices[-2])
-    sensor = float(lens.system().vertices[-1])
-    airy = AIRY * wavelength * 1e-3 * abs(float(first.working_f_number))
-    rows = [
-        ("effective focal length", first.efl, "mm"),
-        ("back focal distance", first.bfd, "mm behind the last vertex"),
-        ("front focal distance", first.ffd, "mm from the first vertex"),
-        ("F-number", first.f_number, "focal length over entrance pupil"),
-    ]
-    if distance is not None:
-        rows += [
-            ("working F-number", first.working_f_number, ""),
-            ("magnification", first.magnification, ""),
-            ("object distance", torch.tensor(distance), "mm in front of the first vertex"),
-        ]
-    rows += [
-        ("entrance pupil diameter", first.entrance_pupil.diameter, "mm"),
-        ("entrance pupil position", first.entrance_pupil.z, "mm from the first vertex"),
-        ("exit pupil diameter", first.exit_pupil.diameter, "mm"),
-        ("exit pupil position", first.exit_pupil.z, "mm from the first vertex"),
-        ("front principal plane", first.front_principal, "mm from the first vertex"),
-        ("rear principal plane", first.rear_principal, "mm from the first vertex"),
-        ("paraxial image", first.image - sensor, "mm behind the sensor"),
-        ("length of the lens", length, "mm, first to last vertex"),
-        ("total track", sensor, "mm, first vertex to sensor"),
-        ("Airy radius", airy, "µm on the sensor"),
-    ]
+    found = first_order_numbers(lens, where.reference_wavelength, where.object_distance)
     return Table(
         ("first order", "value", "unit"),
-        [(name, number(value, 6), unit) for name, value, unit in rows],
-        f"At {wavelength:g} nm.",
+        [
+            (quantity.name, number(quantity.value, quantity.digits), quantity.unit)
+            for quantity in found.quantities()
+        ],
+        f"At {where.reference_wavelength:g} nm.",
         frozenset({0, 2}),
     )
 
 
-@torch.no_grad()
 def seidel_table(lens: Lens, where: Conditions) -> Table:
-    """Return Seidel sums in wavelengths, surface by surface, and their totals.
-
-    The field is the farthest of the lens's own, or its full field where all are on the axis.
-    """
-    wavelength, distance = where.reference_wavelength, where.object_distance
-    try:
-        edge = float(field_scans(lens, distance, count=2)[0].coordinate.abs().max())
-    except InputError:
-        edge = 0.0
-    lines = spectral_lines(lens)
-    short, long = min(lines), max(lines)
-    sums = lens.seidel(edge, wavelength, distance, (short, long))
-    waves = torch.stack(list(sums)).T / (1e-6 * wavelength)
+    """Return Seidel sums in wavelengths, surface by surface, and their totals."""
+    found = seidel_sums(lens, where)
+    waves = found.waves()
     rows = [(str(n), *(_fixed(value) for value in row)) for n, row in enumerate(waves.tolist(), 1)]
     rows.append(("total", *(_fixed(value) for value in waves.sum(0).tolist())))
     unit = where.field_unit if where.field_unit == "°" else " mm"
     posed = "  They are those of the centred lens, without poses." if lens.elements else ""
+    short, long = found.colours
     return Table(
-        ("#", *(f"{h}\n{n}" for h, n in zip(SEIDEL_HEADS, SEIDEL_NAMES, strict=True))),
+        ("#", *(f"{entry.symbol.replace('_', ' ')}\n{entry.short}" for entry in ABERRATIONS)),
         rows,
-        f"In wavelengths of {wavelength:g} nm, at a field of {number(edge, 4)}{unit}; colours from "
-        f"{short:g} to {long:g} nm.{posed}",
+        f"In wavelengths of {found.wavelength:g} nm, at a field of {number(found.edge, 4)}{unit}; "
+        f"colours from {short:g} to {long:g} nm.{posed}",
         frozenset(),
         total=True,
     )
@@ -233,7 +193,7 @@ def spot_radii_table(spots: SpotDiagram, polychromatic: bool = True) -> Table:
         cells = [number(1e3 * value, 4, zeros=True) for value in spots.rms[at].tolist()]
         if many:
             cells.append(number(1e3 * float(spots.polychromatic_rms[at]), 4, zeros=True))
-        rows.append((field_text(point, spots.field_unit), *cells))
+        rows.append((field_label(point, spots.field_unit), *cells))
     airy = [number(1e3 * value, 4, zeros=True) for value in spots.airy_radius.tolist()]
     rows.append(("Airy radius", *airy, *[""] * many))
     caption = "RMS radii in µm about the centroid of each spot"
@@ -241,13 +201,6 @@ def spot_radii_table(spots: SpotDiagram, polychromatic: bool = True) -> Table:
     if bool(spots.rms.isnan().any()):
         caption += "  – : no light passes."
     return Table(heads + ("polychromatic",) * many, rows, caption, total=True)
-
-
-def field_text(point: Sequence[float] | Tensor, unit: str) -> str:
-    """Return a field as text: `14°`, `(3, 14)°`, `−2 mm`."""
-    x, y = (number(value, 6) for value in point)
-    space = "" if unit == "°" else " "
-    return f"{y}{space}{unit}" if x == "0" else f"({x}, {y}){space}{unit}"
 
 
 def _fixed(value: float) -> str:

@@ -2,18 +2,18 @@
 
 import base64
 import json
-from html import escape
 from importlib.resources import files
 
 import numpy as np
 
 from dolens.analysis.conditions import Conditions
+from dolens.html import Markup, element
 from dolens.lens_page.solid import Mesh, Solid
-from dolens.lens_page.tables import field_text
+from dolens.optics.fields import field_label
 from dolens.plotting.style import ordered_colours
 
 
-def viewer_html(found: Solid, where: Conditions) -> str:
+def viewer_html(found: Solid, where: Conditions) -> Markup:
     """Return the elements of a viewer; `viewer_script` brings it to life.
 
     Args:
@@ -21,26 +21,33 @@ def viewer_html(found: Solid, where: Conditions) -> str:
         where: its fields, for the labels of rays.
     """
     shades = ordered_colours(len(found.rays))
-    labels = [field_text(point, where.field_unit) for point in where.fields]
-    boxes = "".join(
-        f'<label><input type="checkbox" data-field="{number}" checked>'
-        f'<span class="key" style="background:{shade}"></span>{escape(label)}'
-        f"{'' if rays else ' (no ray passes)'}</label>"
+    labels = [field_label(point, where.field_unit) for point in where.fields]
+    boxes = (
+        element(
+            "label",
+            element("input", type="checkbox", data_field=str(number), checked=""),
+            element("span", class_="key", style=f"background:{shade}"),
+            f"{label}{'' if rays else ' (no ray passes)'}",
+        )
         for number, (label, shade, rays) in enumerate(zip(labels, shades, found.rays, strict=True))
     )
-    return (
-        '<div id="viewer"><canvas tabindex="0" aria-label="The lens in space; drag to turn it">'
-        "</canvas>"
-        "<noscript><p>The lens in space needs JavaScript.</p></noscript>"
-        '<div class="tools">'
-        '<button type="button" data-view="turned">turned</button>'
-        '<button type="button" data-view="side">from the side</button>'
-        '<button type="button" data-view="front">from the front</button>'
-        '<button type="button" data-zoom="1.25" aria-label="zoom in">+</button>'
-        '<button type="button" data-zoom="0.8" aria-label="zoom out">−</button>'
-        '<label><input type="checkbox" data-cut>cut in half</label>'
-        f'</div><div class="tools">{boxes}</div>'
-        f'<script type="application/json" id="viewer-data">{_data(found, shades)}</script></div>'
+    buttons = (
+        element("button", "turned", type="button", data_view="turned"),
+        element("button", "from the side", type="button", data_view="side"),
+        element("button", "from the front", type="button", data_view="front"),
+        element("button", "+", type="button", data_zoom="1.25", aria_label="zoom in"),
+        element("button", "−", type="button", data_zoom="0.8", aria_label="zoom out"),
+        element("label", element("input", type="checkbox", data_cut=""), "cut in half"),
+    )
+    data = Markup(_data(found, shades))
+    return element(
+        "div",
+        element("canvas", tabindex="0", aria_label="The lens in space; drag to turn it"),
+        element("noscript", element("p", "The lens in space needs JavaScript.")),
+        element("div", *buttons, class_="tools"),
+        element("div", *boxes, class_="tools"),
+        element("script", data, type="application/json", id="viewer-data"),
+        id="viewer",
     )
 
 

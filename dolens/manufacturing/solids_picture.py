@@ -9,7 +9,8 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from dolens.manufacturing.modeller import Shape, box, common, occ, parts
-from dolens.plotting.style import SMALL, TITLE, colours
+from dolens.plotting.style import SMALL, colours
+from dolens.plotting.titles import draw_title
 
 # Triangles stay this close to a solid, as a share of its size.
 _COARSE = 0.002
@@ -77,7 +78,7 @@ def solids_figure(solids: Mapping[str, Shape], title: str) -> Figure:
     figure.legend(
         handles=handles, loc="outside lower center", ncols=6, fontsize=SMALL, frameon=False
     )
-    figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

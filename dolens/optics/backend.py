@@ -1,8 +1,7 @@
 """The implementation that traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from functools import cache
 from itertools import chain, zip_longest
 
@@ -11,19 +10,15 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from dolens.errors import InputError
-from dolens.kernels import operators
-from dolens.optics.packing import pack, unsupported
-from dolens.optics.rays import Components, Rays, TracedRays
+from dolens.optics.packing import unsupported
+from dolens.optics.rays import Rays
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane, traced_rays
 
 logger = logging.getLogger("dolens.kernels")
 
 BACKENDS = ("auto", "reference", "cpu", "cuda")
 # Rays times surfaces below which a lens of backend `auto` is traced without kernels; see `is_few`.
 FEW = 2048
-# So many wavelengths are not searched for equal ones.
-_FEW = 64
 _KERNEL_DTYPES = (torch.float32, torch.float64)
 
 
@@ -126,161 +121,6 @@ def cpu_kernels_serve(system: OpticalSystem, others: Iterable[Tensor] = ()) -> b
     These render, splat and look up images; on other devices PyTorch's operations do.
     """
     return choose_backend(system, others=others) == "cpu"
-
-
-def trace_rays(
-    system: OpticalSystem,
-    rays: Rays,
-    sense: float = 1.0,
-    record: bool = False,
-    first: int = 1,
-    last: int | None = None,
-) -> TracedRays:
-    """Trace rays through surfaces `first` to `last`, and to the sensor where no last is given.
-
-    Args:
-        system: the lens; its `backend` says what traces, see `choose_backend`.
-        rays: as users give them.
-        sense: +1 towards the sensor, -1 towards the object.
-        record: keep the intersections; the reference does this.
-        first: number of the first surface.
-        last: number of the last, or None.
-
-    Raises:
-        InputError: the lens asks for kernels by name that cannot serve.
-    """
-    end = len(system.surfaces) if last is None else last
-    to_sensor = last is None and sense > 0.0
-    reference = record or choose_backend(system, rays) == "reference"
-    finer = torch.promote_types(rays.position.dtype, rays.direction.dtype)
-    ray = before = None
-    if reference or torch.promote_types(finer, system.dtype) != system.dtype:
-        ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
-    if reference:
-        traced = trace_surfaces(
-            system, ray, rays.wavelength, sense, True, record, first=first, last=last
-        )
-        if to_sensor:
-            traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, sense)
-        return traced_rays(traced, before)
-    position, direction, shape = _joined(system, rays, ray, before)
-    table = pack(system, rays.wavelength, sense, first, end, to_sensor)
-    position, direction, path, status, surface = operators.trace(
-        table.values,
-        table.indices,
-        position,
-        direction,
-        _columns(rays.wavelength, shape, system.device),
-        table.codes,
-        table.extras,
-    )
-    path = path.reshape(shape)
-    if before is not None:
-        path = torch.where(status.reshape(shape) == 0, path + before, path + before.detach())
-    status = status.reshape(shape)
-    return TracedRays(
-        position=position.reshape(*shape, 3),
-        direction=direction.reshape(*shape, 3),
-        valid=status == 0,
-        status=status,
-        surface=surface.reshape(shape),
-        path_length=path,
-    )
-
-
-def trace_components(
-    system: OpticalSystem, ray: Components, wavelength: float | Tensor, sense: float
-) -> tuple[Components, Tensor]:
-    """Trace rays through the whole lens without statuses and path lengths.
-
-    Args:
-        system: the lens; its `backend` says what traces.
-        ray: one broadcast shape, in the lens's precision, mm, z from the first vertex.
-        wavelength: nm; a tensor broadcasts with the rays.
-        sense: +1 towards the sensor, -1 towards the object.
-
-    Returns:
-        The rays: on the sensor plane, or on surface 1 for a sense of -1; and bool, which of them
-        are valid, as in `TracedRays`.
-    """
-    rays = Rays.from_components(ray, wavelength)
-    if sense < 0.0 and choose_backend(system, rays) == "reference":
-        traced = trace_surfaces(system, ray, wavelength, sense)
-        return traced.ray, traced.valid
-    hit = trace_rays(system, rays, sense)
-    return hit.components(), hit.valid
-
-
-def _joined(
-    system: OpticalSystem, rays: Rays, ray: Components | None, before: Tensor | None
-) -> tuple[Tensor, Tensor, tuple[int, ...]]:
-    """Positions and directions (N, 3), and the leading shape; of `ray` where it was moved."""
-    if ray is not None and before is not None:
-        position, direction, shape = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1), ray.x.shape
-    else:
-        # As the user gave them: views of (..., 3), which a kernel reads in place.
-        options, shape = {"device": system.device, "dtype": system.dtype}, _shape(rays)
-        position = rays.position.to(**options).expand(*shape, 3)
-        direction = rays.direction.to(**options).expand(*shape, 3)
-    return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(shape)
-
-
-@dataclass(frozen=True)
-class FlatRays:
-    """Rays before a lens as a kernel takes them, in the lens's precision.
-
-    Attributes:
-        position: (N, 3), mm.
-        direction: (N, 3).
-        wavelengths: nm, the distinct ones.
-        column: (N,), int32: which of them a ray has, or None where there is one.
-        before: (N,), mm: optical path to where the rays were moved, or None.
-        shape: the leading shape that they had.
-    """
-
-    position: Tensor
-    direction: Tensor
-    wavelengths: Sequence[float]
-    column: Tensor | None
-    before: Tensor | None
-    shape: tuple[int, ...]
-
-
-@torch.no_grad()
-def flat_rays(system: OpticalSystem, rays: Rays) -> FlatRays:
-    """Rays towards the first surface, without a graph; wavelengths that repeat are one."""
-    ray = before = None
-    if torch.promote_types(rays.position.dtype, system.dtype) != system.dtype:
-        ray, before = enter_lens(system, rays, 1, 1.0)
-    position, direction, shape = _joined(system, rays, ray, before)
-    wavelength = rays.wavelength
-    if isinstance(wavelength, Tensor) and wavelength.numel() > _FEW:
-        wavelength, column = wavelength.unique(return_inverse=True)
-        column = column.to(device=system.device, dtype=torch.int32)
-        column = column.expand(shape).reshape(-1).contiguous()
-    else:
-        column = _columns(wavelength, shape, system.device)
-    if before is not None:
-        before = before.expand(shape).reshape(-1)
-    several = wavelength.reshape(-1).tolist() if isinstance(wavelength, Tensor) else (wavelength,)
-    return FlatRays(position, direction, several, column, before, shape)
-
-
-def _shape(rays: Rays) -> tuple[int, ...]:
-    """The common leading shape of a bundle."""
-    if rays.position.shape == rays.direction.shape and not isinstance(rays.wavelength, Tensor):
-        return tuple(rays.position.shape[:-1])
-    return tuple(rays.components().x.shape)
-
-
-def _columns(
-    wavelength: float | Tensor, shape: tuple[int, ...], device: torch.device
-) -> Tensor | None:
-    """Each ray's column of the table's indices, (N,) int32; None where there is but one."""
-    if not isinstance(wavelength, Tensor) or wavelength.numel() == 1:
-        return None
-    columns = torch.arange(wavelength.numel(), dtype=torch.int32, device=device)
-    return columns.reshape(wavelength.shape).expand(shape).reshape(-1).contiguous()
 
 
 def _tensors(system: OpticalSystem, rays: Rays | None) -> Iterator[Tensor]:

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.backend import choose_backend, flat_rays
+from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack_with_variables
+from dolens.optics.ray_tracing import flat_rays
 from dolens.optics.rays import Rays
 from dolens.optics.reference_jacobian import reference_jacobian, reference_sums
 from dolens.optics.system import OpticalSystem

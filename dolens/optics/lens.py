@@ -8,21 +8,20 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
-from dolens.optics.aiming import AimedRays, aim
-from dolens.optics.backend import check_backend, is_few, trace_rays
+from dolens.optics.backend import check_backend, is_few
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
+from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
-from dolens.optics.paraxial import FirstOrder, first_order, vergence
-from dolens.optics.paraxial_rays import ParaxialRays, paraxial_rays
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
-from dolens.optics.seidel import Seidel, seidel
-from dolens.optics.surfaces.base import Surface, SurfaceState
+from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
 
 
-class Lens(LensViews, nn.Module):
+class Lens(LensRays, LensViews, nn.Module):
     """Surfaces, gaps, media and a sensor plane.
 
     Parameters are named as users write them: `surfaces.1.curvature`, `surfaces.5.x2y`,
@@ -227,101 +226,6 @@ class Lens(LensViews, nn.Module):
         """
         self._check_range(first, last)
         return trace_rays(self._system_for(rays), rays, -1.0, record, first, last)
-
-    def first_order(
-        self, wavelength: float | Tensor = 587.5618, object_distance: float | Tensor | None = None
-    ) -> FirstOrder:
-        """EFL, cardinal points, pupils, F-number, magnification at a wavelength in nm."""
-        return first_order(self.system(), wavelength, object_distance)
-
-    def paraxial_rays(
-        self,
-        field: float | Tensor,
-        wavelength: float | Tensor = 587.5618,
-        object_distance: float | Tensor | None = None,
-    ) -> ParaxialRays:
-        """Paraxial marginal and chief ray at every surface, and Lagrange's invariant.
-
-        Args:
-            field: along y, degrees or mm.
-            wavelength: nm.
-            object_distance: mm, or None for infinity.
-        """
-        field = self._field(field, object_distance)
-        return paraxial_rays(self.system(), wavelength, field, object_distance)
-
-    def seidel(
-        self,
-        field: float | Tensor,
-        wavelength: float | Tensor = 587.5618,
-        object_distance: float | Tensor | None = None,
-        color: tuple[float, float] = (486.1327, 656.2725),
-    ) -> Seidel:
-        """Seidel sums in mm of wave aberration, surface by surface; `.total` is the lens's.
-
-        Args:
-            field: edge of the field, degrees or mm.
-            wavelength: nm.
-            object_distance: mm, or None for infinity.
-            color: shorter and longer wavelength of the chromatic sums, nm.
-        """
-        field = self._field(field, object_distance)
-        return seidel(self.system(), wavelength, field, object_distance, color)
-
-    def aim(
-        self,
-        field: Sequence[float] | Tensor,
-        pupil: Sequence[float] | Tensor,
-        wavelength: float | Tensor = 587.5618,
-        object_distance: float | Tensor | None = None,
-    ) -> AimedRays:
-        """Real rays that cross the stop at given points; see `dolens.optics.aiming`.
-
-        Args:
-            field: (..., 2), degrees or mm.
-            pupil: (..., 2), x and y on the stop over its semi-diameter.
-            wavelength: nm, a number or (...).
-            object_distance: mm, or None for infinity.
-        """
-        options = {"dtype": self.dtype, "device": self.device}
-        field = self._field(field, object_distance)
-        pupil = torch.as_tensor(pupil, **options)
-        for what, values in (("field", field), ("pupil", pupil)):
-            if values.shape[-1:] != (2,):
-                raise InputError(f"{what} must be x and y, (..., 2), not {tuple(values.shape)}")
-        return aim(self.system(), field, pupil, wavelength, object_distance)
-
-    def chief_ray(
-        self,
-        field: Sequence[float] | Tensor,
-        wavelength: float | Tensor = 587.5618,
-        object_distance: float | Tensor | None = None,
-    ) -> AimedRays:
-        """The real ray of a field, (..., 2), through the centre of the stop; see `aim`."""
-        return self.aim(field, (0.0, 0.0), wavelength, object_distance)
-
-    def marginal_rays(
-        self,
-        field: Sequence[float] | Tensor,
-        wavelength: float | Tensor = 587.5618,
-        object_distance: float | Tensor | None = None,
-    ) -> AimedRays:
-        """Real rays of a field, (..., 2), to the stop's edge: upper, lower, sagittal, (..., 3).
-
-        They cross it at +y, -y and +x; `wavelength` broadcasts with (..., 3).
-        """
-        field = torch.as_tensor(field, dtype=self.dtype, device=self.device)[..., None, :]
-        edge = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0))
-        return self.aim(field, edge, wavelength, object_distance)
-
-    def _field(
-        self, field: float | Sequence[float] | Tensor, object_distance: float | Tensor | None
-    ) -> Tensor:
-        """Radians for an object at infinity, mm for a finite one."""
-        field = torch.as_tensor(field, dtype=self.dtype, device=self.device)
-        near = torch.as_tensor(vergence(object_distance), dtype=self.dtype, device=self.device)
-        near = near[..., None] if near.ndim else near
-        return torch.where(near == 0.0, torch.deg2rad(field), field)
 
     def _system_for(self, rays: Rays) -> OpticalSystem:
         """The lens, traced by the reference if these rays are few."""

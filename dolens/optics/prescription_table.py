@@ -141,14 +141,14 @@ class PrescriptionTable:
 
     def text(self) -> str:
         """Return the table as lines of text."""
-        return "\n".join([self.heading, text_table(HEADINGS, self.cells(), 2), *self.notes])
+        return "\n".join([self.heading, text_table(HEADINGS, self.cells(), {0, 1}), *self.notes])
 
     def html(self) -> str:
         """Return the table as HTML, all text escaped."""
         rows = [["∞" if cell == "inf" else cell for cell in row] for row in self.cells()]
         notes = [[note] for note in self.notes]
         beside = html_table(["elements"], notes) if notes else ""
-        return html_table(HEADINGS, rows, self.heading, 2) + beside
+        return html_table(HEADINGS, rows, self.heading, {0, 1}) + beside
 
 
 @torch.no_grad()

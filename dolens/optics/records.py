@@ -16,8 +16,8 @@ from torch import Tensor
 from dolens.kernels.table import Code, Kind, Outline, Slot
 from dolens.optics.elements import carriers
 from dolens.optics.materials import Medium
-from dolens.optics.surfaces.base import FAR
 from dolens.optics.surfaces.clear_aperture import ClearAperture
+from dolens.optics.surfaces.refraction import FAR
 
 
 class Form(NamedTuple):

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, TracedRays
 
 # Numbers of a Jacobian that are held at a time while normal equations are added up.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.materials import Medium
-from dolens.optics.surfaces.base import SurfaceState
+from dolens.optics.surfaces.state import SurfaceState
 
 
 @dataclass(frozen=True)

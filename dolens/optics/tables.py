@@ -1,52 +1,55 @@
 """Tables of plain text cells are laid out for a terminal and for a notebook."""
 
-import html
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+
+from dolens.html import Markup, element
 
 Cells = Sequence[Sequence[str]]
 
 
-def text_table(headings: Sequence[str], rows: Cells, left: int = 1) -> str:
+def text_table(headings: Sequence[str], rows: Cells, left: Collection[int] = (0,)) -> str:
     """Return a table as lines of text, columns two spaces apart.
 
     Args:
         headings: of the columns.
         rows: as many cells each.
-        left: columns from the first that are flush left; the others are flush right.
+        left: numbers of the columns that are flush left; the others are flush right.
     """
     every = [[printable(cell) for cell in row] for row in (headings, *rows)]
     widths = [max(map(len, column)) for column in zip(*every, strict=True)]
     lines = []
     for row in every:
         cells = [
-            cell.ljust(width) if number < left else cell.rjust(width)
+            cell.ljust(width) if number in left else cell.rjust(width)
             for number, (cell, width) in enumerate(zip(row, widths, strict=True))
         ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
 
 
-def html_table(headings: Sequence[str], rows: Cells, caption: str = "", left: int = 1) -> str:
+def html_table(
+    headings: Sequence[str], rows: Cells, caption: str = "", left: Collection[int] = (0,)
+) -> str:
     """Return a table as HTML; all text is escaped.
 
     Args:
         headings: of the columns.
         rows: as many cells each.
         caption: above the table.
-        left: columns from the first that are flush left; the others are flush right.
+        left: numbers of the columns that are flush left; the others are flush right.
     """
+    sides = [f"text-align:{'left' if n in left else 'right'}" for n in range(len(headings))]
 
-    def line(tag: str, cells: Sequence[str]) -> str:
-        side = ["left" if number < left else "right" for number in range(len(cells))]
-        written = (
-            f'<{tag} style="text-align:{where}">{html.escape(printable(cell))}</{tag}>'
-            for where, cell in zip(side, cells, strict=True)
-        )
-        return f"<tr>{''.join(written)}</tr>"
+    def line(tag: str, cells: Sequence[str]) -> Markup:
+        pairs = zip(cells, sides, strict=True)
+        return element("tr", *(element(tag, printable(cell), style=side) for cell, side in pairs))
 
-    head = f"<caption>{html.escape(printable(caption))}</caption>" if caption else ""
-    body = "".join(line("td", [minus(cell) for cell in row]) for row in rows)
-    return f"<table>{head}<thead>{line('th', headings)}</thead><tbody>{body}</tbody></table>"
+    return element(
+        "table",
+        element("caption", printable(caption)) if caption else None,
+        element("thead", line("th", headings)),
+        element("tbody", *(line("td", [minus(cell) for cell in row]) for row in rows)),
+    )
 
 
 def printable(text: str) -> str:

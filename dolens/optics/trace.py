@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.optics.elements import LENS_AXES, change_axes, to_lens_axes
 from dolens.optics.rays import Components, Rays, Status, TracedRays
-from dolens.optics.surfaces.base import FAR, GRAZING, PlaneRay
+from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay
 from dolens.optics.system import OpticalSystem
 
 

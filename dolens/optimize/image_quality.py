@@ -17,8 +17,8 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError, check_choice
-from dolens.optics.backend import trace_rays
 from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Status, TracedRays
 from dolens.optimize.linear_model import LinearModel
 

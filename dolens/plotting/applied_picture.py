@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from dolens.plotting.style import SMALL
+from dolens.plotting.titles import draw_title
 
 _PANEL = 3.6  # inches
 _PART = 160  # pixels along each side of the part
@@ -52,8 +53,7 @@ def applied_figure(
         for panel in (whole, part):
             panel.set(xticks=[], yticks=[])
             panel.spines[:].set_visible(False)
-    if title:
-        figure.suptitle(title)
+    draw_title(figure, title)
     return figure
 
 

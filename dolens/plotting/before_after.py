@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from dolens.optics.lens import Lens
 from dolens.plotting.drawing import draw_layout, layout_drawing
 from dolens.plotting.layout import WIDTH, drawn_height, layout_title
-from dolens.plotting.style import TITLE
+from dolens.plotting.titles import draw_axes_title
 
 
 @torch.no_grad()
@@ -54,10 +54,11 @@ def before_after_figure(
         draw_layout(axes, drawing, z_limits, half_height, legend=number == 0)
         if titles is None:
             line = drawing.fans[0].wavelength
-            name = layout_title(lens, drawing.system, line, object_distance)
             stage = ("initial", "final")[number]
-            axes.set_title(f"({'ab'[number]}) {stage}: {name}", fontsize=TITLE)
+            name = layout_title(lens, drawing.system, line, object_distance, stage)
+            title = f"({'ab'[number]}) {name}"
         else:
-            axes.set_title(titles[number], fontsize=TITLE)
+            title = titles[number]
+        draw_axes_title(axes, title)
     grid[0].set_xlabel("")
     return figure

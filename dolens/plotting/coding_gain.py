@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from dolens.plotting.style import PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
+from dolens.plotting.titles import draw_title
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,5 @@ def coding_gain_figure(
             frameon=False,
             fontsize=SMALL,
         )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.plotting.style import PAGE, SMALL, TITLE
+from dolens.plotting.titles import draw_title
 
 # Inches: a picture is shown about one to one at 120 dpi, unless that is tiny or huge.
 _SMALLEST, _LARGEST = 1.7, 3.2
@@ -80,8 +81,7 @@ def comparison_figure(
             known = psnr is not None and name in psnr
             quality = f": {float(psnr[name][column]):.1f} dB" if known else ""
             axes.set_title(f"{name}, {label}{quality}", fontsize=SMALL)
-    if title:
-        figure.suptitle(title, fontsize=TITLE - 1)
+    draw_title(figure, title, TITLE - 1)
     return figure
 
 

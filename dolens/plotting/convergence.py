@@ -7,7 +7,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dolens.errors import InputError
-from dolens.plotting.style import PAGE, SMALL, TITLE, line_styles, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, line_styles, ruled_axes
+from dolens.plotting.titles import draw_title
 
 # Up to here each iteration is worth a dot.
 _FEW = 40
@@ -85,8 +86,7 @@ def convergence_figure(
     grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10), min_n_ticks=1))
     grid[-1].set_xlim(0.5, count + 0.5)
     figure.align_ylabels()
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

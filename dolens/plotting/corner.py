@@ -14,7 +14,8 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.plotting.number_text import MINUS, number_text, value_and_error
-from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE
+from dolens.plotting.style import PAGE, PALETTE, SMALL
+from dolens.plotting.titles import draw_title
 
 _SIGMAS = (1.0, 2.0)
 # Axes reach this far, in σ; further where points or the truth are, up to the second number.
@@ -125,8 +126,7 @@ def corner_figure(
         beyond = "all" if far.all() else beyond
         note = f"truth more than {_FURTHEST:g}σ off, not drawn: {beyond}"
         title = f"{title}\n{note}" if title else note
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

@@ -9,7 +9,9 @@ from scipy.special import j0, j1
 
 from dolens.analysis.encircled_energy import EncircledEnergy
 from dolens.analysis.spot_diagram import AIRY
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL, ordered_colours, ruled_axes
+from dolens.plotting.titles import draw_title
 
 
 def encircled_energy_figure(
@@ -69,6 +71,5 @@ def encircled_energy_figure(
         frameon=False,
         fontsize=SMALL,
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure

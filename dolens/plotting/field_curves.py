@@ -13,11 +13,11 @@ from dolens.analysis.field_curves import FieldCurves
 from dolens.plotting.style import (
     PAGE,
     SMALL,
-    TITLE,
     ruled_axes,
     spectral_colour,
     wavelength_handles,
 )
+from dolens.plotting.titles import draw_title
 
 # Half widths of axes whose curves do not leave zero, mm and percent.
 _FLAT, _UNDISTORTED = 1e-4, 0.01
@@ -62,8 +62,7 @@ def field_curves_figure(
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

@@ -6,8 +6,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterMathtext, LogLocator, MaxNLocator, NullLocator
 
 from dolens.errors import InputError
-from dolens.plotting.style import PALETTE, SMALL, TITLE, ruled_axes
+from dolens.plotting.style import PALETTE, SMALL, ruled_axes
 from dolens.plotting.ticks import log_ticks
+from dolens.plotting.titles import draw_axes_title
 
 _FEW = 40
 # The height of the merit's axes over that of the damping's.
@@ -62,6 +63,5 @@ def history_figure(
     grid[-1].set_xlabel("iteration", fontsize=SMALL + 1)
     grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10)))
     figure.align_ylabels()
-    if title:
-        grid[0].set_title(title, fontsize=TITLE)
+    draw_axes_title(grid[0], title)
     return figure

@@ -6,7 +6,8 @@ from matplotlib.figure import Figure
 
 from dolens.diffraction.illumination import Illumination
 from dolens.plotting.field_curves import note_if_empty, scan_label
-from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, ruled_axes
+from dolens.plotting.style import PAGE, PALETTE, SMALL, ruled_axes
+from dolens.plotting.titles import draw_title
 
 
 def illumination_figure(
@@ -40,6 +41,5 @@ def illumination_figure(
     figure.legend(
         handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=SMALL
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.lateral_colour import FocalShift, LateralColour
 from dolens.plotting.field_curves import draw_field_limits, note_if_empty, scan_label
-from dolens.plotting.style import PAGE, SMALL, TITLE, ruled_axes, spectral_colour
+from dolens.plotting.style import PAGE, SMALL, ruled_axes, spectral_colour
+from dolens.plotting.titles import draw_title
 
 _BAND = "#E8E8E8"
 
@@ -45,8 +46,7 @@ def lateral_colour_figure(
         frameon=False,
         fontsize=SMALL,
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

@@ -17,7 +17,8 @@ from dolens.optics.system import OpticalSystem
 from dolens.plotting.drawing import draw_layout, layout_drawing
 from dolens.plotting.number_text import number_text, with_minus
 from dolens.plotting.section import SAMPLES, sag_of
-from dolens.plotting.style import PAGE, SMALL, TITLE, open_axes
+from dolens.plotting.style import PAGE, SMALL, open_axes
+from dolens.plotting.titles import draw_axes_title
 
 # A sag below this share of the height of the drawing cannot be seen.
 _VISIBLE = 0.02
@@ -88,7 +89,7 @@ def layout_figure(
     line = drawing.fans[0].wavelength
     if title is None:
         title = layout_title(lens, system, line, object_distance)
-    axes.set_title(title, fontsize=TITLE)
+    draw_axes_title(axes, title)
     return figure
 
 
@@ -101,11 +102,18 @@ def drawn_height(z_limits: tuple[float, float], half_height: float, legend: bool
 
 
 def layout_title(
-    lens: Lens, system: OpticalSystem, wavelength: float, object_distance: float | None = None
+    lens: Lens,
+    system: OpticalSystem,
+    wavelength: float,
+    object_distance: float | None = None,
+    stage: str | None = None,
 ) -> str:
-    """Return the lens's name, its focal length at a wavelength in nm, and its working F-number."""
+    """Return the lens's name, its focal length at a wavelength in nm, and its working F-number.
+
+    A stage, as `final`, stands behind the name.
+    """
     optics = optics_text(system, wavelength, object_distance)
-    name = shown_name(lens)
+    name = ", ".join(part for part in (shown_name(lens), stage) if part)
     return f"{name}: {optics}" if name else optics
 
 

@@ -7,11 +7,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
 from dolens.plotting.captions import caption
 from dolens.plotting.layout import layout_figure
-from dolens.plotting.style import field_label
 
 
 @torch.no_grad()

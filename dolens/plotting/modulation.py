@@ -9,7 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from dolens.analysis.modulation_transfer import Modulation
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL, ordered_colours, ruled_axes
+from dolens.plotting.titles import draw_title
 
 _TANGENTIAL, _SAGITTAL = "-", (0, (1, 1.2))
 # Curves that differ by less are one on paper.
@@ -54,8 +56,7 @@ def modulation_figure(
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

@@ -10,7 +10,9 @@ from matplotlib.lines import Line2D
 from dolens.analysis.modulation_transfer import Modulation
 from dolens.diffraction.transfer import DiffractionModulation
 from dolens.errors import InputError
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label, ordered_colours, ruled_axes
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL, ordered_colours, ruled_axes
+from dolens.plotting.titles import draw_title
 
 
 def modulation_comparison_figure(
@@ -64,8 +66,7 @@ def modulation_comparison_figure(
     figure.legend(handles=handles, loc="outside right center", frameon=False, fontsize=SMALL)
     grid[0].set(ylim=(0.0, 1.02))
     grid[0].set_ylabel("modulation", fontsize=SMALL + 1)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from dolens.plotting.label_placement import place_labels
-from dolens.plotting.style import MARKERS, PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.style import MARKERS, PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
+from dolens.plotting.titles import draw_axes_title
 
 # Room around the points, as a share of the axes' length in decades, and at least in decades.
 _ROOM, _LEAST_ROOM = 0.12, 0.15
@@ -87,8 +88,7 @@ def pareto_figure(
     figure.legend(
         handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=SMALL
     )
-    if title:
-        axes.set_title(title, fontsize=TITLE)
+    draw_axes_title(axes, title)
     # One text for points at one place.
     place_labels(axes, list(dict.fromkeys(labels)), SMALL - 1)
     return figure

@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dolens.diffraction.point_spread import PointSpread
-from dolens.plotting.style import PAGE, SMALL, TITLE, field_label
+from dolens.optics.fields import field_label
+from dolens.plotting.style import PAGE, SMALL
+from dolens.plotting.titles import draw_title
 
 # Lightness grows evenly, for colour-blind readers and in print too.
 _COLOURS = "inferno"
@@ -48,8 +50,7 @@ def point_spread_figure(psf: PointSpread, title: str | None = "Point spread func
     )
     bar.ax.set_yticklabels(("0", "0.01", "0.1", "0.25", "0.5", "1"), fontsize=SMALL)
     bar.set_label("irradiance / peak", fontsize=SMALL + 1)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

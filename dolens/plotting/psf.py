@@ -11,6 +11,7 @@ from dolens.errors import InputError
 from dolens.plotting.number_text import number_text
 from dolens.plotting.scale_bar import scale_bar
 from dolens.plotting.style import PAGE, SMALL, TITLE
+from dolens.plotting.titles import draw_title
 from dolens.sensor.colour import linear_to_srgb
 
 _ENERGY = 0.998
@@ -64,7 +65,7 @@ def psf_figure(
         axes.set_title(f"{label}\npeak {number_text(float(peak), 2)}", fontsize=SMALL)
         if number == 0:
             scale_bar(axes, size, pixel_pitch_mm)
-    figure.suptitle(f"{title}\n{note}" if title else note, fontsize=TITLE if title else SMALL)
+    draw_title(figure, f"{title}\n{note}" if title else note, TITLE if title else SMALL)
     return figure
 
 

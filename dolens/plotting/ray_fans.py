@@ -4,16 +4,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dolens.analysis.ray_fans import RayFans
+from dolens.optics.fields import field_label
 from dolens.plotting.style import (
     DASHES,
     PAGE,
     SMALL,
-    TITLE,
-    field_label,
     ruled_axes,
     spectral_colour,
     wavelength_handles,
 )
+from dolens.plotting.titles import draw_title
 
 _HEIGHT = 1.45
 
@@ -80,6 +80,5 @@ def ray_fans_figure(
     figure.legend(
         handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure

@@ -5,19 +5,20 @@ from collections.abc import Sequence
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from dolens.analysis.rms_curves import RMSCurves
 from dolens.errors import InputError
+from dolens.optics.fields import field_label
 from dolens.plotting.style import (
     DASHES,
     PAGE,
     SMALL,
-    TITLE,
-    field_label,
     ordered_colours,
     ruled_axes,
     spectral_colour,
 )
+from dolens.plotting.titles import draw_title
 
 # Lines that differ by less of the largest radius are one on paper.
 _SAME = 2e-3
@@ -71,8 +72,7 @@ def rms_curves_figure(
     for axes in grid[0]:
         axes.set_ylim(bottom=0.0)
     grid[0, 0].set_ylabel("RMS spot radius (µm)", fontsize=SMALL + 1)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 
@@ -83,10 +83,10 @@ def _comparable(given: Sequence[tuple[RMSCurves, object]]) -> bool:
 
 
 def _over_field(axes: Axes, curves: RMSCurves) -> None:
-    length = curves.fields.norm(dim=-1).numpy()
+    place = _places(curves.fields).numpy()
     for wave, wavelength in enumerate(curves.wavelengths):
         axes.plot(
-            length,
+            place,
             1e3 * curves.rms[:, wave].numpy(),
             color=spectral_colour(float(wavelength)),
             linestyle=DASHES[wave % len(DASHES)],
@@ -95,11 +95,11 @@ def _over_field(axes: Axes, curves: RMSCurves) -> None:
         )
     if len(curves.wavelengths) > 1:
         together = 1e3 * curves.polychromatic.numpy()
-        axes.plot(length, together, color="black", linewidth=1.8, label="all, common centroid")
+        axes.plot(place, together, color="black", linewidth=1.8, label="all, common centroid")
     airy = 1e3 * float(torch.median(curves.airy_radius))
-    axes.plot(length, [airy] * len(length), color="0.6", linewidth=2.5, label="Airy radius")
-    axes.set_xlabel(f"field ({curves.field_unit})", fontsize=SMALL + 1)
-    axes.set_xlim(length.min(), length.max())
+    axes.plot(place, [airy] * len(place), color="0.6", linewidth=2.5, label="Airy radius")
+    axes.set_xlabel(_field_axis(curves), fontsize=SMALL + 1)
+    axes.set_xlim(place.min(), place.max())
 
 
 def _over_wavelength(axes: Axes, curves: RMSCurves) -> None:
@@ -118,6 +118,24 @@ def _over_wavelength(axes: Axes, curves: RMSCurves) -> None:
     axes.plot(waves, airy, color="0.6", linewidth=2.5, label="Airy radius")
     axes.set_xlabel("wavelength (nm)", fontsize=SMALL + 1)
     axes.set_xlim(waves.min(), waves.max())
+
+
+def _places(fields: Tensor) -> Tensor:
+    """Return the fields' places (F,) along the direction of the last one, negative beyond the axis.
+
+    Fields that do not lie along it are at their distances from the axis.
+    """
+    last = fields[-1]
+    along = fields @ last / last.norm().clamp(min=1e-12)
+    distance = fields.norm(dim=-1)
+    return along if torch.allclose(along.abs(), distance) else distance
+
+
+def _field_axis(curves: RMSCurves) -> str:
+    """Return the label of the axis, with the direction of the fields."""
+    x, y = curves.fields.unbind(-1)
+    along = " along y" if not x.any() else (" along x" if not y.any() else "")
+    return f"field{along} ({curves.field_unit})"
 
 
 def _distinct(curves: RMSCurves) -> dict[int, list[str]]:

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
 from dolens.plotting.style import PALETTE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.titles import draw_axes_title
 
 # Characters of a row's label, and so many in a line of it.
 _LONGEST, _LINE = 110, 44
@@ -141,8 +142,7 @@ def _finish(figure: Figure, axes: Axes, points: Sequence[RunPoint], title: str |
     if any(point.low is not None for point in points):
         notes.append("bars of single runs: 95 % interval over photographs")
     heading = "\n".join(text for text in (title, "; ".join(notes)) if text)
-    if heading:
-        axes.set_title(heading, fontsize=TITLE if not notes else SMALL + 1)
+    draw_axes_title(axes, heading, TITLE if not notes else SMALL + 1)
 
 
 def _wrapped(label: str) -> str:

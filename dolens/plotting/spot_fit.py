@@ -9,7 +9,8 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.plotting.scale_bar import scale_bar
-from dolens.plotting.style import PAGE, SMALL, TITLE
+from dolens.plotting.style import PAGE, SMALL
+from dolens.plotting.titles import draw_title
 
 _COLUMNS = ("measured", "initial", "final", "final \N{MINUS SIGN} measured")
 # Light left out beyond each edge of the window, as a share, before the margin is added.
@@ -65,8 +66,7 @@ def spot_fit_figure(
     for axes, name in zip(grid[0], _COLUMNS, strict=True):
         below = f"\n{axes.get_title()}" if axes.get_title() else ""
         axes.set_title(f"{name}{below}", fontsize=SMALL)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

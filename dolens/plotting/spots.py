@@ -12,16 +12,16 @@ from matplotlib.ticker import MaxNLocator
 
 from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.errors import InputError
+from dolens.optics.fields import field_label
 from dolens.plotting.number_text import number_text
 from dolens.plotting.style import (
     PAGE,
     SMALL,
-    TITLE,
-    field_label,
     ruled_axes,
     spectral_colour,
     wavelength_handles,
 )
+from dolens.plotting.titles import draw_title
 
 _PANEL = 1.75
 # Fields of an overlaid diagram stand side by side, up to so many in a row.
@@ -85,8 +85,7 @@ def spots_figure(
         grid[field, 0].set_ylabel(f"{label}\ny (µm)", fontsize=SMALL + 1)
     _label(grid, fields, drawn.reach, overlaid)
     _legend(figure, spots, overlaid)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 
@@ -139,8 +138,7 @@ def spots_comparison_figure(
         for axes, (_, _, half) in zip(grid[row, 1:], columns[1:], strict=True):
             axes.tick_params(labelleft=half != reach)
     _legend(figure, diagrams[0], True)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

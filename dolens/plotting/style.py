@@ -10,8 +10,6 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from dolens.plotting.number_text import with_minus
-
 # Okabe and Ito's colours, told apart by colour-blind readers too; yellow is too pale for lines.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 # Lines of one figure differ in these too, so that they are told apart in grey.
@@ -61,13 +59,6 @@ def spectral_colour(wavelength: float) -> str:
     """Return a line colour for a wavelength (nm), from violet at 400 to dark red at 700."""
     nodes = np.array([to_rgb(colour) for colour in _SPECTRUM.values()])
     return to_hex([np.interp(wavelength, list(_SPECTRUM), channel) for channel in nodes.T])
-
-
-def field_label(field: Sequence[float] | Tensor, unit: str) -> str:
-    """Return `14°`, or `(3, 14)°` for a field beside the y-z plane; in mm likewise."""
-    x, y = (float(f"{float(value):.6g}") for value in field)
-    space = "" if unit == "°" else " "
-    return with_minus(f"{y:g}{space}{unit}" if x == 0.0 else f"({x:g}, {y:g}){space}{unit}")
 
 
 def wavelength_handles(wavelengths: Sequence[float] | Tensor) -> list[Line2D]:

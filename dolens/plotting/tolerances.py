@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, open_axes
+from dolens.plotting.titles import draw_title
 
 _CELL_WIDTH, _CELL_HEIGHT = 0.26, 0.14
 # Inches for the labels of rows, and for those of columns with titles and colour bars.
@@ -90,8 +91,7 @@ def matrix_figure(
         bar.ax.tick_params(labelsize=SMALL - 1)
         bar.ax.locator_params(nbins=5 if len(columns) > 8 else 3)
         bar.outline.set_linewidth(0.4)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 
@@ -157,8 +157,7 @@ def yield_figure(
         frameon=False,
         fontsize=SMALL,
     )
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 
@@ -205,8 +204,7 @@ def offenders_figure(
         axes.grid(True, axis="x", color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
         axes.tick_params(axis="y", length=0)
-    if title:
-        figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 

@@ -7,7 +7,7 @@ that cannot hold them is refused.
 """
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -16,17 +16,18 @@ import torch
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.materials import abbe_number, index_d, parse_material
 from dolens.optics.materials import index_model as find_index_model
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.compare import Difference, differences
 from dolens.prescriptions.files import decode_prescription, encode_prescription
+from dolens.prescriptions.simplifications import (
+    COMPARED_WAVELENGTHS,
+    SIMPLIFICATIONS,
+    Prescription,
+    is_zemax,
+    surfaces_text,
+)
 from dolens.prescriptions.zemax_glass import canonical
-
-Prescription = dict[str, Any]
-# Indices are compared at these wavelengths, nm.
-_WAVELENGTHS = (400.0, 450.0, 486.1327, 546.074, 587.5618, 656.2725, 700.0)
-_KNOWN_MEDIA = ("air", "occluder")
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def _nearest(prescription: Prescription, new: str) -> tuple[Prescription, list[s
         return prescription, []
     except InputError as error:
         refusal = error
-    steps = [step for step in _SIMPLIFICATIONS if step(copy.deepcopy(prescription), new)]
+    steps = [step for step in SIMPLIFICATIONS if step(copy.deepcopy(prescription), new)]
     for count in range(1, len(steps) + 1):
         for some in combinations(steps, count):
             simpler = copy.deepcopy(prescription)
@@ -103,116 +104,6 @@ def _nearest(prescription: Prescription, new: str) -> tuple[Prescription, list[s
             else:
                 return simpler, said
     raise refusal
-
-
-def _dfc_indices(prescription: Prescription, new: str) -> list[str]:
-    """Take the only index model that a .zmx file knows."""
-    model = str(prescription.get("index_model", "dfc"))
-    if not _is_zemax(new) or model == "dfc":
-        return []
-    prescription["index_model"] = "dfc"
-    return [
-        f"the index model '{model}' became 'dfc', the only one that a .zmx file knows: nd and Vd "
-        "are those of the lines C, d and F, and air has index 1"
-    ]
-
-
-def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
-    """Write glass of a catalogue as nd/Vd."""
-    if not new.lower().endswith(".txt"):
-        return []
-    model = find_index_model(str(prescription.get("index_model", "dfc")))
-    said: dict[str, tuple[str, float, list[str]]] = {}
-    for n, row in prescription["surfaces"].items():
-        name = str(row.get("material")).strip()
-        if name.lower() in _KNOWN_MEDIA or name[:1].isdigit():
-            continue
-        medium = parse_material(name, model)
-        pair = f"{index_d(medium):.6f}/{abbe_number(medium):.4f}"
-        try:
-            near = parse_material(pair, model)
-        except InputError:
-            continue
-        error = max(abs(medium.index(w) - near.index(w)) for w in _WAVELENGTHS)
-        said.setdefault(name, (pair, error, []))[2].append(str(n))
-        row["material"] = pair
-    return [
-        f"the glass {name} behind {_surfaces(numbers)} became {pair} (nd/Vd): its index differs by "
-        f"up to {error:.1g} from 400 to 700 nm"
-        for name, (pair, error, numbers) in said.items()
-    ]
-
-
-def _aperture_planes(prescription: Prescription, new: str) -> list[str]:
-    """Write aperture planes as a .zmx file knows them: the stop is one, any other is a plane."""
-    if not _is_zemax(new):
-        return []
-    said = []
-    stop = str(prescription.get("stop", 1))
-    before = prescription.get("object_material", "air")
-    for n, row in prescription["surfaces"].items():
-        flat = row.get("type", "sphere") in ("plane", "sphere") and _is_flat(row)
-        empty = canonical(str(row.get("material"))) == canonical(str(before))
-        before = row.get("material")
-        if row.get("type") == "aperture" and str(n) != stop:
-            row["type"] = "plane"
-            said.append(
-                f"surface {n}, an aperture, became a plane of the same size, which clips the same "
-                "rays: the one aperture of a .zmx file is the stop"
-            )
-        elif flat and empty and str(n) == stop:
-            row["type"] = "aperture"
-            row.pop("radius", None)
-            row.pop("curvature", None)
-            said.append(f"surface {n}, a plane in one medium, became an aperture: it is the stop")
-    return said
-
-
-def _without_poses(prescription: Prescription, new: str) -> list[str]:
-    """Drop elements that stand where they were designed to."""
-    elements = prescription.get("elements")
-    if not isinstance(elements, Mapping) or not elements:
-        return []
-    for row in elements.values():
-        if any(key not in ("surfaces", "pivot") and float(value) for key, value in row.items()):
-            return []
-    del prescription["elements"]
-    return [f"lost: the names of the elements {', '.join(map(str, elements))} (none has a pose)"]
-
-
-def _without_notes(prescription: Prescription, new: str) -> list[str]:
-    """Drop remarks about surfaces."""
-    noted = [str(n) for n, row in prescription["surfaces"].items() if row.pop("note", None)]
-    if not noted:
-        return []
-    return [f"lost: {'remarks' if len(noted) > 1 else 'the remark'} on {_surfaces(noted)}"]
-
-
-def _without_source(prescription: Prescription, new: str) -> list[str]:
-    """Drop where the lens comes from."""
-    source = prescription.pop("source", None)
-    return [f"lost: source {str(source)!r}"] if source else []
-
-
-def _one_line_name(prescription: Prescription, new: str) -> list[str]:
-    """Put a name on one line."""
-    name = str(prescription.get("name") or "")
-    line = " ".join(name.split())
-    if line == name:
-        return []
-    prescription["name"] = line
-    return [f"the name {name!r} became {line!r}"]
-
-
-_SIMPLIFICATIONS: tuple[Callable[[Prescription, str], list[str]], ...] = (
-    _one_line_name,
-    _without_notes,
-    _without_source,
-    _without_poses,
-    _aperture_planes,
-    _glass_by_numbers,
-    _dfc_indices,
-)
 
 
 def _told(difference: Difference, said: list[str]) -> bool:
@@ -237,7 +128,7 @@ def _sentences(found: list[Difference], new: str) -> list[str]:
     for place, key, before, after in found:
         if before is None:
             what = f"added: {key} {_shown(after)}" + (
-                ", which a .zmx file always has" if _is_zemax(new) else ""
+                ", which a .zmx file always has" if is_zemax(new) else ""
             )
         elif after is None:
             what = f"lost: {key} {_shown(before)}"
@@ -250,7 +141,7 @@ def _sentences(found: list[Difference], new: str) -> list[str]:
     for (what, kind), places in groups.items():
         where = {"": "", "sensor": "sensor: "}.get(kind)
         if where is None:
-            where = f"{_surfaces([place.partition(' ')[2] for place in places])}: "
+            where = f"{surfaces_text([place.partition(' ')[2] for place in places])}: "
         sentences.append(where + what)
     return sentences
 
@@ -277,7 +168,7 @@ def _parameters(lens: Lens) -> dict[str, torch.Tensor]:
 
 
 def _indices(lens: Lens) -> list[list[float]]:
-    return [[float(m.index(wave)) for wave in _WAVELENGTHS] for m in lens.materials]
+    return [[float(m.index(wave)) for wave in COMPARED_WAVELENGTHS] for m in lens.materials]
 
 
 @torch.no_grad()
@@ -292,18 +183,6 @@ def _effect(before: Lens, after: Lens) -> str:
     )
 
 
-def _is_zemax(path: str) -> bool:
-    return path.lower().endswith(".zmx")
-
-
-def _is_flat(row: Mapping[str, Any]) -> bool:
-    if row.get("type") == "plane":
-        return True
-    if row.get("curvature") is not None:
-        return float(row["curvature"]) == 0.0
-    return abs(float(row.get("radius", 0.0))) == float("inf")
-
-
 def _medium_name(material: str) -> str:
     """Return one name for a medium, however it is written."""
     return "occluder" if material.strip().lower() == "occluder" else canonical(material)
@@ -313,9 +192,3 @@ def _shown(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_shown(entry)}" for key, entry in value.items())
     return f"{value:.10g}" if isinstance(value, float) else repr(value)
-
-
-def _surfaces(numbers: list[str]) -> str:
-    if len(numbers) == 1:
-        return f"surface {numbers[0]}"
-    return f"surfaces {', '.join(numbers[:-1])} and {numbers[-1]}"

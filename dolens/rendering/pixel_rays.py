@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.view import View
-from dolens.optics.backend import trace_components
+from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane

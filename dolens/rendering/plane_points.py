@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.backend import trace_rays
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import distance_to_plane

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels import splatting
-from dolens.optics.backend import cpu_kernels_serve, trace_components
+from dolens.optics.backend import cpu_kernels_serve
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import entrance_pupil
+from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
 from dolens.rendering.binning import bin_rays
 from dolens.rendering.sampling import regular_square, square_to_disc

@@ -1,7 +1,6 @@
 """A finished run's camera on a user's own pictures: what its sensor sees, and what is restored."""
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,82 +10,32 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError, check_choice
+from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.restored_windows import (
-    DEFAULT_WINDOW,
-    GRID,
     margin_of,
     restore_in_windows,
 )
 from dolens.experiments.camera.views.whole import Placing
+from dolens.experiments.commands.apply_options import Options
 from dolens.experiments.commands.picture_files import (
     read_array,
     read_picture,
     write_picture,
 )
+from dolens.experiments.commands.raw_signal import signal_of
 from dolens.experiments.running.finished_run import FinishedRun, load_run
-from dolens.experiments.running.run_folder import write_json
+from dolens.experiments.running.run_files import write_json
 from dolens.plotting import save_figure
 from dolens.plotting.applied_picture import applied_figure
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.sensor.colour import linear_to_srgb
-from dolens.sensor.readout import Readout
 
 logger = logging.getLogger(__name__)
 
 _SMALLEST = 16
 # Copies of a picture that are held at once, float32 of three channels; and a warning from there on.
 _COPIES, _MUCH_MEMORY = 12, 4e9
-_FORMATS = ("png", "tif")
-
-
-@dataclass(frozen=True)
-class Options:
-    """How pictures are applied to.
-
-    Attributes:
-        depths: mm in front of the first vertex; none: the run's middle depth.
-        scale: pixels of a picture to one of the sensor; None: as the run's views have it.
-        diffraction: `none`, `limit` or `wave`; None: as the run's test images have it.
-        seed: of the noise.
-        bits: of what is written, 8 or 16.
-        format: of what is written, `png` or `tif`.
-        window: pixels along each side of what is restored at once, a multiple of 64.
-        save_raw: whether the sensor's raw values are written too, as .npy.
-        raw: whether the files are what a real sensor gave.
-        black_level: of raw files, in their own numbers; None: the run's readout's.
-        white_level: likewise.
-
-    Raises:
-        InputError: a value that is not allowed.
-    """
-
-    depths: Sequence[float] = ()
-    scale: float | None = None
-    diffraction: str | None = None
-    seed: int = 0
-    bits: int = 8
-    format: str = "png"
-    window: int = DEFAULT_WINDOW
-    save_raw: bool = False
-    raw: bool = False
-    black_level: float | None = None
-    white_level: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.bits not in (8, 16):
-            raise InputError(f"--bits: {self.bits}; allowed: 8, 16")
-        check_choice(self.format, _FORMATS, "--format")
-        if self.window < GRID or self.window % GRID:
-            raise InputError(f"--window: {self.window}; allowed: multiples of {GRID}, pixels")
-        if not self.raw and (self.black_level, self.white_level) != (None, None):
-            raise InputError("--black-level and --white-level are of raw files; give --raw too")
-        if self.raw and (self.depths or self.scale or self.diffraction or self.save_raw):
-            raise InputError(
-                "--raw: the files are images already; leave out --depth, --scale, --diffraction "
-                "and --save-raw"
-            )
 
 
 @dataclass(frozen=True)
@@ -266,65 +215,6 @@ def apply_run(
         found += applied
         write_json(into / f"{Path(file).stem}.json", _record(camera, file, applied))
     return into, camera, found
-
-
-def signal_of(
-    array: np.ndarray,
-    readout: Readout,
-    file: Path,
-    black_level: float | None = None,
-    white_level: float | None = None,
-) -> Tensor:
-    """Return raw numbers as a readout gives them: 0 without light and 1 at full scale.
-
-        signal = (number - black) / (white - black)
-
-    Args:
-        array: (height, width), or (height, width, 3).
-        readout: of the run: its colour filters, bits and black level.
-        file: named in messages.
-        black_level: the number of no light; None: that of the readout's codes, and 0 for numbers
-            with a fraction.
-        white_level: the number at full scale; None: the last of the readout's codes, without bits
-            that of the file, and 1 for numbers with a fraction.
-
-    Returns:
-        (1, 1 or 3, height, width), float32.
-
-    Raises:
-        InputError: other channels than the sensor has, or levels that are not in order.
-    """
-    if readout.pattern is not None and array.ndim != 2:
-        raise InputError(
-            f"{file}: {array.shape[-1]} channels; the run's sensor has {readout.pattern} filters: "
-            "give one number a pixel, as the sensor has it"
-        )
-    if readout.pattern is None and (array.ndim != 3 or array.shape[-1] != 3):
-        raise InputError(
-            f"{file}: of shape {array.shape}; the run's sensor sees all colours in each pixel: "
-            "give (height, width, 3)"
-        )
-    fraction = array.dtype.kind == "f"
-    top = 1.0 if fraction else float(np.iinfo(array.dtype).max)
-    codes = top if fraction or readout.bits is None else 2.0**readout.bits - 1.0
-    no_light = 0.0 if fraction or readout.bits is None else readout.black_level * codes
-    black = no_light if black_level is None else black_level
-    white = codes if white_level is None else white_level
-    if not (math.isfinite(black) and math.isfinite(white) and black < white):
-        raise InputError(
-            f"--black-level {black:g} and --white-level {white:g}: black must be below white"
-        )
-    numbers = torch.from_numpy(array.astype(np.float32))
-    numbers = numbers[None] if numbers.ndim == 2 else numbers.permute(2, 0, 1)
-    signal = ((numbers - black) / (white - black))[None]
-    if float(signal.max()) > 1.001:
-        logger.warning(
-            "%s: numbers up to %g lie above white, %g; is --white-level right?",
-            file,
-            float(numbers.max()),
-            white,
-        )
-    return signal
 
 
 def _metrics(truth: Tensor, sensor: Tensor, restored: Tensor) -> dict[str, float]:

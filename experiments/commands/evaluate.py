@@ -1,6 +1,5 @@
 """The camera of a run again, without training: on other photographs, depths, noise."""
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,47 +11,41 @@ from typing import Any
 
 import lightning
 import torch
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from omegaconf import OmegaConf
 
-from dolens.errors import InputError, one_line
+from dolens.errors import InputError
+from dolens.experiments.commands.evaluation_overrides import (
+    refuse_another_camera,
+    refuse_other_work,
+    with_own_calibration,
+)
 from dolens.experiments.running.composition import changed_places, with_overrides
 from dolens.experiments.running.finished_run import (
     FinishedRun,
     load_recorded,
     working_folder_importable,
 )
-from dolens.experiments.running.recorded_run import RecordedRun, read_record
+from dolens.experiments.running.recorded_run import read_record
+from dolens.experiments.running.run_files import (
+    INFO,
+    METRICS,
+    OVERRIDES,
+    RESOLVED,
+    metrics_of,
+    write_json,
+)
 from dolens.experiments.running.run_folder import (
     describe_run,
     peak_memory_mb,
     plain_metrics,
-    write_json,
 )
 from dolens.experiments.running.training import summary_of
 from dolens.prescriptions import save_lens
 
 logger = logging.getLogger(__name__)
 
-# What decides the work of a run, and not what is evaluated.
-_OF_THE_RUN = {
-    "experiment": "another experiment is another run: train it",
-    "module": "another module is another run: train it",
-    "train": "an evaluation does not train",
-    "test": "an evaluation is a test",
-    "ckpt_path": "name the checkpoint by --checkpoint",
-}
-# Places of the configuration whose change makes another camera, or changes training alone.
-_CAMERA = (
-    ("network",),
-    ("variables",),
-    ("module", "variables"),
-    ("module", "reconstruction", "network"),
-)
-_TRAINING = ("optimizer", "scheduler", "learning_rates", "operands", "discriminator")
 _FORMAT = "[%(asctime)s] %(levelname)s %(name)s: %(message)s"
 
 
@@ -108,13 +101,13 @@ def evaluate(
     started = time.perf_counter()
     output = _new_folder(Path(folder), name)
     record = read_record(folder, output)
-    _refuse_other_work(overrides)
-    given, overrides = list(overrides), _with_own_calibration(record, overrides)
+    refuse_other_work(overrides)
+    given, overrides = list(overrides), with_own_calibration(record, overrides)
     with working_folder_importable():
         config = with_overrides(record, overrides)
     changed = changed_places(record.config, config)
-    _refuse_another_camera(changed, config, perturb_lens)
-    own = _metrics_of(record.folder)
+    refuse_another_camera(changed, config, perturb_lens)
+    own = metrics_of(record.folder)
     # A run that found no classifier for its loss had none; it is not looked for again.
     with_loss = own.get("loss/perceptual_available") != 0.0
     run = load_recorded(record, config, checkpoint, with_loss)
@@ -123,27 +116,22 @@ def evaluate(
         for note in record.notes:
             logger.warning("%s", note)
         _say(run, changed)
-        OmegaConf.save(run.cfg, output / ".hydra" / "resolved.yaml")
+        OmegaConf.save(run.cfg, output / RESOLVED)
         written = [*record.overrides, *overrides]
-        OmegaConf.save(OmegaConf.create(written), output / ".hydra" / "overrides.yaml")
+        OmegaConf.save(OmegaConf.create(written), output / OVERRIDES)
         metrics = _tested(run, output, _evaluated(run, given, changed), command)
         if "network/pretrained" in own:  # of where the run began
             metrics["network/pretrained"] = own["network/pretrained"]
         metrics["cost/wall_s"] = time.perf_counter() - started
         numbers = plain_metrics(metrics)
-        write_json(output / "metrics.json", numbers)
+        write_json(output / METRICS, numbers)
         logger.info("Evaluation: %s", output)
     return Evaluated(output, numbers, run.settings.objective, run)
 
 
 def own_metrics(found: Evaluated) -> dict[str, float]:
     """Return the metrics of the run itself; none where it has not come to its end."""
-    return _metrics_of(found.run.folder)
-
-
-def _metrics_of(folder: Path) -> dict[str, float]:
-    file = folder / "metrics.json"
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return metrics_of(found.run.folder)
 
 
 def _new_folder(folder: Path, name: str | None) -> Path:
@@ -154,63 +142,6 @@ def _new_folder(folder: Path, name: str | None) -> Path:
     if found.exists():
         raise InputError(f"--name: {found} is there already; give another name")
     return found
-
-
-def _refuse_other_work(overrides: Sequence[str]) -> None:
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException as error:
-        raise InputError(one_line(error)) from None
-    for override in parsed:
-        key = override.key_or_group
-        if override.is_sweep_override():
-            raise InputError(
-                f"{override.input_line}: an evaluation is one; give one value at a time"
-            )
-        if key.startswith("hydra"):
-            raise InputError(f"{key}: Hydra has no job here; --name names the folder")
-        if key in _OF_THE_RUN:
-            raise InputError(f"{key}: {_OF_THE_RUN[key]}")
-
-
-def _with_own_calibration(record: RecordedRun, overrides: Sequence[str]) -> list[str]:
-    """The overrides, with the depths that the run's network has its functions of.
-
-    A camera does not know the depth of what it looks at: were its functions those of the scene that
-    it is judged by, a scene of one depth would tell it.
-    """
-    found, views = list(overrides), (record.config["module"] or {}).get("views")
-    if not found or not isinstance(views, Mapping) or "psf_size" not in views:
-        return found
-    depths = views.get("psf_depths") or views["scene"].get("depths")
-    asked = any(text.lstrip("+").startswith("views.psf_depths=") for text in found)
-    if depths is None or asked:
-        return found
-    return [f"views.psf_depths={list(depths)}", *found]
-
-
-def _refuse_another_camera(
-    changed: Sequence[tuple[Any, ...]], config: Mapping[str, Any], perturb_lens: bool
-) -> None:
-    for place in changed:
-        name = ".".join(map(str, place))
-        if any(place[: len(part)] == part for part in _CAMERA):
-            raise InputError(
-                f"{name}: another value makes another camera than the run has trained; train it"
-            )
-        if place[0] in _TRAINING:
-            raise InputError(f"{name}: this setting is of training alone, and nothing is trained")
-        if place[0] == "lens" and not perturb_lens:
-            raise InputError(
-                f"{name}: another value makes another lens than the run has trained; "
-                "--perturb-lens evaluates the camera with it all the same"
-            )
-        judged = config.get("evaluation_renderer") is not None
-        if judged and place[0] == "renderer" and place[1:2] != ("sensor",):
-            raise InputError(
-                f"{name}: renderer makes images for training; test images are made by "
-                "evaluation_renderer"
-            )
 
 
 def _say(run: FinishedRun, changed: Sequence[tuple[Any, ...]]) -> None:
@@ -270,7 +201,7 @@ def _tested(
     device = trainer.strategy.root_device
     info = describe_run(settings.seed, str(device), settings.lens_dtype, list(command))
     info["evaluated"] = dict(evaluated)
-    write_json(output / "run.json", {**info, "status": "running"})
+    write_json(output / INFO, {**info, "status": "running"})
     status = "failed"
     try:
         trainer.test(run.module, run.data, verbose=False)
@@ -279,7 +210,7 @@ def _tested(
         status = "interrupted"
         raise
     finally:
-        write_json(output / "run.json", {**info, "status": status})
+        write_json(output / INFO, {**info, "status": status})
     (output / "lens").mkdir(exist_ok=True)
     save_lens(run.lens, output / "lens" / "final.yaml")
     metrics = dict(trainer.callback_metrics) | summary_of(run.module)

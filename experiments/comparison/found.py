@@ -6,6 +6,7 @@ from pathlib import Path
 
 from dolens.errors import InputError
 from dolens.experiments.comparison.run import Run, UnfinishedRun, read_run, read_unfinished
+from dolens.experiments.running.run_files import CONFIG, has_metrics
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ def find_runs(folders: Iterable[Path], judge: str | None = None) -> FoundRuns:
             no_runs.append(f"{folder} is no run folder, and holds none (no .hydra/config.yaml)")
         places.update({path.resolve(): None for path in found})
     shown = [_short(place) for place in places]
-    runs = tuple(read_run(place, judge) for place in shown if (place / "metrics.json").is_file())
-    others = (place for place in shown if not (place / "metrics.json").is_file())
+    runs = tuple(read_run(place, judge) for place in shown if has_metrics(place))
+    others = (place for place in shown if not has_metrics(place))
     unfinished = tuple(read_unfinished(place) for place in others)
     if not runs:
         failed = [f"{run.folder}: {run.status}: {run.reason}" for run in unfinished]
@@ -68,7 +69,7 @@ def run_folders(folder: Path) -> list[Path]:
 
 def is_run(folder: Path) -> bool:
     """Return whether a folder is that of a run, finished or not."""
-    return (folder / ".hydra" / "config.yaml").is_file()
+    return (folder / CONFIG).is_file()
 
 
 def _below(folder: Path) -> Iterable[Path]:

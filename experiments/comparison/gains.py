@@ -1,14 +1,12 @@
 """What a row gains over another one, paired over seeds and photographs."""
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-import torch
-
-from dolens.experiments.camera.photograph_scores import statistics_of
+from dolens.experiments.camera.photograph_gain import paired_gain
 from dolens.experiments.comparison.rows import Row
 from dolens.experiments.comparison.run import Run
-from dolens.reconstruction.intervals import Interval, gain_interval
+from dolens.reconstruction.intervals import Interval
 
 
 def gain_of(row: Row, against: Row, metric: str) -> Interval | None:
@@ -50,26 +48,10 @@ def gain(
     if not seeds:
         return None
     runs = [group[seed] for seed in seeds], [against[seed] for seed in seeds]
-    if view is not None and _comparable([*runs[0], *runs[1]], metric, view):
-        return gain_interval(
-            *(torch.stack([run.scores.metrics[metric] for run in side]) for side in runs),
-            statistics_of(runs[0][0].scores.views)[view],
-            torch.Generator().manual_seed(0),
-        )
+    if view is not None:
+        scores = ([run.scores for run in side] for side in runs)
+        found = paired_gain(*scores, metric, view)
+        if found is not None:
+            return found
     means = [statistics.mean(run.metrics[key] for run in side) for side in runs]
     return Interval(means[0] - means[1], float("nan"), float("nan"), len(seeds), 0)
-
-
-def _comparable(runs: Sequence[Run], metric: str, view: str) -> bool:
-    """Return whether runs kept scores of the same photographs in the same views."""
-    first = runs[0].scores
-    return (
-        first is not None
-        and view in statistics_of(first.views)
-        and all(
-            run.scores is not None
-            and (run.scores.photographs, run.scores.views) == (first.photographs, first.views)
-            and metric in run.scores.metrics
-            for run in runs
-        )
-    )

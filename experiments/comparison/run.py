@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -15,6 +14,15 @@ from dolens.errors import InputError
 from dolens.experiments.camera.photograph_scores import PhotographScores, read_scores
 from dolens.experiments.running.plain_values import flat
 from dolens.experiments.running.resolvers import register_resolvers
+from dolens.experiments.running.run_files import (
+    CONFIG,
+    HYDRA,
+    METRICS,
+    RESOLVED,
+    info_of,
+    metrics_of,
+    read_yaml,
+)
 
 # How fast a run is changes nothing in what it finds; Hydra's own part says where it is written.
 _PASSED_OVER = ("seed", "threads", "hydra")
@@ -86,17 +94,17 @@ def read_run(folder: Path, judge: str | None = None) -> Run:
     Raises:
         InputError: the run is not finished, or the folder is none of a run.
     """
-    for name in ("metrics.json", ".hydra/hydra.yaml", ".hydra/config.yaml"):
+    for name in (METRICS, HYDRA, CONFIG):
         if not (folder / name).is_file():
             raise InputError(f"{folder} is no finished run folder: {name} is missing")
-    hydra = yaml.safe_load((folder / ".hydra" / "hydra.yaml").read_text(encoding="utf-8"))["hydra"]
-    config = yaml.safe_load((folder / ".hydra" / "config.yaml").read_text(encoding="utf-8"))
+    hydra = read_yaml(folder / HYDRA)["hydra"]
+    config = read_yaml(folder / CONFIG)
     choices = hydra["runtime"]["choices"]
     values = _resolved(folder, config)
     own = _settings(config, values)
     if _continues(config, own, hydra):
         own.pop("ckpt_path")
-    metrics = _judged(json.loads((folder / "metrics.json").read_text(encoding="utf-8")), judge)
+    metrics = _judged(metrics_of(folder), judge)
     overrides = hydra.get("overrides", {}).get("task") or []
     return Run(
         folder,
@@ -123,7 +131,7 @@ def read_unfinished(folder: Path) -> UnfinishedRun:
     Args:
         folder: of a run without metrics.json.
     """
-    info = _json(folder / "run.json")
+    info = info_of(folder)
     status = info.get("status", "failed")
     lines = _log(folder)
     errors = [match[1] for line in lines if (match := _ERROR.match(line))]
@@ -162,10 +170,9 @@ def _continues(config: Mapping[str, Any], own: Mapping[str, str], hydra: Mapping
     if not isinstance(path, str) or not config.get("train", True):
         return False
     started_in = Path(hydra["runtime"].get("cwd", "."))
-    file = (started_in / path).resolve().parent.parent / ".hydra" / "config.yaml"
-    if not file.is_file():
+    before = read_yaml((started_in / path).resolve().parent.parent / CONFIG)
+    if before is None:
         return False
-    before = yaml.safe_load(file.read_text(encoding="utf-8"))
     mine = {key: value for key, value in own.items() if key != "ckpt_path"}
     theirs = {k: v for k, v in _settings(before, {}).items() if k != "ckpt_path"}
     return theirs == mine and before.get("seed") == config.get("seed")
@@ -173,9 +180,9 @@ def _continues(config: Mapping[str, Any], own: Mapping[str, str], hydra: Mapping
 
 def _resolved(folder: Path, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return all settings with interpolations resolved, as far as they can be."""
-    file = folder / ".hydra" / "resolved.yaml"
-    if file.is_file():
-        return dict(flat(yaml.safe_load(file.read_text(encoding="utf-8"))))
+    resolved = read_yaml(folder / RESOLVED)
+    if resolved is not None:
+        return dict(flat(resolved))
     register_resolvers()
     cfg = OmegaConf.create(dict(config))
     found = {}
@@ -199,12 +206,8 @@ def _judged(metrics: Mapping[str, float], judge: str | None) -> dict[str, float]
 
 
 def _code(folder: Path) -> tuple[str, str]:
-    info = _json(folder / "run.json")
+    info = info_of(folder)
     return str((info.get("git") or {}).get("commit")), str(info.get("device"))
-
-
-def _json(file: Path) -> dict[str, Any]:
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 
 def _log(folder: Path) -> list[str]:

@@ -65,6 +65,7 @@ class DesignModule(Experiment):
     Attributes:
         initial: the lens where the search began.
         history: a row of numbers for every iteration.
+        initial_merit: the merit before the first iteration; NaN where nothing was trained.
 
     Raises:
         InputError: a setting that is out of range, or no variables.
@@ -119,6 +120,7 @@ class DesignModule(Experiment):
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
         self.merit: MeritFunction | None = None
         self.history: list[dict[str, float]] = []
+        self.initial_merit = math.nan
         self._stopped: str | None = None
         # Where the round began, so that a resumed one has its rays; and the best round's end.
         for name in ("round_start", "best"):
@@ -161,6 +163,7 @@ class DesignModule(Experiment):
         self.initial_light = None if quality is None else quality.spots.light
         if fresh:
             self._keep_if_better(self.merit())
+            self.initial_merit = float(self.best_merit)
             if not math.isfinite(float(self.best_merit)):
                 raise InputError(
                     "the search cannot begin: rays fail, or apertures clip more than "
@@ -331,17 +334,19 @@ class DesignModule(Experiment):
             self.history,
             self.mtf_max_frequency,
             "" if merit.operands else unit,
+            self.initial_merit,
         )
 
     # ---------------------------------------------------------------- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return the history of iterations."""
-        return {"history": self.history}
+        """Return the history of iterations, and the merit before the first one."""
+        return {"history": self.history, "initial_merit": self.initial_merit}
 
     def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on with that history."""
         self.history = list(checkpoint.get("history", []))
+        self.initial_merit = float(checkpoint.get("initial_merit", math.nan))
 
     def identity(self) -> dict[str, Any]:
         """Return the experiment, the lens and the names of the variables."""

@@ -1,5 +1,6 @@
 """Figures of a lens before and after its design."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -7,16 +8,19 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.ray_fans import ray_fans
 from dolens.analysis.spot_diagram import working_f_numbers
-from dolens.experiments.design.merit_rays import (
-    merit_modulation,
-    merit_rms_against_field,
-    merit_rms_against_wavelength,
-    merit_spots,
+from dolens.experiments.design.merit_pupil import (
+    COMMON_CENTROID,
     pupil_share,
     pupil_text,
     rays_text,
     reference_text,
     whole_stop_rms,
+)
+from dolens.experiments.design.merit_rays import (
+    merit_modulation,
+    merit_rms_against_field,
+    merit_rms_against_wavelength,
+    merit_spots,
 )
 from dolens.experiments.design.tables import spot_table
 from dolens.experiments.experiment import Figures
@@ -34,7 +38,9 @@ from dolens.plotting import (
 from dolens.plotting.layout import optics_text, shown_name
 from dolens.plotting.number_text import number_text
 
-_FREQUENCIES = 101
+_FREQUENCIES = 201
+# Along each diameter of the stop.
+_FAN_POINTS = 101
 # Beyond this over the RMS radius a spot's modulation is nearly nothing.
 _BLURRED = 1.5
 # Significant digits of a headline's radius.
@@ -48,6 +54,7 @@ def design_figures(
     history: Sequence[Mapping[str, float]],
     max_frequency: float | None = None,
     merit_unit: str = "",
+    initial_merit: float = math.nan,
 ) -> Figures:
     """Return the layout, spots, ray fans, MTF and RMS curves of a design, and its history.
 
@@ -62,6 +69,7 @@ def design_figures(
         max_frequency: the end of the MTF curves, cycles/mm; None: half of the diffraction limit, or
             less, where the spots of the design leave no contrast.
         merit_unit: of the merit function, for the history; empty where it has none.
+        initial_merit: before the first iteration; NaN where it is not known.
     """
     fields = [tuple(field) for field in settings.fields_of(lens)]
     waves = list(settings.wavelengths_of(lens))
@@ -75,10 +83,11 @@ def design_figures(
         both = {"initial": initial, "final": lens}
         first, last = (number_text(spot_table(of, settings).mean, _DIGITS) for of in both.values())
         rows = [f"mean RMS radius {first} → {last} µm, {_rays(settings)}"]
-        rows += [] if len(waves) == 1 else ["panels: all wavelengths about their common centroid"]
+        if len(waves) > 1 and reference_text(settings) != COMMON_CENTROID:
+            rows.append("panels: all wavelengths about their common centroid")
         return spots_comparison_figure(
             {name: merit_spots(of, settings) for name, of in both.items()},
-            titled(lens, None, "\n".join(rows)),
+            _titled_both(initial, lens, "\n".join(rows)),
         )
 
     def layouts() -> Figure:
@@ -101,21 +110,26 @@ def design_figures(
             name: merit_modulation(of, settings, frequencies)
             for name, of in (("initial", initial), ("final", lens))
         }
-        # A panel says of which fields it has no wave-optical function.
-        panels = {
-            f"{name}\nproduct¹: {', '.join(products)}" if products else f"{name}\n": mtf
-            for name, (mtf, products) in found.items()
-        }
         rows = [f"MTF with diffraction, {pupil_text(settings)}"]
-        if any(products for _, products in found.values()):
-            rows.append("¹ contrast of the rays × diffraction limit")
-        return modulation_figure(panels, titled(lens, None, "\n".join(rows)))
+        panels = {name: mtf for name, (mtf, _) in found.items()}
+        if all(len(products) == len(fields) for _, products in found.values()):
+            rows.append("contrast of the rays × diffraction limit")
+        elif any(products for _, products in found.values()):
+            # A panel says of which fields it has no wave-optical function.
+            rows.append("¹ contrast of the rays × diffraction limit, not by wave optics")
+            panels = {
+                f"{name}\n{_products(products, len(fields))}": mtf
+                for name, (mtf, products) in found.items()
+            }
+        return modulation_figure(panels, _titled_both(initial, lens, "\n".join(rows)))
 
     def curves() -> Figure:
         edge = max(fields, key=_size)
+        opposite = (-edge[0], -edge[1])
+        start = opposite if opposite in fields else (0.0, 0.0)
         what = ["RMS spot radius", rays_text(settings), reference_text(settings)]
         return rms_curves_figure(
-            merit_rms_against_field(lens, settings, edge) if _size(edge) > 0.0 else None,
+            merit_rms_against_field(lens, settings, edge, start) if _size(edge) > 0.0 else None,
             merit_rms_against_wavelength(lens, settings, _interval(waves)),
             titled(lens, "final", ", ".join(filter(None, what))),
         )
@@ -124,7 +138,7 @@ def design_figures(
         share = pupil_share(lens, settings)
         beyond = f"; shaded: beyond {pupil_text(settings)}" if share < 1.0 else ""
         return ray_fans_figure(
-            ray_fans(lens, fields, waves, object_distance=distance),
+            ray_fans(lens, fields, waves, _FAN_POINTS, distance),
             titled(lens, "final", f"ray fans across the whole stop{beyond}"),
             share,
         )
@@ -139,10 +153,9 @@ def design_figures(
     }
     if history:
         damping = [row.get("train/damping", float("nan")) for row in history]
-        merits = [row["train/merit"] for row in history]
         figures["history"] = lambda: history_figure(
-            merits,
-            damping if any(value == value for value in damping) else None,
+            [initial_merit, *(row["train/merit"] for row in history)],
+            [math.nan, *damping] if any(value == value for value in damping) else None,
             title=": ".join(filter(None, [shown_name(lens), "history of the design"])),
             merit_label=f"merit ({merit_unit})" if merit_unit else "merit",
         )
@@ -154,6 +167,31 @@ def titled(lens: Lens, stage: str | None, rest: str) -> str:
     optics = optics_text(lens.system(), lens.primary_wavelength, lens.object_distance)
     name = ", ".join(part for part in (shown_name(lens), stage) if part)
     return f"{name}: {optics}\n{rest}" if name else f"{optics}\n{rest}"
+
+
+def _titled_both(initial: Lens, final: Lens, rest: str) -> str:
+    """Return a title of a comparison, with the focal lengths and apertures of both lenses."""
+    first, last = (
+        optics_text(lens.system(), lens.primary_wavelength, lens.object_distance)
+        for lens in (initial, final)
+    )
+    if first == last:
+        return titled(final, None, rest)
+    wave = f" at {final.primary_wavelength:.4g} nm"
+    pairs = zip(
+        first.removesuffix(wave).split(", "), last.removesuffix(wave).split(", "), strict=False
+    )
+    changes = [
+        one if one == other else f"{one} → {other.removeprefix('f = ')}" for one, other in pairs
+    ]
+    return f"{shown_name(final)}: {', '.join(changes)}{wave}\n{rest}".removeprefix(": ")
+
+
+def _products(labels: Sequence[str], count: int) -> str:
+    """Return a note about the fields of a panel whose MTF is a product; a blank line for none."""
+    if not labels:
+        return " "
+    return "all fields¹" if len(labels) == count else f"product¹: {', '.join(labels)}"
 
 
 def _radius(lens: Lens, settings: MeritSettings) -> str:

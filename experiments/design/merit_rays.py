@@ -30,67 +30,19 @@ from dolens.analysis.spot_diagram import (
 )
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.errors import InputError
-from dolens.experiments.design.tables import SQUARE_GRID_COUNT, spot_table
+from dolens.experiments.design.merit_pupil import is_grid, pupil_f_numbers, pupil_share
+from dolens.experiments.design.tables import spot_table
+from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
-from dolens.optics.paraxial import first_order
 from dolens.optimize import MeritSettings
 from dolens.optimize.image_quality import ImageQuality, QualityValues
-from dolens.plotting.style import field_label
 
-_CURVE_POINTS = 15
+# Of an RMS curve; an odd number, so that the middle of the interval is among them.
+_CURVE_POINTS = 31
 # Rays along each side of a grid for transfer functions.
 _DENSE_GRID = 121
 # Airy radii beyond which a mean RMS radius leaves diffraction without a say.
 _STEEP = 10.0
-# A quadrature of the whole stop that holds for large aberrations too.
-_WHOLE_STOP = {"rings": 20, "arms": 24}
-
-
-def is_grid(settings: MeritSettings) -> bool:
-    """Return whether the rays are a grid, which need not fill the stop."""
-    return settings.sampling == "square_grid"
-
-
-def pupil_text(settings: MeritSettings) -> str:
-    """Return the pupil of `rms_spot_um`, as `±15 mm` or `the whole stop`."""
-    half_width = settings.sampling_options.get("half_width") if is_grid(settings) else None
-    return "the whole stop" if half_width is None else f"a square of ±{half_width:g} mm"
-
-
-def rays_text(settings: MeritSettings) -> str:
-    """Return which rays `rms_spot_um` is of, as `31×31 rays over ±15 mm`."""
-    if not is_grid(settings):
-        return "rays over the whole stop"
-    options = settings.sampling_options
-    count = options.get("count") or SQUARE_GRID_COUNT
-    half_width = options.get("half_width")
-    width = "the first surface" if half_width is None else f"±{half_width:g} mm"
-    return f"{count}×{count} rays over {width}"
-
-
-def reference_text(settings: MeritSettings) -> str:
-    """Return what radii count from, where that is not each spot's own centroid; else nothing."""
-    point = "chief ray" if settings.reference == "chief" else "centroid"
-    if settings.reference_spectrum == "polychromatic":
-        return f"about one {point} for all wavelengths"
-    return "about the chief rays" if settings.reference == "chief" else ""
-
-
-def pupil_share(lens: Lens, settings: MeritSettings) -> float:
-    """Return how far the grid reaches over the entrance pupil's semi-diameter; 1 for all of it."""
-    half_width = settings.sampling_options.get("half_width") if is_grid(settings) else None
-    if half_width is None:
-        return 1.0
-    pupil = first_order(lens.system(), lens.primary_wavelength).entrance_pupil
-    return min(2.0 * half_width / abs(float(pupil.diameter)), 1.0)
-
-
-def whole_stop_rms(lens: Lens, settings: MeritSettings) -> float | None:
-    """Return the mean RMS radius (µm) over the whole stop; None where the rays fill it anyway."""
-    if pupil_share(lens, settings) >= 1.0:
-        return None
-    whole = {"sampling": "gaussian_quadrature", "sampling_options": _WHOLE_STOP}
-    return spot_table(lens, replace(settings, **whole)).mean
 
 
 @torch.no_grad()
@@ -129,7 +81,7 @@ def merit_spots(lens: Lens, settings: MeritSettings) -> SpotDiagram:
         geo=geo.reshape(shape),
         polychromatic_centroid=common,
         polychromatic_rms=square.sqrt(),
-        airy_radius=AIRY * wavelengths * 1e-6 * _f_numbers(lens, settings, wavelengths),
+        airy_radius=AIRY * wavelengths * 1e-6 * pupil_f_numbers(lens, settings, wavelengths),
     )
 
 
@@ -205,7 +157,7 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
         )
         for way in (along, across)
     )
-    limit = _square_limit(_f_numbers(lens, settings, wavelengths), wavelengths, frequencies)
+    limit = _square_limit(pupil_f_numbers(lens, settings, wavelengths), wavelengths, frequencies)
     unit = field_unit(lens.object_distance)
     return Modulation(
         field, unit, wavelengths, frequencies, tangential * limit, sagittal * limit, limit
@@ -213,11 +165,21 @@ def _grid_modulation(lens: Lens, settings: MeritSettings, frequencies: Tensor) -
 
 
 def merit_rms_against_field(
-    lens: Lens, settings: MeritSettings, edge: Sequence[float]
+    lens: Lens,
+    settings: MeritSettings,
+    edge: Sequence[float],
+    start: Sequence[float] = (0.0, 0.0),
 ) -> RMSCurves:
-    """Return RMS radii from the axis to a field, by the sampling and reference of `rms_spot_um`."""
-    steps = torch.linspace(0.0, 1.0, _CURVE_POINTS, dtype=torch.float64)
-    fields = [(float(s * edge[0]), float(s * edge[1])) for s in steps]
+    """Return RMS radii between two fields, by the sampling and reference of `rms_spot_um`.
+
+    Args:
+        lens: the lens.
+        settings: the rays, and what radii count from.
+        edge: the last field, (x, y) in degrees or mm.
+        start: the first one; the axis, or the field opposite to the edge.
+    """
+    steps = torch.linspace(0.0, 1.0, _CURVE_POINTS, dtype=torch.float64).tolist()
+    fields = [tuple(a + s * (b - a) for a, b in zip(start, edge, strict=True)) for s in steps]
     return _curves(lens, settings, fields, settings.wavelengths_of(lens))
 
 
@@ -250,7 +212,7 @@ def _curves(
         wavelengths=wavelengths,
         rms=rms,
         polychromatic=together,
-        airy_radius=AIRY * wavelengths * 1e-6 * _f_numbers(lens, settings, wavelengths),
+        airy_radius=AIRY * wavelengths * 1e-6 * pupil_f_numbers(lens, settings, wavelengths),
     )
 
 
@@ -288,12 +250,6 @@ def _padded(hits: Tensor, spot: Tensor, count: int) -> Tensor:
     """Return (spots, most rays of one, K) of (N, K); NaN where a spot has fewer."""
     of_spot = [hits[spot == number] for number in range(count)]
     return torch.nn.utils.rnn.pad_sequence(of_spot, batch_first=True, padding_value=math.nan)
-
-
-def _f_numbers(lens: Lens, settings: MeritSettings, wavelengths: Tensor) -> Tensor:
-    """Return working F-numbers of the pupil that the rays fill."""
-    whole = working_f_numbers(lens, wavelengths, lens.object_distance)
-    return whole / pupil_share(lens, settings)
 
 
 def _square_limit(f_numbers: Tensor, wavelengths: Tensor, frequencies: Tensor) -> Tensor:

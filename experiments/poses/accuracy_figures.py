@@ -12,8 +12,9 @@ from dolens.experiments.poses.basin import Basin
 from dolens.experiments.poses.labels import variable_label
 from dolens.experiments.tables import Row
 from dolens.plotting.number_text import number_text
-from dolens.plotting.style import PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.style import PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
+from dolens.plotting.titles import draw_title
 from dolens.rendering.spot_image import SpotImager
 
 _LABELS = {"noise_weighted": "weighted by noise", "s21": "S21"}
@@ -77,7 +78,7 @@ def photons_figure(
     figure.legend(
         handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL
     )
-    figure.suptitle(title, fontsize=TITLE)
+    draw_title(figure, title)
     return figure
 
 
@@ -130,7 +131,7 @@ def rays_figure(
     figure.legend(
         handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=SMALL
     )
-    figure.suptitle(f"{name}: error that the model's rays make", fontsize=TITLE)
+    draw_title(figure, f"{name}: error that the model's rays make")
     return figure
 
 
@@ -162,7 +163,7 @@ def basin_figure(basin: Basin, name: str) -> Figure:
     bar = figure.colorbar(shown, ax=list(panels), pad=0.01, extend="both")
     bar.set_label("RMS error of the fit over bound (no unit)", fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
-    figure.suptitle(f"{name}: from where a fit converges", fontsize=TITLE)
+    draw_title(figure, f"{name}: from where a fit converges")
     return figure
 
 

@@ -12,6 +12,7 @@ from dolens.alignment.pixel_moments import Pixels
 from dolens.experiments.poses.alignment_result import COLUMNS, Alignment
 from dolens.plotting.style import DASHES, PAGE, SMALL, TITLE, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
+from dolens.plotting.titles import draw_title
 
 _PANELS = (("tilt", slice(0, 2), "°"), ("decentre", slice(2, 4), "µm"))
 
@@ -52,10 +53,10 @@ def alignment_figure(found: Alignment, setup: Setup) -> Figure:
     for axes, letter in zip(grid, "abcd", strict=True):
         axes.set_title(f"({letter})", loc="left", fontsize=SMALL + 1, fontweight="bold")
     photons = f"{setup.photons:_.0f}".replace("_", "\N{NARROW NO-BREAK SPACE}")
-    figure.suptitle(
+    draw_title(
+        figure,
         f"{setup.lens}: {len(found.element) - 1} misalignments from {setup.fields} fields"
         f", {photons} photons a spot{_sensor(setup)}",
-        fontsize=TITLE,
     )
     return figure
 

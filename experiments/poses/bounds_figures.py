@@ -15,8 +15,9 @@ from dolens.experiments.poses.arrangement import UNSEEN, Arrangement
 from dolens.experiments.poses.labels import variable_label
 from dolens.plotting.corner import corner_figure
 from dolens.plotting.number_text import MINUS, number_text
-from dolens.plotting.style import DASHES, MARKERS, PAGE, SMALL, TITLE, colours, ruled_axes
+from dolens.plotting.style import DASHES, MARKERS, PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
+from dolens.plotting.titles import draw_title
 
 
 def bounds_figures(arrangements: Sequence[Arrangement], name: str, photons: float) -> Figures:
@@ -54,10 +55,10 @@ def _overview(arrangements: Sequence[Arrangement], name: str, photons: float) ->
         frameon=False,
         fontsize=SMALL,
     )
-    figure.suptitle(
+    draw_title(
+        figure,
         f"{name}: Cramér–Rao bounds of its pose from images of {number_text(photons)} photons "
         "in all",
-        fontsize=TITLE,
     )
     return figure
 

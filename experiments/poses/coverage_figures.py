@@ -7,7 +7,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.plotting.number_text import number_text
-from dolens.plotting.style import PAGE, SMALL, TITLE, colours, open_axes
+from dolens.plotting.style import PAGE, SMALL, colours, open_axes
+from dolens.plotting.titles import draw_axes_title
 
 
 def coverage_figure(
@@ -60,7 +61,7 @@ def coverage_figure(
         va="bottom",
         fontsize=SMALL,
     )
-    axes.set_title(title, fontsize=TITLE)
+    draw_axes_title(axes, title)
     open_axes(axes)
     reach = max(abs(limit) for limit in axes.get_xlim())
     powers = [10.0**power for power in range(1, 9) if 10.0**power <= reach]

@@ -2,12 +2,10 @@
 
 from collections.abc import Mapping
 
-import torch
-
+from dolens.experiments.camera.photograph_gain import paired_gain
 from dolens.experiments.camera.photograph_scores import read_scores, statistics_of
 from dolens.experiments.report.plan import Comparison
 from dolens.experiments.report.results import Result
-from dolens.reconstruction.intervals import gain_interval
 
 _METRIC = "psnr_db"
 
@@ -46,16 +44,14 @@ def gain_numbers(run: Result, against: Result, judge: str | None = None) -> dict
         An empty mapping where a run has no scores of photographs, or the two have other ones.
     """
     stage = f"test_{judge}" if judge else "test"
-    scores = [read_scores(side.folder, stage) for side in (run, against)]
-    ours, others = scores
-    if ours is None or others is None:
+    ours, others = (read_scores(side.folder, stage) for side in (run, against))
+    if ours is None:
         return {}
-    if (ours.photographs, ours.views) != (others.photographs, others.views):
-        return {}
-    pair = [side.metrics[_METRIC][None] for side in (ours, others)]
     numbers = {"gain/photographs": float(len(ours.photographs))}
-    for view, statistic in statistics_of(ours.views).items():
-        found = gain_interval(*pair, statistic, torch.Generator().manual_seed(0))
+    for view in statistics_of(ours.views):
+        found = paired_gain([ours], [others], _METRIC, view)
+        if found is None:
+            return {}
         key = f"gain/{_METRIC}" + (f"/{view}" if view else "")
         numbers |= {key: found.estimate, f"{key}/low": found.low, f"{key}/high": found.high}
     return {name: value for name, value in numbers.items() if value == value}

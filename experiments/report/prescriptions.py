@@ -14,7 +14,8 @@ import torch
 from matplotlib.figure import Figure
 
 from dolens.experiments.report.golden_rays import load_golden_rays, trace_errors
-from dolens.experiments.running.run_folder import describe_run, peak_memory_mb, write_json
+from dolens.experiments.running.run_files import INFO, METRICS, write_json
+from dolens.experiments.running.run_folder import describe_run, peak_memory_mb
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
 from dolens.packaged import packaged_configuration
@@ -77,8 +78,8 @@ def main(folder: Path) -> None:
     numbers |= trace_costs(load_lens(prescribed / "cooke_triplet.yaml"))
     numbers["cost/wall_s"] = time.perf_counter() - started
     numbers["cost/peak_memory_mb"] = peak_memory_mb(torch.device("cpu"))
-    write_json(folder / "metrics.json", numbers)
-    write_json(folder / "run.json", {**info, "status": "finished"})
+    write_json(folder / METRICS, numbers)
+    write_json(folder / INFO, {**info, "status": "finished"})
 
 
 def layout(lens: Lens, shown: Shown) -> Figure:

@@ -1,15 +1,20 @@
 """Finished runs as the report reads them."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dolens.errors import InputError
 from dolens.experiments.report.plan import Plan, System
+from dolens.experiments.running.run_files import (
+    info_of,
+    is_finished,
+    metrics_of,
+    overrides_of,
+    read_json,
+    read_yaml,
+)
 
 RECORD = "report_run.json"
 # Settings that change nothing in what a run finds.
@@ -41,10 +46,7 @@ class Result:
 
         A radius is found where the file has a curvature in its place, too.
         """
-        path = self.folder / "lens" / "final.yaml"
-        if not path.is_file():
-            return None
-        found: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        found: Any = read_yaml(self.folder / "lens" / "final.yaml")
         for key in place.split("."):
             if not isinstance(found, Mapping):
                 return None
@@ -74,32 +76,14 @@ def read_result(name: str, folder: Path) -> Result:
     Raises:
         InputError: the folder is not that of a finished run.
     """
-    if not is_finished(folder):
-        raise InputError(f"{folder} is not the folder of a finished run")
     return Result(
         name,
-        folder,
+        _finished(folder),
         overrides_of(folder),
-        read_json(folder / "metrics.json"),
-        read_json(folder / "run.json"),
+        metrics_of(folder),
+        info_of(folder),
         read_json(folder / RECORD),
     )
-
-
-def is_finished(folder: Path) -> bool:
-    """Return whether a folder has the metrics of a run that ended without an error."""
-    if not (folder / "metrics.json").is_file():
-        return False
-    return read_json(folder / "run.json").get("status") == "finished"
-
-
-def overrides_of(folder: Path) -> tuple[str, ...]:
-    """Return the overrides of a run as Hydra kept them; none where it kept none."""
-    path = folder / ".hydra" / "overrides.yaml"
-    if not path.is_file():
-        return ()
-    found = yaml.safe_load(path.read_text(encoding="utf-8"))
-    return tuple(str(entry) for entry in found or ())
 
 
 def same_overrides(some: Iterable[str], others: Iterable[str]) -> bool:
@@ -150,11 +134,6 @@ def assigned(plan: Plan, given: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file; an empty mapping where there is none."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-
-
 def _finished(folder: Path) -> Path:
     if not is_finished(folder):
         raise InputError(f"{folder} is not the folder of a finished run")
@@ -162,7 +141,7 @@ def _finished(folder: Path) -> Path:
 
 
 def _system_of(plan: Plan, folder: Path) -> System | None:
-    module = read_json(folder / "run.json").get("module")
+    module = info_of(folder).get("module")
     for system in plan.systems:
         if system.module is not None:
             if system.module == module:

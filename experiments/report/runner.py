@@ -1,6 +1,5 @@
 """Runs the systems of the report, one after another, each in a process of its own."""
 
-import json
 import os
 import shlex
 import shutil
@@ -14,7 +13,8 @@ from pathlib import Path
 
 from dolens.experiments.report.code_version import code_fingerprint
 from dolens.experiments.report.plan import System
-from dolens.experiments.report.results import RECORD, is_finished, read_json
+from dolens.experiments.report.results import RECORD
+from dolens.experiments.running.run_files import is_finished, read_json, write_json
 
 # What a run may take to end by itself once it is interrupted.  Ctrl-C in a terminal reaches it too;
 # a second signal at once would disturb what it saves.
@@ -92,7 +92,7 @@ def run_system(system: System, folder: Path, tick: Callable[[float], None]) -> F
         "name": system.name,
         "overrides": list(system.overrides),
     }
-    _write(folder / RECORD, {**record, "status": None})
+    write_json(folder / RECORD, {**record, "status": None})
     started = time.perf_counter()
     with log.open("w", encoding="utf-8") as output:
         process = subprocess.Popen(
@@ -104,7 +104,7 @@ def run_system(system: System, folder: Path, tick: Callable[[float], None]) -> F
             _stop(process)
             raise
     finish = Finish(status, time.perf_counter() - started, cpu, log)
-    _write(
+    write_json(
         folder / RECORD,
         {**record, "status": finish.status, "wall_s": finish.wall_s, "cpu_s": finish.cpu_s},
     )
@@ -148,7 +148,3 @@ def _stop(process: subprocess.Popen) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def _write(path: Path, content: dict) -> None:
-    path.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n", encoding="utf-8")

@@ -9,8 +9,9 @@ from dolens.experiments.report.assemble import assemble
 from dolens.experiments.report.checks import Outcome, load_checks
 from dolens.experiments.report.plan import Plan, System
 from dolens.experiments.report.progress import Pace
-from dolens.experiments.report.results import RECORD, is_finished, read_json
+from dolens.experiments.report.results import RECORD
 from dolens.experiments.report.runner import Finish, is_current, last_words, run_system
+from dolens.experiments.running.run_files import is_finished, read_json
 
 PAGE = "index.html"
 RUNS = "runs"

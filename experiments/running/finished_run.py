@@ -16,8 +16,14 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from dolens.errors import InputError, one_line
+from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, check_experiment
+from dolens.experiments.running.checkpoint_state import (
+    CHECKPOINTS,
+    checkpoint_file,
+    read_checkpoint,
+    take_up,
+)
 from dolens.experiments.running.composition import with_overrides
 from dolens.experiments.running.extensions import import_extensions
 from dolens.experiments.running.perturbed_lens import perturbed_state
@@ -29,8 +35,6 @@ from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription
 
 logger = logging.getLogger(__name__)
-
-CHECKPOINTS = ("last", "best")
 
 
 @dataclass(frozen=True)
@@ -185,14 +189,14 @@ def _loaded(
     check_experiment(module, train=False)
     file, state = None, {}
     if module.trains:
-        file = _checkpoint_file(record, checkpoint)
+        file = checkpoint_file(record, checkpoint)
         state = read_checkpoint(file)
         values = state["state_dict"]
         if config["lens"] != record.config["lens"]:
             wanted = _lens(settings.prescription(), settings)
             recorded = _lens(record.config["lens"], settings)
             values = perturbed_state(module, wanted, recorded, values)
-        _take_up(module, {**state, "state_dict": values}, file)
+        take_up(module, {**state, "state_dict": values}, file)
     elif str(checkpoint) != CHECKPOINTS[0]:
         raise InputError(
             f"{record.folder}: {type(module).__name__} trains nothing, and has no checkpoint"
@@ -206,74 +210,6 @@ def _lens(prescription: Mapping[str, Any], settings: RunSettings) -> Lens:
     return lens_from_prescription(
         prescription, settings.dtype, where="lens", backend=settings.backend
     )
-
-
-def _checkpoint_file(record: RecordedRun, checkpoint: str | Path) -> Path:
-    """Return the path of a checkpoint.
-
-    Raises:
-        InputError: there is none.
-    """
-    if str(checkpoint) not in CHECKPOINTS:
-        file = Path(checkpoint).expanduser().resolve()
-        if not file.is_file():
-            raise InputError(
-                f"checkpoint: {checkpoint} does not exist; allowed: {', '.join(CHECKPOINTS)}, or "
-                "the path of a file"
-            )
-        return file
-    folder = record.folder / "checkpoints"
-    file = folder / f"{checkpoint}.ckpt"
-    if file.is_file():
-        return file
-    others = sorted(path.stem for path in folder.glob("*.ckpt"))
-    there = f"there is {', '.join(others)}" if others else "there is none"
-    raise InputError(
-        f"{record.folder}: this run ({record.status}) has no checkpoint checkpoints/{file.name}; "
-        f"{there}"
-    )
-
-
-def read_checkpoint(file: Path) -> Mapping[str, Any]:
-    """Read a checkpoint as plain tensors and values, on the CPU.
-
-    Raises:
-        InputError: the file holds something else, or no state of a module.
-    """
-    try:
-        found = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:
-        reason = one_line(error)[:200]
-        raise InputError(f"{file} is not a safe checkpoint ({reason})") from None
-    if not isinstance(found, Mapping) or "state_dict" not in found:
-        raise InputError(f"{file} holds no state of a module")
-    return found
-
-
-def _take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
-    """Give a module the state of a checkpoint, as a trainer does.
-
-    Raises:
-        InputError: the checkpoint is of another experiment, lens or network.
-    """
-    module.on_load_checkpoint(dict(state))
-    try:
-        module.load_state_dict(state["state_dict"])
-    except RuntimeError as error:
-        reason = _misfit(state["state_dict"], module.state_dict()) or one_line(error)
-        raise InputError(f"{file} does not fit the run's configuration: {reason}") from None
-    module.settle()
-
-
-def _misfit(found: Mapping[str, Any], own: Mapping[str, Any]) -> str:
-    """Return the first thing in which a state differs from what a module takes; nothing: ''."""
-    for name, value in own.items():
-        if name not in found:
-            return f"{name} is missing in the checkpoint"
-        if found[name].shape != value.shape:
-            shapes = tuple(found[name].shape), tuple(value.shape)
-            return f"{name} has shape {shapes[0]} in the checkpoint and {shapes[1]} here"
-    return next((f"there is no {name} here" for name in found if name not in own), "")
 
 
 def _made(key: str, config: DictConfig) -> Any:

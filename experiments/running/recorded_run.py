@@ -13,8 +13,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.running.renaming import translated, with_targets_of_now
+from dolens.experiments.running.run_files import HYDRA, INFO, OVERRIDES, RESOLVED
 
-_RECORDS = (".hydra/resolved.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml", "run.json")
+_RECORDS = (RESOLVED, HYDRA, OVERRIDES, INFO)
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ def read_record(folder: str | Path, output: str | Path | None = None) -> Recorde
     folder = Path(folder).expanduser().resolve()
     _check_folder(folder)
     output = folder if output is None else Path(output).expanduser().resolve()
-    config = _mapping(folder / ".hydra/resolved.yaml")
-    job = _mapping(folder / ".hydra/hydra.yaml")
+    config = _mapping(folder / RESOLVED)
+    job = _mapping(folder / HYDRA)
     try:
         runtime = job["hydra"]["runtime"]
         choices, written_to = dict(runtime["choices"]), str(runtime["output_dir"])
@@ -78,7 +79,7 @@ def read_record(folder: str | Path, output: str | Path | None = None) -> Recorde
         sources = tuple(Path(source["path"]) for source in searched)
     except (KeyError, TypeError):
         raise InputError(f"{folder}: .hydra/hydra.yaml is not that of a run") from None
-    overrides = _read(folder / ".hydra/overrides.yaml") or []
+    overrides = _read(folder / OVERRIDES) or []
     try:
         now, notes = translated([str(override) for override in overrides])
     except HydraException as error:
@@ -91,7 +92,7 @@ def read_record(folder: str | Path, output: str | Path | None = None) -> Recorde
         tuple(notes),
         choices,
         sources,
-        _mapping(folder / "run.json"),
+        _mapping(folder / INFO),
         output,
     )
 

@@ -1,6 +1,5 @@
-"""The files run.json and metrics.json of a run folder."""
+"""What run.json and metrics.json of a run say: code, versions, machine, memory, numbers."""
 
-import json
 import math
 import platform
 import resource
@@ -24,13 +23,6 @@ _PACKAGES = (
     "numpy",
     "scikit-image",
 )
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a mapping as JSON, whole or not at all."""
-    temporary = path.with_suffix(path.suffix + ".part")
-    temporary.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-    temporary.replace(path)
 
 
 def describe_run(seed: int, device: str, dtype: str, command: list[str]) -> dict[str, Any]:

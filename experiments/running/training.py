@@ -28,11 +28,11 @@ from dolens.experiments.running.compared_settings import all_settings, choices_o
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.extensions import import_extensions
 from dolens.experiments.running.resolvers import register_resolvers
+from dolens.experiments.running.run_files import INFO, METRICS, RESOLVED, write_json
 from dolens.experiments.running.run_folder import (
     describe_run,
     peak_memory_mb,
     plain_metrics,
-    write_json,
 )
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.optics.lens import Lens
@@ -83,11 +83,11 @@ def run(cfg: DictConfig) -> float:
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
     (folder / "lens").mkdir(exist_ok=True)
     (folder / ".hydra").mkdir(exist_ok=True)
-    OmegaConf.save(cfg, folder / ".hydra" / "resolved.yaml", resolve=True)
+    OmegaConf.save(cfg, folder / RESOLVED, resolve=True)
     save_lens(lens, folder / "lens" / "initial.yaml")
     device = str(trainer.strategy.root_device)
     info = describe_run(settings.seed, device, settings.lens_dtype, sys.argv)
-    write_json(folder / "run.json", {**info, "status": "running"})
+    write_json(folder / INFO, {**info, "status": "running"})
     status = "failed"
     try:
         if settings.train:
@@ -105,12 +105,12 @@ def run(cfg: DictConfig) -> float:
         raise
     finally:
         save_lens(module.lens, folder / "lens" / "final.yaml")
-        write_json(folder / "run.json", {**info, "status": status})
+        write_json(folder / INFO, {**info, "status": status})
     metrics.update(summary_of(module))
     metrics["cost/wall_s"] = time.perf_counter() - started
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
     numbers = plain_metrics(metrics)
-    write_json(folder / "metrics.json", numbers)
+    write_json(folder / METRICS, numbers)
     summary = RunSummary(
         choices=choices_of(cfg),
         settings=all_settings(cfg),

@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from overlaps import flaws
 
 from dolens.analysis.spot_diagram import spot_diagram
-from dolens.experiments.design.merit_rays import rays_text, reference_text
+from dolens.experiments.design.merit_pupil import rays_text, reference_text
 from dolens.experiments.design.tables import spot_table
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens
@@ -69,6 +69,25 @@ def test_before_and_after_are_in_one_figure_on_one_scale(module):
 )
 def test_figures_of_a_design_can_be_printed(module, name):
     assert not flaws(module.figures()[name]())
+
+
+def test_comparisons_name_the_apertures_of_both_lenses(module):
+    """The curvature of the first surface sets the focal length, and so the F-number."""
+    module.initial.surfaces["1"].curvature.data.mul_(0.5)
+    first, last = (first_order(lens.system(), 532.8) for lens in (module.initial, module.lens))
+    title = module.figures()["spots_before_after"]().get_suptitle().split("\n")[0]
+    assert (
+        f"F/{float(first.working_f_number):.3g} → F/{float(last.working_f_number):.3g} at 532.8 nm"
+        in title
+    )
+
+
+def test_the_history_begins_before_the_first_iteration(module):
+    module.history = [{"train/merit": 8.0, "train/damping": 1e-3}]
+    module.initial_merit = 600.0
+    merit, damping = module.figures()["history"]().axes
+    np.testing.assert_array_equal(merit.get_lines()[0].get_data(), [[0, 1], [600.0, 8.0]])
+    np.testing.assert_array_equal(damping.get_lines()[0].get_ydata(), [math.nan, 1e-3])
 
 
 def test_other_rays_and_references_are_named():

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 import torch
 
 from dolens import Lens, Rays
-from dolens.optics.backend import trace_rays
 from dolens.optics.jacobian import OUTPUTS, normal_equations, ray_jacobian
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Status, TracedRays
 from tests.optics.random_lenses import random_lens, random_rays, returning
 

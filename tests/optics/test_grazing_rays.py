@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from dolens import Rays
-from dolens.optics.backend import trace_rays
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Status
-from dolens.optics.surfaces.base import FAR
+from dolens.optics.surfaces.refraction import FAR
 from dolens.prescriptions import lens_from_prescription
 
 SEMI_DIAMETER = 1.1

@@ -9,7 +9,9 @@ import torch
 from matplotlib.figure import Figure
 
 from dolens import load_lens
+from dolens.analysis.conditions import conditions
 from dolens.errors import InputError
+from dolens.lens_page.tables import first_order_table
 from dolens.prescriptions import lens_from_prescription
 
 SINGLET = {
@@ -71,6 +73,9 @@ def test_summary_holds_the_numbers_and_writes_them(root):
     assert found.total_track == pytest.approx(60.177) and found.defocus == pytest.approx(
         -0.2251, abs=1e-4
     )
+    assert (found.front_principal_z, found.rear_principal_z) == pytest.approx(
+        (float(first.front_principal.detach()), float(first.rear_principal.detach()))
+    )
     assert [row.field for row in found.fields] == [(0.0, 0.0), (0.0, 14.0)]
     sums = lens.seidel(14.0)
     assert found.seidel["coma"] == pytest.approx(float(sums.total.coma.detach()))
@@ -78,6 +83,17 @@ def test_summary_holds_the_numbers_and_writes_them(root):
     text = repr(found)
     assert "effective focal length" in text and "50.019" in text and "S_III" in text
     assert found._repr_html_().count("<table>") == 3
+
+
+def test_a_notebook_and_a_page_show_the_same_quantities(root):
+    lens = load_lens(root / "conf/lens/cooke_triplet.yaml", torch.float64)
+    page = first_order_table(lens, conditions(lens))
+    shown = lens.summary().first_order_cells()
+    assert [(name, unit) for name, _, unit in page.rows] == [
+        (name, unit) for name, _, unit in shown
+    ]
+    for (_, theirs, _), (_, ours, _) in zip(page.rows, shown, strict=True):
+        assert float(theirs.replace("−", "-")) == float(ours)
 
 
 def test_summary_of_a_lens_without_light_says_so(root):
@@ -119,6 +135,7 @@ import sys
 from IPython.core.interactiveshell import InteractiveShell
 shell = InteractiveShell.instance()
 from dolens import load_lens
+from dolens.analysis.conditions import conditions
 lens = load_lens({str(root / "conf/lens/cooke_triplet.yaml")!r})
 figure = lens.draw()
 assert "matplotlib.pyplot" not in sys.modules

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dolens import Rays, Status
 from dolens.optics.rays import Components
-from dolens.optics.surfaces.base import PlaneRay
+from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.trace import trace_surfaces
 from dolens.prescriptions import lens_from_prescription
 

@@ -8,7 +8,7 @@ import torch
 
 from dolens import InputError
 from dolens.optics.surfaces import SURFACES, Conic, EvenAsphere, Plane, Sphere, XYPolynomial
-from dolens.optics.surfaces.base import PlaneRay
+from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
 
 SEMI_DIAMETER = 8.0

@@ -5,7 +5,7 @@ import torch
 
 from dolens import Rays, load_lens
 from dolens.errors import InputError
-from dolens.optics.backend import trace_rays
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optimize import DampedLeastSquares
 from dolens.optimize.residuals import TensorResiduals
 from tests.optimize.standard_problems import CERTIFIED, MORE

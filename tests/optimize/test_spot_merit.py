@@ -233,7 +233,7 @@ def test_the_jacobian_is_that_of_forward_mode(triplet):
 
     def residuals(theta):
         values = dict(zip(names, theta.unbind(), strict=True))
-        from dolens.optics.backend import trace_rays
+        from dolens.optics.ray_tracing import trace_rays
 
         hit = trace_rays(lens.system(values).traced_by("reference"), spots.rays)
         points = hit.position[:, :2]

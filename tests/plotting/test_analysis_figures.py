@@ -168,6 +168,16 @@ def test_rms_curves_are_in_micrometres_over_degrees_and_nanometres():
         rms_curves_figure()
 
 
+def test_fields_on_both_sides_of_the_axis_are_plotted_on_both_sides():
+    """A lens that is tilted in y blurs fields above the axis unlike those below."""
+    fields = torch.tensor([[0.0, -2.0], [0.0, 0.0], [0.0, 2.0]], dtype=torch.float64)
+    rms = torch.tensor([[3.0], [1.0], [2.0]], dtype=torch.float64) * 1e-3
+    curves = RMSCurves(fields, "°", LINES[:1], rms, rms[:, 0], torch.tensor([2e-3]))
+    (axes,) = rms_curves_figure(curves).axes
+    np.testing.assert_allclose(axes.get_lines()[0].get_data(), [[-2, 0, 2], [3, 1, 2]])
+    assert axes.get_xlabel() == "field along y (°)" and axes.get_xlim() == (-2.0, 2.0)
+
+
 def test_before_and_after_share_their_scale(root, triplet):
     longer = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
     longer.sensor_distance.add_(20.0)
@@ -177,7 +187,7 @@ def test_before_and_after_share_their_scale(root, triplet):
     assert above.get_aspect() == below.get_aspect() == 1.0
     sensors = [by_gid(axes, "sensor")[0].get_xdata()[0] for axes in figure.axes]
     assert sensors[1] - sensors[0] == pytest.approx(20.0)
-    assert above.get_title().startswith("(a) initial: Cooke triplet: f = 50.02 mm, F/4.9")
+    assert above.get_title().startswith("(a) Cooke triplet, initial: f = 50.02 mm, F/4.9")
     alone = layout_figure(triplet, fields_deg=(0.0, 14.0), rays=3).axes[0]
     for one, other in zip(by_gid(above, "ray"), by_gid(alone, "ray"), strict=True):
         np.testing.assert_array_equal(one.get_xydata(), other.get_xydata())

@@ -2,8 +2,9 @@
 
 import pytest
 
+from dolens.optics.fields import field_label
 from dolens.plotting.number_text import number_text, value_and_error, with_minus
-from dolens.plotting.style import field_label, line_styles
+from dolens.plotting.style import line_styles
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,11 @@ def test_powers_of_ten_are_written_as_such(value, printed):
 def test_only_a_hyphen_before_a_number_is_a_minus():
     assert with_minus("(-2, 0)° of U-Net, 3-4") == "(−2, 0)° of U-Net, 3-4"
     assert field_label((-2.0, 0.0), "°") == "(−2, 0)°"
+
+
+def test_a_field_on_the_y_axis_is_one_number():
+    labels = [field_label(point, "mm") for point in ((0.0, -14.0), (3.0, 14.0), (-0.0, -0.0))]
+    assert labels == ["−14 mm", "(3, 14) mm", "0 mm"]
 
 
 def test_no_two_lines_look_alike():

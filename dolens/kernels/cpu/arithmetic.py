@@ -1,6 +1,6 @@
 """All surfaces share these functions of one ray: clamps, transfer, Snell's law, and its adjoint.
 
-They mirror `dolens.optics.trace` and `dolens.optics.surfaces.base`.
+They mirror `dolens.optics.trace` and `dolens.optics.surfaces.refraction`.
 """
 
 import math

@@ -1,7 +1,7 @@
 """All surfaces share these functions of a block: clamps, transfer, Snell's law, and its adjoint.
 
-It mirrors `dolens.optics.trace` and `dolens.optics.surfaces.base`.  Constants take the precision of
-the rays they meet.
+It mirrors `dolens.optics.trace` and `dolens.optics.surfaces.refraction`.  Constants take the
+precision of the rays they meet.
 """
 
 import triton

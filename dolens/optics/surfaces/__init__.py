@@ -2,11 +2,12 @@
 
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.b_spline import BSpline
-from dolens.optics.surfaces.base import PackedShape, Surface, SurfaceState
+from dolens.optics.surfaces.base import PackedShape, Surface
 from dolens.optics.surfaces.conic import Conic, Sphere
 from dolens.optics.surfaces.even_asphere import EvenAsphere
 from dolens.optics.surfaces.plane import Aperture, Plane
 from dolens.optics.surfaces.registry import SURFACES, register_surface, unregister_surface
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
 __all__ = [

@@ -8,7 +8,6 @@ reaches; their gradient is cut off where the trace ends.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -18,36 +17,12 @@ from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
+from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay, Refraction, snell
 
 Parameters = Mapping[str, Tensor]
 
-# Smallest cosine that is divided by.  Its square is far above the smallest float32.
-GRAZING = 1e-9
-# A ray this many semi-diameters off the axis is invalid, and stays there.
-FAR = 1e3
 # A ray whose crossing rounding moves by this share of its distance and semi-diameter is invalid.
 _UNCERTAIN = 1e-2
-
-
-class PlaneRay(NamedTuple):
-    """Rays cross the vertex plane z = 0 at x, y (mm) with these direction cosines."""
-
-    x: Tensor
-    y: Tensor
-    l: Tensor  # noqa: E741
-    m: Tensor
-    n: Tensor
-
-
-class Refraction(NamedTuple):
-    """Refraction gives direction cosines behind a surface, and a margin that is positive without
-    TIR.
-    """
-
-    l: Tensor  # noqa: E741
-    m: Tensor
-    n: Tensor
-    transmitted: Tensor
 
 
 class PackedShape(NamedTuple):
@@ -66,46 +41,6 @@ class PackedShape(NamedTuple):
     columns: int = 0
     degree: int = 0
     extras: tuple[int, ...] = ()
-
-
-def safe_sqrt(squared: Tensor) -> Tensor:
-    """Return the square root, with a finite derivative everywhere; exact where its argument is
-    positive.
-    """
-    return torch.sqrt(squared.clamp(min=GRAZING * GRAZING))
-
-
-def snell(
-    direction: tuple[Tensor, Tensor, Tensor],
-    normal: tuple[Tensor, Tensor, Tensor],
-    ratio: float | Tensor,
-    sense: float,
-) -> Refraction:
-    """Refract directions by Snell's law in vector form.
-
-    Args:
-        direction: cosines of unit vectors.
-        normal: unit vectors towards +z.
-        ratio: μ, index before over index after, in the order of the light's travel.
-        sense: s, +1 forward and -1 backward: the sign of direction · normal.
-
-    Returns:
-        d' = μ·d + (s·cos t - μ·cos i)·N with cos²t = 1 - μ²(1 - cos²i); `transmitted` is cos²t.
-    """
-    l, m, n = direction  # noqa: E741
-    nx, ny, nz = normal
-    cosine = torch.addcmul(torch.addcmul(l * nx, m, ny), n, nz)
-    # Only rays that missed have |cos i| > 1; two keeps them finite and rounding unclipped.
-    cosine = cosine.clamp(-2.0, 2.0)
-    squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
-    along = sense * safe_sqrt(squared) - ratio * cosine
-    # Rays that missed have no unit normal; a direction that grew would overflow float32 later.
-    return Refraction(
-        torch.addcmul(ratio * l, along, nx).clamp(-2.0, 2.0),
-        torch.addcmul(ratio * m, along, ny).clamp(-2.0, 2.0),
-        torch.addcmul(ratio * n, along, nz).clamp(-2.0, 2.0),
-        squared.detach(),
-    )
 
 
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
@@ -352,46 +287,3 @@ def _newton_step(shape: type[Surface], p: Parameters, ray: PlaneRay, t: Tensor) 
     slope = torch.addcmul(torch.addcmul(-n, l, sx), m, sy)
     magnitude = slope.abs().clamp(min=GRAZING)
     return torch.addcmul(sag, n, t, value=-1.0) / torch.copysign(magnitude, slope)
-
-
-@dataclass(frozen=True)
-class SurfaceState:
-    """The pure functions see a surface in this form.
-
-    Attributes:
-        shape: the `Surface` subclass, used as a namespace of pure functions.
-        parameters: name → tensor.
-        aperture: what light passes.
-        edge: the semi-diameter as a tensor, where a gradient with respect to it is wanted.
-    """
-
-    shape: type[Surface]
-    parameters: Parameters
-    aperture: ClearAperture
-    edge: Tensor | None = None
-
-    def rim_sag(self, like: Tensor) -> Tensor:
-        """Return the sag (mm) at the aperture's reach along x, in another tensor's precision."""
-        reach = torch.full_like(like, self.semi_diameter)
-        return self.shape.sag_and_gradient(self.parameters, reach, torch.zeros_like(like))[0]
-
-    @property
-    def semi_diameter(self) -> float:
-        """Return the distance of the clear aperture's farthest point from the vertex, mm."""
-        return self.aperture.edge.semi_diameter
-
-    @property
-    def edge_radius(self) -> float | Tensor:
-        """Return the semi-diameter, mm, with its gradient where there is one."""
-        return self.semi_diameter if self.edge is None else self.edge
-
-    def edge_distance(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return how far points (mm, in the surface's axes) lie inside the aperture's edge;
-        negative outside.  It is differentiable in the points and in `edge`.
-        """
-        depth = self.aperture.depth(x, y)
-        if self.edge is None:
-            return depth
-        # Of an obscuration the distance does not move with the outer edge.
-        outer = self.aperture.edge.depth(x, y) <= depth
-        return depth + torch.where(outer, (self.edge - self.edge.detach()).to(depth), 0.0)

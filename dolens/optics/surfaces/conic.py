@@ -9,14 +9,8 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
-from dolens.optics.surfaces.base import (
-    GRAZING,
-    PackedShape,
-    Parameters,
-    PlaneRay,
-    Surface,
-    safe_sqrt,
-)
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.refraction import GRAZING, PlaneRay, safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 
 _FLAT = 1e-15  # 1/mm

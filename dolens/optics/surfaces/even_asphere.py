@@ -8,8 +8,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters, PlaneRay, Surface
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
 from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
+from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import register_surface
 
 _POWER = re.compile(r"a([1-9]\d*)")

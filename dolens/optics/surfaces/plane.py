@@ -7,14 +7,8 @@ from torch import Tensor
 
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
-from dolens.optics.surfaces.base import (
-    PackedShape,
-    Parameters,
-    PlaneRay,
-    Refraction,
-    Surface,
-    safe_sqrt,
-)
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.refraction import PlaneRay, Refraction, safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 
 

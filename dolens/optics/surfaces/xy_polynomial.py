@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, safe_sqrt
+from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import trace_rays
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.pupil.exit_pupil import ExitPupil

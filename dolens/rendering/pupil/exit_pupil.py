@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.backend import trace_components
 from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.pupil.limiting_aperture import limiting_aperture, limiting_pupil_radius

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import trace_rays
 from dolens.optics.elements import from_lens_axes
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dolens.optics.backend import trace_rays
+from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, Status
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.imaging_system import ImagingSystem

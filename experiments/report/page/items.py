@@ -3,7 +3,6 @@
 import shlex
 
 from dolens.experiments.report.checks import State
-from dolens.experiments.report.page.html import Child, Markup, element, joined, prose, table
 from dolens.experiments.report.page.material import Material
 from dolens.experiments.report.page.numbers import (
     count_text,
@@ -21,6 +20,7 @@ from dolens.experiments.report.page.pictures import embedded, size_of
 from dolens.experiments.report.plan import Item, Row
 from dolens.experiments.report.results import Result, telling_overrides
 from dolens.experiments.report.runner import shown_command
+from dolens.html import Child, Markup, element, joined, prose, table
 
 _BADGES = {
     State.HOLDS: "its checks hold",
@@ -117,7 +117,7 @@ def _rows(material: Material, item: Item) -> Markup | None:
     rows: list[tuple[Child, ...]] = [
         (row.what, row.printed, ours_text(material, row)) for row in item.rows
     ]
-    return table(("Quantity", "Printed", "Ours"), rows, "numbers")
+    return table(("Quantity", "Printed", "Ours"), rows, "numbers", named_cells=True)
 
 
 def _checks(material: Material, item: Item) -> Markup | None:
@@ -133,7 +133,7 @@ def _checks(material: Material, item: Item) -> Markup | None:
         )
         for outcome in outcomes
     ]
-    return table(("Check", "Expected", "Found", "Outcome"), rows, "numbers")
+    return table(("Check", "Expected", "Found", "Outcome"), rows, "numbers", named_cells=True)
 
 
 def _pictures(material: Material, item: Item) -> Markup | None:
@@ -145,14 +145,12 @@ def _pictures(material: Material, item: Item) -> Markup | None:
             missing.append(f"{picture.run}: {picture.name}")
             continue
         width, height = size_of(path)
-        image = Markup(
-            element(
-                "img",
-                src=embedded(path),
-                alt=picture.caption,
-                width=str(width),
-                height=str(height),
-            ).removesuffix("</img>")
+        image = element(
+            "img",
+            src=embedded(path),
+            alt=picture.caption,
+            width=str(width),
+            height=str(height),
         )
         shown.append(element("figure", image, element("figcaption", picture.caption)))
     note = f"No picture yet of {'; '.join(missing)}." if missing else ""

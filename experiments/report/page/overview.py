@@ -5,9 +5,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from dolens.experiments.report.checks import SOURCES, Check, Outcome, State
-from dolens.experiments.report.page.html import Child, Markup, element, joined, prose, table
 from dolens.experiments.report.page.material import Material
 from dolens.experiments.report.page.numbers import limit_text, number_text, value_text
+from dolens.html import Child, Markup, element, joined, prose, table
 from dolens.plotting.number_text import with_minus
 
 _ORDER = (State.FAILS, State.NOT_RUN, State.HOLDS)
@@ -75,7 +75,7 @@ def found_text(outcome: Outcome) -> str:
 
 def checks_table(outcomes: Sequence[Outcome]) -> Markup:
     """Return the checks of several items in a table."""
-    return table(_COLUMNS, [_row(outcome) for outcome in outcomes], "checks")
+    return table(_COLUMNS, [_row(outcome) for outcome in outcomes], "checks", named_cells=True)
 
 
 def _row(outcome: Outcome) -> tuple[Child, ...]:

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from dolens.experiments.report.page.html import Child, Markup, element, joined, table
 from dolens.experiments.report.page.items import command_of, cost_text, item_section
 from dolens.experiments.report.page.material import Material
 from dolens.experiments.report.page.overview import anchor, overview
 from dolens.experiments.report.plan import Section
+from dolens.html import Child, Markup, document, element, joined, table
 
 _STYLE = Path(__file__).with_name("style.css")
 _TITLE = "dolens: the dO supplement, run again"
@@ -25,28 +25,18 @@ _CONVENTIONS = (
 
 def page(material: Material) -> str:
     """Return the page as one HTML file without references to other files."""
-    head = element(
-        "head",
-        Markup('<meta charset="utf-8">'),
-        Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
-        element("title", _TITLE),
-        element("style", Markup(_STYLE.read_text(encoding="utf-8"))),
+    main = element(
+        "main",
+        element("h1", _TITLE),
+        element("p", _ABOUT),
+        element("p", _CONVENTIONS, class_="quiet"),
+        element("p", material.made, class_="quiet"),
+        overview(material),
+        _contents(material),
+        *(_section(material, section) for section in material.plan.sections),
+        _runs(material),
     )
-    body = element(
-        "body",
-        element(
-            "main",
-            element("h1", _TITLE),
-            element("p", _ABOUT),
-            element("p", _CONVENTIONS, class_="quiet"),
-            element("p", material.made, class_="quiet"),
-            overview(material),
-            _contents(material),
-            *(_section(material, section) for section in material.plan.sections),
-            _runs(material),
-        ),
-    )
-    return f'<!doctype html>\n<html lang="en">{head}{body}</html>\n'
+    return document(_TITLE, _STYLE.read_text(encoding="utf-8"), [main])
 
 
 def _contents(material: Material) -> Markup:
@@ -79,7 +69,7 @@ def _runs(material: Material) -> Markup:
         )
     return joined(
         element("h2", "All runs"),
-        table(("Run", "Cost", "Code", "Command"), rows, "runs"),
+        table(("Run", "Cost", "Code", "Command"), rows, "runs", named_cells=True),
     )
 
 

@@ -9,12 +9,12 @@ import torch
 from dolens.errors import InputError
 from dolens.experiments.report.checks import State, outcomes
 from dolens.experiments.report.gains import gain_numbers
-from dolens.experiments.report.page.html import element, prose
 from dolens.experiments.report.page.material import Material
 from dolens.experiments.report.page.numbers import number_text, seconds_text, value_text
 from dolens.experiments.report.page.overview import gain_sentence
 from dolens.experiments.report.page.page import page
 from dolens.experiments.report.results import assigned, read_result, same_overrides
+from dolens.html import element, prose
 from tests.experiments.report.report_runs import CHECKS, PLAN, finished_run
 
 

@@ -1,0 +1,151 @@
+"""How a lens images points of the object: spots, fans, MTF, point spread functions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from dolens.optics.lens_views.conditions import looked_at, shown, title_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from dolens.analysis.conditions import FieldPoints
+    from dolens.optics.lens_views.conditions import Wavelengths
+
+
+class ImagePointViews:
+    """Methods of `Lens` that show the image of some field points; see `LensViews` for their
+    arguments."""
+
+    def spots(
+        self,
+        fields: FieldPoints | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        rays: int = 2000,
+        overlaid: bool = True,
+        **aperture: float,
+    ) -> Figure:
+        """Plot spot diagrams; the numbers are those of `analysis.spot_diagram.spot_diagram`.
+
+        Args:
+            fields: see the class, as the other arguments that are not named here.
+            wavelengths: see the class.
+            object_distance: see the class.
+            rays: of each spot, a multiple of four.
+            overlaid: one panel a field; else one for every field and wavelength.
+            aperture: see the class.
+        """
+        from dolens.analysis.spot_diagram import spot_diagram
+        from dolens.plotting.spots import spots_figure
+
+        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        spots = spot_diagram(lens, given.fields, given.wavelengths, rays, given.object_distance)
+        return shown(spots_figure(spots, overlaid, title_of("Spot diagram", lens, given)))
+
+    def ray_fans(
+        self,
+        fields: FieldPoints | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        **aperture: float,
+    ) -> Figure:
+        """Plot transverse ray aberrations; see `analysis.ray_fans.ray_fans`."""
+        from dolens.analysis.ray_fans import ray_fans
+        from dolens.plotting.ray_fans import ray_fans_figure
+
+        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        fans = ray_fans(
+            lens, given.fields, given.wavelengths, object_distance=given.object_distance
+        )
+        return shown(ray_fans_figure(fans, title_of("Ray fans", lens, given)))
+
+    def mtf(
+        self,
+        fields: FieldPoints | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        frequencies: Sequence[float] | Tensor | None = None,
+        diffraction: bool = True,
+        geometric: bool = True,
+        **aperture: float,
+    ) -> Figure:
+        """Plot the MTF with diffraction and of rays, of all wavelengths together.
+
+        See `diffraction.transfer.diffraction_modulation` and
+        `analysis.modulation_transfer.modulation`.
+
+        Args:
+            fields: see the class, as the other arguments that are not named here.
+            wavelengths: see the class.
+            object_distance: see the class.
+            frequencies: cycles/mm; None for 61 as far as the best field leaves contrast.
+            diffraction: whether to plot the MTF with diffraction.
+            geometric: whether to plot the MTF of rays.
+            aperture: see the class.
+        """
+        from dolens.analysis.modulation_transfer import frequency_range, modulation
+        from dolens.diffraction.transfer import diffraction_modulation
+        from dolens.plotting.modulation_comparison import modulation_comparison_figure
+
+        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        scene = given.fields, given.wavelengths
+        distance = given.object_distance
+        if frequencies is None:
+            frequencies = frequency_range(lens, *scene, distance)
+        wave = diffraction_modulation(lens, *scene, frequencies, distance) if diffraction else None
+        rays = modulation(lens, *scene, frequencies, 6000, distance) if geometric else None
+        title = title_of("Modulation transfer function", lens, given)
+        return shown(modulation_comparison_figure(wave, rays, title))
+
+    def encircled_energy(
+        self,
+        fields: FieldPoints | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        radii_um: Sequence[float] | Tensor | None = None,
+        **aperture: float,
+    ) -> Figure:
+        """Plot encircled energy, with diffraction and of rays.
+
+        See `diffraction.point_spread.diffraction_encircled_energy` and
+        `analysis.encircled_energy.encircled_energy`.
+
+        Args:
+            fields: see the class, as the other arguments that are not named here.
+            wavelengths: see the class.
+            object_distance: see the class.
+            radii_um: µm, ascending; None for 101 as far as the largest point spread function goes.
+            aperture: see the class.
+        """
+        from dolens.analysis.encircled_energy import encircled_energy
+        from dolens.diffraction.point_spread import diffraction_encircled_energy
+        from dolens.plotting.encircled_energy import encircled_energy_figure
+
+        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        scene, distance = (given.fields, given.wavelengths), given.object_distance
+        waves = diffraction_encircled_energy(lens, *scene, radii_um, distance)
+        rays = encircled_energy(lens, *scene, waves.radii_um, object_distance=distance)
+        title = title_of("Encircled energy", lens, given)
+        return shown(encircled_energy_figure(waves, rays, title))
+
+    def psf(
+        self,
+        fields: FieldPoints | None = None,
+        wavelengths: Wavelengths = None,
+        object_distance: float | None = None,
+        **aperture: float,
+    ) -> Figure:
+        """Show point spread functions with diffraction, of all wavelengths together.
+
+        See `diffraction.point_spread.point_spread`.
+        """
+        from dolens.diffraction.point_spread import point_spread
+        from dolens.plotting.point_spread import point_spread_figure
+
+        lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
+        found = point_spread(lens, given.fields, given.wavelengths, given.object_distance)
+        return shown(point_spread_figure(found, title_of("Point spread functions", lens, given)))

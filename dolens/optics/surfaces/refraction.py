@@ -1,0 +1,72 @@
+"""Rays at a surface, and Snell's law."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+# Smallest cosine that is divided by.  Its square is far above the smallest float32.
+GRAZING = 1e-9
+# A ray this many semi-diameters off the axis is invalid, and stays there.
+FAR = 1e3
+
+
+class PlaneRay(NamedTuple):
+    """Rays cross the vertex plane z = 0 at x, y (mm) with these direction cosines."""
+
+    x: Tensor
+    y: Tensor
+    l: Tensor  # noqa: E741
+    m: Tensor
+    n: Tensor
+
+
+class Refraction(NamedTuple):
+    """Refraction gives direction cosines behind a surface, and a margin that is positive without
+    TIR.
+    """
+
+    l: Tensor  # noqa: E741
+    m: Tensor
+    n: Tensor
+    transmitted: Tensor
+
+
+def safe_sqrt(squared: Tensor) -> Tensor:
+    """Return the square root, with a finite derivative everywhere; exact where its argument is
+    positive.
+    """
+    return torch.sqrt(squared.clamp(min=GRAZING * GRAZING))
+
+
+def snell(
+    direction: tuple[Tensor, Tensor, Tensor],
+    normal: tuple[Tensor, Tensor, Tensor],
+    ratio: float | Tensor,
+    sense: float,
+) -> Refraction:
+    """Refract directions by Snell's law in vector form.
+
+    Args:
+        direction: cosines of unit vectors.
+        normal: unit vectors towards +z.
+        ratio: μ, index before over index after, in the order of the light's travel.
+        sense: s, +1 forward and -1 backward: the sign of direction · normal.
+
+    Returns:
+        d' = μ·d + (s·cos t - μ·cos i)·N with cos²t = 1 - μ²(1 - cos²i); `transmitted` is cos²t.
+    """
+    l, m, n = direction  # noqa: E741
+    nx, ny, nz = normal
+    cosine = torch.addcmul(torch.addcmul(l * nx, m, ny), n, nz)
+    # Only rays that missed have |cos i| > 1; two keeps them finite and rounding unclipped.
+    cosine = cosine.clamp(-2.0, 2.0)
+    squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
+    along = sense * safe_sqrt(squared) - ratio * cosine
+    # Rays that missed have no unit normal; a direction that grew would overflow float32 later.
+    return Refraction(
+        torch.addcmul(ratio * l, along, nx).clamp(-2.0, 2.0),
+        torch.addcmul(ratio * m, along, ny).clamp(-2.0, 2.0),
+        torch.addcmul(ratio * n, along, nz).clamp(-2.0, 2.0),
+        squared.detach(),
+    )

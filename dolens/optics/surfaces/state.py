@@ -1,0 +1,52 @@
+"""A surface as the pure functions see it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.optics.surfaces.base import Parameters, Surface
+from dolens.optics.surfaces.clear_aperture import ClearAperture
+
+
+@dataclass(frozen=True)
+class SurfaceState:
+    """The pure functions see a surface in this form.
+
+    Attributes:
+        shape: the `Surface` subclass, used as a namespace of pure functions.
+        parameters: name → tensor.
+        aperture: what light passes.
+        edge: the semi-diameter as a tensor, where a gradient with respect to it is wanted.
+    """
+
+    shape: type[Surface]
+    parameters: Parameters
+    aperture: ClearAperture
+    edge: Tensor | None = None
+
+    def rim_sag(self, like: Tensor) -> Tensor:
+        """Return the sag (mm) at the aperture's reach along x, in another tensor's precision."""
+        reach = torch.full_like(like, self.semi_diameter)
+        return self.shape.sag_and_gradient(self.parameters, reach, torch.zeros_like(like))[0]
+
+    @property
+    def semi_diameter(self) -> float:
+        """Return the distance of the clear aperture's farthest point from the vertex, mm."""
+        return self.aperture.edge.semi_diameter
+
+    @property
+    def edge_radius(self) -> float | Tensor:
+        """Return the semi-diameter, mm, with its gradient where there is one."""
+        return self.semi_diameter if self.edge is None else self.edge
+
+    def edge_distance(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return how far points (mm, in the surface's axes) lie inside the aperture's edge;
+        negative outside.  It is differentiable in the points and in `edge`.
+        """
+        depth = self.aperture.depth(x, y)
+        if self.edge is None:
+            return depth
+        # Of an obscuration the distance does not move with the outer edge.
+        outer = self.aperture.edge.depth(x, y) <= depth
+        return depth + torch.where(outer, (self.edge - self.edge.detach()).to(depth), 0.0)

@@ -1,0 +1,144 @@
+"""A prescription is simplified for a format that cannot hold it, and what changes is said."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.optics.materials import abbe_number, index_d, parse_material
+from dolens.optics.materials import index_model as find_index_model
+from dolens.prescriptions.zemax_glass import canonical
+
+Prescription = dict[str, Any]
+# Indices are compared at these wavelengths, nm.
+COMPARED_WAVELENGTHS = (400.0, 450.0, 486.1327, 546.074, 587.5618, 656.2725, 700.0)
+_KNOWN_MEDIA = ("air", "occluder")
+
+
+def _dfc_indices(prescription: Prescription, new: str) -> list[str]:
+    """Take the only index model that a .zmx file knows."""
+    model = str(prescription.get("index_model", "dfc"))
+    if not is_zemax(new) or model == "dfc":
+        return []
+    prescription["index_model"] = "dfc"
+    return [
+        f"the index model '{model}' became 'dfc', the only one that a .zmx file knows: nd and Vd "
+        "are those of the lines C, d and F, and air has index 1"
+    ]
+
+
+def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
+    """Write glass of a catalogue as nd/Vd."""
+    if not new.lower().endswith(".txt"):
+        return []
+    model = find_index_model(str(prescription.get("index_model", "dfc")))
+    said: dict[str, tuple[str, float, list[str]]] = {}
+    for n, row in prescription["surfaces"].items():
+        name = str(row.get("material")).strip()
+        if name.lower() in _KNOWN_MEDIA or name[:1].isdigit():
+            continue
+        medium = parse_material(name, model)
+        pair = f"{index_d(medium):.6f}/{abbe_number(medium):.4f}"
+        try:
+            near = parse_material(pair, model)
+        except InputError:
+            continue
+        error = max(abs(medium.index(w) - near.index(w)) for w in COMPARED_WAVELENGTHS)
+        said.setdefault(name, (pair, error, []))[2].append(str(n))
+        row["material"] = pair
+    return [
+        f"the glass {name} behind {surfaces_text(numbers)} became {pair} (nd/Vd): its index "
+        f"differs by up to {error:.1g} from 400 to 700 nm"
+        for name, (pair, error, numbers) in said.items()
+    ]
+
+
+def _aperture_planes(prescription: Prescription, new: str) -> list[str]:
+    """Write aperture planes as a .zmx file knows them: the stop is one, any other is a plane."""
+    if not is_zemax(new):
+        return []
+    said = []
+    stop = str(prescription.get("stop", 1))
+    before = prescription.get("object_material", "air")
+    for n, row in prescription["surfaces"].items():
+        flat = row.get("type", "sphere") in ("plane", "sphere") and _is_flat(row)
+        empty = canonical(str(row.get("material"))) == canonical(str(before))
+        before = row.get("material")
+        if row.get("type") == "aperture" and str(n) != stop:
+            row["type"] = "plane"
+            said.append(
+                f"surface {n}, an aperture, became a plane of the same size, which clips the same "
+                "rays: the one aperture of a .zmx file is the stop"
+            )
+        elif flat and empty and str(n) == stop:
+            row["type"] = "aperture"
+            row.pop("radius", None)
+            row.pop("curvature", None)
+            said.append(f"surface {n}, a plane in one medium, became an aperture: it is the stop")
+    return said
+
+
+def _without_poses(prescription: Prescription, new: str) -> list[str]:
+    """Drop elements that stand where they were designed to."""
+    elements = prescription.get("elements")
+    if not isinstance(elements, Mapping) or not elements:
+        return []
+    for row in elements.values():
+        if any(key not in ("surfaces", "pivot") and float(value) for key, value in row.items()):
+            return []
+    del prescription["elements"]
+    return [f"lost: the names of the elements {', '.join(map(str, elements))} (none has a pose)"]
+
+
+def _without_notes(prescription: Prescription, new: str) -> list[str]:
+    """Drop remarks about surfaces."""
+    noted = [str(n) for n, row in prescription["surfaces"].items() if row.pop("note", None)]
+    if not noted:
+        return []
+    return [f"lost: {'remarks' if len(noted) > 1 else 'the remark'} on {surfaces_text(noted)}"]
+
+
+def _without_source(prescription: Prescription, new: str) -> list[str]:
+    """Drop where the lens comes from."""
+    source = prescription.pop("source", None)
+    return [f"lost: source {str(source)!r}"] if source else []
+
+
+def _one_line_name(prescription: Prescription, new: str) -> list[str]:
+    """Put a name on one line."""
+    name = str(prescription.get("name") or "")
+    line = " ".join(name.split())
+    if line == name:
+        return []
+    prescription["name"] = line
+    return [f"the name {name!r} became {line!r}"]
+
+
+SIMPLIFICATIONS: tuple[Callable[[Prescription, str], list[str]], ...] = (
+    _one_line_name,
+    _without_notes,
+    _without_source,
+    _without_poses,
+    _aperture_planes,
+    _glass_by_numbers,
+    _dfc_indices,
+)
+
+
+def is_zemax(path: str) -> bool:
+    """Return whether a file is named as one of Zemax."""
+    return path.lower().endswith(".zmx")
+
+
+def _is_flat(row: Mapping[str, Any]) -> bool:
+    if row.get("type") == "plane":
+        return True
+    if row.get("curvature") is not None:
+        return float(row["curvature"]) == 0.0
+    return abs(float(row.get("radius", 0.0))) == float("inf")
+
+
+def surfaces_text(numbers: list[str]) -> str:
+    """Return `surface 3`, or `surfaces 1, 2 and 3`."""
+    if len(numbers) == 1:
+        return f"surface {numbers[0]}"
+    return f"surfaces {', '.join(numbers[:-1])} and {numbers[-1]}"

@@ -1,0 +1,81 @@
+"""The state of a checkpoint is found, read and given to a module."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dolens.errors import InputError, one_line
+from dolens.experiments.experiment import Experiment
+from dolens.experiments.running.recorded_run import RecordedRun
+
+CHECKPOINTS = ("last", "best")
+
+
+def checkpoint_file(record: RecordedRun, checkpoint: str | Path) -> Path:
+    """Return the path of a checkpoint.
+
+    Raises:
+        InputError: there is none.
+    """
+    if str(checkpoint) not in CHECKPOINTS:
+        file = Path(checkpoint).expanduser().resolve()
+        if not file.is_file():
+            raise InputError(
+                f"checkpoint: {checkpoint} does not exist; allowed: {', '.join(CHECKPOINTS)}, or "
+                "the path of a file"
+            )
+        return file
+    folder = record.folder / "checkpoints"
+    file = folder / f"{checkpoint}.ckpt"
+    if file.is_file():
+        return file
+    others = sorted(path.stem for path in folder.glob("*.ckpt"))
+    there = f"there is {', '.join(others)}" if others else "there is none"
+    raise InputError(
+        f"{record.folder}: this run ({record.status}) has no checkpoint checkpoints/{file.name}; "
+        f"{there}"
+    )
+
+
+def read_checkpoint(file: Path) -> Mapping[str, Any]:
+    """Read a checkpoint as plain tensors and values, on the CPU.
+
+    Raises:
+        InputError: the file holds something else, or no state of a module.
+    """
+    try:
+        found = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:
+        reason = one_line(error)[:200]
+        raise InputError(f"{file} is not a safe checkpoint ({reason})") from None
+    if not isinstance(found, Mapping) or "state_dict" not in found:
+        raise InputError(f"{file} holds no state of a module")
+    return found
+
+
+def take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:
+    """Give a module the state of a checkpoint, as a trainer does.
+
+    Raises:
+        InputError: the checkpoint is of another experiment, lens or network.
+    """
+    module.on_load_checkpoint(dict(state))
+    try:
+        module.load_state_dict(state["state_dict"])
+    except RuntimeError as error:
+        reason = _misfit(state["state_dict"], module.state_dict()) or one_line(error)
+        raise InputError(f"{file} does not fit the run's configuration: {reason}") from None
+    module.settle()
+
+
+def _misfit(found: Mapping[str, Any], own: Mapping[str, Any]) -> str:
+    """Return the first thing in which a state differs from what a module takes; nothing: ''."""
+    for name, value in own.items():
+        if name not in found:
+            return f"{name} is missing in the checkpoint"
+        if found[name].shape != value.shape:
+            shapes = tuple(found[name].shape), tuple(value.shape)
+            return f"{name} has shape {shapes[0]} in the checkpoint and {shapes[1]} here"
+    return next((f"there is no {name} here" for name in found if name not in own), "")
