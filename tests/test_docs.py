@@ -23,7 +23,7 @@ NAMES = sorted(
         if not name.endswith((".py", ".txt"))
     }
 )
-COMMANDS = sorted(set(re.findall(r"`(?:python train\.py|dolens train) ([^`]+)`", SUPPLEMENT)))
+COMMANDS = sorted(set(re.findall(r"`(experiment=[^`]+)`", SUPPLEMENT)))
 # Commands of the other documents that run packaged experiments: each a line of its own.
 TRAININGS = sorted(
     {

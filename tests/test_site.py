@@ -46,3 +46,20 @@ def test_the_api_has_what_a_user_imports(site):
     text = "".join(p.read_text(encoding="utf-8") for p in (site / "api").glob("*.html"))
     for name in ("load_lens", "DampedLeastSquares", "RayRenderer", "UNetRestoration", "Experiment"):
         assert name in text, name
+
+
+def test_no_page_shows_its_markup(site):
+    """A fence, a list or a heading that Markdown did not take stands in the text as it is typed."""
+    for page in site.rglob("*.html"):
+        text = re.sub(
+            r"<(pre|code|script|style)\b.*?</\1>", "", page.read_text("utf-8"), flags=re.S
+        )
+        for paragraph in re.findall(r"<(?:p|li)>(.*?)</(?:p|li)>", text, re.S):
+            assert "```" not in paragraph and "\n- " not in paragraph, (page.name, paragraph[:200])
+
+
+def test_what_a_function_returns_is_one_entry(site):
+    """`Returns:` describes one value over several lines; each line is not a value of its own."""
+    text = (site / "api/optics.html").read_text(encoding="utf-8")
+    for part in re.findall(r"Returns:.*?</ul>", text, re.S):
+        assert part.count("<li") == 1, re.sub(r"<[^>]*>", "", part)[:300]

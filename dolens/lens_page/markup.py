@@ -12,6 +12,17 @@ from dolens.packaged import installed_version
 # Every page says by this what it is, so that only pages are overwritten unasked.
 GENERATOR = "dolens show"
 
+# Colours for a dark page: the complement turned by 180° in hue, so that dark becomes light and hues
+# stay (the matrix of the W3C's Filter Effects), then lightened, so that no line is lost.
+# `nightColour` in viewer.js does the same to rays.
+_NIGHT = """<svg width="0" height="0" style="position:absolute" aria-hidden="true">
+<filter id="night" color-interpolation-filters="sRGB">
+<feColorMatrix values=".574 -1.43 -.144 0 1
+ -.426 -.43 -.144 0 1  -.426 -1.43 .856 0 1  0 0 0 1 0"/>
+<feComponentTransfer><feFuncR type="gamma" exponent=".6"/><feFuncG type="gamma" exponent=".6"/>
+<feFuncB type="gamma" exponent=".6"/></feComponentTransfer>
+</filter></svg>"""
+
 
 @dataclass(frozen=True)
 class Block:
@@ -68,7 +79,7 @@ def page_html(
     )
     page = element("div", header, contents, element("main", *sections), class_="page")
     script = element("script", Markup(viewer_script()))
-    return document(title, css, [page, script], f"{GENERATOR} {version}")
+    return document(title, css, [Markup(_NIGHT), page, script], f"{GENERATOR} {version}")
 
 
 def table_html(shown: Table) -> Markup:

@@ -91,11 +91,11 @@ class Offenders:
         rows = [
             (
                 parameter_label(t.names[p]),
-                t.label(p).replace("deg", "°").replace("-", "−"),
+                t.label(p).replace("-", "−"),
                 f"{100.0 * float(c.share[p]):.1f} %",
-                number(1e3 * growth[p], 3),
-                number(1e3 * unfocused[p], 3),
-                number(1e3 * s.largest_centroid_shift[p], 3),
+                number(1e3 * growth[p], 3, zeros=True),
+                number(1e3 * unfocused[p], 3, zeros=True),
+                number(1e3 * s.largest_centroid_shift[p], 3, zeros=True),
             )
             for p in c.order[:_MOST]
         ]

@@ -43,8 +43,14 @@ class Table:
     numbered: bool = False
 
 
-def number(value: float | Tensor, digits: int = 5) -> str:
-    """Return a number with so many significant digits, a true minus and the sign of infinity."""
+def number(value: float | Tensor, digits: int = 5, zeros: bool = False) -> str:
+    """Return a number with so many significant digits, a true minus and the sign of infinity.
+
+    Args:
+        value: the number.
+        digits: how many.
+        zeros: whether zeros at its end stay, as they do where measured numbers stand in a column.
+    """
     value = float(value)
     if math.isnan(value):
         return "–"
@@ -55,7 +61,8 @@ def number(value: float | Tensor, digits: int = 5) -> str:
     if not e and abs(value) >= 1e-4:
         # As many digits for 22.000 as for 22.014, without an exponent for large numbers.
         mantissa = f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}"
-        mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
+        strip = "." in mantissa and not zeros
+        mantissa = mantissa.rstrip("0").rstrip(".") if strip else mantissa
     sign = f"e{int(exponent):d}" if e else ""
     return (mantissa + sign).replace("-", "−")
 
@@ -183,11 +190,11 @@ def spot_radii_table(spots: SpotDiagram, polychromatic: bool = True) -> Table:
     heads = ("field", *(f"{float(wave):g} nm" for wave in spots.wavelengths))
     rows = []
     for at, point in enumerate(spots.fields):
-        cells = [number(1e3 * value, 4) for value in spots.rms[at].tolist()]
+        cells = [number(1e3 * value, 4, zeros=True) for value in spots.rms[at].tolist()]
         if many:
-            cells.append(number(1e3 * float(spots.polychromatic_rms[at]), 4))
+            cells.append(number(1e3 * float(spots.polychromatic_rms[at]), 4, zeros=True))
         rows.append((field_label(point, spots.field_unit), *cells))
-    airy = [number(1e3 * value, 4) for value in spots.airy_radius.tolist()]
+    airy = [number(1e3 * value, 4, zeros=True) for value in spots.airy_radius.tolist()]
     rows.append(("Airy radius", *airy, *[""] * many))
     caption = "RMS radii in µm about the centroid of each spot"
     caption += "; polychromatic: about that of all wavelengths together." if many else "."

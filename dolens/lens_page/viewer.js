@@ -129,8 +129,17 @@
   function rgb(hex) {
     return [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255);
   }
+  // The filter "night" of the page, for a background that is dark.
+  function nightColour([r, g, b]) {
+    const turned = [0.574 * r - 1.43 * g - 0.144 * b, -0.426 * r - 0.43 * g - 0.144 * b,
+      -0.426 * r - 1.43 * g + 0.856 * b];
+    return turned.map((c) => Math.min(Math.max(1 + c, 0), 1) ** 0.6);
+  }
   function lineColour(field) {
-    if (field >= 0) return [...rgb(data.fields[field].colour), 0.95];
+    if (field >= 0) {
+      const colour = rgb(data.fields[field].colour);
+      return [...(dark.matches ? nightColour(colour) : colour), 0.95];
+    }
     return dark.matches ? [0.75, 0.85, 0.92, 0.55] : [0.13, 0.2, 0.25, 0.55];
   }
 

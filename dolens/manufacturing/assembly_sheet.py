@@ -47,7 +47,7 @@ def assembly_sheets(
     paper = [_DRAWING[2] * 297.0, _DRAWING[3] * 210.0]
     needs = (
         (high[0] - low[0]) / (1.0 - 24.0 / paper[0]),
-        (high[1] - low[1]) / (1.0 - 30.0 / paper[1]),
+        (high[1] - low[1]) / (1.0 - 34.0 / paper[1]),
     )
     _, scale = drawing_axes(Figure(figsize=(11.69, 8.27)), _DRAWING, *needs)
     figure = new_sheet(block, 1, "Assembly", scale)
@@ -133,19 +133,21 @@ def _draw(
     ends = [first - 5.0 * unit, z + 5.0 * unit]
     axes.plot(ends, [zero, zero], color="0.4", lw=0.5, dashes=(14, 3, 2, 3), zorder=2)
     last = -math.inf
+    highest = max(*tops, _draw_stop(axes, lens, middle, unit))
     for element, outline, top in zip(elements, outlines, tops, strict=True):
         patch = {"facecolor": "#EAF2F7", "edgecolor": INK, "lw": 0.8, "zorder": 1}
         axes.add_patch(Polygon(outline, **patch))
         # Labels of neighbours that are close go up in steps, so that none covers another.
         centre = float(outline[:, 0].mean())
         raised = centre - last < 7.0 * unit
-        level = max(tops) + (9.0 if raised else 5.0) * unit
+        level = highest + (9.0 if raised else 5.0) * unit
         last = -math.inf if raised else centre
         axes.plot([centre, centre], [top - 1.0 * unit, level - 1.2 * unit], color="0.5", lw=0.4)
         axes.text(centre, level, element.name, fontsize=TEXT, ha="center", va="center")
     axes.plot([z, z], [zero - half, zero + half], color=INK, lw=2.0, zorder=3)
-    axes.text(z + 2.0 * unit, zero + 0.6 * half, "sensor", fontsize=TEXT, va="center")
-    _draw_stop(axes, lens, middle, unit)
+    # Above the axis, whatever the sensor's size.
+    label = zero + max(0.6 * half, 2.5 * unit)
+    axes.text(z + 2.0 * unit, label, "sensor", fontsize=TEXT, va="center")
     system = lens.system().double()
     vertices = [float(v.detach()) - middle[0] for v in system.vertices]
     level = bottom - 6.0 * unit
@@ -165,7 +167,9 @@ def _draw(
     )
 
 
-def _draw_stop(axes: Axes, lens: Lens, middle: np.ndarray, unit: float) -> None:
+def _draw_stop(axes: Axes, lens: Lens, middle: np.ndarray, unit: float) -> float:
+    """Draw the stop's edge above and below the axis; return the greatest height of the marks."""
+    highest = -math.inf
     face = face_of(lens.system().double(), lens.stop)
     reach = face.aperture.edge.extent[1]
     for side in (1.0, -1.0):
@@ -175,6 +179,8 @@ def _draw_stop(axes: Axes, lens: Lens, middle: np.ndarray, unit: float) -> None:
         axes.plot(
             points[:, 2], points[:, 1], color="#B00020", lw=2.0, solid_capstyle="butt", zorder=4
         )
+        highest = max(highest, float(points[:, 1].max()))
+    return highest
 
 
 def _notes(figure: Figure, lens: Lens, tolerances: ShopTolerances, continues: bool) -> None:
@@ -183,8 +189,8 @@ def _notes(figure: Figure, lens: Lens, tolerances: ShopTolerances, continues: bo
     near = lens.object_distance is not None and math.isfinite(lens.object_distance)
     lines = [
         ("At the design wavelength", f"{line:g} nm"),
-        ("Focal length", f"{length(float(order.efl.detach()), 3, 4)} mm"),
-        ("Back focal distance", f"{length(float(order.bfd.detach()), 3, 4)} mm"),
+        ("Focal length", f"{length(float(order.efl.detach()), 3, 3)} mm"),
+        ("Back focal distance", f"{length(float(order.bfd.detach()), 3, 3)} mm"),
         ("F-number", f"{float(order.f_number.detach()):.3f}"),
         ("Object", f"{length(lens.object_distance)} mm before S1" if near else "at infinity"),
         ("Sensor behind last surface", f"{length(float(lens.sensor_distance.detach()))} mm"),

@@ -40,8 +40,8 @@ def number(value: float, decimals: int) -> str:
 
 
 def coefficient(value: float) -> str:
-    """Return a coefficient with nine digits."""
-    return f"{value:.8e}".replace("-", "−")
+    """Return a coefficient with nine digits at most: `2e−06`, `1.23456789e−06`."""
+    return f"{value:.9g}".replace("-", "−")
 
 
 def radius_text(face: Face, is_front: bool) -> str:

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Affine2D, ScaledTranslation
 
 # A4, landscape.
 SIZE = (11.69, 8.27)
@@ -254,6 +257,24 @@ def grid_table(
                 weight="bold" if number == 0 else "normal",
             )
     axes.plot([0, 1], [1.0 - 2.1 * step] * 2, color=INK, lw=THIN)
+
+
+def draw_formula(figure: Figure, place: tuple[float, float], formula: str, size: float) -> None:
+    """Draw mathematical text as outlines, which look the same in every viewer.
+
+    Signs such as roots come from fonts that only matplotlib has.
+
+    Args:
+        figure: the sheet.
+        place: of the left end at half the height, as shares of the sheet.
+        formula: between dollar signs.
+        size: of letters, points.
+    """
+    outline = TextPath((0.0, 0.0), formula, size=size)
+    extents = outline.get_extents()
+    centred = Affine2D().translate(-extents.x0, -0.5 * (extents.y0 + extents.y1)).scale(1.0 / 72.0)
+    placed = centred + figure.dpi_scale_trans + ScaledTranslation(*place, figure.transFigure)
+    figure.add_artist(PathPatch(outline, transform=placed, facecolor=INK, linewidth=0.0))
 
 
 def _all_scales() -> list[float]:

@@ -22,6 +22,7 @@ from dolens.manufacturing.drawing_sheet import (
     THICK,
     TitleBlock,
     dimension,
+    draw_formula,
     drawing_axes,
     grid_table,
     new_sheet,
@@ -154,25 +155,30 @@ def _draw_section(
     top = points[np.abs(points[:, 1] - edge) < 1e-9 * (1.0 + abs(edge))]
     if not element.conical_edge and len(top) > 1:
         ends = [(float(pick(top[:, 0])), edge) for pick in (np.min, np.max)]
-        text = f"({length(element.edge_thickness, 3, 4)})"
+        text = f"({length(element.edge_thickness, 3, 3)})"
         dimension(axes, *ends, high[1] + 6.0 * unit, text, False, True)
 
 
 def _side_panel(figure: Figure, element: GlassElement, tolerances: ShopTolerances) -> None:
     """Put equations, sag tables and notes right of the section."""
     left, width, top = 0.655, 0.315, 0.95
-    for face in (element.front, element.back):
-        if not is_aspheric(face):
-            continue
-        formula = equation(face)
-        if formula is not None:
-            figure.text(left, top - 0.018, f"S{face.number}:", fontsize=TEXT, va="center")
-            figure.text(left + 0.035, top - 0.018, formula, fontsize=TEXT + 1.0, va="center")
-            top -= 0.048
-        both = is_aspheric(element.front) and is_aspheric(element.back)
-        height = 0.115 if both else 0.24
-        _sag_table(figure, face, (left, top - height, width, height), both)
+    aspheric = [face for face in (element.front, element.back) if is_aspheric(face)]
+    formulas = {face.number: equation(face) for face in aspheric}
+    for formula in dict.fromkeys(filter(None, formulas.values())):
+        names = ", ".join(f"S{number}" for number, text in formulas.items() if text == formula)
+        figure.text(left, top - 0.018, f"{names}:", fontsize=TEXT, va="center")
+        draw_formula(figure, (left + 0.05, top - 0.018), formula, TEXT + 1.0)
+        top -= 0.048
+    if len(aspheric) == 2 and all(face.shape.rotational for face in aspheric):
+        half, height = 0.5 * width - 0.005, 0.23
+        for face, at in zip(aspheric, (left, left + width - half), strict=True):
+            _sag_table(figure, face, (at, top - height, half, height), False)
         top -= height + 0.012
+    else:
+        height = 0.24 / len(aspheric) if aspheric else 0.0
+        for face in aspheric:
+            _sag_table(figure, face, (left, top - height, width, height), len(aspheric) == 2)
+            top -= height + 0.012
     notes = [
         "CX convex, CC concave. Øe is the clear aperture that the design uses.",
         "Thickness in brackets: for reference.",

@@ -15,6 +15,10 @@ from dolens.plotting.titles import draw_title
 # Triangles stay this close to a solid, as a share of its size.
 _COARSE = 0.002
 _ANGLE = 0.15
+# Of the eye, degrees about the axes z, x, y of the drawing.
+_ELEVATION, _AZIMUTH = 18.0, -62.0
+# Drawn after all solids: what is cut at x = 0 lies nearer to the eye than the rest.
+_CUT = 1000
 _LIGHT = np.array([-0.4, -0.75, 0.53])
 
 
@@ -57,8 +61,10 @@ def solids_figure(solids: Mapping[str, Shape], title: str) -> Figure:
     shades = dict(zip(meshes, colours(len(meshes)), strict=True))
     for number, (shown, caption) in enumerate(((meshes, "whole"), (halves, "cut at x = 0")), 1):
         axes = figure.add_subplot(1, 2, number, projection="3d", proj_type="ortho")
-        for name, mesh in shown.items():
-            _draw(axes, mesh, shades[name])
+        axes.computed_zorder = False
+        # The eye is at larger z, so that what is farther along the lens hides what is before it.
+        for rank, name in enumerate(sorted(shown, key=lambda name: shown[name][..., 2].mean()), 1):
+            _draw(axes, shown[name], shades[name], rank)
         axes.set(xlim=(low[2], high[2]), ylim=(low[0], high[0]), zlim=(low[1], high[1]))
         axes.set_box_aspect(np.maximum((high - low)[[2, 0, 1]], 1e-6), zoom=0.95)
         axes.set_xlabel("z (mm)", fontsize=SMALL)
@@ -67,7 +73,7 @@ def solids_figure(solids: Mapping[str, Shape], title: str) -> Figure:
         axes.tick_params(labelsize=SMALL - 1)
         axes.locator_params(nbins=4)
         axes.set_title(caption, fontsize=SMALL + 1)
-        axes.view_init(elev=18, azim=-62)
+        axes.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     handles = [Patch(color=shade, label=name) for name, shade in shades.items()]
     figure.legend(
         handles=handles, loc="outside lower center", ncols=6, fontsize=SMALL, frameon=False
@@ -76,14 +82,25 @@ def solids_figure(solids: Mapping[str, Shape], title: str) -> Figure:
     return figure
 
 
-def _draw(axes: Axes3D, mesh: np.ndarray, shade: str) -> None:
+def visible(mesh: np.ndarray) -> np.ndarray:
+    """Return which of the triangles (N, 3, 3), corners in the drawing's axes, face the eye."""
+    elevation, azimuth = np.radians([_ELEVATION, _AZIMUTH])
+    level = np.cos(elevation)
+    eye = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+    return np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0]) @ eye > 0.0
+
+
+def _draw(axes: Axes3D, mesh: np.ndarray, shade: str, rank: int) -> None:
     # Matplotlib's upright axis is its third: the lens's z, x, y are drawn as x, y, z.
     mesh = mesh[:, :, [2, 0, 1]]
+    mesh = mesh[visible(mesh)]
     normal = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     bright = 0.45 + 0.55 * np.abs((normal / np.maximum(length, 1e-30)) @ _LIGHT)
     colour = np.array([int(shade[k : k + 2], 16) / 255.0 for k in (1, 3, 5)])
     faces = np.concatenate([np.outer(bright, colour), np.ones((len(mesh), 1))], axis=1)
-    axes.add_collection3d(
-        Poly3DCollection(mesh, facecolors=faces, edgecolors=faces, linewidths=0.2)
-    )
+    cut = (np.abs(mesh[:, :, 1]) < 1e-9).all(1)
+    for part, order in ((~cut, rank), (cut, _CUT + rank)):
+        if part.any():
+            shown = {"facecolors": faces[part], "edgecolors": faces[part], "zorder": order}
+            axes.add_collection3d(Poly3DCollection(mesh[part], linewidths=0.2, **shown))

@@ -83,10 +83,11 @@ class Tolerances:
         return self.steps * torch.where(self.normal, inside, centred)
 
     def label(self, column: int) -> str:
-        """Return a tolerance as one reads it: `± 0.05 deg`."""
+        """Return a tolerance as one reads it: `± 0.05°`, `± 0.02 mm`."""
         number = float(self.half_range[column])
         unit = self.unit_names[column]
-        return f"± {100.0 * number if unit == '%' else number:g} {unit}".strip()
+        after = "°" if unit == "deg" else f" {unit}"
+        return f"± {100.0 * number if unit == '%' else number:g}{after}".strip()
 
 
 def tolerances_from(lens: Lens, settings: Mapping[str, Any], factor: float = 1.0) -> Tolerances:

@@ -13,7 +13,7 @@ from dolens.manufacturing.glass_elements import glass_elements
 from dolens.manufacturing.lens_export import export_lens
 from dolens.manufacturing.sag_errors import sag_errors
 from dolens.manufacturing.solids import element_solid
-from dolens.manufacturing.solids_picture import mesh_volume, triangles
+from dolens.manufacturing.solids_picture import mesh_volume, triangles, visible
 from dolens.manufacturing.step import export_step, product_name
 from dolens.manufacturing.step_file import read_step_file
 from dolens.prescriptions import lens_from_prescription
@@ -220,3 +220,14 @@ def test_a_format_that_cannot_hold_the_lens_is_named_and_the_others_are_written(
         "lens.zmx: surface 2: a .zmx file cannot hold type 'xy_polynomial' "
         "(allowed: plane, aperture, sphere, conic, even_asphere)"
     )
+
+
+def test_only_what_faces_the_eye_is_drawn():
+    """Of a box three sides show: those towards larger z, smaller x and larger y."""
+    corners = triangles(modeller.box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
+    shown = corners[visible(corners[:, :, [2, 0, 1]])]
+    assert len(corners) == 12 and len(shown) == 6
+    sides = {
+        (axis, float(c[0, axis])) for c in shown for axis in range(3) if np.ptp(c[:, axis]) == 0
+    }
+    assert sides == {(2, 3.0), (0, 0.0), (1, 2.0)}

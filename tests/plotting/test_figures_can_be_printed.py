@@ -229,7 +229,7 @@ def test_values_have_the_digits_that_their_deviations_allow():
 def test_tolerances():
     rows, names = (
         [f"(0, {n})°  588 nm" for n in range(6)],
-        [f"tilt {n}  ± 0.05 deg" for n in range(9)],
+        [f"tilt {n}  ± 0.05°" for n in range(9)],
     )
     matrix = torch.randn(6, 9)
     figure = matrix_figure({"motion (µm)": (matrix, names)}, rows, [("x", 3), ("y", 3)], "Title")

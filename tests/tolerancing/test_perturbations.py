@@ -30,7 +30,7 @@ def test_units_are_those_of_files(triplet):
     expected = [0.002 / -22.213, 1e-5, 0.03, math.radians(0.1)]
     assert found.steps.tolist() == pytest.approx(expected, rel=1e-12)
     labels = [found.label(column) for column in range(4)]
-    assert labels == ["± 0.2 %", "± 1e-05 1/mm", "± 0.03 mm", "± 0.1 deg"]
+    assert labels == ["± 0.2 %", "± 1e-05 1/mm", "± 0.03 mm", "± 0.1°"]
     assert scaled_tolerances(found, 0.5).steps.tolist() == pytest.approx(
         [0.5 * s for s in expected]
     )
