@@ -31,7 +31,7 @@ from dolens.errors import InputError, check_keys
 from dolens.lens_page.tables import Table, number
 from dolens.optics.elements import Element
 from dolens.optics.lens import Lens
-from dolens.plotting.tolerances import offenders_figure, parameter_label
+from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
 from dolens.prescriptions.checks import require_mapping
 from dolens.prescriptions.files import decode_yaml
 from dolens.prescriptions.poses import elements_from
@@ -76,7 +76,7 @@ class Offenders:
         t, c, s = self.tolerances, self.contributions, self.sensitivities
         first = c.order[:_MOST]
         return offenders_figure(
-            [f"{parameter_label(t.names[p])}  {t.label(p)}" for p in first],
+            [tolerance_label(t.names[p], t.label(p)) for p in first],
             c.share[first].tolist(),
             {
                 "refocused": s.increase()[first].tolist(),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
 from dolens.plotting.titles import draw_title
@@ -82,13 +83,6 @@ def coding_gain_figure(
     for axes in grid[0]:
         handles |= {label: h for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if handles:
-        figure.legend(
-            handles.values(),
-            handles.keys(),
-            loc="outside lower center",
-            ncols=len(handles),
-            frameon=False,
-            fontsize=SMALL,
-        )
+        legend_below(figure, list(handles.values()), len(handles), list(handles))
     draw_title(figure, title)
     return figure

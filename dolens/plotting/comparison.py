@@ -16,6 +16,8 @@ _SMALLEST, _LARGEST = 1.7, 3.2
 _DPI = 120
 # Wide enough for a title.
 _NARROWEST = 5.0
+# The label above each column.
+_LABEL = 0.15
 
 
 @torch.no_grad()
@@ -28,7 +30,7 @@ def comparison_figure(
     title: str | None = None,
 ) -> Figure:
     """Show raw images above restored ones, one column a view. The truth stands at the left where it
-    is the same for all views, else above them.
+    is the same for all views, else above them.  Labels stand above the columns.
 
     Args:
         truth: (3, H, W), or (views, 3, H, W), display-encoded in [0, 1].
@@ -64,7 +66,7 @@ def comparison_figure(
     columns = views + beside
     panel = min(min(max(width / _DPI, _SMALLEST), _LARGEST), (PAGE - 0.2) / columns)
     tall = panel * height / width + 0.35
-    heading = 0.2 * (title.count("\n") + 1) + 0.1 if title else 0.0
+    heading = (0.2 * (title.count("\n") + 1) + 0.1 if title else 0.0) + _LABEL
     figure = Figure(
         figsize=(max(panel * columns + 0.2, _NARROWEST), len(images) * tall + heading),
         layout="constrained",
@@ -80,7 +82,8 @@ def comparison_figure(
             _show(axes, image)
             known = psnr is not None and name in psnr
             quality = f": {float(psnr[name][column]):.1f} dB" if known else ""
-            axes.set_title(f"{name}, {label}{quality}", fontsize=SMALL)
+            heading = f"{label}\n" if row == 0 else ""
+            axes.set_title(f"{heading}{name}{quality}", fontsize=SMALL)
     draw_title(figure, title, TITLE - 1)
     return figure
 

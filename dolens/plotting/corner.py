@@ -13,6 +13,7 @@ from matplotlib.patches import Ellipse
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.plotting.legends import legend_below
 from dolens.plotting.number_text import MINUS, number_text, value_and_error
 from dolens.plotting.style import PAGE, PALETTE, SMALL
 from dolens.plotting.titles import draw_title
@@ -118,9 +119,7 @@ def corner_figure(
     # A cross takes two.
     crosses = int((np.isfinite(cross) & ~far).sum()) > 1
     handles = _handles(len(dots), crosses)
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 4)
     if far.any():
         beyond = ", ".join(label for label, out in zip(labels, far, strict=True) if out)
         beyond = "all" if far.all() else beyond

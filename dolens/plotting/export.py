@@ -33,6 +33,9 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = _DPI) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context(_SETTINGS):
+        # Tick labels are known once axes have their size: labels at the edge fit after two passes.
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)
         figure.savefig(path, dpi=dpi, metadata=_DATES.get(path.suffix.removeprefix(".").lower()))
 
 

@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from dolens.analysis.conditions import FieldScan
 from dolens.analysis.field_curves import FieldCurves
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import (
     PAGE,
     SMALL,
@@ -59,9 +60,7 @@ def field_curves_figure(
         Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),
         *wavelength_handles(rows[0].wavelengths),
     ]
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 5)
     draw_title(figure, title)
     return figure
 

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from dolens.diffraction.illumination import Illumination
 from dolens.plotting.field_curves import note_if_empty, scan_label
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import PAGE, PALETTE, SMALL, ruled_axes
 from dolens.plotting.titles import draw_title
 
@@ -38,8 +39,6 @@ def illumination_figure(
     grid[0].set_ylim(0.0, top)
     grid[0].set_ylabel("irradiance (% of the axis)", fontsize=SMALL + 1)
     handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 2, labels)
     draw_title(figure, title)
     return figure

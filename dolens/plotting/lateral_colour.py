@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.lateral_colour import FocalShift, LateralColour
 from dolens.plotting.field_curves import draw_field_limits, note_if_empty, scan_label
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import PAGE, SMALL, ruled_axes, spectral_colour
 from dolens.plotting.titles import draw_title
 
@@ -38,14 +39,7 @@ def lateral_colour_figure(
     if focal_shift is not None:
         _draw_shift(grid[-1], focal_shift)
     handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower center",
-        ncols=5,
-        frameon=False,
-        fontsize=SMALL,
-    )
+    legend_below(figure, handles, 5, labels)
     draw_title(figure, title)
     return figure
 

@@ -48,7 +48,8 @@ def layout_figure(
     Artists carry gids: `ray`, `surface 3`, `glass 3` (the element behind surface 3), `edge`,
     `stop`, `stop tick`, `obscuration`, `sensor`, `axis`.
 
-    XY polynomials whose sag is too small to be seen get axes of their own below, in µm.
+    Freeform plates whose sag is too small to be seen get axes of their own below, in µm; flat ones
+    do not.
 
     Args:
         lens: the lens.
@@ -73,7 +74,7 @@ def layout_figure(
         number
         for number, surface in enumerate(system.surfaces, 1)
         if issubclass(surface.shape, (XYPolynomial, BSpline))
-        and _depth(system, number) < _VISIBLE * 2.0 * drawing.height
+        and 0.0 < _depth(system, number) < _VISIBLE * 2.0 * drawing.height
     ]
     drawn = drawn_height(drawing.z_limits, drawing.half_height, drawing.needs_legend)
     figure = Figure(figsize=(WIDTH, drawn + (1.9 if plates else 0.0)), layout="constrained")
@@ -99,6 +100,12 @@ def drawn_height(z_limits: tuple[float, float], half_height: float, legend: bool
     beside = 0.95 + (0.9 if legend else 0.0)
     drawn = (WIDTH - beside) * 2.0 * half_height / (z_limits[1] - z_limits[0])
     return min(max(drawn, 1.0), 6.2) + 0.85
+
+
+@torch.no_grad()
+def lens_title(lens: Lens, object_distance: float | None = None) -> str:
+    """Return the lens's name, focal length and F-number at its primary wavelength, for a title."""
+    return layout_title(lens, lens.system(), lens.primary_wavelength, object_distance)
 
 
 def layout_title(

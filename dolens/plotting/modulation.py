@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 
 from dolens.analysis.modulation_transfer import Modulation
 from dolens.optics.fields import field_label
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import PAGE, SMALL, ordered_colours, ruled_axes
 from dolens.plotting.titles import draw_title
 
@@ -53,9 +54,7 @@ def modulation_figure(
     for label, dashes in (("tangential", _TANGENTIAL), ("sagittal", _SAGITTAL)):
         handles.append(Line2D([], [], color="0.3", linestyle=dashes, linewidth=1.5, label=label))
     handles.append(Line2D([], [], color="black", linestyle="--", label="diffraction limit"))
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 5)
     draw_title(figure, title)
     return figure
 

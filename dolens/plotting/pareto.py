@@ -6,19 +6,22 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from dolens.plotting.label_placement import place_labels
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import MARKERS, PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
 from dolens.plotting.titles import draw_axes_title
 
 # Room around the points, as a share of the axes' length in decades, and at least in decades.
 _ROOM, _LEAST_ROOM = 0.12, 0.15
+# So many points all get their labels.
+_FEW = 8
 
 
 class Point(NamedTuple):
     """A `Point` is one alternative with its cost and error.
 
     Attributes:
-        label: written beside it where it is on the front or marked.
+        label: written beside it where it is on the front or marked, or where points are few.
         cost: positive.
         error: positive.
         marked: whether it is drawn large.
@@ -64,7 +67,7 @@ def pareto_figure(
         labels += [
             (p.label, p.cost, max(p.error, least), "black")
             for p in points
-            if p.marked or p in front
+            if p.marked or p in front or len(everything) <= _FEW
         ]
     if front:
         x = [p.cost for p in front]
@@ -85,9 +88,7 @@ def pareto_figure(
     log_ticks(axes.xaxis)
     log_ticks(axes.yaxis)
     handles, names = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 4, names)
     draw_axes_title(axes, title)
     # One text for points at one place.
     place_labels(axes, list(dict.fromkeys(labels)), SMALL - 1)

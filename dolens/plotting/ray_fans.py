@@ -5,6 +5,7 @@ from matplotlib.figure import Figure
 
 from dolens.analysis.ray_fans import RayFans
 from dolens.optics.fields import field_label
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import (
     DASHES,
     PAGE,
@@ -77,8 +78,6 @@ def ray_fans_figure(
     handles = wavelength_handles(fans.wavelengths)
     for number, handle in enumerate(handles):
         handle.set_linestyle(DASHES[number % len(DASHES)])
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 5)
     draw_title(figure, title)
     return figure

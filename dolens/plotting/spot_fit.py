@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -17,6 +18,9 @@ _COLUMNS = ("measured", "initial", "final", "final \N{MINUS SIGN} measured")
 _BEYOND = 0.002
 _MARGIN = 0.12
 _SMALLEST_WINDOW = 8
+# Near the focus most light is in a few pixels.  Where the mean is below this share of the brightest
+# pixel, colours follow the square root, so that the rest is seen.
+_PEAKED = 0.05
 # Inches, of an image with its heading and scale bar.
 _ROW = 1.75
 
@@ -75,10 +79,11 @@ def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: floa
     peak = images[0].max()
     shown = [i[top : top + size, left : left + size] / peak for i in images]
     brightest = max(float(picture.max()) for picture in shown)
+    peaked = float(shown[0].mean()) < _PEAKED * brightest
+    gamma = 0.5 if peaked else 1.0
     for axes, picture in zip(line, shown, strict=False):
-        bright = axes.imshow(
-            picture.numpy(), cmap="inferno", vmin=0.0, vmax=brightest, interpolation="nearest"
-        )
+        norm = PowerNorm(gamma, vmin=0.0, vmax=brightest)
+        bright = axes.imshow(picture.numpy(), cmap="inferno", norm=norm, interpolation="nearest")
         axes.set_title(f"peak {float(picture.max()):.2f}", fontsize=SMALL)
     left_over = 100.0 * (shown[2] - shown[0])
     reach = float(left_over.abs().max()) or 1.0
@@ -86,7 +91,7 @@ def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: floa
         left_over.numpy(), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest"
     )
     for picture, owners, name in (
-        (bright, line[:3], "over measured peak\n(no unit)"),
+        (bright, line[:3], f"over measured peak\n(no unit{', square-root scale' * peaked})"),
         (differing, line[3], "difference (%)"),
     ):
         bar = figure.colorbar(picture, ax=owners, fraction=0.05, pad=0.02)

@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.errors import InputError
 from dolens.optics.fields import field_label
+from dolens.plotting.legends import legend_below
 from dolens.plotting.number_text import number_text
 from dolens.plotting.style import (
     PAGE,
@@ -235,9 +236,7 @@ def _legend(figure: Figure, spots: SpotDiagram, overlaid: bool) -> None:
         Line2D([], [], marker="o", markerfacecolor="none", label="Airy disc", **style),
         Line2D([], [], marker="+", label="chief ray", **style),
     ]
-    figure.legend(
-        handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 5)
 
 
 def _dots(spots: SpotDiagram) -> list[Line2D]:

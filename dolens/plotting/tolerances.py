@@ -12,6 +12,8 @@ from matplotlib.patches import Patch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.plotting.legends import legend_below
+from dolens.plotting.number_text import number_text
 from dolens.plotting.style import PAGE, PALETTE, SMALL, TITLE, open_axes
 from dolens.plotting.titles import draw_title
 
@@ -150,13 +152,7 @@ def yield_figure(
         open_axes(axes)
         legend = axes.get_legend_handles_labels()
     band = Patch(facecolor="0.5", alpha=0.3, label="±2σ of the share, by the number of lenses")
-    figure.legend(
-        handles=[*legend[0], band],
-        loc="outside lower center",
-        ncols=3 if len(panels) > 1 else 2,
-        frameon=False,
-        fontsize=SMALL,
-    )
+    legend_below(figure, [*legend[0], band], 3 if len(panels) > 1 else 2)
     draw_title(figure, title)
     return figure
 
@@ -218,6 +214,13 @@ def parameter_label(name: str) -> str:
     if first == "thicknesses":
         return f"thickness {rest[0]}"
     return name.replace("_", " ")
+
+
+def tolerance_label(name: str, tolerance: str) -> str:
+    """Return a parameter with its tolerance: `front tilt x, ±0.05°` of `± 0.05 deg`."""
+    number, _, unit = tolerance.removeprefix("± ").partition(" ")
+    printed = "°" if unit == "deg" else f" {unit}".rstrip()
+    return f"{parameter_label(name)}, ±{number_text(float(number), 4)}{printed}"
 
 
 def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:

@@ -15,7 +15,7 @@ from dolens.experiments.camera.reconstruction import evaluating
 from dolens.experiments.experiment import Figures
 from dolens.optics.paraxial import first_order
 from dolens.plotting import comparison_figure, layout_figure, psf_figure
-from dolens.plotting.layout import layout_title, optics_text, shown_name
+from dolens.plotting.layout import layout_title, lens_title, optics_text, shown_name
 from dolens.plotting.number_text import number_text
 from dolens.reconstruction import psnr_db
 from dolens.sensor.colour import linear_to_srgb
@@ -24,6 +24,8 @@ _PUPIL_SAMPLES = 96  # along each side of the pupil
 # A window of point spread functions is doubled until it holds this share of each, up to so many
 # pixels along each side.
 _HELD, _LARGEST_WINDOW = 0.998, 1025
+# Zones of a sensor that are not shares of its field.
+_ZONES = {"axis": "on the axis", "full": "edge of the field", "field": "anywhere in the field"}
 
 
 def camera_figures(
@@ -61,7 +63,8 @@ def _images(
     )
     quality = {"raw": psnr_db(raw, truth).tolist(), "restored": psnr_db(restored, truth).tolist()}
     kind = {"val": "validation", "test": "test"}[stage]
-    title = f"{shown_name(camera.lens)}: one crop of one {kind} photograph, PSNR of this crop"
+    title = lens_title(copy.deepcopy(camera.lens).cpu(), camera.views.object_distance)
+    title += f"\none crop of one {kind} photograph, PSNR of this crop"
     if scores is not None:
         found = scores.metrics["psnr_db"]
         mean, count = float(found.mean()), len(found)
@@ -131,6 +134,8 @@ def _metres(distance: float) -> str:
 
 
 def _label(label: str) -> str:
-    """Return `8 m` for the label `8m` of a depth; other labels as they are."""
+    """Return `8 m` for the label `8m` of a depth, and `0.7 of the field` for that of a zone."""
     number = label.removesuffix("m")
-    return f"{number} m" if number != label and number.replace(".", "").isdigit() else label
+    if number.replace(".", "").isdigit():
+        return f"{number} m" if number != label else f"{label} of the field"
+    return _ZONES.get(label, label)

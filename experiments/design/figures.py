@@ -127,12 +127,15 @@ def design_figures(
         edge = max(fields, key=_size)
         opposite = (-edge[0], -edge[1])
         start = opposite if opposite in fields else (0.0, 0.0)
-        what = ["RMS spot radius", rays_text(settings), reference_text(settings)]
-        return rms_curves_figure(
-            merit_rms_against_field(lens, settings, edge, start) if _size(edge) > 0.0 else None,
-            merit_rms_against_wavelength(lens, settings, _interval(waves)),
-            titled(lens, "final", ", ".join(filter(None, what))),
-        )
+        what = f"RMS spot radius, {rays_text(settings)}"
+        along = None
+        if _size(edge) > 0.0:
+            along = merit_rms_against_field(lens, settings, edge, start)
+            # Over the wavelength each is about its own.
+            note = reference_text(settings)
+            what += f"\nat the left {note}" if note else ""
+        over = merit_rms_against_wavelength(lens, settings, _interval(waves))
+        return rms_curves_figure(along, over, titled(lens, "final", what))
 
     def fans() -> Figure:
         share = pupil_share(lens, settings)

@@ -28,6 +28,7 @@ from dolens.experiments.poses.basin import Basin
 from dolens.experiments.poses.bench import Bench, Light, check_precision, draw, simulate
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
+from dolens.plotting.layout import lens_title
 from dolens.rendering.spot_image import SpotImager
 from dolens.stages import stage as named_stage
 
@@ -124,8 +125,8 @@ class PoseAccuracyModule(Analysis):
 
     def figures(self) -> Figures:
         """Return a figure for each part that was measured, by its name."""
-        name = self.lens.name
-        title = f"{name}: error and light, {self.by_photons.measurements} measurements each"
+        name = lens_title(self.lens)
+        title = f"{name}\nerror and light, {self.by_photons.measurements} measurements each"
         figures = {
             "photons": lambda: photons_figure(
                 self.rows, self.true, title, self.by_photons.measurements

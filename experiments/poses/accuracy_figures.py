@@ -11,6 +11,7 @@ from dolens.alignment.pose import Pose
 from dolens.experiments.poses.basin import Basin
 from dolens.experiments.poses.labels import variable_label
 from dolens.experiments.tables import Row
+from dolens.plotting.legends import legend_below
 from dolens.plotting.number_text import number_text
 from dolens.plotting.style import PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
@@ -75,9 +76,7 @@ def photons_figure(
         log_ticks(axes.xaxis, 3)
         log_ticks(axes.yaxis, 5)
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL
-    )
+    legend_below(figure, handles, 3, labels)
     draw_title(figure, title)
     return figure
 
@@ -96,7 +95,7 @@ def rays_figure(
         imagers: name → how images are made.
         ray_counts: of a source.
         photons: of a source, that the bound is of.
-        name: the name of the lens, for the title.
+        name: the lens and its aperture, for the title.
     """
     figure = Figure(figsize=(PAGE, 4.6), layout="constrained")
     axes = figure.subplots(1, 1)
@@ -128,10 +127,8 @@ def rays_figure(
     log_ticks(axes.xaxis)
     log_ticks(axes.yaxis)
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=SMALL
-    )
-    draw_title(figure, f"{name}: error that the model's rays make")
+    legend_below(figure, handles, 2, labels)
+    draw_title(figure, f"{name}\nerror that the model's rays make")
     return figure
 
 
@@ -154,8 +151,8 @@ def basin_figure(basin: Basin, name: str) -> Figure:
         )
         _write(axes, table)
         errors = list(basin.along.values())
-        axes.set_xticks(range(len(errors[0])), [f"{e:g}" for e in errors[0]], fontsize=SMALL)
-        axes.set_yticks(range(len(errors[1])), [f"{e:g}" for e in errors[1]], fontsize=SMALL)
+        axes.set_xticks(range(len(errors[0])), [number_text(e) for e in errors[0]], fontsize=SMALL)
+        axes.set_yticks(range(len(errors[1])), [number_text(e) for e in errors[1]], fontsize=SMALL)
         axes.set_xlabel(_start(across, units), fontsize=SMALL + 1)
         share = shares[f"basin/converged/centroid_weight_{weight:g}"]
         axes.set_title(f"μ = {weight:g} /mm²: {100.0 * share:.0f} % converge", fontsize=SMALL + 1)
@@ -163,7 +160,7 @@ def basin_figure(basin: Basin, name: str) -> Figure:
     bar = figure.colorbar(shown, ax=list(panels), pad=0.01, extend="both")
     bar.set_label("RMS error of the fit over bound (no unit)", fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
-    draw_title(figure, f"{name}: from where a fit converges")
+    draw_title(figure, f"{name}\nfrom where a fit converges")
     return figure
 
 

@@ -22,7 +22,7 @@ class Setup:
     """Describes the simulated measurement, for titles and lines.
 
     Attributes:
-        lens: the name of the lens.
+        lens: its name and aperture.
         fields: the number of fields.
         photons: photons of each spot.
         pixels: pixels of the sensor; None: an ideal one.
@@ -55,7 +55,7 @@ def alignment_figure(found: Alignment, setup: Setup) -> Figure:
     photons = f"{setup.photons:_.0f}".replace("_", "\N{NARROW NO-BREAK SPACE}")
     draw_title(
         figure,
-        f"{setup.lens}: {len(found.element) - 1} misalignments from {setup.fields} fields"
+        f"{setup.lens}\n{len(found.element) - 1} misalignments from {setup.fields} fields"
         f", {photons} photons a spot{_sensor(setup)}",
     )
     return figure

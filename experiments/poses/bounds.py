@@ -28,6 +28,7 @@ from dolens.experiments.poses.results import spread_metrics
 from dolens.experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
+from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
@@ -101,7 +102,7 @@ class PoseBoundsModule(Analysis):
 
     def figures(self) -> Figures:
         """Return `knowledge`, and `corner_<arrangement>` where all variables can be seen."""
-        return bounds_figures(self.arrangements, self.lens.name, int(self.light.photons))
+        return bounds_figures(self.arrangements, lens_title(self.lens), int(self.light.photons))
 
     def bound_rows(self) -> list[Row]:
         """Return rows of bounds.csv, one for each variable of each arrangement."""

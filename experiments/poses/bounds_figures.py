@@ -14,6 +14,7 @@ from dolens.experiments.experiment import Figures
 from dolens.experiments.poses.arrangement import UNSEEN, Arrangement
 from dolens.experiments.poses.labels import variable_label
 from dolens.plotting.corner import corner_figure
+from dolens.plotting.legends import legend_below
 from dolens.plotting.number_text import MINUS, number_text
 from dolens.plotting.style import DASHES, MARKERS, PAGE, SMALL, colours, ruled_axes
 from dolens.plotting.ticks import log_ticks
@@ -25,7 +26,7 @@ def bounds_figures(arrangements: Sequence[Arrangement], name: str, photons: floa
 
     Args:
         arrangements: what was found.
-        name: the name of the lens.
+        name: the lens and its aperture, for titles.
         photons: of all images of an arrangement together.
     """
     figures = {"knowledge": partial(_overview, arrangements, name, photons)}
@@ -47,17 +48,10 @@ def _overview(arrangements: Sequence[Arrangement], name: str, photons: float) ->
         axes.set_title(f"({letter})", loc="left", fontsize=SMALL + 1, fontweight="bold")
     handles, labels = middle.get_legend_handles_labels()
     unseen = Line2D([], [], color="0.3", marker=">", markerfacecolor="none", linestyle="none")
-    figure.legend(
-        [*handles, unseen],
-        [*labels, "cannot be seen"],
-        loc="outside lower center",
-        ncols=2,
-        frameon=False,
-        fontsize=SMALL,
-    )
+    legend_below(figure, [*handles, unseen], 2, [*labels, "cannot be seen"])
     draw_title(
         figure,
-        f"{name}: Cramér–Rao bounds of its pose from images of {number_text(photons)} photons "
+        f"{name}\nCramér–Rao bounds of its pose from images of {number_text(photons)} photons "
         "in all",
     )
     return figure
@@ -175,7 +169,7 @@ def _corner(found: Arrangement, name: str) -> Figure:
         values,
         found.estimates,
         values if found.estimates is not None else None,
-        f"{name}, {_label(found)}: Cramér–Rao bounds",
+        f"{name}\n{_label(found)}: Cramér–Rao bounds",
     )
 
 

@@ -18,6 +18,7 @@ from dolens.experiments.poses.estimates import Estimates, probability
 from dolens.experiments.poses.misalignment import MisalignmentModule
 from dolens.experiments.poses.results import error_statistics
 from dolens.experiments.tables import Row
+from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
@@ -100,7 +101,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             case: {fit: self.over_bound(case, fit) for fit in fits}
             for case, (_, fits) in self.cases.items()
         }
-        title = f"{self.lens.name}: errors over bounds, {self.draws} measurements"
+        title = f"{lens_title(self.lens)}\nerrors over bounds, {self.draws} measurements"
         return coverage_figure(errors, [fit.name for fit in self.fits], title)
 
     def over_bound(self, case: str, fit: str) -> Tensor:

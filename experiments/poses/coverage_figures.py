@@ -6,6 +6,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from dolens.plotting.legends import legend_below
 from dolens.plotting.number_text import number_text
 from dolens.plotting.style import PAGE, SMALL, colours, open_axes
 from dolens.plotting.titles import draw_axes_title
@@ -69,13 +70,5 @@ def coverage_figure(
     axes.set_xticks(ticks, [number_text(tick) for tick in ticks])
     axes.set_xticks([], minor=True)
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower center",
-        ncols=min(len(names), 6),
-        frameon=False,
-        fontsize=SMALL,
-        markerscale=2.0,
-    )
+    legend_below(figure, handles, 6, labels, 2.0)
     return figure

@@ -1,4 +1,8 @@
-"""Labels of variables in figures."""
+"""Labels of variables and images in figures."""
+
+from collections.abc import Sequence
+
+from dolens.plotting.number_text import number_text
 
 
 def variable_label(name: str) -> str:
@@ -10,3 +14,16 @@ def variable_label(name: str) -> str:
     short = name.removeprefix("elements.").replace("sources.*.", "sources ")
     short = short.replace("sources.", "source ")
     return short.replace(".", " ").replace("_", " ")
+
+
+def image_labels(sources: int, planes: Sequence[float]) -> list[str]:
+    """Return the source and the plane (mm) of each image, as far as there are several.
+
+    The images of a source on all planes follow one another, as `Pose.images` gives them.
+    """
+    return [
+        (f", source {source + 1}" if sources > 1 else "")
+        + (f"\nplane {number_text(plane)} mm" if len(planes) > 1 else "")
+        for source in range(sources)
+        for plane in planes
+    ]

@@ -15,12 +15,13 @@ from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.experiments.experiment import Figures
 from dolens.experiments.poses.estimates import Estimates
-from dolens.experiments.poses.labels import variable_label
+from dolens.experiments.poses.labels import image_labels, variable_label
 from dolens.experiments.poses.settings import Fit, Stage
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.plotting.convergence import convergence_figure
 from dolens.plotting.corner import corner_figure
+from dolens.plotting.layout import lens_title
 from dolens.plotting.spot_fit import spot_fit_figure
 from dolens.rendering.spot_image import SpotImage
 from dolens.sensor.pixels import Sensor
@@ -85,15 +86,15 @@ def _spots(fitted: FittedPoses) -> Figure:
         for kept, scaled in ((initial, fitted.initial[number]), (final, None)):
             images = enumerate(fitted.images(number, scaled))
             kept.append(torch.stack([measurement.as_seen(image, s)[0] for s, image in images]))
-        sources = [f", source {source + 1}" for source in range(len(shares))]
-        labels += [f"fit {fit.name}{source if len(shares) > 1 else ''}" for source in sources]
+        pose = fitted.poses[number]
+        labels += [f"fit {fit.name}{of}" for of in image_labels(len(pose.sources), pose.planes)]
     return spot_fit_figure(
         torch.cat(measured),
         torch.cat(initial),
         torch.cat(final),
         labels,
         fitted.sensor.pixel_pitch,
-        f"{fitted.lens.name}: images of point sources, measured and modelled",
+        f"{lens_title(fitted.lens)}\nimages of point sources, measured and modelled",
     )
 
 
@@ -116,7 +117,7 @@ def _convergence(fitted: FittedPoses, number: int) -> Figure:
         values,
         stages,
         {variable_label(name): truth[name] for name in pose.names if name in truth},
-        f"{fitted.lens.name}: convergence of fit {fit.name}",
+        f"{lens_title(fitted.lens)}\nconvergence of fit {fit.name}",
     )
 
 
@@ -151,5 +152,5 @@ def _corner(fitted: FittedPoses, number: int) -> Figure:
         true if about_truth else found,
         points,
         true if truth else None,
-        f"{fitted.lens.name}: how well fit {fit.name} knows its pose (Cramér–Rao)",
+        f"{lens_title(fitted.lens)}\nhow well fit {fit.name} knows its pose (Cramér–Rao)",
     )

@@ -30,6 +30,7 @@ from dolens.experiments.settings import PupilRays, Spots
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import DEGREE, unit_of
+from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
@@ -101,7 +102,7 @@ class TripletAlignmentModule(Analysis):
     def figures(self) -> Figures:
         """Return `alignment`."""
         setup = Setup(
-            self.lens.name, len(self.spots.fields), self.photons, self.pixels, self.sensor
+            lens_title(self.lens), len(self.spots.fields), self.photons, self.pixels, self.sensor
         )
         return {"alignment": lambda: alignment_figure(self.alignment, setup)}
 

@@ -27,13 +27,14 @@ class Check:
         item: the item of the supplement that it belongs to.
         run: the system or comparison.
         metric: its name in metrics.json.
-        what: the statement that is checked, with units.
+        what: the statement that is checked.
         kind: of SOURCES.
         source: where the expected value comes from.
         expected: the value, or None.
         tolerance: the largest deviation from it that passes.
         low: the least value that passes, or None.
         high: the largest value that passes, or None.
+        unit: of all these numbers; empty where they have none.
     """
 
     item: str
@@ -46,6 +47,7 @@ class Check:
     tolerance: float | None = None
     low: float | None = None
     high: float | None = None
+    unit: str = ""
 
     def __post_init__(self) -> None:
         where = f"expected.yaml: {self.run}: {self.metric}"

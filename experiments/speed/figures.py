@@ -1,7 +1,8 @@
 """Figures of error against cost."""
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 from matplotlib.figure import Figure
@@ -21,7 +22,7 @@ _AXES = {
     "psf": (
         "forward_s",
         "error_grey_levels",
-        "time per point spread function (s)",
+        "time per point spread function (µs)",
         "RMS error of an image (grey levels)",
     ),
     "render": (
@@ -38,41 +39,39 @@ _GRADIENT_AXES = (
     "relative error of the gradient (no unit)",
 )
 _TITLES = {"trace": "ray traces", "psf": "point spread functions", "render": "images"}
+# Seconds in the table, µs in the figure.
+_SCALE = {"forward_s": 1e6}
 _LEAST_ERROR = {"trace": 1e-10, "psf": None, "render": None}
 
 
-def speed_figures(rows: Sequence[Row], scenes: Sequence[str], parts: Sequence[str]) -> Figures:
+def speed_figures(rows: Sequence[Row], scenes: Mapping[str, str], parts: Sequence[str]) -> Figures:
     """Return error against cost: `<part>_<scene>`, and `gradient_<scene>` for renders.
 
     Args:
         rows: the table of measurements.
-        scenes: their names.
+        scenes: name → its lens and aperture, for titles.
         parts: those that were measured, of `trace`, `psf` and `render`.
     """
     figures = {}
-    for scene in scenes:
+    for scene, lens in scenes.items():
         for part in parts:
-            figures[f"{part}_{scene}"] = partial(_part_figure, rows, scene, part)
+            figures[f"{part}_{scene}"] = partial(_part_figure, rows, scene, part, lens)
         if "render" in parts:
-            figures[f"gradient_{scene}"] = partial(_gradient_figure, rows, scene)
+            figures[f"gradient_{scene}"] = partial(_gradient_figure, rows, scene, lens)
     return figures
 
 
-def _part_figure(rows: Sequence[Row], scene: str, part: str) -> Figure:
+def _part_figure(rows: Sequence[Row], scene: str, part: str, lens: str) -> Figure:
     cost, error, *labels = _AXES[part]
     floor = _uncertainty(rows, scene) if part == "render" else _LEAST_ERROR[part]
     points = _points(rows, scene, part, cost, error)
-    return pareto_figure(points, *labels, f"{_name(scene)}: {_TITLES[part]}", floor)
+    return pareto_figure(points, *labels, f"{lens}\n{_TITLES[part]}: error against time", floor)
 
 
-def _gradient_figure(rows: Sequence[Row], scene: str) -> Figure:
+def _gradient_figure(rows: Sequence[Row], scene: str, lens: str) -> Figure:
     cost, error, *labels = _GRADIENT_AXES
     points = _points(rows, scene, "render", cost, error)
-    return pareto_figure(points, *labels, f"{_name(scene)}: gradients of images", None)
-
-
-def _name(scene: str) -> str:
-    return scene.replace("_", " ")
+    return pareto_figure(points, *labels, f"{lens}\ngradients of images: error against time", None)
 
 
 def _points(
@@ -83,7 +82,8 @@ def _points(
     for row in rows:
         if (row["scene"], row["part"]) == (scene, part) and math.isfinite(float(row[error])):
             model = str(row["model"])
-            point = Point(_setting(str(row["setting"])), row[cost], row[error], model == "auto")
+            setting = _setting(str(row["setting"]))
+            point = Point(setting, _SCALE.get(cost, 1.0) * row[cost], row[error], model == "auto")
             families.setdefault(model, []).append(point)
     return families
 
@@ -95,5 +95,5 @@ def _uncertainty(rows: Sequence[Row], scene: str) -> float | None:
 
 
 def _setting(setting: str) -> str:
-    """Return a label: one ray, not `1 rays`."""
-    return "1 ray" if setting == "1 rays" else setting
+    """Return a label: one ray, not `1 rays`; one grey level likewise."""
+    return re.sub(r"\b1 (ray|grey level)s$", r"1 \1", setting)

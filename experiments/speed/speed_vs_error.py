@@ -20,6 +20,7 @@ from dolens.experiments.speed.traces import trace_rows
 from dolens.experiments.tables import Row
 from dolens.optics.lens import Lens
 from dolens.plotting import Point, pareto_front
+from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
@@ -79,7 +80,8 @@ class SpeedVsErrorModule(Analysis):
 
     def figures(self) -> Figures:
         """Return error against cost for each scene and part."""
-        return speed_figures(self.rows, [s.name for s in self.subjects], self.parts)
+        titles = {s.name: lens_title(s.lens) for s in self.subjects}
+        return speed_figures(self.rows, titles, self.parts)
 
     def _trace(self, subject: Subject) -> list[dict[str, float | str]]:
         return trace_rows(subject, ("reference", "cpu"), self.effort.rays, self.effort.seconds)

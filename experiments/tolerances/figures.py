@@ -12,22 +12,23 @@ from dolens.plotting.tolerances import (
     matrix_figure,
     offenders_figure,
     parameter_label,
+    tolerance_label,
     yield_figure,
 )
 from dolens.tolerancing import ToleranceAnalysis
 
 _MOST_OFFENDERS = 20
-_UNIT_WORDS = {"deg": "µm/°", "mm": "µm/mm", "%": "µm/%", "1/mm": "µm/mm⁻¹"}
+_UNIT_WORDS = {"deg": "µm/°", "mm": "µm/mm", "%": "µm/%", "1/mm": "µm·mm"}
 
 
 def tolerance_figures(
-    found: ToleranceAnalysis, name: str, spots: Sequence[str], weights: Tensor
+    found: ToleranceAnalysis, title: str, spots: Sequence[str], weights: Tensor
 ) -> Figures:
     """Return Jacobians as matrices, yield curves, and the worst offenders.
 
     Args:
         found: the analysis.
-        name: the name of the lens, for titles.
+        title: the lens and its aperture; what a figure shows is written below it.
         spots: labels of its S spots.
         weights: (S,), weights of the spots, of sum 1.
     """
@@ -36,7 +37,7 @@ def tolerance_figures(
     blocks = [("x", len(spots)), ("y", len(spots))]
     motion = s.centroid_jacobian.transpose(0, 1).flatten(0, 1)
     labels = [parameter_label(parameter) for parameter in t.names]
-    with_tolerance = [f"{label}  {t.label(p)}" for p, label in enumerate(labels)]
+    with_tolerance = [tolerance_label(n, t.label(p)) for p, n in enumerate(t.names)]
     scale = 1e3 * per_unit(t)
     first = c.order[:_MOST_OFFENDERS]
     ends = s.rms_at_ends_refocused.square() - s.rms_refocused.square()
@@ -45,18 +46,18 @@ def tolerance_figures(
             _by_unit(motion * scale, labels, t.unit_names),
             spots * 2,
             blocks,
-            f"{name}: how spots move (Jacobian of their centroids)",
+            f"{title}\nhow spots move: Jacobian of their centroids, rays over the whole stop",
         ),
         "centroid_by_tolerance": lambda: matrix_figure(
             {"motion (µm)": (1e3 * motion * s.steps, with_tolerance)},
             spots * 2,
             blocks,
-            f"{name}: how far a whole tolerance moves spots",
+            f"{title}\nhow far a whole tolerance moves spots, rays over the whole stop",
         ),
         "rms_jacobian": lambda: matrix_figure(
             _by_unit(s.rms_jacobian * scale, labels, t.unit_names),
             spots,
-            title=f"{name}: Jacobian of the spots' RMS radii",
+            title=f"{title}\nJacobian of the spots' RMS radii, rays over the whole stop",
         ),
         "rms_by_tolerance": lambda: matrix_figure(
             {
@@ -70,9 +71,9 @@ def tolerance_figures(
                 ),
             },
             spots,
-            title=f"{name}: what a whole tolerance does to the spots' RMS radii",
+            title=f"{title}\nwhat a whole tolerance does to the spots' RMS radii",
         ),
-        "yield": lambda: _yields(found, name, weights),
+        "yield": lambda: _yields(found, title, weights),
         "worst_offenders": lambda: offenders_figure(
             [with_tolerance[p] for p in first],
             c.share[first].tolist(),
@@ -80,12 +81,12 @@ def tolerance_figures(
                 "refocused": s.increase()[first].tolist(),
                 "not refocused": s.increase(refocused=False)[first].tolist(),
             },
-            f"{name}: worst offenders",
+            f"{title}\nworst offenders",
         ),
     }
 
 
-def _yields(found: ToleranceAnalysis, name: str, weights: Tensor) -> Figure:
+def _yields(found: ToleranceAnalysis, title: str, weights: Tensor) -> Figure:
     outcomes = {
         f"{how}, {stage}": outcome.found(stage == "refocused")
         for stage in ("refocused", "not refocused")
@@ -102,7 +103,7 @@ def _yields(found: ToleranceAnalysis, name: str, weights: Tensor) -> Figure:
             mean: float((design @ weights).sqrt()),
             worst: float(design[weights > 0.0].amax().sqrt()),
         },
-        f"{name}: {len(found.errors)} lenses drawn from the tolerances",
+        f"{title}\n{len(found.errors)} lenses drawn from the tolerances",
     )
 
 

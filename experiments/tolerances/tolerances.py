@@ -22,6 +22,7 @@ from dolens.experiments.tolerances.tables import (
     sensitivity_rows,
 )
 from dolens.optics.lens import Lens
+from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
 from dolens.tolerancing import (
     Outcome,
@@ -124,7 +125,8 @@ class TolerancesModule(Analysis):
 
     def figures(self) -> Figures:
         """Return the matrices, the yield curves and the worst offenders."""
-        return tolerance_figures(self.analysis, self.lens.name, self._spot_labels(), self.weights)
+        title = lens_title(self.lens, self.lens.object_distance)
+        return tolerance_figures(self.analysis, title, self._spot_labels(), self.weights)
 
     def _metrics(self, found: ToleranceAnalysis) -> dict[str, float]:
         increase = (1e3 * found.sensitivities.increase()).tolist()

@@ -6,6 +6,7 @@ import torch
 from matplotlib.patches import Ellipse
 
 from dolens.errors import InputError
+from dolens.experiments.poses.labels import image_labels
 from dolens.plotting.convergence import convergence_figure
 from dolens.plotting.corner import corner_figure
 from dolens.plotting.spot_fit import spot_fit_figure
@@ -140,3 +141,12 @@ def test_a_covariance_of_another_shape_or_without_spread_is_refused():
         corner_figure(COVARIANCE, LABELS, UNITS, points=torch.zeros(5, 2))
     with pytest.raises(InputError, match="variances must be positive"):
         corner_figure(0.0 * COVARIANCE, LABELS, UNITS)
+
+
+def test_images_on_several_planes_name_their_plane():
+    """One source on three planes, once labelled as three sources; a source's images together."""
+    assert image_labels(1, [0.0]) == [""]
+    assert image_labels(1, [0.0, -8.0]) == ["\nplane 0 mm", "\nplane −8 mm"]
+    assert image_labels(2, [0.0]) == [", source 1", ", source 2"]
+    both = image_labels(2, [0.0, 4.5])
+    assert both[1:3] == [", source 1\nplane 4.5 mm", ", source 2\nplane 0 mm"]

@@ -5,10 +5,18 @@ import sys
 import numpy as np
 import pytest
 import torch
+from matplotlib.image import imread
 from PIL import Image
 
+from dolens import load_lens
 from dolens.errors import InputError
-from dolens.plotting import figure_to_image, history_figure, save_figure, save_figures
+from dolens.plotting import (
+    figure_to_image,
+    history_figure,
+    layout_figure,
+    save_figure,
+    save_figures,
+)
 
 
 def test_an_image_tensor_has_the_figures_size_and_colours():
@@ -57,3 +65,20 @@ def test_a_figure_is_written_in_every_format_that_is_asked_for(tmp_path):
     assert again == svg
     with pytest.raises(InputError, match="gif"):
         save_figures(figure, tmp_path / "history", ("gif",))
+
+
+def test_no_label_is_cut_at_the_edge_of_a_saved_layout(root, tmp_path):
+    """A plate of some picometres, whose sags have long numbers."""
+    lens = load_lens(root / "conf/lens/wavefront_coding.yaml").requires_grad_(False)
+    lens.surfaces["5"].x3.fill_(1e-11)
+    save_figure(layout_figure(lens, fields_deg=(0.0, 0.5), rays=3), tmp_path / "layout.png")
+    pixels = imread(tmp_path / "layout.png")[..., :3]
+    for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]):
+        assert (edge == 1.0).all()
+
+
+def test_a_plate_without_sag_is_not_plotted(root):
+    lens = load_lens(root / "conf/lens/wavefront_coding.yaml").requires_grad_(False)
+    lens.surfaces["5"].x3.fill_(0.0)
+    lens.surfaces["5"].y3.fill_(0.0)
+    assert len(layout_figure(lens, rays=3).axes) == 1

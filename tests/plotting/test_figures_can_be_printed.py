@@ -196,6 +196,7 @@ def test_images_of_sources_are_not_clipped():
     figure = spot_fit_figure(measured, initial, measured, ["10°"], 0.05, "Title")
     assert not flaws(figure)
     panels = [axes.images[0] for axes in figure.axes if axes.images][:3]
+    assert {panel.norm.gamma for panel in panels} == {1.0}
     brightest = max(float(panel.get_array().max()) for panel in panels)
     assert [panel.get_clim()[1] for panel in panels] == pytest.approx([brightest] * 3)
 
@@ -247,3 +248,14 @@ def test_gain_against_light():
     figure = coding_gain_figure([found, found])
     assert not flaws(figure)
     assert math.isfinite(drawn_points(figure.axes[0]).sum())
+
+
+def test_light_around_a_focus_is_seen():
+    """A disc of 1 % of the brightest pixel, a tenth up the colours by its root."""
+    image = torch.zeros(1, 40, 40)
+    image[0, 10:30, 10:30], image[0, 20, 20] = 0.01, 1.0
+    figure = spot_fit_figure(image, image, image, ["0°"], 0.05, "Title")
+    assert not flaws(figure)
+    panel = next(axes.images[0] for axes in figure.axes if axes.images)
+    assert float(panel.norm(0.01)) == pytest.approx(0.1)
+    assert any("square-root scale" in axes.get_ylabel() for axes in figure.axes)

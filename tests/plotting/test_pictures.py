@@ -93,27 +93,26 @@ def test_comparison_shows_each_image_in_its_place():
     shown = {axes.get_title(): axes.images[0] for axes in figure.axes}
     expected = {
         "truth": truth,
-        "raw, 1m: 21.0 dB": raw[0],
-        "raw, 8m: 22.0 dB": raw[1],
-        "restored, 1m: 30.1 dB": restored[0],
-        "restored, 8m: 31.0 dB": restored[1],
+        "1m\nraw: 21.0 dB": raw[0],
+        "8m\nraw: 22.0 dB": raw[1],
+        "restored: 30.1 dB": restored[0],
+        "restored: 31.0 dB": restored[1],
     }
     assert shown.keys() == expected.keys()
     for title, image in expected.items():
         np.testing.assert_array_equal(shown[title].get_array(), image.permute(1, 2, 0).numpy())
         assert shown[title].get_interpolation() == "nearest"
-    places = {
-        axes.get_title().split(":")[0]: axes.get_subplotspec().get_geometry()[2:]
-        for axes in figure.axes
-    }
+    places = {axes.get_title(): axes.get_subplotspec().get_geometry()[2:] for axes in figure.axes}
     # Cells of two rows of three, by first and last number.
     assert places["truth"] == (0, 3)
-    assert (places["raw, 8m"], places["restored, 1m"]) == ((2, 2), (4, 4))
+    # Labels stand above their columns.
+    below = places["8m\nraw: 22.0 dB"], places["restored: 31.0 dB"]
+    assert below == ((2, 2), (5, 5)) and places["restored: 30.1 dB"] == (4, 4)
 
 
 def test_comparison_without_numbers_names_the_images_only():
     figure = comparison_figure(*images(depths=1), ["1m"])
-    assert [axes.get_title() for axes in figure.axes] == ["truth", "raw, 1m", "restored, 1m"]
+    assert [axes.get_title() for axes in figure.axes] == ["truth", "1m\nraw", "restored"]
 
 
 def test_values_beyond_the_display_are_clipped():

@@ -2,10 +2,12 @@
 
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from overlaps import flaws
 
 from dolens import load_lens
 from dolens.plotting import before_after_figure, history_figure
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import TITLE
 from dolens.plotting.titles import draw_axes_title, draw_title
 
@@ -47,3 +49,13 @@ def test_titles_of_axes_with_a_long_name_fit_too(root):
     lens.name = "A triplet whose name is as long as a catalogue has"
     assert not flaws(before_after_figure(lens, lens, rays=3))
     assert not flaws(history_figure([3.0, 2.0, 1.0], title=f"{lens.name}: history of the design"))
+
+
+def test_a_legend_has_fewer_columns_where_the_figure_is_narrow():
+    handles = [Line2D([], [], label=f"{wave} nm") for wave in range(400, 405)]
+    for width, columns in ((7.2, 5), (3.0, 3)):
+        figure = Figure(figsize=(width, 2.0), layout="constrained")
+        legend = legend_below(figure, handles, 5)
+        assert legend._ncols == columns
+        assert [text.get_text() for text in legend.get_texts()] == [h.get_label() for h in handles]
+        assert not flaws(figure)

@@ -8,6 +8,7 @@ from dolens.plotting.tolerances import (
     matrix_figure,
     offenders_figure,
     parameter_label,
+    tolerance_label,
     yield_figure,
 )
 
@@ -65,3 +66,9 @@ def test_bars_are_in_per_cent_and_micrometres_the_worst_on_top():
 )
 def test_parameters_in_words(name, label):
     assert parameter_label(name) == label
+
+
+def test_tolerances_are_printed_with_their_units():
+    assert tolerance_label("elements.front.tilt_x", "± 0.05 deg") == "front tilt x, ±0.05°"
+    assert tolerance_label("surfaces.3.curvature", "± 0.1 %") == "curvature 3, ±0.1 %"
+    assert tolerance_label("surfaces.3.curvature", "± 1e-05 1/mm") == "curvature 3, ±10⁻⁵ 1/mm"

@@ -9,6 +9,7 @@ from dolens.experiments.report.page.numbers import (
     memory_text,
     number_text,
     seconds_text,
+    step_text,
 )
 from dolens.experiments.report.page.overview import (
     anchor,
@@ -76,8 +77,7 @@ def cost_text(result: Result) -> str:
         parts[-1] += f" ({seconds_text(record['cpu_s'])} of processor time)"
     if "cost/step_s" in metrics:
         step = metrics["cost/step_s"]
-        of_step = seconds_text(step) if step >= 1.0 else f"{number_text(1e3 * step, 2)} ms"
-        parts.append(f"{of_step} a step")
+        parts.append(f"{step_text(step)} a step")
     if "cost/rays" in metrics:
         parts.append(f"{count_text(metrics['cost/rays'])} rays")
     if "cost/peak_memory_mb" in metrics:

@@ -41,6 +41,14 @@ def seconds_text(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
+def step_text(seconds: float) -> str:
+    """Return the time of a step as `4.7 ms`, `470 ms` or `1.5 s`."""
+    milliseconds = 1e3 * seconds
+    if milliseconds >= 1000.0:
+        return seconds_text(seconds)
+    return f"{milliseconds:.0f} ms" if milliseconds >= 9.95 else f"{milliseconds:.2g} ms"
+
+
 def memory_text(megabytes: float) -> str:
     """Return a size as `830 MB` or `1.2 GB`."""
     return f"{megabytes:.0f} MB" if megabytes < 1000.0 else f"{megabytes / 1024.0:.1f} GB"

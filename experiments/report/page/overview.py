@@ -26,7 +26,9 @@ def overview(material: Material) -> Markup:
     counts = Counter(outcome.state for outcome in material.outcomes)
     badges = [
         element(
-            "span", f"{counts[state]} {_count_words(state)}", class_=f"badge {css_class(state)}"
+            "span",
+            f"{counts[state]} {_count_words(state, counts[state])}",
+            class_=f"badge {css_class(state)}",
         )
         for state in _ORDER
     ]
@@ -54,23 +56,28 @@ def anchor(item: str) -> str:
 
 
 def expected_text(check: Check) -> str:
-    """Return what passes, as `4.29 ± 0.01`, `at most 5` or `2 to 3`."""
+    """Return what passes, as `4.29 ± 0.01 µm`, `at most 5 nm` or `2 to 3`."""
     if check.expected is not None and check.tolerance is not None:
         expected = value_text(check.expected, check.tolerance)
-        return f"{expected} ± {limit_text(check.tolerance)}"
+        return _with_unit(f"{expected} ± {limit_text(check.tolerance)}", check.unit)
     if check.low is None:
-        return f"at most {limit_text(float(check.high))}"
+        return _with_unit(f"at most {limit_text(float(check.high))}", check.unit)
     if check.high is None:
-        return f"at least {limit_text(check.low)}"
-    return f"{limit_text(check.low)} to {limit_text(check.high)}"
+        return _with_unit(f"at least {limit_text(check.low)}", check.unit)
+    return _with_unit(f"{limit_text(check.low)} to {limit_text(check.high)}", check.unit)
 
 
 def found_text(outcome: Outcome) -> str:
-    """Return the value that was found, or why there is none."""
+    """Return the value that was found, with its unit, or why there is none."""
     if outcome.value is None:
         return outcome.note or "not run"
     tolerance = outcome.check.tolerance
-    return value_text(outcome.value, tolerance) if tolerance else number_text(outcome.value, 3)
+    text = value_text(outcome.value, tolerance) if tolerance else number_text(outcome.value, 3)
+    return _with_unit(text, outcome.check.unit)
+
+
+def _with_unit(text: str, unit: str) -> str:
+    return f"{text}{unit}" if unit in ("", "°") else f"{text} {unit}"
 
 
 def checks_table(outcomes: Sequence[Outcome]) -> Markup:
@@ -189,8 +196,10 @@ def _legend() -> str:
     return "; ".join(f"{_KINDS[kind]} – {words}" for kind, words in SOURCES.items())
 
 
-def _count_words(state: State) -> str:
-    return {State.HOLDS: "hold", State.FAILS: "do not hold", State.NOT_RUN: "were not run"}[state]
+def _count_words(state: State, count: int) -> str:
+    one = {State.HOLDS: "holds", State.FAILS: "does not hold", State.NOT_RUN: "was not run"}
+    more = {State.HOLDS: "hold", State.FAILS: "do not hold", State.NOT_RUN: "were not run"}
+    return (one if count == 1 else more)[state]
 
 
 def _spaced(children: Sequence[Markup]) -> list[Child]:

@@ -10,7 +10,12 @@ from dolens.errors import InputError
 from dolens.experiments.report.checks import State, outcomes
 from dolens.experiments.report.gains import gain_numbers
 from dolens.experiments.report.page.material import Material
-from dolens.experiments.report.page.numbers import number_text, seconds_text, value_text
+from dolens.experiments.report.page.numbers import (
+    number_text,
+    seconds_text,
+    step_text,
+    value_text,
+)
 from dolens.experiments.report.page.overview import gain_sentence
 from dolens.experiments.report.page.page import page
 from dolens.experiments.report.results import assigned, read_result, same_overrides
@@ -79,9 +84,9 @@ def test_text_is_escaped(text):
 @pytest.mark.parametrize(
     "words",
     [
-        "1 hold",
+        "1 holds",
         "2 do not hold",
-        "1 were not run",
+        "1 was not run",
         "20.50",  # the radius of lens/final.yaml
         "2.895 ± 0.010 (95 %: 2.800 to 3.000)",
         "not run",
@@ -103,6 +108,7 @@ def test_numbers_are_written_for_readers():
     assert number_text(float("nan")) == "no number"
     assert value_text(1.5720432910, 1e-8) == "1.572043291"
     assert [seconds_text(s) for s in (0.25, 59.7, 7500.0)] == ["0.2 s", "1 min 0 s", "2 h 5 min"]
+    assert [step_text(s) for s in (0.0047, 0.468, 1.52)] == ["4.7 ms", "468 ms", "1.5 s"]
 
 
 def test_finished_runs_are_taken_by_their_overrides(tmp_path):
