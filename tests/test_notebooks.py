@@ -10,6 +10,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+# Fewer steps and rays than a reader takes: every line runs, in a tenth of the time.
+SHORTER = {
+    "camera_in_pytorch": {"range(80)": "range(4)"},
+    "pose_from_a_point": {"rays=50_000": "rays=10_000", "rays=400_000": "rays=20_000"},
+}
 
 
 def test_there_are_five_notebooks():
@@ -17,11 +22,17 @@ def test_there_are_five_notebooks():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path):
+def test_a_notebook_runs(path, tmp_path):
+    text = path.read_text(encoding="utf-8")
+    for printed, shorter in SHORTER.get(path.stem, {}).items():
+        assert printed in text, f"{printed} is not in the notebook any more"
+        text = text.replace(printed, shorter)
+    copy = tmp_path / path.name
+    copy.write_text(text, encoding="utf-8")
     options = ("--nbmake", "--nbmake-timeout=300", "-q", "-n", "0", "-p", "no:cacheprovider")
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, path],
-        cwd=ROOT,
+        [sys.executable, "-m", "pytest", *options, copy],
+        cwd=tmp_path,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,

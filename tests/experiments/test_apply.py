@@ -104,8 +104,24 @@ def camera(loaded):
 
 
 @pytest.fixture(scope="module")
-def pictures(loaded):
-    return PictureCamera(loaded, Options(bits=16))
+def applied(tiny_run, tmp_path_factory):
+    """The folder of a picture that a camera was applied to, the camera, and what it found.
+
+    The picture is two windows wide.
+    """
+    parent = tmp_path_factory.mktemp("applied")
+    torch.manual_seed(3)
+    blocks = torch.nn.functional.interpolate(torch.rand(1, 3, 8, 10), size=(60, 100))[0]
+    write_picture(parent / "blocks.png", blocks, 8)
+    options = Options(depths=(8000.0, 4500.0), bits=16, save_raw=True, window=64)
+    return apply_run(tiny_run, [parent / "blocks.png"], options, out=parent / "out")
+
+
+@pytest.fixture
+def pictures(applied) -> PictureCamera:
+    camera = applied[1]
+    camera.options = Options(bits=16)
+    return camera
 
 
 def test_a_small_picture_is_imaged_as_rays_image_it(camera):
@@ -139,16 +155,8 @@ def test_a_depth_that_is_none_is_refused():
 # ---------------------------------------------------------------- files
 
 
-def test_a_picture_goes_in_and_comes_out(tiny_run, tmp_path):
-    torch.manual_seed(3)
-    blocks = torch.nn.functional.interpolate(torch.rand(1, 3, 8, 10), size=(80, 100))[0]
-    write_picture(tmp_path / "blocks.png", blocks, 8)
-    folder, camera, found = apply_run(
-        tiny_run,
-        [tmp_path / "blocks.png"],
-        Options(depths=(8000.0, 4500.0), bits=16, save_raw=True, window=64),
-        out=tmp_path / "out",
-    )
+def test_a_picture_goes_in_and_comes_out(applied, tmp_path):
+    folder, camera, found = applied
     names = {path.name for path in folder.iterdir()}
     for depth in ("8m", "4.5m"):
         kinds = ("sensor.png", "restored.png", "comparison.png", "raw.npy")
@@ -168,7 +176,7 @@ def test_a_picture_goes_in_and_comes_out(tiny_run, tmp_path):
 
 
 def test_noise_belongs_to_the_seed_and_not_to_the_windows(pictures, tmp_path):
-    write_picture(tmp_path / "grey.png", torch.full((3, 70, 140), 0.5), 8)
+    write_picture(tmp_path / "grey.png", torch.full((3, 60, 100), 0.5), 8)
 
     def restored(**options):
         pictures.options = Options(bits=16, **options)

@@ -1,6 +1,6 @@
 """A setting that has another name now says so, and an old run's overrides are translated."""
 
-import subprocess
+import runpy
 import sys
 
 import pytest
@@ -131,7 +131,9 @@ def test_the_rate_that_nothing_read_names_the_one_that_is(composed):
         checked(composed(CAMERA, "+optimizer.network.lr=0.1"))
 
 
-def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(composed, root, tmp_path):
+def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(
+    composed, root, tmp_path, monkeypatch, capfd
+):
     """The script, on a run folder whose overrides have the names of before."""
     kept = [
         "experiment=cooke_sensitivity",
@@ -145,10 +147,13 @@ def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(composed, roo
     folder = tmp_path / "run"
     old = [*kept, "module.rings=3", "+module.arms=6"]
     (folder / ".hydra/overrides.yaml").write_text("\n".join(f"- '{text}'" for text in old))
-    script = [sys.executable, str(root / "scripts/reproduce.py"), str(folder)]
-    done = subprocess.run(script, capture_output=True, text=True, cwd=root, timeout=500)
-    assert done.returncode == 0, done.stderr
+    script = root / "scripts/reproduce.py"
+    monkeypatch.setattr(sys, "argv", [str(script), str(folder)])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(script), run_name="__main__")
+    said = capfd.readouterr()
+    assert ended.value.code == 0, said.err
     for name in ("rings", "arms"):
         note = f"note: module.{name}: this setting is called module.spots.pupil.{name} now"
-        assert note in done.stdout.splitlines()
-    assert done.stdout.splitlines()[-1] == "reproduced"
+        assert note in said.out.splitlines()
+    assert said.out.splitlines()[-1] == "reproduced"

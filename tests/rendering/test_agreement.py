@@ -84,10 +84,6 @@ def test_a_plan_says_how_its_gradients_agree(root, caplog):
     assert numbers["auto/gradient_cosine"] > 0.95
     assert abs(numbers["auto/gradient_norm_ratio"] - 1.0) < 0.15 + numbers["auto/gradient_noise"]
     assert "gradients have a cosine of" in caplog.text
-    # Nobody asked: nothing is measured.
-    quiet = AutoRenderer(Sensor(24, 24, 0.06), 2.0, diffraction=False)
-    quiet.make_plan(lens, PlanarScene((1e6,), LINES))
-    assert "auto/gradient_cosine" not in quiet.numbers()
 
 
 def test_gradient_tolerances_that_make_no_sense_are_errors():

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dolens.cli.app import app
-from dolens.experiments.report import assemble, session
+from dolens.experiments.report import assemble, runner, session
 from dolens.experiments.report.checks import Check
 from dolens.experiments.report.plan import Item, Plan, Section, System
 from dolens.experiments.report.progress import Pace
@@ -23,7 +23,18 @@ folder = pathlib.Path(sys.argv[1])
 print("written")
 """
 FAILS = "import sys; print('no lens of this name'); sys.exit(3)"
-SLEEPS = "import time; time.sleep(60)"
+# Takes an interrupt even where pytest runs in the background of a shell, which ignores them.
+SLEEPS = """
+import pathlib, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+folder = pathlib.Path(sys.argv[1])
+try:
+    (folder / "started").touch()
+    time.sleep(60)
+except KeyboardInterrupt:
+    (folder / "interrupted").touch()
+    raise
+"""
 
 
 class Silent:
@@ -93,17 +104,23 @@ def test_a_run_counts_as_finished_only_with_the_same_code_and_settings(plan, tmp
     assert last_words(folder.with_name("writes.log")) == "written"
 
 
-def test_an_interrupt_ends_the_run_and_writes_the_page(plan, tmp_path):
+def test_an_interrupt_ends_the_run_and_writes_the_page(plan, tmp_path, monkeypatch):
+    folder = tmp_path / "report/runs/writes"
+
     class Impatient(Silent):
         def tick(self, elapsed, remaining):
-            raise KeyboardInterrupt
+            if (folder / "started").exists():
+                raise KeyboardInterrupt
 
+    # No terminal interrupts the run beside the report here, so there is nothing to wait for.
+    monkeypatch.setattr(runner, "_FIRST_GRACE_S", 0.0)
     sleeping = System("writes", "w", 1.0, module="report_sleeps")
     plan = Plan((sleeping,), (), ())
     with pytest.raises(KeyboardInterrupt):
         make_report(plan, tmp_path / "report", Choice(), Impatient())
     assert (tmp_path / "report/index.html").is_file()
-    assert not is_current(sleeping, tmp_path / "report/runs/writes", any_code=True)
+    assert (folder / "interrupted").exists()
+    assert not is_current(sleeping, folder, any_code=True)
 
 
 def test_a_folder_of_someone_else_is_not_emptied(plan, tmp_path):
