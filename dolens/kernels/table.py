@@ -41,12 +41,14 @@ class Slot:
     LIMIT = 12  # |x|, |y| and the distance from the vertex plane are clamped to it, mm
     SCALE = 13  # mm, sets the tolerance of Newton's iteration
     EDGE = 14  # circle: its semi-diameter squared, mm²; else a number out of reach
-    HALF_X = 15  # rectangle: half widths, mm; see also HALF_Y
-    HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; rectangle: half widths
+    HALF_X = 15  # rectangle: half widths, mm; ellipse: 1/a² and 1/b²; see also HALF_Y
+    HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; others: as HALF_X
     HOLE_Y = 17
     SENSE = 18  # +1 towards the sensor, -1 from it
     TAG = 19  # 4·surface number; a status is added to it where a ray fails
     HALF_Y = 20
+    CENTER_X = 22  # of the rectangle, the ellipse and the obscuration, mm
+    CENTER_Y = 23
     HEADER = 24  # length of the header: the shape's first number
 
 
@@ -74,6 +76,7 @@ class Outline(IntEnum):
     NONE = 0
     CIRCLE = 1
     RECTANGLE = 2
+    ELLIPSE = 3
 
 
 class Failure:

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
-_SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
+SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):
@@ -204,6 +204,6 @@ def save_lens(lens: Lens, path: str | Path) -> None:
 
 def _suffix(path: Path) -> str:
     suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise InputError(f"{path}: lens files end in {', '.join(_SUFFIXES)}")
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: lens files end in {', '.join(SUFFIXES)}")
     return suffix
