@@ -88,7 +88,7 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
         )
     prescription["stop"] = stops[0]
     if distance is not None:
-        prescription["object_distance"] = _in_front(distance, prescription, rows, hard, where)
+        prescription["object_distance"] = _in_front(distance, prescription, rows, hard)
     found = _with_sensor(prescription, rows, hard, file.surfaces[-1], factor, where)
     return ReadPrescription(found, [*passed_over(file), *other_configurations(file, where)])
 
@@ -129,27 +129,14 @@ def _row(block: SurfaceBlock, catalogues: list[str] | None, pupil: bool) -> tupl
 
 
 def _in_front(
-    distance: float,
-    prescription: dict[str, Any],
-    rows: list[Row],
-    hard: list[bool],
-    where: str,
+    distance: float, prescription: dict[str, Any], rows: list[Row], hard: list[bool]
 ) -> float:
     """Return the distance (mm) of the object, after the planes that do nothing are left out where
     the object lies on one of them or behind it.
-
-    Raises:
-        InputError: the object is virtual: light would meet the lens before it.
     """
-    while distance <= 0.0:
-        if (
-            prescription["stop"] == 1
-            or hard[0]
-            or not _is_dummy(rows[0], prescription["object_material"])
-        ):
-            raise InputError(
-                f"{where}: an object on or behind the first surface is not held (DISZ {distance:g})"
-            )
+    while distance <= 0.0 and prescription["stop"] > 1 and not hard[0]:
+        if not _is_dummy(rows[0], prescription["object_material"]):
+            break
         distance += rows.pop(0)["thickness"]
         hard.pop(0)
         prescription["stop"] -= 1

@@ -142,6 +142,8 @@ relaxed = settings(
 @relaxed
 @given(prescriptions([*ROTATIONAL, "aperture", "xy_polynomial"], ["dfc", "do", "paper"]))
 def test_any_lens_through_the_source_s_format(data):
+    for row in data["surfaces"].values():
+        row.pop("a2", None)  # which this format does not have
     require_equal(
         lens_from_prescription(FORMATS[".txt"](data)), lens_from_prescription(copy.deepcopy(data))
     )

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dolens import Rays, Status, load_lens
+from dolens.optics.fields import Fields
 from dolens.prescriptions.zemax_reader import prescription_from_zemax, read_zemax
 from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet, surface, triplet
 
@@ -42,7 +43,7 @@ def test_the_triplet_traces_as_the_reference(tmp_path, reference):
     assert lens.stop == 4
     assert lens.wavelengths == (486.1327, 587.5618, 656.2725)
     assert lens.reference_wavelength == 587.5618
-    assert lens.fields == ("angles", ((0.0, 0.0), (0.0, 14.0), (0.0, 20.0)))
+    assert lens.fields == Fields("angles", ((0.0, 0.0), (0.0, 14.0), (0.0, 20.0)))
     assert lens.sensor_diameter == 36.346
     rays = reference("rays/rays_triplet__dfc.json")["rays"]
     hit = lens.trace(
