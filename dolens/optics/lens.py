@@ -47,6 +47,11 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: field points that the prescription is meant for.
         object_distance: mm from the object to the first vertex; None is infinity.
         backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
+        wavelength_weights: how much each of the wavelengths counts, of any sum; None: all the same.
+        temperature: °C, of the lens in use; None where the prescription does not say.
+        pressure: atm, of the air around it; likewise.
+        telecentric_object: whether chief rays are meant to be parallel to the axis in object space,
+            as the stop makes them.
     """
 
     def __init__(
@@ -66,6 +71,10 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: Fields | None = None,
         object_distance: float | None = None,
         backend: str = "auto",
+        wavelength_weights: Sequence[float] | None = None,
+        temperature: float | None = None,
+        pressure: float | None = None,
+        telecentric_object: bool = False,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -86,6 +95,10 @@ class Lens(LensRays, LensViews, nn.Module):
         self.reference_wavelength = reference_wavelength
         self.fields = fields
         self.object_distance = object_distance
+        self.wavelength_weights = None if wavelength_weights is None else tuple(wavelength_weights)
+        self.temperature = temperature
+        self.pressure = pressure
+        self.telecentric_object = telecentric_object
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
         self.surfaces = nn.ModuleDict(
