@@ -14,6 +14,7 @@ from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
+from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
@@ -47,6 +48,8 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: field points that the prescription is meant for.
         object_distance: mm from the object to the first vertex; None is infinity.
         backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
+        source: the patent, book or catalogue that the prescription is taken from.
+        published: the numbers that the source prints beside it; nothing is computed from them.
     """
 
     def __init__(
@@ -66,6 +69,8 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: Fields | None = None,
         object_distance: float | None = None,
         backend: str = "auto",
+        source: str = "",
+        published: Published | None = None,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -77,6 +82,8 @@ class Lens(LensRays, LensViews, nn.Module):
         if not 1 <= stop <= count:
             raise InputError(f"lens '{name}': stop must be a surface from 1 to {count}, not {stop}")
         self.name = name
+        self.source = source
+        self.published = published
         self.stop = stop
         self.index_model = index_model
         self.sensor_diameter = sensor_diameter
