@@ -41,12 +41,14 @@ class Slot:
     LIMIT = 12  # |x|, |y| and the distance from the vertex plane are clamped to it, mm
     SCALE = 13  # mm, sets the tolerance of Newton's iteration
     EDGE = 14  # circle: its semi-diameter squared, mm²; else a number out of reach
-    HALF_X = 15  # rectangle: half widths, mm; see also HALF_Y
-    HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; rectangle: half widths
+    HALF_X = 15  # rectangle: half widths, mm; ellipse: 1/a² and 1/b²; see also HALF_Y
+    HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; others: as HALF_X
     HOLE_Y = 17
     SENSE = 18  # +1 towards the sensor, -1 from it
     TAG = 19  # 4·surface number; a status is added to it where a ray fails
     HALF_Y = 20
+    CENTER_X = 22  # of the rectangle, the ellipse and the obscuration, mm
+    CENTER_Y = 23
     HEADER = 24  # length of the header: the shape's first number
 
 
@@ -62,7 +64,7 @@ class Code:
     EDGE = 6  # an `Outline`
     HOLE = 7
     COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
-    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
+    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term, or an asphere a2
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
     ROW = 16  # length of a row
@@ -74,6 +76,7 @@ class Outline(IntEnum):
     NONE = 0
     CIRCLE = 1
     RECTANGLE = 2
+    ELLIPSE = 3
 
 
 class Failure:

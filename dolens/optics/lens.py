@@ -48,6 +48,11 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: field points that the prescription is meant for.
         object_distance: mm from the object to the first vertex; None is infinity.
         backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
+        wavelength_weights: how much each of the wavelengths counts, of any sum; None: all the same.
+        temperature: °C, of the lens in use; None where the prescription does not say.
+        pressure: atm, of the air around it; likewise.
+        telecentric_object: whether chief rays are meant to be parallel to the axis in object space,
+            as the stop makes them.
         source: the patent, book or catalogue that the prescription is taken from.
         published: the numbers that the source prints beside it; nothing is computed from them.
     """
@@ -69,6 +74,10 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: Fields | None = None,
         object_distance: float | None = None,
         backend: str = "auto",
+        wavelength_weights: Sequence[float] | None = None,
+        temperature: float | None = None,
+        pressure: float | None = None,
+        telecentric_object: bool = False,
         source: str = "",
         published: Published | None = None,
     ) -> None:
@@ -93,6 +102,10 @@ class Lens(LensRays, LensViews, nn.Module):
         self.reference_wavelength = reference_wavelength
         self.fields = fields
         self.object_distance = object_distance
+        self.wavelength_weights = None if wavelength_weights is None else tuple(wavelength_weights)
+        self.temperature = temperature
+        self.pressure = pressure
+        self.telecentric_object = telecentric_object
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
         self.surfaces = nn.ModuleDict(

@@ -8,7 +8,7 @@ from torch import nn
 
 from dolens.optics.elements import TILTS, Element
 from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse, Rectangle
 from dolens.optics.tables import html_table, printable, text_table
 
 HEADINGS = (
@@ -219,8 +219,14 @@ def _aperture(aperture: ClearAperture) -> str:
     edge = aperture.edge
     if isinstance(edge, Rectangle):
         found = f"rectangle {_number(2.0 * edge.half_width_x)} × {_number(2.0 * edge.half_width_y)}"
+    elif isinstance(edge, Ellipse):
+        found = f"ellipse {_number(2.0 * edge.semi_axis_x)} × {_number(2.0 * edge.semi_axis_y)}"
     else:
         found = "circle" if isinstance(edge, Circle) else "no edge"
+    if aperture.window is not None:
+        found = f"{found} and {_aperture(ClearAperture(aperture.window))}"
+    if any(aperture.center):
+        found = f"{found} about ({', '.join(_number(value) for value in aperture.center)})"
     return f"{found}, obscured" if aperture.obscuration is not None else found
 
 

@@ -216,16 +216,20 @@ class _Writer:
     def aperture(self, row: list[int], aperture: ClearAperture) -> None:
         """Write a surface's clear aperture."""
         values, record = self.constants, row[Code.OFFSET]
-        edge, hole = aperture.edge, aperture.obscuration
-        values[record + Slot.LIMIT] = FAR * edge.semi_diameter
-        values[record + Slot.SCALE] = edge.semi_diameter
+        edge, hole, size = aperture.edge, aperture.obscuration, aperture.semi_diameter
+        values[record + Slot.LIMIT] = FAR * size
+        values[record + Slot.SCALE] = size
         # A full circle is tested on the way; where there is none it is out of reach.
-        values[record + Slot.EDGE] = (2.0 * FAR * edge.semi_diameter) ** 2
-        row[Code.EDGE], first, second = edge.packed()
-        if row[Code.EDGE] == Outline.CIRCLE:
-            values[record + Slot.EDGE] = first
-        else:
-            values[record + Slot.HALF_X], values[record + Slot.HALF_Y] = first, second
+        values[record + Slot.EDGE] = (2.0 * FAR * size) ** 2
+        for outline in (edge, aperture.window):
+            if outline is None:
+                continue
+            row[Code.EDGE], first, second = outline.packed()
+            if row[Code.EDGE] == Outline.CIRCLE:
+                values[record + Slot.EDGE] = first
+            else:
+                values[record + Slot.HALF_X], values[record + Slot.HALF_Y] = first, second
+        values[record + Slot.CENTER_X], values[record + Slot.CENTER_Y] = aperture.center
         if hole is not None:
             row[Code.HOLE], *numbers = hole.packed()
             values[record + Slot.HOLE_X], values[record + Slot.HOLE_Y] = numbers

@@ -33,12 +33,14 @@ from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
 from dolens.optics.surfaces import SURFACES, Surface
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
+from dolens.prescriptions.automatic_apertures import set_automatic_semi_diameters
 from dolens.prescriptions.checks import (
     as_integer,
     as_number,
     as_numbers,
     require_mapping,
 )
+from dolens.prescriptions.field_data import set_object_fields
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
 from dolens.prescriptions.system_data import (
@@ -131,7 +133,8 @@ def lens_from_prescription(
             published=published_from(prescription.get(PUBLISHED_KEY), where),
             **data,
         )
-        return set_stop_semi_diameter(lens, prescription)
+        lens = set_object_fields(set_stop_semi_diameter(lens, prescription))
+        return set_automatic_semi_diameters(lens, prescription)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(where) else f"{where}: {message}") from None

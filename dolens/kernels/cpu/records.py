@@ -8,6 +8,7 @@ from dolens.kernels.table import Code, Failure, Kind, Outline, Slot
 SHIFT, LIMIT, SCALE = Slot.SHIFT, Slot.LIMIT, Slot.SCALE
 EDGE, HALF_X, HALF_Y = Slot.EDGE, Slot.HALF_X, Slot.HALF_Y
 HOLE_X, HOLE_Y = Slot.HOLE_X, Slot.HOLE_Y
+CENTER_X, CENTER_Y = Slot.CENTER_X, Slot.CENTER_Y
 SENSE, TAG = Slot.SENSE, Slot.TAG
 STEP_X, STEP_Y, STEP_Z = range(Slot.STEP, Slot.STEP + 3)
 TURN_XX, TURN_XY, TURN_XZ, TURN_YX, TURN_YY, TURN_YZ, TURN_ZX, TURN_ZY, TURN_ZZ = range(
@@ -30,7 +31,7 @@ STARTS_ON_CONIC, STENCIL = Code.ROW + 6, Code.ROW + 7
 CODE_ROW = Code.ROW + 8
 
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
-CIRCLE, RECTANGLE = int(Outline.CIRCLE), int(Outline.RECTANGLE)
+CIRCLE, RECTANGLE, ELLIPSE = int(Outline.CIRCLE), int(Outline.RECTANGLE), int(Outline.ELLIPSE)
 
 STATUS_BITS, STATUS_MASK = Failure.BITS, Failure.MASK
 STOPPED, TOTALLY_REFLECTED, MISSED = Failure.VIGNETTED, Failure.TOTALLY_REFLECTED, Failure.MISSED

@@ -16,6 +16,8 @@ HALF_X = tl.constexpr(int(Slot.HALF_X))
 HALF_Y = tl.constexpr(int(Slot.HALF_Y))
 HOLE_X = tl.constexpr(int(Slot.HOLE_X))
 HOLE_Y = tl.constexpr(int(Slot.HOLE_Y))
+CENTER_X = tl.constexpr(int(Slot.CENTER_X))
+CENTER_Y = tl.constexpr(int(Slot.CENTER_Y))
 SENSE = tl.constexpr(int(Slot.SENSE))
 TAG = tl.constexpr(int(Slot.TAG))
 SHAPE = tl.constexpr(int(Slot.HEADER))  # the first number of a shape
@@ -49,6 +51,7 @@ HAS_SENSOR = tl.constexpr(1 << int(Kind.SENSOR))
 
 CIRCLE = tl.constexpr(int(Outline.CIRCLE))
 RECTANGLE = tl.constexpr(int(Outline.RECTANGLE))
+ELLIPSE = tl.constexpr(int(Outline.ELLIPSE))
 
 # Added to a surface's tag where a ray fails; `dolens.optics.rays.Status`.
 VIGNETTED = tl.constexpr(int(Failure.VIGNETTED))

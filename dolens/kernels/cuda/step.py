@@ -9,10 +9,13 @@ from dolens.kernels.cuda.conic import conic_intersect, sphere_intersect
 from dolens.kernels.cuda.explicit import explicit_intersect
 from dolens.kernels.cuda.functions import CODE
 from dolens.kernels.cuda.layout import (
+    CENTER_X,
+    CENTER_Y,
     CHANGE_AXES,
     CIRCLE,
     CONIC,
     EDGE,
+    ELLIPSE,
     HALF_X,
     HALF_Y,
     HAS_CHANGE_AXES,
@@ -72,15 +75,20 @@ def intersect(
 def passes(record, codes, x, y):
     """Return whether a point is strictly inside the clear aperture."""
     inside = tl.load(record + EDGE) - (x * x + y * y) > 0.0
-    if tl.load(codes + OUTLINE) == RECTANGLE:
+    outline, hole = tl.load(codes + OUTLINE), tl.load(codes + HOLE)
+    x, y = x - tl.load(record + CENTER_X), y - tl.load(record + CENTER_Y)
+    if outline == RECTANGLE:
         inside &= tl.abs(x) < tl.load(record + HALF_X)
         inside &= tl.abs(y) < tl.load(record + HALF_Y)
-    hole = tl.load(codes + HOLE)
+    if outline == ELLIPSE:
+        inside &= tl.load(record + HALF_X) * x * x + tl.load(record + HALF_Y) * y * y < 1.0
     if hole == CIRCLE:
         inside &= x * x + y * y > tl.load(record + HOLE_X)
     if hole == RECTANGLE:
         across = tl.abs(x) > tl.load(record + HOLE_X)
         inside &= across | (tl.abs(y) > tl.load(record + HOLE_Y))
+    if hole == ELLIPSE:
+        inside &= tl.load(record + HOLE_X) * x * x + tl.load(record + HOLE_Y) * y * y > 1.0
     return inside
 
 

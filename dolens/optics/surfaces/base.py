@@ -31,7 +31,7 @@ class PackedShape(NamedTuple):
     Attributes:
         numbers: scalars and arrays, the latter by rows; None: zero.
         count: coefficients of an asphere or a polynomial, or rows of a spline.
-        columns: of a spline; 1 for a polynomial with a b·z² term.
+        columns: of a spline; 1 for a polynomial with a b·z² term, or an asphere with a2.
         degree: highest power of x or y.
         extras: further integers.
     """
@@ -113,15 +113,23 @@ class Surface(nn.Module):
                 self.register_buffer(name, tensor)
             else:
                 self.register_parameter(name, nn.Parameter(tensor))
-        self.check_aperture()
+        if aperture.clips:
+            self.check_aperture()
 
     @property
     def semi_diameter(self) -> float:
         """Return the distance of the clear aperture's farthest point from the vertex, mm."""
-        return self.aperture.edge.semi_diameter
+        return self.aperture.semi_diameter
 
     def check_aperture(self) -> None:
         """Raise `InputError` where the clear aperture reaches beyond the surface's sag branch."""
+
+    @property
+    def reach(self) -> float:
+        """Return the distance from the axis, mm, at which the sag branch ends; `inf` where it goes
+        on.
+        """
+        return math.inf
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:

@@ -82,16 +82,21 @@ class Conic(Surface):
 
     def check_aperture(self) -> None:
         """Check that the clear aperture ends where the sag does: (1+k)·c²·r² ≤ 1."""
+        # A whole hemisphere is allowed, and 1/R has rounded.
+        rounding = 4.0 * torch.finfo(self.curvature.dtype).eps
+        if self.semi_diameter > self.reach * (1.0 + rounding):
+            raise InputError(
+                f"semi_diameter {self.semi_diameter:g} mm exceeds the surface, which ends at "
+                f"{self.reach:g} mm from the axis (radius {1.0 / float(self.curvature):g} mm)"
+            )
+
+    @property
+    def reach(self) -> float:
+        """Return 1/√((1+k)c²), mm; `inf` of a plane, a paraboloid and a hyperboloid."""
         stored = {name: float(value.detach()) for name, value in self.named_parameters()}
         c = stored["curvature"]
         alpha = (1.0 + stored.get("conic", 0.0)) * c * c
-        # A whole hemisphere is allowed, and 1/R has rounded.
-        rounding = 4.0 * torch.finfo(self.curvature.dtype).eps
-        if alpha * self.semi_diameter**2 > 1.0 + rounding:
-            raise InputError(
-                f"semi_diameter {self.semi_diameter:g} mm exceeds the surface, which ends at "
-                f"{1.0 / math.sqrt(alpha):g} mm from the axis (radius {1.0 / c:g} mm)"
-            )
+        return 1.0 / math.sqrt(alpha) if alpha > 0.0 else math.inf
 
     @classmethod
     def conic_constant(cls, p: Parameters) -> Tensor | float:
