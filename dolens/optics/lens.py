@@ -14,6 +14,7 @@ from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
+from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
@@ -52,6 +53,8 @@ class Lens(LensRays, LensViews, nn.Module):
         pressure: atm, of the air around it; likewise.
         telecentric_object: whether chief rays are meant to be parallel to the axis in object space,
             as the stop makes them.
+        source: the patent, book or catalogue that the prescription is taken from.
+        published: the numbers that the source prints beside it; nothing is computed from them.
     """
 
     def __init__(
@@ -75,6 +78,8 @@ class Lens(LensRays, LensViews, nn.Module):
         temperature: float | None = None,
         pressure: float | None = None,
         telecentric_object: bool = False,
+        source: str = "",
+        published: Published | None = None,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -86,6 +91,8 @@ class Lens(LensRays, LensViews, nn.Module):
         if not 1 <= stop <= count:
             raise InputError(f"lens '{name}': stop must be a surface from 1 to {count}, not {stop}")
         self.name = name
+        self.source = source
+        self.published = published
         self.stop = stop
         self.index_model = index_model
         self.sensor_diameter = sensor_diameter

@@ -17,6 +17,7 @@ Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind th
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
+So are the numbers that its source publishes (see `dolens.prescriptions.published`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -41,6 +42,7 @@ from dolens.prescriptions.checks import (
 )
 from dolens.prescriptions.field_data import set_object_fields
 from dolens.prescriptions.poses import element_rows, elements_from
+from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
     set_stop_semi_diameter,
@@ -52,6 +54,7 @@ from dolens.prescriptions.system_data import (
 _LENS_KEYS = (
     "name",
     "source",
+    PUBLISHED_KEY,
     "index_model",
     "stop",
     "object_material",
@@ -126,6 +129,8 @@ def lens_from_prescription(
             dtype,
             elements_from(prescription.get("elements"), dtype, where),
             backend=backend,
+            source=str(prescription.get("source") or ""),
+            published=published_from(prescription.get(PUBLISHED_KEY), where),
             **data,
         )
         lens = set_object_fields(set_stop_semi_diameter(lens, prescription))
@@ -164,6 +169,8 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         sensor["diameter"] = lens.sensor_diameter
     return {
         "name": lens.name,
+        **({"source": lens.source} if lens.source else {}),
+        **published_rows(lens.published),
         "index_model": lens.index_model,
         "stop": lens.stop,
         "object_material": lens.materials[0].name,

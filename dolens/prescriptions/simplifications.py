@@ -103,6 +103,12 @@ def _without_source(prescription: Prescription, new: str) -> list[str]:
     return [f"lost: source {str(source)!r}"] if source else []
 
 
+def _without_published(prescription: Prescription, new: str) -> list[str]:
+    """Drop the numbers that the source publishes."""
+    found = prescription.pop("published", None)
+    return ["lost: the published numbers"] if found else []
+
+
 def _one_line_name(prescription: Prescription, new: str) -> list[str]:
     """Put a name on one line."""
     name = str(prescription.get("name") or "")
@@ -117,6 +123,7 @@ SIMPLIFICATIONS: tuple[Callable[[Prescription, str], list[str]], ...] = (
     _one_line_name,
     _without_notes,
     _without_source,
+    _without_published,
     _without_poses,
     _aperture_planes,
     _glass_by_numbers,
