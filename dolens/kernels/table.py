@@ -63,7 +63,7 @@ class Code:
     EDGE = 6  # an `Outline`
     HOLE = 7
     COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
-    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
+    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term, or an asphere a2
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
     ROW = 16  # length of a row

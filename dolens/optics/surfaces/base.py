@@ -31,7 +31,7 @@ class PackedShape(NamedTuple):
     Attributes:
         numbers: scalars and arrays, the latter by rows; None: zero.
         count: coefficients of an asphere or a polynomial, or rows of a spline.
-        columns: of a spline; 1 for a polynomial with a b·z² term.
+        columns: of a spline; 1 for a polynomial with a b·z² term, or an asphere with a2.
         degree: highest power of x or y.
         extras: further integers.
     """
