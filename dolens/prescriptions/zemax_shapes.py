@@ -11,6 +11,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_coordinate_break import COORDINATE_BREAK
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_shape import ZemaxShape
 from dolens.prescriptions.zemax_standard import STANDARD
@@ -19,7 +20,8 @@ from dolens.prescriptions.zemax_xy_polynomial import XY_POLYNOMIAL
 
 # One line here makes a shape known to the reader and the writer.
 SHAPES: dict[str, ZemaxShape] = {
-    shape.type: shape for shape in (STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL)
+    shape.type: shape
+    for shape in (STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL, COORDINATE_BREAK)
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
 _NOT_HELD = {
@@ -29,7 +31,6 @@ _NOT_HELD = {
     "BINARY": "a diffractive phase",
     "BIRE": "a birefringent medium",
     "CADPART": "a part from a CAD program",
-    "COORDBRK": "a coordinate break (decentred and tilted axes)",
     "CONJUGAT": "a surface given by two conjugate points",
     "CUBICSPL": "a cubic spline",
     "CYLINDER": "a cylinder",

@@ -19,6 +19,7 @@ HOLE_Y = tl.constexpr(int(Slot.HOLE_Y))
 CENTER_X = tl.constexpr(int(Slot.CENTER_X))
 CENTER_Y = tl.constexpr(int(Slot.CENTER_Y))
 SENSE = tl.constexpr(int(Slot.SENSE))
+SENSE_BEHIND = tl.constexpr(int(Slot.SENSE_BEHIND))
 TAG = tl.constexpr(int(Slot.TAG))
 SHAPE = tl.constexpr(int(Slot.HEADER))  # the first number of a shape
 

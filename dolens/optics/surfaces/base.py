@@ -81,6 +81,7 @@ class Surface(nn.Module):
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
             These three are not inherited, since a subclass may have another sag.
+        changes_axes: whether this is a coordinate break, which light does not meet.
     """
 
     kind: ClassVar[str] = ""
@@ -90,6 +91,7 @@ class Surface(nn.Module):
     optional: ClassVar[tuple[str, ...]] = ()
     rotational: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
+    changes_axes: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -216,7 +218,7 @@ class Surface(nn.Module):
         Args:
             p: parameters.
             ray: at the vertex plane, in the surface's own axes.
-            sense: +1 for light travelling towards +z through the surface, -1 for backward mode.
+            sense: +1 for light that comes towards +z, -1 for light that comes towards -z.
             scale: mm, a length of the size of the aperture; it sets the tolerance near zero.
 
         Returns:
@@ -280,7 +282,7 @@ class Surface(nn.Module):
         ratio: float | Tensor,
         sense: float,
     ) -> Refraction:
-        """Refract rays at points (mm) of the surface; see `snell`."""
+        """Refract or reflect rays at points (mm) of the surface; see `snell`."""
         return snell(direction, cls.normal(p, *point), ratio, sense)
 
 
