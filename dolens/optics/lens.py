@@ -17,8 +17,9 @@ from dolens.optics.materials import Medium
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
-from dolens.optics.surfaces.state import SurfaceState
+from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
+from dolens.optics.vergence import with_vergences
 
 
 class Lens(LensRays, LensViews, nn.Module):
@@ -160,7 +161,16 @@ class Lens(LensRays, LensViews, nn.Module):
             aperture = surface.aperture
             if edge is not None:
                 aperture = aperture.resized(float(edge.detach()))
-            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge))
+            law = surface.law and LawState(surface.law, parameters)
+            if surface.phase is not None:
+                own = {**surface.phase._parameters, **surface.phase._buffers}
+                if values:
+                    own = {
+                        name: values.pop(f"surfaces.{number}.phase.{name}", value)
+                        for name, value in own.items()
+                    }
+                law = LawState(type(surface.phase), own)
+            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge, law))
         thicknesses = [
             values.pop(f"thicknesses.{number}", gap) for number, gap in self.thicknesses.items()
         ]
@@ -176,7 +186,7 @@ class Lens(LensRays, LensViews, nn.Module):
         sensor_distance = values.pop("sensor_distance", self.sensor_distance)
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
-        return OpticalSystem(
+        system = OpticalSystem(
             surfaces,
             thicknesses,
             sensor_distance,
@@ -185,6 +195,7 @@ class Lens(LensRays, LensViews, nn.Module):
             elements,
             self.backend,
         )
+        return with_vergences(system, self.primary_wavelength, self.object_distance)
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""
