@@ -3,8 +3,8 @@
 A paraxial ray at a surface is its height y and its reduced slope n·u.  Refraction leaves the height
 alone, n'u' = nu - y(n' - n)c; transfer leaves the reduced slope alone, y' = y + (t/n)·nu (Welford,
 ch. 3).  Any two rays give all others, so that two are traced at a time.  Everything here is
-arithmetic of numbers and tensors alike.  What adds to a surface's power (n' - n)c, a diffractive
-phase or an ideal lens, adds to it here.
+arithmetic of numbers and tensors alike.  Where light travels towards -z the index is negative.
+What adds to a surface's power (n' - n)c, a diffractive phase or an ideal lens, adds to it here.
 """
 
 from collections import deque

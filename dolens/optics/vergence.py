@@ -33,7 +33,7 @@ def with_vergences(
     lenses = [i for i, law in enumerate(laws) if law is not None and law.law is IdealLens]
     if not lenses:
         return system
-    index = system.indices(wavelength)
+    index = system.signed_indices(wavelength)
     near = index[0] * vergence(object_distance)
     one = torch.ones_like(system.sensor_distance)
     ray = TwoRays(one, 0.0 * one, near * one, 0.0 * one)

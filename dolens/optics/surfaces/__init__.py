@@ -4,6 +4,7 @@ from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.base import PackedShape, Surface
 from dolens.optics.surfaces.conic import Conic, Sphere
+from dolens.optics.surfaces.coordinate_break import BREAKS, CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.even_asphere import EvenAsphere
 from dolens.optics.surfaces.paraxial_lens import ParaxialLens
 from dolens.optics.surfaces.phase import PHASES, Grating, Phase, RadialPhase, XYPhase
@@ -13,11 +14,13 @@ from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
 __all__ = [
+    "BREAKS",
     "PHASES",
     "SURFACES",
     "Aperture",
     "BSpline",
     "Conic",
+    "CoordinateBreak",
     "EvenAsphere",
     "Grating",
     "LawState",
@@ -30,6 +33,7 @@ __all__ = [
     "Surface",
     "SurfaceKernel",
     "SurfaceState",
+    "TiltFirstBreak",
     "XYPhase",
     "XYPolynomial",
     "register_surface",
