@@ -16,7 +16,7 @@ from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
-from dolens.optics.mirrors import media_of
+from dolens.optics.mirrors import MIRROR, media_of
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
@@ -96,6 +96,11 @@ class Lens(LensRays, LensViews, nn.Module):
             media_of(self.materials)
         except InputError as error:
             raise InputError(f"lens '{name}': {error}") from None
+        for number, (surface, medium) in enumerate(zip(surfaces, materials[1:], strict=True), 1):
+            if surface.law is not None and medium is MIRROR:
+                raise InputError(
+                    f"lens '{name}': surface {number}: a {surface.law.kind} cannot be a mirror"
+                )
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
         )

@@ -89,8 +89,9 @@ class Structure(NamedTuple):
 class Records:
     """Records as constants plus signed numbers of the lens: values[places] += signs·x[sources].
 
-    The lens's numbers x come in this order: the scalars of all surfaces, those of all laws, the gaps
-    and the sensor's distance; the arrays of all surfaces; then step (3) and turn (9) of each change of axes.
+    The lens's numbers x come in this order: the scalars of all surfaces, those of all laws, the
+    gaps and the sensor's distance; the arrays of all surfaces; then step (3) and turn (9) of each
+    change of axes.
 
     Attributes:
         constants: (V,), float64.

@@ -121,7 +121,10 @@ def seidel(
         def distortion(a: Tensor, n: Tensor) -> Tensor:
             return -a * (a * a * h / n**2 - (a * h - invariant) * h_chief * c / n)
 
-        bend_after, bend_before = -h * marginal.slope_after / n_after, -h * marginal.slope_before / n
+        bend_after, bend_before = (
+            -h * marginal.slope_after / n_after,
+            -h * marginal.slope_before / n,
+        )
         dispersion = (short - long) / index
         step_of_power = shorter - longer
         return Seidel(
@@ -133,8 +136,7 @@ def seidel(
             petzval=-(invariant**2) * c * inverse,
             distortion=step(distortion(after_chief, n_after), distortion(a_chief, n))
             + asphere * h_chief**3,
-            axial_color=h * (after * dispersion[1:] - a * dispersion[:-1])
-            + h * h * step_of_power,
+            axial_color=h * (after * dispersion[1:] - a * dispersion[:-1]) + h * h * step_of_power,
             lateral_color=h * (after_chief * dispersion[1:] - a_chief * dispersion[:-1])
             + h * h_chief * step_of_power,
         )
@@ -157,9 +159,7 @@ def _aberrates(system: OpticalSystem) -> list[float]:
     return [float(law is None or law.law is not IdealLens) for law in laws]
 
 
-def _fourth_order_paths(
-    system: OpticalSystem, wavelength: float | Tensor
-) -> list[float | Tensor]:
+def _fourth_order_paths(system: OpticalSystem, wavelength: float | Tensor) -> list[float | Tensor]:
     """Return ψ₄ (1/mm³) of every surface.
 
     Raises:

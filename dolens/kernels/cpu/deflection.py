@@ -173,7 +173,9 @@ def phase_adjoint(real: types.Type) -> Callable[..., None]:
     return kernel
 
 
-def given_by_phase(phase: Factory, phase_hessian: Factory, phase_parameters: Factory) -> LawFunctions:
+def given_by_phase(
+    phase: Factory, phase_hessian: Factory, phase_parameters: Factory
+) -> LawFunctions:
     """Return the functions of a law that is given by its phase.
 
     Args:

@@ -157,7 +157,8 @@ def trace(
             table.values, table.values.numel() - 1, media, table.indices.shape[1],
             codes.codes, codes.extras, codes.codes.shape[0], count,
             position, *position.stride(), direction, *direction.stride(), which,
-            *out, KINDS=codes.kinds, FORMS=codes.forms, LAWS=codes.laws, BLOCK=FORWARD_BLOCK, **_OPTIONS,
+            *out, KINDS=codes.kinds, FORMS=codes.forms, LAWS=codes.laws,
+            BLOCK=FORWARD_BLOCK, **_OPTIONS,
         )  # fmt: skip
     return out
 

@@ -1,4 +1,4 @@
-"""A surface's gradient g = ∇F at a point, F's second derivatives, and the cotangents of its numbers.
+"""A surface's gradient g = ∇F at a point, F's second derivatives, and cotangents of its numbers.
 
 F = z - sag, or a conic's implicit form; the unit normal is g/|g|.
 """

@@ -13,9 +13,7 @@ from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit
-def ideal_lens_forward(
-    numbers, codes, x, y, l, m, n, nx, ny, nz, index, ratio, per_radian, sense
-):
+def ideal_lens_forward(numbers, codes, x, y, l, m, n, nx, ny, nz, index, ratio, per_radian, sense):
     """Change slopes and path."""
     behind = divide(index, ratio)
     bend, turn = divide(tl.load(numbers), behind), divide(tl.load(numbers + 1), index)

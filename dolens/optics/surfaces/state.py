@@ -41,9 +41,7 @@ class SurfaceState:
     edge: Tensor | None = None
     deflection: LawState | None = None
 
-    def deflect(
-        self, point: Vector, direction: Vector, media: Media, travel: Travel
-    ) -> Deflected:
+    def deflect(self, point: Vector, direction: Vector, media: Media, travel: Travel) -> Deflected:
         """Deflect rays at points (mm) of the surface by its law; see `Law.deflect`."""
         normal = self.shape.normal(self.parameters, *point)
         law = self.deflection

@@ -13,9 +13,7 @@ _TURN = tl.constexpr(2.0 * math.pi)
 
 
 @triton.jit
-def grating_forward(
-    numbers, codes, x, y, l, m, n, nx, ny, nz, index, ratio, per_radian, sense
-):
+def grating_forward(numbers, codes, x, y, l, m, n, nx, ny, nz, index, ratio, per_radian, sense):
     """Deflect rays by a grating."""
     slope = _TURN * tl.load(numbers) * tl.load(numbers + 1)
     py = slope + tl.zeros_like(x)

@@ -1,4 +1,4 @@
-"""A radial phase φ = m·q·h(q) with q = (r/R)² and h = p2 + p4·q + ...; numbers: m, R, p2, p4, ..."""
+"""A radial phase φ = m·q·h(q) with q = (r/R)², h = p2 + p4·q + ...; numbers: m, R, p2, p4, ..."""
 
 import triton
 import triton.language as tl
