@@ -141,7 +141,8 @@ def aim(
         q, slopes, found = found_near or _follow(problem)
     residual, reached = _miss(system, wavelength, near, tangents, target, q)
     with torch.no_grad():
-        front = slopes.abs().amax((-2, -1)) * system.surfaces[0].semi_diameter
+        first = system.surfaces[system.met[0] - 1]
+        front = slopes.abs().amax((-2, -1)) * first.semi_diameter
         rounding = torch.finfo(system.dtype).eps * (front + problem.scale)
         converged = found & reached & (residual.abs().amax(-1) <= ROUNDING * rounding)
     q = q - _solve(slopes, residual)

@@ -11,7 +11,7 @@ from dolens.prescriptions.zemax_glass import canonical
 Prescription = dict[str, Any]
 # Indices are compared at these wavelengths, nm.
 COMPARED_WAVELENGTHS = (400.0, 450.0, 486.1327, 546.074, 587.5618, 656.2725, 700.0)
-_KNOWN_MEDIA = ("air", "occluder")
+_KNOWN_MEDIA = ("air", "occluder", "mirror")
 
 
 def _dfc_indices(prescription: Prescription, new: str) -> list[str]:
@@ -33,7 +33,9 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
     model = find_index_model(str(prescription.get("index_model", "dfc")))
     said: dict[str, tuple[str, float, list[str]]] = {}
     for n, row in prescription["surfaces"].items():
-        name = str(row.get("material")).strip()
+        if row.get("material") is None:
+            continue
+        name = str(row["material"]).strip()
         if name.lower() in _KNOWN_MEDIA or name[:1].isdigit():
             continue
         medium = parse_material(name, model)
@@ -63,7 +65,9 @@ def _aperture_planes(prescription: Prescription, new: str) -> list[str]:
         flat = row.get("type", "sphere") in ("plane", "sphere") and _is_flat(row)
         flat = flat and row.get("phase") is None
         empty = canonical(str(row.get("material"))) == canonical(str(before))
-        before = row.get("material")
+        # A mirror and a coordinate break leave the medium as it is.
+        if str(row.get("material", "mirror")).strip().lower() != "mirror":
+            before = row["material"]
         if row.get("type") == "aperture" and str(n) != stop:
             row["type"] = "plane"
             said.append(

@@ -20,6 +20,8 @@ from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.mirrors import MIRROR
+from dolens.prescriptions.breaks import is_break
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.system_data import PUPIL_KEYS
@@ -83,7 +85,9 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
         if shape.surface:
             material = read_glass(block.words("GLAS"), catalogues, place)
             block = SurfaceBlock(lines, factor, place, before, material)
-            row["material"] = before = material
+            row["material"] = material
+            # Behind a mirror is the medium in front of it.
+            before = before if material == MIRROR.name else material
         if block.stop:
             stops.append(len(rows) + 1)
         row = shape.read(block) | row
@@ -130,11 +134,13 @@ def _with_sensor(
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
     gaps = [rows[-1].pop("thickness")]
     while len(rows) > 1 and len(rows) != prescription["stop"] and not hard[len(rows) - 1]:
-        if not _is_dummy(rows[-1], rows[-2].get("material")):
+        if not _is_dummy(rows[-1], _medium_behind(rows[:-1], prescription)):
             break
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
     for n, row in enumerate(rows, 1):
+        if is_break(row):
+            continue
         if not ("semi_diameter" in row or "aperture" in row) and n != prescription["stop"]:
             raise InputError(f"{where}: surface {n}: DIAM is missing or 0; write the semi-diameter")
     sensor = {"distance": math.fsum(gaps)}
@@ -163,6 +169,12 @@ def _object(
         return None
     distance = block.length("DISZ")
     return None if abs(distance) >= _INFINITE else distance
+
+
+def _medium_behind(rows: list[dict[str, Any]], prescription: dict[str, Any]) -> str:
+    """Return the medium behind the last of some rows: mirrors and breaks leave it as it is."""
+    media = (row.get("material", MIRROR.name) for row in reversed(rows))
+    return next((m for m in media if m != MIRROR.name), prescription["object_material"])
 
 
 def _is_ignored(lines: Block) -> bool:

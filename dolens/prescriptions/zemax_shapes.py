@@ -11,6 +11,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_coordinate_break import COORDINATE_BREAK
 from dolens.prescriptions.zemax_diffractive import BINARY_1, BINARY_2, GRATING, PARAXIAL
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_shape import ZemaxShape
@@ -22,7 +23,7 @@ from dolens.prescriptions.zemax_xy_polynomial import XY_POLYNOMIAL
 SHAPES: dict[str, ZemaxShape] = {
     shape.type: shape
     for shape in (
-        *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL),
+        *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL, COORDINATE_BREAK),
         *(PARAXIAL, GRATING, BINARY_1, BINARY_2),
     )
 }
@@ -34,7 +35,6 @@ _NOT_HELD = {
     "BINARY": "a diffractive phase",
     "BIRE": "a birefringent medium",
     "CADPART": "a part from a CAD program",
-    "COORDBRK": "a coordinate break (decentred and tilted axes)",
     "CONJUGAT": "a surface given by two conjugate points",
     "CUBICSPL": "a cubic spline",
     "CYLINDER": "a cylinder",
