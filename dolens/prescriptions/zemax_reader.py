@@ -227,4 +227,4 @@ def _refuse_own_axes(block: SurfaceBlock) -> None:
 def _is_dummy(row: Row, before: str | None) -> bool:
     """Return whether a row is a plane between one medium and the same."""
     flat = row["type"] == "plane" or (row["type"] == "sphere" and row.get("radius") == math.inf)
-    return flat and row["material"] == before
+    return flat and "phase" not in row and row["material"] == before
