@@ -33,10 +33,9 @@ def convert(
 
     from dolens.errors import InputError
     from dolens.prescriptions.conversion import converted
-    from dolens.prescriptions.files import load_prescription
-    from dolens.prescriptions.zemax_unread import unread_in_zemax
+    from dolens.prescriptions.files import read_lens_file
 
-    prescription = load_prescription(old)
+    prescription, passed_over = read_lens_file(old)
     if not force and new.exists():
         same = new.samefile(old)
         raise InputError(
@@ -44,10 +43,8 @@ def convert(
         )
     found = converted(prescription, str(old), str(new), index_model)
     changes = list(found.changes)
-    if old.suffix.lower() == ".zmx":
-        unread = unread_in_zemax(old.read_bytes())
-        if unread:
-            changes.append(f"not read from {old.name}: {', '.join(unread)}")
+    if passed_over:
+        changes.append(f"passed over in {old.name}: {'; '.join(passed_over)}")
     _write(found.data, new)
 
     console = Console(highlight=False, soft_wrap=True)

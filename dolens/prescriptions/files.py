@@ -1,5 +1,6 @@
 """Lens files are read and written."""
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,12 @@ from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
+from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
+from dolens.prescriptions.zemax_reader import read_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
+
+logger = logging.getLogger(__name__)
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
@@ -73,17 +77,27 @@ def load_prescription(path: str | Path) -> Any:
         InputError: the file is missing, of another kind, or not valid; the message is one line
             that names the file, and the line, surface and key where there is one.
     """
+    return read_lens_file(path).prescription
+
+
+def read_lens_file(path: str | Path) -> ReadPrescription:
+    """Read a lens file as plain data, and list what is passed over; see `load_prescription`."""
     path = find_lens(path)
     _suffix(path)
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return decode_prescription(data, path)
+    return read_lens_data(data, path)
 
 
 def decode_prescription(data: bytes, path: str | Path) -> Any:
-    """Read the content of a lens file as plain data.
+    """Read the content of a lens file as plain data; see `read_lens_data`."""
+    return read_lens_data(data, path).prescription
+
+
+def read_lens_data(data: bytes, path: str | Path) -> ReadPrescription:
+    """Read the content of a lens file as plain data, and list what is passed over.
 
     Args:
         data: what the file holds.
@@ -94,10 +108,11 @@ def decode_prescription(data: bytes, path: str | Path) -> Any:
     """
     suffix = _suffix(Path(path))
     if suffix == ".zmx":
-        return prescription_from_zemax(decode_zemax(data, str(path)), str(path))
+        return read_zemax(decode_zemax(data, str(path)), str(path))
     if suffix == ".txt":
-        return prescription_from_diffoptics(_text(data, path, "text"), str(path))
-    return decode_yaml(data, path)
+        found = prescription_from_diffoptics(_text(data, path, "text"), str(path))
+        return ReadPrescription(found, [])
+    return ReadPrescription(decode_yaml(data, path), [])
 
 
 def decode_yaml(data: bytes, where: str | Path) -> Any:
@@ -169,7 +184,10 @@ def load_lens(
             that names the file, and the surface and key where there is one.
     """
     path = find_lens(path)
-    return lens_from_prescription(load_prescription(path), dtype, index_model, str(path), backend)
+    prescription, passed_over = read_lens_file(path)
+    if passed_over:
+        logger.info("%s: passed over: %s", path, "; ".join(passed_over))
+    return lens_from_prescription(prescription, dtype, index_model, str(path), backend)
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:

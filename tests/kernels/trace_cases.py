@@ -46,10 +46,14 @@ def _polynomial():
 
 
 def _aspheres():
-    """Aspheres of many and of no coefficients; the second has a conic that nothing simplifies."""
+    """Aspheres of many and of few coefficients; the second has a conic that nothing simplifies,
+    and a square term.
+    """
     front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "a6": -1e-7,
              "a8": 3e-9, "a10": 1e-11, "a12": -1e-13}  # fmt: skip
-    return _singlet(front, {"type": "even_asphere", "radius": -60.0, "conic": 0.4, "a4": 1e-5})
+    return _singlet(
+        front, {"type": "even_asphere", "radius": -60.0, "conic": 0.4, "a2": 1e-3, "a4": 1e-5}
+    )
 
 
 def _own_surface():

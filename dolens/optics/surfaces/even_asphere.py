@@ -49,7 +49,7 @@ class EvenAsphere(Conic):
             if power is None:
                 continue
             if power % 2:
-                raise InputError(f"'{key}': even aspheric coefficients are a2, a4, a6, ...")
+                raise InputError(f"'{key}': even aspheric coefficients are a2, a4, a6, a8, ...")
             powers.append(power)
         return ["curvature", "conic", *(f"a{power}" for power in sorted(powers))]
 
