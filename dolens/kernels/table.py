@@ -55,7 +55,7 @@ class Code:
 
     KIND = 0
     OFFSET = 1  # of the record in `values`
-    LENGTH = 2  # of the record
+    LENGTH = 2  # of the record, up to data that have no cotangents
     BEFORE = 3  # row of `indices`: medium in front, in the order of travel
     AFTER = 4  # and behind
     REFRACTS = 5  # 0: the same medium on both sides

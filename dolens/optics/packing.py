@@ -93,13 +93,14 @@ def _lay_out(
         shape = surface.shape
         if shape.kernel is None:
             raise InputError(f"surface {number} ({shape.kind}) has no kernel")
-        numbers, count, columns, degree, extras = shape.packed(surface.parameters)
+        numbers, count, columns, degree, extras, data = shape.packed(surface.parameters)
         sizes = []
         for value in numbers:
             sizes.append(None if value is None else value.shape)
             if value is not None:
                 (arrays if value.ndim else scalars).append(value)
-        forms.append(Form(shape.kernel.code, count, columns, degree, extras, tuple(sizes)))
+        form = Form(shape.kernel.code, count, columns, degree, extras, tuple(sizes), data)
+        forms.append(form)
         apertures.append(surface.aperture)
     scalars += (*system.thicknesses, system.sensor_distance)
     layout = records(

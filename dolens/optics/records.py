@@ -30,6 +30,7 @@ class Form(NamedTuple):
         degree: highest power of x or y.
         extras: further integers.
         sizes: the shape of each number's tensor; None: the number is zero.
+        data: as in `PackedShape`.
     """
 
     kind: int
@@ -38,6 +39,7 @@ class Form(NamedTuple):
     degree: int
     extras: tuple[int, ...]
     sizes: tuple[torch.Size | None, ...]
+    data: int = 0
 
 
 class Structure(NamedTuple):
@@ -190,7 +192,7 @@ class _Writer:
                 self.add(len(self.constants), source, count)
                 scalar, array = (scalar + 1, array) if size == () else (scalar, array + count)
             self.constants += [0.0] * count
-        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET]
+        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET] - form.data
 
     def add(self, place: int, source: int, count: int = 1, sign: float = 1.0) -> None:
         """Neighbouring numbers of the lens are added to neighbouring places."""

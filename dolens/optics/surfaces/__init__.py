@@ -7,6 +7,7 @@ from dolens.optics.surfaces.biconic import Biconic
 from dolens.optics.surfaces.conic import Conic, Sphere
 from dolens.optics.surfaces.even_asphere import EvenAsphere
 from dolens.optics.surfaces.forbes import QBfs, QCon
+from dolens.optics.surfaces.grid_sag import GridSag
 from dolens.optics.surfaces.odd_asphere import OddAsphere
 from dolens.optics.surfaces.plane import Aperture, Plane
 from dolens.optics.surfaces.registry import SURFACES, register_surface, unregister_surface
@@ -22,6 +23,7 @@ __all__ = [
     "Biconic",
     "Conic",
     "EvenAsphere",
+    "GridSag",
     "OddAsphere",
     "PackedShape",
     "Plane",
