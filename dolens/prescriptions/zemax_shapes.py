@@ -13,6 +13,7 @@ from dolens.errors import InputError
 from dolens.prescriptions.zemax_biconic_toroid import BICONIC, TOROID
 from dolens.prescriptions.zemax_block import SurfaceBlock
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
+from dolens.prescriptions.zemax_grid_sag import GRID_SAG
 from dolens.prescriptions.zemax_polynomials import (
     EXTENDED_ASPHERE,
     EXTENDED_ODD_ASPHERE,
@@ -41,6 +42,7 @@ SHAPES: dict[str, ZemaxShape] = {
         ZERNIKE_STANDARD,
         ZERNIKE_FRINGE,
         FORBES,
+        GRID_SAG,
     )
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
@@ -63,7 +65,6 @@ _NOT_HELD = {
     "GENFRESN": "a Fresnel surface",
     "GRADIUM": "a gradient-index medium",
     "GRID_PHA": "a phase given on a grid",
-    "GRID_SAG": "a sag given on a grid",
     "GRIDPHAS": "a phase given on a grid",
     "GRIDSAG": "a sag given on a grid",
     "GRINSU": "a gradient-index medium",

@@ -104,6 +104,15 @@ def _forbes():
     return _singlet(front, back)
 
 
+def _grid():
+    """A smooth bump with ripples on a conic, off its middle."""
+    u = torch.linspace(-6.0, 6.0, 13, dtype=F64)
+    ripple = 0.003 * _random(13, 13, seed=6) - 0.002 * (u[:, None] ** 2 + 0.5 * u[None] ** 2)
+    back = {"type": "grid_sag", "radius": -60.0, "conic": 0.4, "a4": 1e-6, "sag": ripple.tolist(),
+            "spacing_x": 1.0, "spacing_y": 1.0, "decenter_x": 0.5, "decenter_y": -0.3}  # fmt: skip
+    return _singlet({"type": "sphere", "radius": 40.0}, back)
+
+
 def _own_surface():
     """A surface of a user's own behind a sphere; it is registered while the lens is made."""
     back = {"type": "paraboloid", "curvature_x": -0.02, "curvature_y": -0.015, "twist": 0.002}
@@ -163,6 +172,7 @@ LENSES = {
     "cylinders": lambda root: _cylinders(),
     "zernike": lambda root: _zernike(),
     "forbes": lambda root: _forbes(),
+    "grid": lambda root: _grid(),
     "clipped": lambda root: _clipped(),
     "own_surface": lambda root: _own_surface(),
 }
