@@ -61,14 +61,14 @@ class Code:
 
     KIND = 0
     OFFSET = 1  # of the record in `values`
-    LENGTH = 2  # of the record
+    LENGTH = 2  # of the record, up to data that have no cotangents
     BEFORE = 3  # row of `indices`: medium in front, in the order of travel
     AFTER = 4  # and behind
     REFRACTS = 5  # 0: the same medium on both sides, and no mirror
     EDGE = 6  # an `Outline`
     HOLE = 7
     COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
-    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term, or an asphere a2
+    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
     # Of a deflection.  Its record holds its surface's shape, padded to two numbers, then the law's.

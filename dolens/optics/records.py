@@ -33,6 +33,7 @@ class Form(NamedTuple):
         degree: highest power of x or y.
         extras: further integers.
         sizes: the shape of each number's tensor; None: the number is zero.
+        data: as in `PackedShape`.
     """
 
     kind: int
@@ -41,6 +42,7 @@ class Form(NamedTuple):
     degree: int
     extras: tuple[int, ...]
     sizes: tuple[torch.Size | None, ...]
+    data: int = 0
 
 
 class LawForm(NamedTuple):
@@ -244,7 +246,7 @@ class _Writer:
                 self.add(len(self.constants), source, count)
                 scalar, array = (scalar + 1, array) if size == () else (scalar, array + count)
             self.constants += [0.0] * count
-        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET]
+        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET] - form.data
 
     def deflection(self, row: list[int], number: int, law: LawForm) -> None:
         """The numbers of a surface's shape, and those of its law."""
