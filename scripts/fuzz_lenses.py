@@ -14,6 +14,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tests.optics.random_lenses import KINDS, SAG_KINDS
 from tests.optics.ray_facts import PRECISIONS, cases, violations
 
 
