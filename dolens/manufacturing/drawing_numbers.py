@@ -36,8 +36,9 @@ EQUATIONS = {
     "zernike_fringe": f"{_ZERNIKE}, Z in fringe order",
     "q_con": f"$z={_CONIC}" + r"+u^4\sum_m q_m\,Q_m^{\mathrm{con}}(u^2)$",
     "q_bfs": (
-        r"$z=\dfrac{r^2/R}{1+\sqrt{1-r^2/R^2}}"
-        r"+\dfrac{u^2(1-u^2)}{\sqrt{1-r^2/R^2}}\sum_m q_m\,Q_m^{\mathrm{bfs}}(u^2)$"
+        f"$z={_CONIC}"
+        r"+u^2(1-u^2)\,\sqrt{\dfrac{1-k\,r^2/R^2}{1-(1+k)\,r^2/R^2}}"
+        r"\sum_m q_m\,Q_m^{\mathrm{bfs}}(u^2)$"
     ),
 }
 # Numbers of a surface that are no coefficients, and their symbols on a drawing.

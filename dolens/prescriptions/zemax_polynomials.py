@@ -3,8 +3,8 @@
 ODDASPHE has PARM 1 to 8, the coefficients of r to r⁸.  The extended aspheres have XDAT 1, the
 number of terms, XDAT 2, a radius that r is divided by, and from XDAT 3 the coefficients: of even
 powers in XASPHERE, of all powers in XOSPHERE, behind the PARM of EVENASPH.  QED_TYPE has
-XDAT 1: 0 for Q_con and 1 for Q_bfs, then number of terms, normalisation radius, and from XDAT 4
-the coefficients.
+XDAT 1: 0 for Q_bfs and 1 for Q_con, then number of terms, normalisation radius, and from XDAT 4
+the coefficients; CONI counts for both, the departure of Q_bfs being along the conic's normal.
 """
 
 import re
@@ -116,13 +116,11 @@ def _read_forbes(block: SurfaceBlock) -> Row:
     kind = number_in_text(block.extra_data.get(1, "0"), f"{block.place}: XDAT 1")
     if kind not in (0.0, 1.0):
         raise InputError(
-            f"{block.place}: XDAT 1 must be 0 (Q_con) or 1 (Q_bfs), not {block.extra_data[1]}"
+            f"{block.place}: XDAT 1 must be 0 (Q_bfs) or 1 (Q_con), not {block.extra_data[1]}"
         )
     count = number_of_terms(block, 2, _MOST)
     positive_extra(block, 3, "the normalization radius")
-    row = _base(block, "q_bfs" if kind else "q_con")
-    if kind and row.pop("conic") != 0.0:
-        raise InputError(f"{block.place}: Q_bfs departs from a sphere; CONI must be 0")
+    row = _base(block, "q_con" if kind else "q_bfs")
     terms = {
         f"q{n}": block.extra(n + _FORBES_FIRST, 1)
         for n in range(count)
@@ -132,15 +130,14 @@ def _read_forbes(block: SurfaceBlock) -> Row:
 
 
 def _write_forbes(row: Mapping[str, Any], place: str) -> list[str]:
-    best_fit = row["type"] == "q_bfs"
     terms = {int(m[1]): value for key, value in row.items() if (m := _FORBES_TERM.fullmatch(key))}
     count = max(terms, default=-1) + 1
     if count > _MOST:
         raise InputError(f"{place}: a .zmx file cannot hold 'q{count - 1}'")
     return [
         curvature_line(row, place),
-        *([] if best_fit else [conic_line(row, place)]),
-        f"XDAT 1 {int(best_fit)}",
+        conic_line(row, place),
+        f"XDAT 1 {int(row['type'] == 'q_con')}",
         f"XDAT 2 {count}",
         f"XDAT 3 {as_number(row.get('normalization_radius'), place)!r}",
         *(f"XDAT {n + _FORBES_FIRST} {text(value, place)}" for n, value in sorted(terms.items())),

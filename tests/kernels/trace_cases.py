@@ -156,7 +156,7 @@ def _zernike():
 
 def _forbes():
     """Both families, with orders left out."""
-    front = {"type": "q_bfs", "radius": 25.0, "q0": 0.05, "q1": -0.01, "q4": 2e-3,
+    front = {"type": "q_bfs", "radius": 25.0, "conic": -0.6, "q0": 0.05, "q1": -0.01, "q4": 2e-3,
              "normalization_radius": 5.2}  # fmt: skip
     back = {"type": "q_con", "radius": -50.0, "conic": 0.5, "q0": 0.03, "q3": -2e-3, "q5": 1e-3,
             "normalization_radius": 5.0}  # fmt: skip

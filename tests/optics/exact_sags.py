@@ -141,15 +141,17 @@ def q_con_polynomial(m, q):
 
 
 def _q_bfs(p, x, y):
-    c, r2 = p["curvature"], x**2 + y**2
-    base = _conic(c, mp.mpf(0), r2)
+    """The departure along the conic's normal, from the conic's slope."""
+    c, k, r2 = p["curvature"], p["conic"], x**2 + y**2
+    base = _conic(c, k, r2)
     if base is None:
         return None
     q = r2 / p["normalization_radius"] ** 2
     total = mp.fsum(
         a * mp.polyval(q_bfs_polynomial(m)[::-1], q) for m, a in _forbes_terms(p).items()
     )
-    return base + q * (1 - q) / mp.sqrt(1 - c**2 * r2) * total
+    slope_squared = c**2 * r2 / (1 - (1 + k) * c**2 * r2)
+    return base + q * (1 - q) * mp.sqrt(1 + slope_squared) * total
 
 
 @lru_cache(maxsize=64)

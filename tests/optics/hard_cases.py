@@ -226,6 +226,11 @@ CASES: dict[str, HardCase] = {
         rays=[((9.9, 0.0, -5.0), AXIAL), ((-5.0, 3.0, -5.0), at_angle(30.0))],
         sensor=20.0,
     ),
+    "Q_bfs about a conic, where the sphere of its curvature has ended": HardCase(
+        [surface("q_bfs", radius=8.0, conic=-0.8, normalization_radius=11.0, q0=-0.3, q2=0.05)],
+        rays=[((9.9, 0.0, -5.0), AXIAL), ((-6.0, -7.0, -5.0), at_angle(20.0))],
+        sensor=20.0,
+    ),
     "a millionth below total reflection": HardCase(
         [surface(radius=math.inf, semi_diameter=50.0, material="air")],
         rays=[((-1.0, 0.0, -0.5), at_angle(BELOW))],

@@ -85,7 +85,7 @@ def surface(draw: Draw, radius: float) -> dict:
         )
     # In units of the aperture; a conic's sag must reach its edge.
     if kind in CONICS:
-        conic = 0.0 if kind in ("sphere", "q_bfs") else draw.size(2.0, 2.0)
+        conic = 0.0 if kind == "sphere" else draw.size(2.0, 2.0)
         steepest = (1.0 if draw.wild else 0.8) / math.sqrt(max(1.0 + conic, 0.2))
         if draw.wild and conic < -1.0 and draw.chance(0.3):
             steepest *= 10.0 ** draw.between(0.0, 3.0)
@@ -94,7 +94,7 @@ def surface(draw: Draw, radius: float) -> dict:
             row["curvature"] = math.copysign(steepest / radius, row["curvature"])
         if draw.chance(0.05):
             row["curvature"] = draw.one_of((0.0, 1e-12, -1e-17))
-        if kind not in ("sphere", "q_bfs"):
+        if kind != "sphere":
             row["conic"] = conic
     if kind in ANAMORPHIC:
         for axis in "xy":

@@ -42,7 +42,9 @@ def cubic(x, y):
 def test_a_bicubic_polynomial_is_reproduced():
     surface = grid(cubic)
     x, y = points()
-    base = EvenAsphere.sag_and_gradient({n: torch.tensor(v).to(F64) for n, v in BASE.items()}, x, y)
+    base = EvenAsphere.sag_and_gradient(
+        {n: torch.tensor(v, dtype=F64) for n, v in BASE.items()}, x, y
+    )
     xs, ys = x.clone().requires_grad_(), y.clone().requires_grad_()
     expected = cubic(xs, ys)
     slopes = torch.autograd.grad(expected.sum(), (xs, ys))
@@ -71,7 +73,7 @@ def test_without_slopes_it_is_the_spline_through_the_nodes():
 
 def test_slopes_that_are_given_are_used():
     """A plane whose nodes are said to be steep: Hermite's x(1 - x)² beside a node."""
-    surface = grid(lambda x, y: 0.0 * x * y, slope_x=torch.full((9, 11), 0.1).to(F64))
+    surface = grid(lambda x, y: 0.0 * x * y, slope_x=torch.full((9, 11), 0.1, dtype=F64))
     p = parameters(surface)
     x = torch.tensor([0.3], dtype=F64)
     t = 0.3 / 1.2

@@ -262,13 +262,15 @@ def test_coefficients_of_auxiliary_polynomials_give_the_same_sum():
 
 def test_forbes_surfaces_without_coefficients_are_sphere_and_conic():
     p = numbers(curvature=0.05, q0=0.0, q3=0.0, normalization_radius=8.0)
-    require_same_surface(QBfs, p, Sphere, numbers(curvature=0.05))
     conic = numbers(curvature=0.05, conic=-2.0)
+    require_same_surface(QBfs, p | conic, Conic, conic)
     require_same_surface(QCon, p | conic, Conic, conic)
+    sphere = numbers(conic=0.0)
+    require_same_surface(QBfs, p | sphere, Sphere, numbers(curvature=0.05))
 
 
 def test_q_bfs_departs_neither_at_the_vertex_nor_at_the_normalisation_radius():
-    p = numbers(curvature=0.05, q0=0.1, q1=0.05, q7=-0.02, normalization_radius=8.0)
+    p = numbers(curvature=0.05, conic=0.0, q0=0.1, q1=0.05, q7=-0.02, normalization_radius=8.0)
     ends = torch.tensor([0.0, 8.0], dtype=F64)
     sag = QBfs.sag_and_gradient(p, ends, torch.zeros_like(ends))[0]
     sphere = Sphere.sag_and_gradient(p, ends, torch.zeros_like(ends))[0]
@@ -303,7 +305,6 @@ ANAMORPHIC = {"radius": None, "radius_x": 20.0, "radius_y": 40.0}
     [
         ({"type": "q_con", "q0": 1e-3}, "'normalization_radius' must be given and positive"),
         ({"type": "q_bfs", "q01": 1e-3, "normalization_radius": 5.0}, "q01"),
-        ({"type": "q_bfs", "conic": 1.0, "normalization_radius": 5.0}, "conic"),
         ({"type": "zernike_fringe", "z38": 0.1, "normalization_radius": 5.0}, "z1 to z37"),
         ({"type": "zernike_standard", "z232": 0.1, "normalization_radius": 5.0}, "z1 to z231"),
         ({"type": "zernike_standard", "normalization_radius": -5.0}, "positive"),
@@ -338,7 +339,7 @@ def test_prescriptions_come_back_to_the_last_bit(kind):
         "zernike_fringe": {"conic": 0.0, "z4": 1e-3, "normalization_radius": 5.0,
                            "decenter_x": 0.0, "decenter_y": 0.0},
         "q_con": {"conic": 1.0, "q0": 0.01, "q4": 1e-4, "normalization_radius": 5.1},
-        "q_bfs": {"q0": 0.01, "q4": 1e-4, "normalization_radius": 5.1},
+        "q_bfs": {"conic": -0.2, "q0": 0.01, "q4": 1e-4, "normalization_radius": 5.1},
     }  # fmt: skip
     row = {"type": kind} | {k: v for k, v in (ROW | rows[kind]).items() if v is not None}
     lens = lens_from_prescription({"surfaces": {"1": row}, "sensor": {"distance": 10.0}})

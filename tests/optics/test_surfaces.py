@@ -96,7 +96,14 @@ SHAPES = {
     ),
     "q_bfs": (
         QBfs,
-        {"curvature": 1 / 16.0, "q0": 0.03, "q2": -0.01, "q5": 1e-3, "normalization_radius": 8.0},
+        {
+            "curvature": 1 / 16.0,
+            "conic": -0.4,
+            "q0": 0.03,
+            "q2": -0.01,
+            "q5": 1e-3,
+            "normalization_radius": 8.0,
+        },
     ),
 }
 

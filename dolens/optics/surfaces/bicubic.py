@@ -4,25 +4,33 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 
 def spline_slopes(values: np.ndarray, spacing: float) -> np.ndarray:
     """Return the slopes along the last axis of the cubic spline through equally spaced values.
 
-    The spline has no knot at the last node but one from either end, so that it reproduces cubics.
-    Fewer than four nodes have the slopes of the polynomial through them.
+    Second derivatives are continuous at every node, and third ones at the last but one from either
+    end, so that cubics are reproduced.  Two or three nodes have the polynomial through them.
+    Source: de Boor, A Practical Guide to Splines, ch. IV ("not-a-knot").
 
     Args:
         values: (..., n) with n ≥ 2.
         spacing: of the nodes.
     """
     count = values.shape[-1]
-    place = spacing * np.arange(count)
-    degree = min(3, count - 1)
-    spline = make_interp_spline(place, values, k=degree, axis=-1)
-    return spline.derivative()(place)
+    step = np.diff(values, axis=-1) / spacing
+    if count == 2:
+        return np.concatenate([step, step], -1)
+    middle = 0.5 * (step[..., :-1] + step[..., 1:])
+    bend = step[..., 1:] - step[..., :-1]
+    if count == 3:
+        return np.concatenate([middle - bend, middle, middle + bend], -1)
+    system = np.diag(np.full(count, 4.0)) + np.eye(count, k=1) + np.eye(count, k=-1)
+    right = np.concatenate([-2.0 * bend[..., :1], 6.0 * middle, 2.0 * bend[..., -1:]], -1)
+    system[0], system[-1] = 0.0, 0.0
+    system[0, 0], system[0, 2], system[-1, -1], system[-1, -3] = 1.0, -1.0, 1.0, -1.0
+    return np.linalg.solve(system, right.reshape(-1, count).T).T.reshape(values.shape)
 
 
 class Cell(NamedTuple):

@@ -55,7 +55,7 @@ class ForbesSag(Surface):
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
         """Return the conic's own intersection, or the vertex plane where that is out of reach."""
-        c, k = p["curvature"], p.get("conic", 0.0)
+        c, k = p["curvature"], p["conic"]
         t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
         return torch.where(met > 0.0, t, torch.zeros_like(t))
 
@@ -104,11 +104,12 @@ class QCon(ForbesSag):
 
 @register_surface
 class QBfs(ForbesSag):
-    """The sag is that of the best-fit sphere + u²·(1 - u²)/√(1 - c²r²)·Σ q_m·Q_m^bfs(u²).
+    """The sag is conic + u²·(1 - u²)·σ·Σ q_m·Q_m^bfs(u²).
 
-    The departure is measured along the sphere's normal; it is zero at the vertex and at u = 1, and
-    the square of its mean slope is Σ q_m² (over the normalisation radius).  The surface ends where
-    the root is 1e-6: a millionth before the hemisphere.
+    The departure is measured along the conic's normal, whose secant is σ = √(1 - k·c²r²)/
+    √(1 - (1+k)·c²r²); with k = 0 the conic is the best-fit sphere of Forbes's definition.  The
+    departure is zero at the vertex and at u = 1, and the mean square of its slope is Σ q_m² (over
+    the normalisation radius).  The surface ends where the last root is 1e-6.
     Source: Forbes (2007, 2010), as `q_con` and `dolens.optics.surfaces.forbes_basis`.
     """
 
@@ -118,38 +119,44 @@ class QBfs(ForbesSag):
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Return curvature, coefficients, and the normalisation radius."""
-        return ["curvature", *cls.added_names(keys)]
+        """Return curvature, conic constant, coefficients, and the normalisation radius."""
+        return ["curvature", "conic", *cls.added_names(keys)]
 
     @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-        """Return sag and slopes, and the margin of the sphere's branch."""
-        c = p["curvature"]
+        """Return sag and slopes, and the margin of the conic's branch.
+
+        With a = 1 - k·c²r² and b = a - c²r²: σ = √(a/b), and dσ/d(r²) = σ·c²/(2ab).
+        """
+        c, k = p["curvature"], p["conic"]
         r2 = torch.addcmul(x * x, y, y)
-        sag, slope, _ = conic_sag(c, 0.0, r2)
+        sag, slope, _ = conic_sag(c, k, r2)
         scale = 1.0 / p["normalization_radius"] ** 2
         q, total, derivative = r2 * scale, torch.zeros_like(r2), torch.zeros_like(r2)
         for m, (value, d) in enumerate(q_bfs(q, _count(p))):
             if f"q{m}" in p:
                 total = total + p[f"q{m}"] * value
                 derivative = derivative + p[f"q{m}"] * d
-        squared = 1.0 - c * c * r2
-        secant = torch.rsqrt(squared.clamp(min=_STEEPEST))
+        turned = c * c * r2
+        squared = 1.0 - (1.0 + k) * turned
+        b = squared.clamp(min=_STEEPEST)
+        a = b + turned
+        secant = torch.sqrt(a / b)
         departure = q * (1.0 - q) * total
         along = scale * ((1.0 - 2.0 * q) * total + q * (1.0 - q) * derivative)
-        slope = slope + secant * (along + 0.5 * (c * c) * secant * secant * departure)
+        slope = slope + secant * (along + (0.5 * (c * c)) * departure / (a * b))
         exists = squared.detach() - _STEEPEST
         return sag + departure * secant, 2.0 * x * slope, 2.0 * y * slope, exists
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """Return c, no k, no a2, the normalisation radius, and the coefficients of auxiliary
+        """Return c, k, no a2, the normalisation radius, and the coefficients of auxiliary
         polynomials; columns: how many; degree: 1.
         """
         count = _count(p)
-        numbers = [p["curvature"], None, None, p["normalization_radius"]]
+        numbers = [p["curvature"], p["conic"], None, p["normalization_radius"]]
         if count:
             given = torch.stack([p.get(f"q{m}", _zero(p)) for m in range(count)])
             numbers.append(torch.from_numpy(to_auxiliary(count)).to(given) @ given)

@@ -62,8 +62,9 @@ class Toroid(Surface):
         on = root > GRAZING
         inverse = 1.0 / torch.where(on, root, g)
         sag = torch.addcmul(f, cx * x, x / (g + root))
-        sx = torch.where(on, 1.0, 2.0) * cx * x * inverse
-        across = torch.where(on, g * inverse, 1.0 + (cx * x * inverse) ** 2)
+        bent = cx * x * inverse
+        sx = torch.where(on, bent, 2.0 * bent)
+        across = torch.where(on, g * inverse, 1.0 + bent * bent)
         margin = torch.minimum(exists, squared.detach())
         return sag, sx, df * across, torch.minimum(margin, (1.0 - cx * f).detach())
 
