@@ -85,7 +85,7 @@ def _folded():
     """Breaks before, between and behind mirrors and a lens that is out of place."""
 
     def broken(**row):
-        return {"type": "coordinate_break", **row}
+        return {"type": "coordinate_break", "thickness": 0.0, **row}
 
     glass = {"semi_diameter": 5.0, "material": _GLASS}
     mirror = {"semi_diameter": 9.0, "material": "mirror", "thickness": 0.0}
