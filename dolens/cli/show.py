@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 def show(
     lens: Annotated[
         str,
-        typer.Argument(help="A lens file (.yaml, .txt, .zmx), or the name of a lens of dolens."),
+        typer.Argument(
+            help="A lens file (.yaml, .json, .zmx, .seq, .len, .roa, .txt), or the name of a "
+            "lens of dolens."
+        ),
     ],
     html: Annotated[
         Path | None,

@@ -1,39 +1,24 @@
 """Lens files are read and written."""
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
-from dolens.errors import InputError, did_you_mean, one_line
+from dolens.errors import InputError, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
-from dolens.prescriptions.zemax import decode_zemax, encode_zemax
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.lens_formats import MOST_BYTES, encode_lens, read_lens
+from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.yaml_text import plain_values
+
+logger = logging.getLogger(__name__)
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
-_SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """This safe YAML loader also refuses a key written twice: the first would be lost."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        seen = set()
-        scalars = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for key_node in scalars:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
-                line = key_node.start_mark.line + 1
-                raise yaml.YAMLError(f"key '{key}' is given twice, again in line {line}")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
 
 
 def lens_names() -> list[str]:
@@ -73,31 +58,37 @@ def load_prescription(path: str | Path) -> Any:
         InputError: the file is missing, of another kind, or not valid; the message is one line
             that names the file, and the line, surface and key where there is one.
     """
+    return read_lens_file(path).prescription
+
+
+def read_lens_file(path: str | Path) -> ReadPrescription:
+    """Read a lens file as plain data, and list what is passed over; see `load_prescription`."""
     path = find_lens(path)
-    _suffix(path)
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: is larger than {MOST_BYTES // 2**20} MB, and no lens")
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return decode_prescription(data, path)
+    return read_lens_data(data, path)
 
 
 def decode_prescription(data: bytes, path: str | Path) -> Any:
-    """Read the content of a lens file as plain data.
+    """Read the content of a lens file as plain data; see `read_lens_data`."""
+    return read_lens_data(data, path).prescription
+
+
+def read_lens_data(data: bytes, path: str | Path) -> ReadPrescription:
+    """Read the content of a lens file as plain data, and list what is passed over.
 
     Args:
         data: what the file holds.
-        path: its suffix says which format that is; messages name it.
+        path: its name; see `dolens.prescriptions.lens_formats.read_lens`.
 
     Raises:
         InputError: see `load_prescription`.
     """
-    suffix = _suffix(Path(path))
-    if suffix == ".zmx":
-        return prescription_from_zemax(decode_zemax(data, str(path)), str(path))
-    if suffix == ".txt":
-        return prescription_from_diffoptics(_text(data, path, "text"), str(path))
-    return decode_yaml(data, path)
+    return read_lens(data, path)
 
 
 def decode_yaml(data: bytes, where: str | Path) -> Any:
@@ -110,20 +101,11 @@ def decode_yaml(data: bytes, where: str | Path) -> Any:
     Raises:
         InputError: it is not valid YAML; the message is one line.
     """
-    text = _text(data, where, "YAML")
     try:
-        # A subclass of the safe loader: it builds plain values only.
-        return yaml.load(text, Loader=_UniqueKeyLoader)
-    except yaml.YAMLError as error:
-        reason = one_line(error)
-        raise InputError(f"{where}: is not valid YAML ({reason})") from None
-
-
-def _text(data: bytes, where: str | Path, kind: str) -> str:
-    try:
-        return data.decode("utf-8")
+        text = data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: is not valid {kind} ({error})") from None
+        raise InputError(f"{where}: is not valid YAML ({error})") from None
+    return plain_values(text, str(where))
 
 
 def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:
@@ -136,15 +118,7 @@ def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> by
     Raises:
         InputError: the format cannot hold the lens; the message names the surface and key.
     """
-    suffix = _suffix(Path(path))
-    if suffix == ".zmx":
-        return encode_zemax(zemax_of(prescription, str(path)))
-    if suffix == ".txt":
-        return diffoptics_text_of(prescription, str(path)).encode()
-    text = yaml.safe_dump(
-        prescription, sort_keys=False, default_flow_style=None, width=200, allow_unicode=True
-    )
-    return text.encode()
+    return encode_lens(prescription, path)
 
 
 def load_lens(
@@ -169,7 +143,10 @@ def load_lens(
             that names the file, and the surface and key where there is one.
     """
     path = find_lens(path)
-    return lens_from_prescription(load_prescription(path), dtype, index_model, str(path), backend)
+    prescription, passed_over = read_lens_file(path)
+    if passed_over:
+        logger.info("%s: passed over: %s", path, "; ".join(passed_over))
+    return lens_from_prescription(prescription, dtype, index_model, str(path), backend)
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:
@@ -182,10 +159,3 @@ def save_lens(lens: Lens, path: str | Path) -> None:
     """
     path = Path(path)
     path.write_bytes(encode_prescription(prescription_of(lens), path))
-
-
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise InputError(f"{path}: lens files end in {', '.join(_SUFFIXES)}")
-    return suffix
