@@ -44,9 +44,10 @@ class Slot:
     HALF_X = 15  # rectangle: half widths, mm; see also HALF_Y
     HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; rectangle: half widths
     HOLE_Y = 17
-    SENSE = 18  # +1 towards the sensor, -1 from it
+    SENSE = 18  # +1 for light that comes towards +z, -1 towards -z
     TAG = 19  # 4·surface number; a status is added to it where a ray fails
     HALF_Y = 20
+    SENSE_BEHIND = 21  # as SENSE, of the light that leaves: the other one behind a mirror
     HEADER = 24  # length of the header: the shape's first number
 
 
@@ -58,11 +59,11 @@ class Code:
     LENGTH = 2  # of the record
     BEFORE = 3  # row of `indices`: medium in front, in the order of travel
     AFTER = 4  # and behind
-    REFRACTS = 5  # 0: the same medium on both sides
+    REFRACTS = 5  # 0: the same medium on both sides, and no mirror
     EDGE = 6  # an `Outline`
     HOLE = 7
     COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
-    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
+    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term, or an asphere a2
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
     ROW = 16  # length of a row

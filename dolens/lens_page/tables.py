@@ -225,4 +225,4 @@ def _outline(outline: Outline) -> str:
 
 
 def _is_glass(row: SurfaceRow) -> bool:
-    return row.material not in ("air", "occluder")
+    return row.material not in ("air", "occluder", "mirror")

@@ -8,12 +8,15 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.axial_ray import reversals
 from dolens.optics.backend import check_backend, is_few
+from dolens.optics.broken_axes import GlobalAxes
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
+from dolens.optics.mirrors import media_of
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
@@ -35,7 +38,7 @@ class Lens(LensRays, LensViews, nn.Module):
         surfaces: in the order that light meets them; the first vertex is at z = 0.
         thicknesses: gaps between neighbouring vertices, mm, one fewer than surfaces.
         sensor_distance: last vertex to sensor, mm.
-        materials: before surface 1 and after each surface.
+        materials: before surface 1 and after each surface; `MIRROR` after one that reflects.
         stop: number of the stop surface, from 1.
         index_model: the model that the materials were made with.
         name: for titles and messages.
@@ -88,6 +91,10 @@ class Lens(LensRays, LensViews, nn.Module):
         self.object_distance = object_distance
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
+        try:
+            media_of(self.materials)
+        except InputError as error:
+            raise InputError(f"lens '{name}': {error}") from None
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
         )
@@ -102,6 +109,9 @@ class Lens(LensRays, LensViews, nn.Module):
         self.elements = nn.ModuleDict(dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.to(dtype)
+        self.reversals: tuple[int, ...] = ()
+        self._check_breaks()
+        self.reversals = reversals(self.system(), self.primary_wavelength)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -176,14 +186,17 @@ class Lens(LensRays, LensViews, nn.Module):
         sensor_distance = values.pop("sensor_distance", self.sensor_distance)
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
+        materials, mirrors = media_of(self.materials)
         return OpticalSystem(
             surfaces,
             thicknesses,
             sensor_distance,
-            self.materials,
+            materials,
             self.stop,
             elements,
             self.backend,
+            mirrors,
+            self.reversals,
         )
 
     def forward(self, rays: Rays) -> TracedRays:
@@ -200,9 +213,10 @@ class Lens(LensRays, LensViews, nn.Module):
         few rays is faster with the kernels: set `backend` to `cpu`.
 
         Args:
-            rays: travelling towards +z in the medium before surface `first`; they may start
-                anywhere, and are first moved along their own line to that surface.  Rays in double
-                precision are moved in double precision, whatever the lens's.
+            rays: travelling with the light in the medium before surface `first`: towards +z, or
+                towards -z behind an odd number of mirrors; they may start anywhere, and are first
+                moved along their own line to that surface.  Rays in double precision are moved in
+                double precision, whatever the lens's.
             record: whether to keep the intersection with every surface.
             first: number of the first surface that they meet.
             last: number of the last; given, the trace ends there, in the medium behind it.
@@ -216,13 +230,14 @@ class Lens(LensRays, LensViews, nn.Module):
         """Trace rays backwards, from the sensor's side through every surface into object space.
 
         Args:
-            rays: travelling towards -z in the medium behind surface `last`.
+            rays: travelling against the light in the medium behind surface `last`: towards -z, or
+                towards +z behind an odd number of mirrors.
             record: whether to keep the intersection with every surface, last surface first.
             first: number of the surface where the trace ends.
             last: number of the surface that they meet first; None: the lens's last.
 
         Returns:
-            The rays on surface `first`, travelling towards -z in the medium before it.
+            The rays on surface `first`, in the medium before it, travelling against the light.
         """
         self._check_range(first, last)
         return trace_rays(self._system_for(rays), rays, -1.0, record, first, last)
@@ -231,6 +246,27 @@ class Lens(LensRays, LensViews, nn.Module):
         """The lens, traced by the reference if these rays are few."""
         system = self.system()
         return system.traced_by("reference") if is_few(system, rays) else system
+
+    def global_axes(self) -> GlobalAxes:
+        """Return vertex and rotation of every surface, and of the sensor, in the lens's axes.
+
+        These are the axes of the first row, in front of any coordinate break.  All are double, and
+        differentiable.
+        """
+        return self.system().global_axes()
+
+    def _check_breaks(self) -> None:
+        """Raise `InputError` where breaks are all there is, the stop, or have a medium."""
+        media = media_of(self.materials).materials
+        breaks = [int(n) for n, surface in self.surfaces.items() if surface.changes_axes]
+        if len(breaks) == len(self.surfaces):
+            raise InputError(f"lens '{self.name}': there is no surface but coordinate breaks")
+        for number in breaks:
+            place = f"lens '{self.name}': surface {number} is a coordinate break"
+            if number == self.stop:
+                raise InputError(f"{place}, and cannot be the stop")
+            if media[number] != media[number - 1]:
+                raise InputError(f"{place}; the medium behind it is the one in front of it")
 
     def _check_range(self, first: int, last: int | None) -> None:
         count = len(self.surfaces)

@@ -17,7 +17,7 @@ from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 from dolens.optics.elements import LENS_AXES, relative_axes
 from dolens.optics.materials import Medium
-from dolens.optics.records import Form, Records, Structure, records, tensor
+from dolens.optics.records import BREAK, Form, Records, Structure, records, tensor
 from dolens.optics.row_jacobian import jacobian_of
 from dolens.optics.system import OpticalSystem
 
@@ -93,13 +93,14 @@ def _lay_out(
         shape = surface.shape
         if shape.kernel is None:
             raise InputError(f"surface {number} ({shape.kind}) has no kernel")
+        code = BREAK if shape.changes_axes else shape.kernel.code
         numbers, count, columns, degree, extras = shape.packed(surface.parameters)
         sizes = []
         for value in numbers:
             sizes.append(None if value is None else value.shape)
             if value is not None:
                 (arrays if value.ndim else scalars).append(value)
-        forms.append(Form(shape.kernel.code, count, columns, degree, extras, tuple(sizes)))
+        forms.append(Form(code, count, columns, degree, extras, tuple(sizes)))
         apertures.append(surface.aperture)
     scalars += (*system.thicknesses, system.sensor_distance)
     layout = records(
@@ -108,6 +109,8 @@ def _lay_out(
             tuple(apertures),
             tuple(system.materials),
             tuple((element.first, element.last) for element in system.elements),
+            system.mirrors,
+            system.senses,
             sense,
             first,
             last,
@@ -115,7 +118,7 @@ def _lay_out(
         )
     )
     if layout.turns:
-        axes = (LENS_AXES, *system.axes)
+        axes = (LENS_AXES, *system.all_axes)
         for now, then in layout.turns:
             if then:
                 arrays += relative_axes(axes[now], axes[then])

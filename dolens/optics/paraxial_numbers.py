@@ -24,6 +24,7 @@ class ParaxialNumbers:
         materials: before surface 1 and after each surface.
         stop: number of the stop surface, from 1.
         stop_radius: mm.
+        senses: +1 where light travels towards +z, -1 towards -z; of each medium.
     """
 
     curvatures: tuple[float | Tensor, ...]
@@ -32,6 +33,7 @@ class ParaxialNumbers:
     materials: tuple[Medium, ...]
     stop: int
     stop_radius: float | Tensor
+    senses: tuple[float, ...]
 
     @classmethod
     @torch.no_grad()
@@ -50,6 +52,7 @@ class ParaxialNumbers:
             tuple(system.materials),
             system.stop,
             float(system.surfaces[system.stop - 1].semi_diameter),
+            system.senses,
         )
 
     @classmethod
@@ -71,6 +74,7 @@ class ParaxialNumbers:
             tuple(system.materials),
             system.stop,
             numbers[-1],
+            system.senses,
         )
 
     @property
@@ -83,13 +87,12 @@ class ParaxialNumbers:
         _, b, _, d = self._unit_rays_behind(wavelength, self.stop, len(self.curvatures))
         if d == 0.0:
             return float("inf"), float("inf")
-        image_index = float(self.materials[-1].index(wavelength))
+        image_index = self._index(-1, wavelength)
         return self.length - b * image_index / d, 2.0 * self.stop_radius / abs(d)
 
     def chief_ray_magnification(self, wavelength: float, depth: float) -> float | Tensor:
         """Height on the sensor over height on an object at a depth in mm, by the chief ray."""
-        before = float(self.materials[0].index(wavelength))
-        behind = float(self.materials[-1].index(wavelength))
+        before, behind = self._index(0, wavelength), self._index(-1, wavelength)
         a, b, _, _ = self._unit_rays_at_stop(wavelength)
         # The chief ray heads for the entrance pupil at z = n b/a: from height 1 at -depth.
         slope = -a / (b * before + depth * a)
@@ -103,14 +106,17 @@ class ParaxialNumbers:
         rays = self._unit_rays_behind(wavelength, 1, self.stop - 1)
         if self.stop == 1:
             return rays
-        index = float(self.materials[self.stop - 1].index(wavelength))
+        index = self._index(self.stop - 1, wavelength)
         return rays.transferred(self.thicknesses[self.stop - 2], index)
 
     def _unit_rays_behind(self, wavelength: float, first: int, last: int) -> TwoRays:
         """Trace the unit rays from just before surface `first` to just after `last`."""
-        media = self.materials[first - 1 : last + 1]
         return behind_surfaces(
             self.curvatures[first - 1 : last],
             self.thicknesses[first - 1 : max(last - 1, 0)],
-            [float(medium.index(wavelength)) for medium in media],
+            [self._index(medium, wavelength) for medium in range(first - 1, last + 1)],
         )
+
+    def _index(self, medium: int, wavelength: float) -> float:
+        """Return a medium's index, negative where light travels towards -z."""
+        return self.senses[medium] * float(self.materials[medium].index(wavelength))

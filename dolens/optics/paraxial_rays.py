@@ -76,7 +76,7 @@ def paraxial_rays(
     """
     matrix = matrix_to_stop(system, wavelength)
     a, b = matrix[0, 0], matrix[0, 1]
-    n = system.indices(wavelength)
+    n = system.signed_indices(wavelength)
     near = vergence(object_distance)
     tangent = field_tangent(field, object_distance, matrix)
     at_stop = a + b * (n[0] * near)

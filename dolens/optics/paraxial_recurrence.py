@@ -3,7 +3,7 @@
 A paraxial ray at a surface is its height y and its reduced slope n·u.  Refraction leaves the height
 alone, n'u' = nu - y(n' - n)c; transfer leaves the reduced slope alone, y' = y + (t/n)·nu (Welford,
 ch. 3).  Any two rays give all others, so that two are traced at a time.  Everything here is
-arithmetic of numbers and tensors alike.
+arithmetic of numbers and tensors alike.  Where light travels towards -z the index is negative.
 """
 
 from collections import deque

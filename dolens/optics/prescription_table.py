@@ -8,6 +8,7 @@ from torch import nn
 
 from dolens.optics.elements import TILTS, Element
 from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
+from dolens.optics.mirrors import MIRROR
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
 from dolens.optics.tables import html_table, printable, text_table
 
@@ -201,7 +202,9 @@ def prescription_table(lens: nn.Module) -> PrescriptionTable:
 
 
 def _glass_numbers(medium: Medium) -> tuple[float, float]:
-    """Return nd and Vd; NaN where the catalogue's range ends short of lines F, d and C."""
+    """Return nd and Vd; NaN of a mirror, and where the catalogue ends short of lines F, d and C."""
+    if medium is MIRROR:
+        return math.nan, math.nan
     first, last = getattr(medium, "wavelengths", (0.0, math.inf))
     if first > LINE_F or last < LINE_C:
         return math.nan, math.nan

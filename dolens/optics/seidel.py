@@ -11,7 +11,8 @@ refraction invariants, H = n(u·h̄ - ū·h) = A·h̄ - Ā·h is Lagrange's, Δ 
     S_V   = -(Ā/A)(Ā² h Δ(u/n) + H² c Δ(1/n)) + 8 G h h̄³ Δn
     C_L   = A h Δ(δn/n),   C_T = Ā h Δ(δn/n)
 
-with G the r⁴ coefficient of the surface beyond its osculating sphere.  With Δ(u/n) = A Δ(1/n²) -
+with G the r⁴ coefficient of the surface beyond its osculating sphere, and n negative where light
+travels towards -z.  With Δ(u/n) = A Δ(1/n²) -
 h c Δ(1/n) the division by A cancels: S_V = -Ā(Ā² h Δ(1/n²) - (Ā h - H) h̄ c Δ(1/n)) + ....
 
 Signs: the sums are positive for undercorrected aberration, S_I > 0 of a simple converging lens.
@@ -81,8 +82,8 @@ def seidel(
         color: the shorter and the longer wavelength in nm: δn = n(shorter) - n(longer).
     """
     marginal, chief, invariant = paraxial_rays(system, wavelength, field, object_distance)
-    index = _vector(system.indices(wavelength), system)
-    short, long = (_vector(system.indices(nm), system) for nm in color)
+    index = _vector(system.signed_indices(wavelength), system)
+    short, long = (_vector(system.signed_indices(nm), system) for nm in color)
     n, n_after = index[:-1], index[1:]
     states = [(surface.shape, surface.parameters) for surface in system.surfaces]
     c = _vector((shape.paraxial_curvature(p) for shape, p in states), system)

@@ -21,7 +21,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.paraxial import FirstOrder, first_order
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane
+from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_sensor
 
 _KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
 
@@ -96,7 +96,7 @@ class LensProperties:
         self.crossings[field] = aimed.crossing
         ray, _ = enter_lens(system, aimed, 1, 1.0)
         traced = trace_surfaces(system, ray, self.wavelength, 1.0)
-        return trace_to_plane(system, traced, system.vertices[-1], self.wavelength, 1.0).ray
+        return trace_to_sensor(system, traced, self.wavelength).ray
 
 
 @dataclass(frozen=True)

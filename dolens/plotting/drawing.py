@@ -166,9 +166,11 @@ def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) 
             for edge in (top, bottom):
                 axes.plot(*edge.T, color=_EDGE, linewidth=0.9, gid="edge", zorder=2)
     for number, (z, y) in enumerate(profiles, 1):
-        refracts = system.materials[number - 1] != system.materials[number]
-        if number in bounding or (refracts and number != system.stop):
-            axes.plot(z, y, color=_EDGE, linewidth=1.0, gid=f"surface {number}", zorder=2)
+        mirror = number in system.mirrors
+        refracts = system.refracts(number)
+        if mirror or number in bounding or (refracts and number != system.stop):
+            width = 2.2 if mirror else 1.0
+            axes.plot(z, y, color=_EDGE, linewidth=width, gid=f"surface {number}", zorder=2)
 
 
 def _is_glass(system: OpticalSystem, number: int) -> bool:

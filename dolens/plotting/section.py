@@ -11,7 +11,7 @@ from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Outline
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import trace_surfaces, trace_to_plane
+from dolens.optics.trace import trace_surfaces, trace_to_sensor
 
 Profile = tuple[np.ndarray, np.ndarray]
 
@@ -191,7 +191,7 @@ def trace_fan(
         zero = torch.zeros_like(y)
         ray = Components(zero, y, zero + start, zero, slopes * n, n)
         traced = trace_surfaces(system, ray, wavelength, record=True)
-        traced = trace_to_plane(system, traced, system.vertices[-1], wavelength, 1.0)
+        traced = trace_to_sensor(system, traced, wavelength)
         points = [ray[:3], *traced.points, traced.ray[:3]]
         return torch.stack([torch.stack(point, -1) for point in points], 1), traced.valid
 

@@ -14,6 +14,9 @@ A prescription is a mapping::
 
 Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
 `occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+`material: mirror` makes the surface reflect; behind it light travels towards -z, and thicknesses
+are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
+that stands behind them (see breaks.py).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
@@ -30,8 +33,10 @@ from dolens.errors import InputError, check_keys, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
+from dolens.optics.mirrors import media_of
 from dolens.optics.surfaces import SURFACES, Surface
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
+from dolens.prescriptions.breaks import KIND, break_from, break_row, is_break
 from dolens.prescriptions.checks import (
     as_integer,
     as_number,
@@ -100,8 +105,12 @@ def lens_from_prescription(
     materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
     for number, row in enumerate(rows, 1):
         place = f"{where}: surface {number}"
-        surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
-        materials.append(_material(row.get("material"), model, place))
+        if is_break(row):
+            surfaces.append(break_from(row, place, dtype))
+            materials.append(media_of(materials).materials[-1])
+        else:
+            surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
+            materials.append(_material(row.get("material"), model, place))
         if number < len(rows):
             if row.get("thickness") is None:
                 raise InputError(f"{place}: 'thickness' is missing (mm to surface {number + 1})")
@@ -140,6 +149,9 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
     """
     rows: dict[str, dict[str, Any]] = {}
     for (number, surface), material in zip(lens.surfaces.items(), lens.materials[1:], strict=True):
+        if surface.changes_axes:
+            rows[number] = break_row(surface) | _gap(lens, number)
+            continue
         row: dict[str, Any] = {"type": surface.kind}
         for key, value in (*surface.named_parameters(), *surface.named_buffers()):
             number_value = value.detach().tolist()
@@ -152,8 +164,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
             else:
                 row[key] = number_value
         row |= aperture_rows(surface.aperture)
-        if number in lens.thicknesses:
-            row["thickness"] = float(lens.thicknesses[number].detach())
+        row |= _gap(lens, number)
         row["material"] = material.name
         rows[number] = row
     sensor: dict[str, Any] = {"distance": float(lens.sensor_distance.detach())}
@@ -171,12 +182,19 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
     }
 
 
+def _gap(lens: Lens, number: str) -> dict[str, float]:
+    """Return the thickness behind a surface, which the last has not."""
+    if number not in lens.thicknesses:
+        return {}
+    return {"thickness": float(lens.thicknesses[number].detach())}
+
+
 def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     kind = str(row.get("type", "sphere"))
     if kind not in SURFACES:
         raise InputError(
             f"{place}: type '{kind}' is unknown{did_you_mean(kind, SURFACES)} "
-            f"(allowed: {', '.join(SURFACES)})"
+            f"(allowed: {', '.join((*SURFACES, KIND))})"
         )
     shape = SURFACES[kind]
     try:

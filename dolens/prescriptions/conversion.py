@@ -154,6 +154,7 @@ def _same_numbers(before: Lens, after: Lens) -> bool:
         and all(torch.equal(value, second[name]) for name, value in first.items())
         and before.stop == after.stop
         and _indices(before) == _indices(after)
+        and before.system().mirrors == after.system().mirrors
         and [s.aperture for s in before.surfaces.values()]
         == [s.aperture for s in after.surfaces.values()]
     )
@@ -169,7 +170,8 @@ def _parameters(lens: Lens) -> dict[str, torch.Tensor]:
 
 
 def _indices(lens: Lens) -> list[list[float]]:
-    return [[float(m.index(wave)) for wave in COMPARED_WAVELENGTHS] for m in lens.materials]
+    media = lens.system().materials
+    return [[float(m.index(wave)) for wave in COMPARED_WAVELENGTHS] for m in media]
 
 
 @torch.no_grad()

@@ -16,8 +16,7 @@ from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.unknown_content import require_text
 from dolens.prescriptions.yaml_text import read_yaml, yaml_of
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_unread import unread_in_zemax
+from dolens.prescriptions.zemax_reader import read_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
 
 # A lens is text of some kilobytes; more is no lens.
@@ -44,10 +43,6 @@ class LensFormat:
     write: Callable[[Mapping[str, Any], str], bytes] | None
 
 
-def _read_zemax(text: str, where: str) -> ReadPrescription:
-    return ReadPrescription(prescription_from_zemax(text, where), unread_in_zemax(text.encode()))
-
-
 def _read_diffoptics(text: str, where: str) -> ReadPrescription:
     return ReadPrescription(prescription_from_diffoptics(text, where), [])
 
@@ -65,7 +60,7 @@ FORMATS: tuple[LensFormat, ...] = (
         "Zemax",
         (".zmx",),
         re.compile(r"^SURF 0\s*$", re.MULTILINE),
-        _read_zemax,
+        read_zemax,
         lambda prescription, where: encode_zemax(zemax_of(prescription, where)),
     ),
     LensFormat(

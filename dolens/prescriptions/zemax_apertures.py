@@ -16,6 +16,13 @@ from dolens.prescriptions.zemax import Line
 
 Block = dict[str, list[Line]]
 
+_NOT_HELD = {
+    "SPID": "a spider, which blocks light with its arms,",
+    "USAP": "an aperture whose outline the user draws",
+    "USOB": "an obscuration whose outline the user draws",
+    "ELAP": "an elliptical aperture",
+    "ELOB": "an elliptical obscuration",
+}
 _HALF_WIDTHS = ("half_width_x", "half_width_y")
 
 
@@ -34,6 +41,9 @@ def read_apertures(block: Block, factor: Fraction, place: str) -> tuple[dict[str
     Raises:
         InputError: a decentred aperture, a floating one with a hole, or an obscuring ring.
     """
+    for operand, what in _NOT_HELD.items():
+        if operand in block:
+            raise InputError(f"{place}: {what} is not held ({operand})")
     if any(number_in_text(word, f"{place}: OBDC") for word in _words(block, "OBDC")[:2]):
         raise InputError(f"{place}: OBDC, a decentred aperture, is not held")
     drawn = scaled((_words(block, "DIAM") or ["0"])[0], factor, f"{place}: DIAM")

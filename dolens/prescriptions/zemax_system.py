@@ -26,17 +26,13 @@ def read_system(file: ZemaxFile, factor: Fraction, where: str) -> dict[str, Any]
     """Read name, source, wavelengths, fields and pupil as a prescription writes them.
 
     Raises:
-        InputError: the mode is not sequential, there are several configurations, or a field or
-            aperture is of a kind that a prescription does not hold.
+        InputError: the mode is not sequential, or a field or aperture is of a kind that a
+            prescription does not hold.
     """
     mode = _last(file, "MODE")
     if mode and mode.arguments[:1] != ["SEQ"]:
-        raise InputError(f"{where}: MODE {mode.text} is not held (allowed: SEQ)")
-    zoom = _last(file, "MNUM")
-    if zoom and zoom.arguments and _count(zoom, 0, where) > 1:
-        raise InputError(
-            f"{where}: MNUM {zoom.arguments[0]}: several configurations are not held (allowed: 1)"
-        )
+        what = "a non-sequential system" if mode.arguments[:1] == ["NSC"] else "this mode"
+        raise InputError(f"{where}: {what} is not held (MODE {mode.text}; allowed: SEQ)")
     found: dict[str, Any] = {}
     name = _last(file, "NAME")
     if name and name.text:

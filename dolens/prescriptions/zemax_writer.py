@@ -1,7 +1,5 @@
 """A prescription is written as the text of a Zemax `.zmx` file."""
 
-import math
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,10 +10,9 @@ from dolens.prescriptions.decimals import shifted
 from dolens.prescriptions.zemax_apertures import aperture_lines
 from dolens.prescriptions.zemax_glass import canonical, catalogue_line, glass_line
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
+from dolens.prescriptions.zemax_shapes import shape_of_row
 
-_TYPES = ("plane", "aperture", "sphere", "conic", "even_asphere")
 _D_LINE = 587.5618
-_POWER = re.compile(r"a(\d+)")
 
 
 def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
@@ -111,43 +108,15 @@ def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
 
 
 def _surface(row: Mapping[str, Any], place: str) -> list[str]:
-    """Write a surface's block, without its number, stop and distance.
-
-    Zemax writes a curvature of zero as 0.0, so CURV 0 can mean a plane, and a sphere whose
-    curvature happens to be 0 stays one.  CONI is written for conics and aspheres alone.
-    """
-    kind = str(row.get("type", "sphere"))
-    if kind not in _TYPES:
-        raise InputError(
-            f"{place}: a .zmx file cannot hold type '{kind}' (allowed: {', '.join(_TYPES)})"
-        )
-    lines = [f"  TYPE {'EVENASPH' if kind == 'even_asphere' else 'STANDARD'}"]
+    """Write a surface's block, without its number, stop and distance."""
+    shape = shape_of_row(row, place)
+    lines = [f"  TYPE {shape.type}"]
     if row.get("note"):
         lines.append(f"  COMM {row['note']}")
-    if kind in ("plane", "aperture"):
-        lines.append("  CURV 0")
-    else:
-        lines.append(f'  CURV {_curvature(row, place)!r} 0 0 0 0 ""')
-    if kind in ("conic", "even_asphere"):
-        lines.append(f"  CONI {_text(row.get('conic', 0.0), place)}")
-    for key in row:
-        power = _POWER.fullmatch(key)
-        if power and kind == "even_asphere":
-            n = int(power[1])
-            if n % 2 or not 4 <= n <= 16:
-                raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a4 to a16)")
-            lines.append(f"  PARM {n // 2} {_text(row[key], place)}")
-    lines += glass_line(row.get("material"), place)
-    return lines + aperture_lines(row, place)
-
-
-def _curvature(row: Mapping[str, Any], place: str) -> float:
-    if row.get("curvature") is not None:
-        return as_number(row["curvature"], f"{place}: 'curvature'")
-    radius = as_number(row.get("radius", math.inf), f"{place}: 'radius'", finite=False)
-    if radius == 0.0:
-        raise InputError(f"{place}: 'radius' is 0; write .inf for a plane")
-    return 1.0 / radius
+    lines += [f"  {line}" for line in shape.write(row, place)]
+    if not shape.surface:
+        return lines
+    return [*lines, *glass_line(row.get("material"), place), *aperture_lines(row, place)]
 
 
 def _text(value: object, place: str) -> str:

@@ -46,10 +46,73 @@ def _polynomial():
 
 
 def _aspheres():
-    """Aspheres of many and of no coefficients; the second has a conic that nothing simplifies."""
+    """Aspheres of many and of few coefficients; the second has a conic that nothing simplifies,
+    and a square term.
+    """
     front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "a6": -1e-7,
              "a8": 3e-9, "a10": 1e-11, "a12": -1e-13}  # fmt: skip
-    return _singlet(front, {"type": "even_asphere", "radius": -60.0, "conic": 0.4, "a4": 1e-5})
+    return _singlet(
+        front, {"type": "even_asphere", "radius": -60.0, "conic": 0.4, "a2": 1e-3, "a4": 1e-5}
+    )
+
+
+def _mirrors():
+    """A Mangin mirror, then mirrors of every kind, and glass behind them."""
+
+    def row(kind, thickness, material="mirror", **more):
+        return {"type": kind, "semi_diameter": 6.0, "thickness": thickness, "material": material,
+                **more}  # fmt: skip
+
+    surfaces = [
+        row("sphere", 2.0, _GLASS, radius=-40.0),
+        row("conic", -2.0, radius=-70.0, conic=-0.6),
+        row("sphere", -12.0, "air", radius=-40.0),
+        row("even_asphere", 12.0, radius=90.0, conic=0.3, a4=1e-5, a6=-1e-8),
+        row("sphere", -12.0, radius=-80.0),
+        row("plane", 12.0),
+        row("xy_polynomial", -12.0, x2=-0.004, y2=-0.005, xy=1e-4, x3=1e-5, y4=-1e-7),
+        row("conic", 8.0, radius=200.0, conic=-3.0),
+        row("sphere", 2.0, _GLASS, radius=60.0),
+        row("plane", None, "air"),
+    ]
+    surfaces[-1].pop("thickness")
+    return lens_from_prescription(
+        {"surfaces": {str(n): r for n, r in enumerate(surfaces, 1)}, "sensor": {"distance": 15.0}}
+    )
+
+
+def _folded():
+    """Breaks before, between and behind mirrors and a lens that is out of place."""
+
+    def broken(**row):
+        return {"type": "coordinate_break", **row}
+
+    glass = {"semi_diameter": 5.0, "material": _GLASS}
+    mirror = {"semi_diameter": 9.0, "material": "mirror", "thickness": 0.0}
+    surfaces = [
+        broken(tilt_x=2.0, decenter_x=0.2, thickness=1.0),
+        {"type": "sphere", "radius": 60.0, "thickness": 2.0, **glass},
+        {"type": "sphere", "radius": -90.0, "thickness": 20.0, **glass, "material": "air"},
+        broken(tilt_x=45.0, decenter_y=0.3),
+        {"type": "plane", **mirror},
+        broken(tilt_x=45.0, thickness=-15.0),
+        broken(tilt_y=-20.0, tilt_z=10.0),
+        {"type": "conic", "radius": 90.0, "conic": -0.8, **mirror},
+        broken(tilt_y=-20.0, tilt_x=3.0, order="tilt_first", decenter_x=-0.4, thickness=10.0),
+        {"type": "even_asphere", "radius": 80.0, "conic": 0.0, "a4": 1e-5, **glass,
+         "thickness": 3.0},
+        {"type": "sphere", "radius": -70.0, **glass, "material": "air", "thickness": 4.0},
+        broken(tilt_x=-8.0),
+    ]  # fmt: skip
+    surfaces[-1].pop("thickness", None)
+    elements = {
+        "1": {"surfaces": [2, 3], "tilt_x": 1.0, "decenter_x": 0.1, "shift_z": 0.05},
+        "2": {"surfaces": [8, 11], "tilt_y": 0.5, "decenter_y": -0.1, "pivot": [0.0, 1.0, 2.0]},
+    }
+    return lens_from_prescription(
+        {"surfaces": {str(n): r for n, r in enumerate(surfaces, 1)}, "elements": elements,
+         "sensor": {"distance": 12.0}, "stop": 2}
+    )  # fmt: skip
 
 
 def _own_surface():
@@ -108,6 +171,8 @@ LENSES = {
     "even_aspheres": lambda root: _aspheres(),
     "clipped": lambda root: _clipped(),
     "own_surface": lambda root: _own_surface(),
+    "mirrors": lambda root: _mirrors(),
+    "folded": lambda root: _folded(),
 }
 
 

@@ -1,6 +1,7 @@
-"""An even asphere has the sag s = conic + q²·H(q) with q = r² and H = a4 + a6·q + ....
+"""An even asphere has the sag s = conic + a2·q + q²·H(q) with q = r² and H = a4 + a6·q + ....
 
-Coefficients come in groups of four, so that four steps are unrolled at a time.
+Coefficients come in groups of four, so that four steps are unrolled at a time; behind them a2,
+where there is one.
 """
 
 from collections.abc import Callable
@@ -32,7 +33,7 @@ from dolens.kernels.cpu.layout import (
     UNBOUNDED,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COUNT, SHAPE, SHORT_RECORD
+from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT, SHAPE, SHORT_RECORD
 
 # Work rows: q, H, H' and H''/2; for the cotangents, powers of q and the weight of the slope.
 Q, H, H_SLOPE, H_SECOND, *_ = OWN
@@ -81,25 +82,41 @@ def _horner(real: types.Type) -> tuple[Any, Any]:
     return first, second
 
 
+@cache
+def _square_coefficient(real: types.Type) -> Any:
+    """Compile a2 of a record, zero where it has none."""
+    zero = real(0.0)
+
+    @njit(**OPTIONS)
+    def square_coefficient(record, codes):  # noqa: ANN001, ANN202
+        q = carray(codes, CODE_ROW)
+        if q[COLUMNS] == 0:
+            return zero
+        return carray(shifted(record, COEFFICIENTS + q[COUNT]), 1)[0]
+
+    return square_coefficient
+
+
 def even_asphere_sag(real: types.Type) -> Callable[..., None]:
     """Fill the rows of sag, slopes, and the margin of the conic's branch."""
     _, safe_sqrt, *_ = arithmetic(real)
     horner, _ = _horner(real)
+    square_coefficient = _square_coefficient(real)
     one, two = real(1.0), real(2.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
         count = carray(codes, CODE_ROW)[COUNT]
         horner(w, record, count)
-        c = p[SHAPE]
+        c, a2 = p[SHAPE], square_coefficient(record, codes)
         ec2 = (one + p[SHAPE + 1]) * c * c
         for i in range(BLOCK):
             q, h, d = w[Q + i], w[H + i], w[H_SLOPE + i]
             squared = one - ec2 * q
             root = safe_sqrt(squared)
             both = c / (root * (one + root))
-            twice = both * (one + root) + two * q * (two * h + q * d)
-            w[SAG + i] = both * root * q + q * q * h
+            twice = both * (one + root) + two * (a2 + q * (two * h + q * d))
+            w[SAG + i] = both * root * q + q * (a2 + q * h)
             w[SLOPE_X + i], w[SLOPE_Y + i] = w[POINT_X + i] * twice, w[POINT_Y + i] * twice
             w[MARGIN + i] = squared
 
@@ -112,20 +129,21 @@ def even_asphere_hessian(real: types.Type) -> Callable[..., None]:
     """
     _, safe_sqrt, *_ = arithmetic(real)
     _, horner = _horner(real)
+    square_coefficient = _square_coefficient(real)
     half, one, two, four = real(0.5), real(1.0), real(2.0), real(4.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
         count = carray(codes, CODE_ROW)[COUNT]
         horner(w, record, count)
-        c = p[SHAPE]
+        c, a2 = p[SHAPE], square_coefficient(record, codes)
         ec2 = (one + p[SHAPE + 1]) * c * c
         for i in range(BLOCK):
             x, y, q = w[POINT_X + i], w[POINT_Y + i], w[Q + i]
             h, d, e = w[H + i], w[H_SLOPE + i], w[H_SECOND + i]
             root = safe_sqrt(one - ec2 * q)
             conic = half * c / root
-            slope = conic + q * (two * h + q * d)
+            slope = conic + a2 + q * (two * h + q * d)
             second = half * conic * ec2 / (root * root) + two * h + four * q * d + two * q * q * e
             w[SLOPE_X + i], w[SLOPE_Y + i] = two * x * slope, two * y * slope
             w[SAG_XX + i] = two * slope + four * x * x * second
@@ -136,7 +154,7 @@ def even_asphere_hessian(real: types.Type) -> Callable[..., None]:
 
 
 def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
-    """Fill the cotangents of c, k and the coefficients.
+    """Fill the cotangents of c, k and the coefficients, a2 last.
 
     With R = √(1 - (1+k)c²q): s_c = (q + (1+k)s²)/2R and s_k = c·s²/2R of the conic's sag s, and of
     its derivative in q, c/2R: 1/2R³ and c³q/4R³.
@@ -146,7 +164,7 @@ def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
-        count = carray(codes, CODE_ROW)[COUNT]
+        count, squares = carray(codes, CODE_ROW)[COUNT], carray(codes, CODE_ROW)[COLUMNS]
         cot = carray(cotangents, UNBOUNDED)
         c, e = p[SHAPE], one + p[SHAPE + 1]
         for i in range(BLOCK):
@@ -160,6 +178,10 @@ def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
             cot[OF_SECOND + i] = half * c * (of_sag * inverse * sag * sag + c * c * q * cubed)
             # From here on: q^(j+1) and the weights of q^(j+2) and its derivative.
             w[LOWER + i], w[OF_SLOPE + i] = q, of_slope
+        if squares > 0:
+            out = carray(shifted(cotangents, OF_COEFFICIENTS + BLOCK * count), BLOCK)
+            for i in range(BLOCK):
+                out[i] = w[OF_SAG + i] * w[Q + i] + w[OF_SLOPE + i]
         for j in range(count):
             out = carray(shifted(cotangents, OF_COEFFICIENTS + BLOCK * j), BLOCK)
             power = real(j + 2)

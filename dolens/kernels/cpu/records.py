@@ -8,7 +8,7 @@ from dolens.kernels.table import Code, Failure, Kind, Outline, Slot
 SHIFT, LIMIT, SCALE = Slot.SHIFT, Slot.LIMIT, Slot.SCALE
 EDGE, HALF_X, HALF_Y = Slot.EDGE, Slot.HALF_X, Slot.HALF_Y
 HOLE_X, HOLE_Y = Slot.HOLE_X, Slot.HOLE_Y
-SENSE, TAG = Slot.SENSE, Slot.TAG
+SENSE, SENSE_BEHIND, TAG = Slot.SENSE, Slot.SENSE_BEHIND, Slot.TAG
 STEP_X, STEP_Y, STEP_Z = range(Slot.STEP, Slot.STEP + 3)
 TURN_XX, TURN_XY, TURN_XZ, TURN_YX, TURN_YY, TURN_YZ, TURN_ZX, TURN_ZY, TURN_ZZ = range(
     Slot.TURN, Slot.TURN + 9

@@ -1,12 +1,22 @@
-"""An even asphere has the sag s = conic + q²·H(q) with q = r² and H = a4 + a6·q + ...."""
+"""An even asphere has the sag s = conic + a2·q + q²·H(q) with q = r² and H = a4 + a6·q + ....
+
+Behind the coefficients of H comes a2, where there is one.
+"""
 
 import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
 from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.layout import COUNT, SHAPE
+from dolens.kernels.cuda.layout import COLUMNS, COUNT, SHAPE
 from dolens.kernels.cuda.sums import add_sum
+
+
+@triton.jit
+def _square_coefficient(record, codes, count):
+    """Return a2, zero where the record has none."""
+    has = tl.load(codes + COLUMNS) != 0
+    return tl.load(record + SHAPE + 2 + count, mask=has, other=0.0)
 
 
 @triton.jit
@@ -21,8 +31,9 @@ def even_asphere_sag(record, codes, extras, x, y):
         h = h * q + tl.load(record + SHAPE + 1 + count - i)
     squared = 1.0 - (1.0 + k) * c * c * q
     root = safe_sqrt(squared)
-    twice = divide(c, root) + 2.0 * q * (2.0 * h + q * d)
-    return divide(c * q, 1.0 + root) + q * q * h, x * twice, y * twice, squared
+    a2 = _square_coefficient(record, codes, count)
+    twice = divide(c, root) + 2.0 * (a2 + q * (2.0 * h + q * d))
+    return divide(c * q, 1.0 + root) + q * (a2 + q * h), x * twice, y * twice, squared
 
 
 @triton.jit
@@ -39,7 +50,7 @@ def even_asphere_hessian(record, codes, extras, x, y):
     ec2 = (1.0 + k) * c * c
     root = safe_sqrt(1.0 - ec2 * q)
     conic = divide(0.5 * c, root)
-    slope = conic + q * (2.0 * h + q * d)
+    slope = conic + _square_coefficient(record, codes, count) + q * (2.0 * h + q * d)
     second = divide(0.5 * conic * ec2, root * root) + 2.0 * h + 4.0 * q * d + 2.0 * q * q * e
     return (
         2.0 * x * slope,
@@ -52,7 +63,7 @@ def even_asphere_hessian(record, codes, extras, x, y):
 
 @triton.jit
 def even_asphere_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive):
-    """Add the cotangents of c, k and the coefficients, from those of the sag and its slopes.
+    """Add the cotangents of c, k and the coefficients, a2 last, from those of sag and slopes.
 
     With R = √(1 - (1+k)c²q): s_c = (q + (1+k)s²)/2R and s_k = c·s²/2R of the conic's sag s, and of
     its derivative in q, c/2R: 1/2R³ and c³q/4R³.
@@ -68,8 +79,11 @@ def even_asphere_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, a
     add_sum(sums + SHAPE, 0.5 * of_sag * inverse * (q + e * sag * sag) + cubed, alive)
     of_k = 0.5 * c * (of_sag * inverse * sag * sag + c * c * q * cubed)
     add_sum(sums + SHAPE + 1, of_k, alive)
+    count = tl.load(codes + COUNT)
+    if tl.load(codes + COLUMNS) != 0:
+        add_sum(sums + SHAPE + 2 + count, of_sag * q + of_slope, alive)
     lower = q
-    for i in range(tl.load(codes + COUNT)):
+    for i in range(count):
         upper = lower * q
         add_sum(sums + SHAPE + 2 + i, of_sag * upper + (i + 2.0) * of_slope * lower, alive)
         lower = upper

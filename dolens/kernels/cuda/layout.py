@@ -17,6 +17,7 @@ HALF_Y = tl.constexpr(int(Slot.HALF_Y))
 HOLE_X = tl.constexpr(int(Slot.HOLE_X))
 HOLE_Y = tl.constexpr(int(Slot.HOLE_Y))
 SENSE = tl.constexpr(int(Slot.SENSE))
+SENSE_BEHIND = tl.constexpr(int(Slot.SENSE_BEHIND))
 TAG = tl.constexpr(int(Slot.TAG))
 SHAPE = tl.constexpr(int(Slot.HEADER))  # the first number of a shape
 

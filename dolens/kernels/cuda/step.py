@@ -33,6 +33,7 @@ from dolens.kernels.cuda.layout import (
     REFRACTS,
     SCALE,
     SENSE,
+    SENSE_BEHIND,
     SENSOR,
     SHIFT,
     SPHERE,
@@ -127,7 +128,8 @@ def step(
             (vignetted > 0) | passes(record, codes, x, y), vignetted, tag + VIGNETTED
         )
         if tl.load(codes + REFRACTS) != 0:
-            l, m, n, transmitted = refract(l, m, n, nx, ny, nz, ratio, sense)
+            behind = tl.load(record + SENSE_BEHIND)
+            l, m, n, transmitted = refract(l, m, n, nx, ny, nz, ratio, behind)
             ended = tl.where((ended > 0) | (transmitted > 0.0), ended, tag + TOTALLY_REFLECTED)
     if HAS_CHANGE_AXES & KINDS:
         if kind == CHANGE_AXES:

@@ -4,6 +4,7 @@ from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.base import PackedShape, Surface
 from dolens.optics.surfaces.conic import Conic, Sphere
+from dolens.optics.surfaces.coordinate_break import BREAKS, CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.even_asphere import EvenAsphere
 from dolens.optics.surfaces.plane import Aperture, Plane
 from dolens.optics.surfaces.registry import SURFACES, register_surface, unregister_surface
@@ -11,10 +12,12 @@ from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
 __all__ = [
+    "BREAKS",
     "SURFACES",
     "Aperture",
     "BSpline",
     "Conic",
+    "CoordinateBreak",
     "EvenAsphere",
     "PackedShape",
     "Plane",
@@ -22,6 +25,7 @@ __all__ = [
     "Surface",
     "SurfaceKernel",
     "SurfaceState",
+    "TiltFirstBreak",
     "XYPolynomial",
     "register_surface",
     "unregister_surface",

@@ -31,7 +31,7 @@ class PackedShape(NamedTuple):
     Attributes:
         numbers: scalars and arrays, the latter by rows; None: zero.
         count: coefficients of an asphere or a polynomial, or rows of a spline.
-        columns: of a spline; 1 for a polynomial with a b·z² term.
+        columns: of a spline; 1 for a polynomial with a b·z² term, or an asphere with a2.
         degree: highest power of x or y.
         extras: further integers.
     """
@@ -81,6 +81,7 @@ class Surface(nn.Module):
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
             These three are not inherited, since a subclass may have another sag.
+        changes_axes: whether this is a coordinate break, which light does not meet.
     """
 
     kind: ClassVar[str] = ""
@@ -90,6 +91,7 @@ class Surface(nn.Module):
     optional: ClassVar[tuple[str, ...]] = ()
     rotational: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
+    changes_axes: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -208,7 +210,7 @@ class Surface(nn.Module):
         Args:
             p: parameters.
             ray: at the vertex plane, in the surface's own axes.
-            sense: +1 for light travelling towards +z through the surface, -1 for backward mode.
+            sense: +1 for light that comes towards +z, -1 for light that comes towards -z.
             scale: mm, a length of the size of the aperture; it sets the tolerance near zero.
 
         Returns:
@@ -272,7 +274,7 @@ class Surface(nn.Module):
         ratio: float | Tensor,
         sense: float,
     ) -> Refraction:
-        """Refract rays at points (mm) of the surface; see `snell`."""
+        """Refract or reflect rays at points (mm) of the surface; see `snell`."""
         return snell(direction, cls.normal(p, *point), ratio, sense)
 
 

@@ -18,7 +18,11 @@ _POWER = re.compile(r"a([1-9]\d*)")
 
 @register_surface
 class EvenAsphere(Conic):
-    """The sag is s(r) = conic + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power)."""
+    """The sag is s(r) = conic + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power).
+
+    There may be a term a2·r².  It bends the vertex as a curvature 2·a2 does and goes on otherwise
+    than the conic, so that designs which have one cannot do without it; others should.
+    """
 
     kind = "even_asphere"
     kernel = SurfaceKernel("dolens.kernels.cpu.even_asphere", "dolens.kernels.cuda.even_asphere")
@@ -33,8 +37,8 @@ class EvenAsphere(Conic):
             if match is None:
                 continue
             power = int(match[1])
-            if power < 4 or power % 2:
-                raise InputError(f"'{key}': even aspheric coefficients are a4, a6, a8, ...")
+            if power % 2:
+                raise InputError(f"'{key}': even aspheric coefficients are a2, a4, a6, a8, ...")
             powers.append(power)
         return ["curvature", "conic", *(f"a{power}" for power in sorted(powers))]
 
@@ -58,17 +62,28 @@ class EvenAsphere(Conic):
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """Return c, k, a4, a6, ...: all powers up to the highest, in groups of four."""
+        """Return c, k, a4, a6, ...: all powers up to the highest, in groups of four; then a2."""
         powers = [int(name[1:]) for name in p if _POWER.fullmatch(name)]
         count = -(-(max(powers, default=2) // 2 - 1) // 4) * 4
         coefficients = [p.get(f"a{2 * i + 4}") for i in range(count)]
         numbers = (p["curvature"], p["conic"], *coefficients)
+        if "a2" in p:
+            return PackedShape((*numbers, p["a2"]), count=count, columns=1)
         return PackedShape(numbers, count=count)
 
     @classmethod
+    def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
+        """Return c + 2·a2."""
+        return p["curvature"] + 2.0 * p["a2"] if "a2" in p else p["curvature"]
+
+    @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
-        """Return k·c³/8 + a4."""
-        return Conic.fourth_order_departure.__func__(cls, p) + p.get("a4", 0.0)
+        """Return k·c³/8 + a4, and with a2 also (c³ - (c + 2·a2)³)/8."""
+        departure = Conic.fourth_order_departure.__func__(cls, p) + p.get("a4", 0.0)
+        if "a2" in p:
+            vertex = cls.paraxial_curvature(p)
+            departure = departure + (p["curvature"] ** 3 - vertex**3) / 8.0
+        return departure
 
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
