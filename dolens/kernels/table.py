@@ -1,6 +1,8 @@
 """Kernels see a lens as a table of numbers and codes, with one record for every step of a ray.
 
-A step is a surface, or a change of axes between elements of different poses, or the sensor plane.
+A step is a surface, or a change of axes between elements of different poses, or the sensor plane,
+or a deflection: a surface whose light a law deflects has two steps, one that carries rays to it and
+leaves their directions alone, and one that changes these.
 Steps come in the order that light meets them, so that backward mode is another table, not another
 kernel.  Every step has a row of `codes` (integers) and a record in `values` (numbers): a header of
 fixed slots and then the numbers of its shape.
@@ -23,10 +25,11 @@ class Kind(IntEnum):
     CHANGE_AXES = 0  # the ray is carried to the plane of the next vertex, then turned
     LENS_AXES = 1  # position ← turn·position + step, direction ← turn·direction
     SENSOR = 2  # carried along the line to z = 0, after the shift
-    PLANE = 3  # no numbers
-    SPHERE = 4  # c
-    CONIC = 5  # c, k
-    BY_SAG = 6  # the first code of a `SurfaceKernel` of its own
+    DEFLECT = 3  # where it stands on a surface, a law changes its direction and path
+    PLANE = 4  # no numbers
+    SPHERE = 5  # c
+    CONIC = 6  # c, k
+    BY_SAG = 7  # the first code of a `SurfaceKernel` of its own
 
 
 class Slot:
@@ -66,6 +69,11 @@ class Code:
     COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term, or an asphere a2
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
+    # Of a deflection.  Its record holds its surface's shape, padded to two numbers, then the law's.
+    LAW = 12  # the code of its `LawKernel`
+    BASE = 13  # the kind of the surface that it stands on
+    WAVE = 14  # row of `indices` that holds λ/2π, mm
+    NUMBERS = 15  # where the law's numbers begin in the record
     ROW = 16  # length of a row
 
 
@@ -98,7 +106,8 @@ class SurfaceTable:
     Attributes:
         values: (V,), the records one after the other, and last of all what is added to z of the
             rays that leave the last step, mm; in the rays' precision; differentiable.
-        indices: (media, wavelengths), float64, in the order of travel; differentiable.
+        indices: (media, wavelengths), float64, in the order of travel; differentiable.  Of a lens
+            with deflections a last row holds λ/2π, mm.
         codes: (steps, Code.ROW), int64, on the CPU.
         extras: (E,), int64, on the CPU.
     """

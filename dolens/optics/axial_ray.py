@@ -6,8 +6,9 @@ import torch
 
 from dolens.optics.elements import LENS_AXES, change_axes
 from dolens.optics.rays import Components
+from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.refraction import PlaneRay
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, per_radian
 
 # A ray whose cosine to the axis is smaller does not say from which side it comes.
 _ALONG = 1e-9
@@ -51,7 +52,7 @@ def reversals(system: OpticalSystem, wavelength: float) -> tuple[int, ...]:
             break
         leaving = -sense if number in system.mirrors else sense
         if abs(n) > _ALONG:
-            ray = _through(system, number, ray, sense, leaving, indices)
+            ray = _through(system, number, ray, sense, leaving, indices, wavelength)
         sense = leaving
     return tuple(found)
 
@@ -63,6 +64,7 @@ def _through(
     sense: float,
     leaving: float,
     indices: list[float | torch.Tensor],
+    wavelength: float,
 ) -> Components:
     """Return a ray behind a surface, in its axes."""
     surface = system.surfaces[number - 1]
@@ -73,7 +75,16 @@ def _through(
     t, met = surface.shape.intersect(p, PlaneRay(x, y, l, m, n), sense, size)
     point = (x + t * l, y + t * m, t * n)
     behind = Components(*point, *direction)
-    if system.refracts(number):
+    if surface.deflection is not None:
+        before, after = indices[number - 1], indices[number]
+        media = Media(before, after, per_radian(wavelength, n))
+        *bent, transmitted, _ = surface.deflect(
+            point, (l, m, n), media, Travel(sense, leaving, True)
+        )
+        behind = Components(*point, *bent)
+        if transmitted is not None:
+            met = transmitted if met is None else torch.minimum(met, transmitted)
+    elif system.refracts(number):
         ratio = indices[number - 1] / indices[number]
         *bent, transmitted = surface.shape.refract(p, point, (l, m, n), ratio, leaving)
         behind = Components(*point, *bent)

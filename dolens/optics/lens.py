@@ -16,12 +16,13 @@ from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
-from dolens.optics.mirrors import media_of
+from dolens.optics.mirrors import MIRROR, media_of
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
-from dolens.optics.surfaces.state import SurfaceState
+from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
+from dolens.optics.vergence import with_vergences
 
 
 class Lens(LensRays, LensViews, nn.Module):
@@ -95,6 +96,11 @@ class Lens(LensRays, LensViews, nn.Module):
             media_of(self.materials)
         except InputError as error:
             raise InputError(f"lens '{name}': {error}") from None
+        for number, (surface, medium) in enumerate(zip(surfaces, materials[1:], strict=True), 1):
+            if surface.law is not None and medium is MIRROR:
+                raise InputError(
+                    f"lens '{name}': surface {number}: a {surface.law.kind} cannot be a mirror"
+                )
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
         )
@@ -170,7 +176,16 @@ class Lens(LensRays, LensViews, nn.Module):
             aperture = surface.aperture
             if edge is not None:
                 aperture = aperture.resized(float(edge.detach()))
-            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge))
+            law = surface.law and LawState(surface.law, parameters)
+            if surface.phase is not None:
+                own = {**surface.phase._parameters, **surface.phase._buffers}
+                if values:
+                    own = {
+                        name: values.pop(f"surfaces.{number}.phase.{name}", value)
+                        for name, value in own.items()
+                    }
+                law = LawState(type(surface.phase), own)
+            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge, law))
         thicknesses = [
             values.pop(f"thicknesses.{number}", gap) for number, gap in self.thicknesses.items()
         ]
@@ -187,7 +202,7 @@ class Lens(LensRays, LensViews, nn.Module):
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
         materials, mirrors = media_of(self.materials)
-        return OpticalSystem(
+        system = OpticalSystem(
             surfaces,
             thicknesses,
             sensor_distance,
@@ -198,6 +213,7 @@ class Lens(LensRays, LensViews, nn.Module):
             mirrors,
             self.reversals,
         )
+        return with_vergences(system, self.primary_wavelength, self.object_distance)
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.paraxial_recurrence import TwoRays, behind_surfaces
+from dolens.optics.paraxial_surfaces import curvatures_of, powers_of
 from dolens.optics.system import OpticalSystem
 
 
@@ -93,11 +94,11 @@ def _unit_rays_behind(
     system: OpticalSystem, wavelength: float | Tensor, first: int, last: int
 ) -> TwoRays:
     """Trace the unit rays from just before surface `first` to just after `last`."""
-    surfaces = system.surfaces[first - 1 : last]
     return behind_surfaces(
-        [s.shape.paraxial_curvature(s.parameters) for s in surfaces],
+        curvatures_of(system, first, last),
         system.thicknesses[first - 1 : max(last - 1, 0)],
         system.signed_indices(wavelength)[first - 1 : last + 1],
+        powers_of(system, wavelength, first, last),
     )
 
 

@@ -43,6 +43,18 @@ class Form(NamedTuple):
     sizes: tuple[torch.Size | None, ...]
 
 
+class LawForm(NamedTuple):
+    """A law of deflection without its numbers.
+
+    Attributes:
+        code: of its kernel.
+        sizes: the shape of each number's tensor; None: the number is zero.
+    """
+
+    code: int
+    sizes: tuple[torch.Size | None, ...]
+
+
 class Structure(NamedTuple):
     """The structure of a lens, which the layout of the records depends on.
 
@@ -57,6 +69,7 @@ class Structure(NamedTuple):
         first: number of the first surface that is packed, as the prescription counts.
         last: number of the last.
         to_sensor: go on to the sensor plane (forward only).
+        laws: what deflects light at each surface in the place of Snell's law, or None.
     """
 
     forms: tuple[Form, ...]
@@ -69,14 +82,16 @@ class Structure(NamedTuple):
     first: int
     last: int
     to_sensor: bool
+    laws: tuple[LawForm | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Records:
     """Records as constants plus signed numbers of the lens: values[places] += signs·x[sources].
 
-    The lens's numbers x come in this order: the scalars of all surfaces, the gaps and the sensor's
-    distance; the arrays of all surfaces; then step (3) and turn (9) of each change of axes.
+    The lens's numbers x come in this order: the scalars of all surfaces, those of all laws, the
+    gaps and the sensor's distance; the arrays of all surfaces; then step (3) and turn (9) of each
+    change of axes.
 
     Attributes:
         constants: (V,), float64.
@@ -86,6 +101,7 @@ class Records:
         codes: (steps, Code.ROW), int64; shared, not to be written to.
         extras: int64; likewise.
         media: places in `materials`, in the order of travel.
+        waves: whether a row of λ/2π follows those of the media.
         turns: surfaces whose axes rays leave and enter, the sensor's being last of all; 0 stands
             for the lens's own axes, and a last pair (number, 0) for rays that end in them.
     """
@@ -97,6 +113,7 @@ class Records:
     codes: Tensor
     extras: Tensor
     media: tuple[int, ...]
+    waves: bool
     turns: tuple[tuple[int, int], ...]
 
 
@@ -128,6 +145,10 @@ class _Writer:
         for of_surface in sizes:
             self.scalar.append(place)
             place += sum(size == () for size in of_surface)
+        self.of_law, self.waves = [], False
+        for law in structure.laws:
+            self.of_law.append(place)
+            place += 0 if law is None else sum(size is not None for size in law.sizes)
         self.gaps = place
         place += len(structure.forms)
         for of_surface in sizes:
@@ -153,11 +174,17 @@ class _Writer:
             row = self.step(s.forms[number - 1].kind, medium, medium + 1, number)
             if then == line:
                 self.shift(row, at, number)
-            self.constants[row[Code.OFFSET] + Slot.SENSE_BEHIND] = s.sense * s.senses[behind]
+            sense_behind = s.sense * s.senses[behind]
+            self.constants[row[Code.OFFSET] + Slot.SENSE_BEHIND] = sense_behind
+            law = s.laws[number - 1]
             bends = s.materials[before] != s.materials[behind] or number in s.mirrors
-            row[Code.REFRACTS] = int(bends)
+            row[Code.REFRACTS] = int(bends and law is None)
             self.aperture(row, s.apertures[number - 1])
             self.shape(row, number)
+            if law is not None:
+                row = self.step(Kind.DEFLECT, medium, medium + 1, number)
+                self.constants[row[Code.OFFSET] + Slot.SENSE_BEHIND] = sense_behind
+                self.deflection(row, number, law)
             line, now, at = then, number, number
         if s.to_sensor:
             self.media.append(len(s.forms))
@@ -166,6 +193,9 @@ class _Writer:
         else:
             self.media.append(s.first - 1)
         self.leave(line, now, at, len(numbers))
+        for row in self.codes:
+            if row[Code.KIND] == Kind.DEFLECT:
+                row[Code.WAVE] = len(self.media)
         places, sources, signs = zip(*self.entries, strict=True) if self.entries else ((), (), ())
         return Records(
             constants=tensor(self.constants, np.float64),
@@ -175,6 +205,7 @@ class _Writer:
             codes=tensor(self.codes, np.int64).reshape(-1, Code.ROW),
             extras=tensor([*self.extras, 0], np.int64),
             media=tuple(self.media),
+            waves=self.waves,
             turns=tuple(self.turns),
         )
 
@@ -213,6 +244,22 @@ class _Writer:
                 self.add(len(self.constants), source, count)
                 scalar, array = (scalar + 1, array) if size == () else (scalar, array + count)
             self.constants += [0.0] * count
+        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET]
+
+    def deflection(self, row: list[int], number: int, law: LawForm) -> None:
+        """The numbers of a surface's shape, and those of its law."""
+        self.waves = True
+        form = self.structure.forms[number - 1]
+        self.shape(row, number)
+        self.constants += [0.0] * (2 - len(form.sizes))
+        row[Code.LAW], row[Code.BASE] = law.code, form.kind
+        row[Code.NUMBERS] = len(self.constants) - row[Code.OFFSET]
+        source = self.of_law[number - 1]
+        for size in law.sizes:
+            if size is not None:
+                self.add(len(self.constants), source)
+                source += 1
+            self.constants.append(0.0)
         row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET]
 
     def add(self, place: int, source: int, count: int = 1, sign: float = 1.0) -> None:

@@ -1,5 +1,6 @@
 """A lens as pure functions see it: tensors and names, no state."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,6 +12,15 @@ from dolens.optics.broken_axes import GlobalAxes, broken_axes
 from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.materials import Medium
 from dolens.optics.surfaces.state import SurfaceState
+
+
+def per_radian(wavelength: float | Tensor, like: Tensor) -> float | Tensor:
+    """Return λ/2π in mm, the path in vacuum of one radian, of a wavelength in nm.
+
+    A tensor of wavelengths gives one in the precision of `like`, and on its device.
+    """
+    length = wavelength * (1e-6 / (2.0 * math.pi))
+    return length.to(like) if isinstance(length, Tensor) else length
 
 
 @dataclass(frozen=True)
@@ -138,7 +148,8 @@ class OpticalSystem:
     def rotationally_symmetric(self) -> bool:
         """Return whether nothing in the lens singles out a direction across the axis."""
         surfaces = all(s.shape.rotational and s.aperture.rotational for s in self.surfaces)
-        return surfaces and not self.elements
+        laws = all(s.deflection is None or s.deflection.law.rotational for s in self.surfaces)
+        return surfaces and laws and not self.elements
 
     def traced_by(self, backend: str) -> "OpticalSystem":
         """The same lens, traced by another implementation."""
@@ -148,10 +159,7 @@ class OpticalSystem:
         """The same lens in double precision; gradients flow back to its own tensors."""
         return replace(
             self,
-            surfaces=[
-                replace(s, parameters={n: p.double() for n, p in s.parameters.items()})
-                for s in self.surfaces
-            ],
+            surfaces=[s.double() for s in self.surfaces],
             thicknesses=[gap.double() for gap in self.thicknesses],
             sensor_distance=self.sensor_distance.double(),
             elements=[

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
 from dolens.optics.rays import Components, Rays, Status, TracedRays
+from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, per_radian
 
 
 class Margins(NamedTuple):
@@ -117,6 +118,7 @@ def trace_surfaces(
     indices, places, senses = system.indices(wavelength), system.axes, system.senses
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
+    forward = sense > 0.0
     margins: list[Margins] = []
     points: list[tuple[Tensor, Tensor, Tensor]] = []
     # Positions count from the vertex at hand: float32 then errs by the sag's rounding only.
@@ -159,7 +161,14 @@ def trace_surfaces(
         if record:
             points.append(to_lens_axes(Components(x, y, z, l, m, n), axes)[:3])
         transmitted = None
-        if system.refracts(number):
+        if surface.deflection is not None:
+            media = Media(before, after, per_radian(wavelength, ray.n))
+            travel = Travel(arriving, leaving, forward)
+            l, m, n, transmitted, added = surface.deflect(  # noqa: E741
+                (x, y, z), (l, m, n), media, travel
+            )
+            path = None if path is None else path + added
+        elif system.refracts(number):
             l, m, n, transmitted = shape.refract(  # noqa: E741
                 parameters, (x, y, z), (l, m, n), before / after, leaving
             )

@@ -17,6 +17,8 @@ Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind th
 `material: mirror` makes the surface reflect; behind it light travels towards -z, and thicknesses
 are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
 that stands behind them (see breaks.py).
+A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
+lens (see deflections.py).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
@@ -43,6 +45,14 @@ from dolens.prescriptions.checks import (
     as_numbers,
     require_mapping,
 )
+from dolens.prescriptions.deflections import (
+    PHASE_KEY,
+    is_paraxial_lens,
+    phase_from,
+    phase_row,
+    power_row,
+    with_power,
+)
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
@@ -63,7 +73,7 @@ _LENS_KEYS = (
     "sensor",
     *SYSTEM_DATA_KEYS,
 )
-_SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, "thickness", "material", "note")
+_SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
 
 
@@ -153,8 +163,11 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
             rows[number] = break_row(surface) | _gap(lens, number)
             continue
         row: dict[str, Any] = {"type": surface.kind}
-        for key, value in (*surface.named_parameters(), *surface.named_buffers()):
+        for key, value in (*surface._parameters.items(), *surface._buffers.items()):
             number_value = value.detach().tolist()
+            if key == "power" and surface.law is not None:
+                row |= power_row(number_value)
+                continue
             if key == "curvature":
                 row["radius"] = _radius(number_value)
                 if 1.0 / row["radius"] != number_value:
@@ -163,6 +176,8 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
                     row["curvature"] = number_value
             else:
                 row[key] = number_value
+        if surface.phase is not None:
+            row[PHASE_KEY] = phase_row(surface.phase)
         row |= aperture_rows(surface.aperture)
         row |= _gap(lens, number)
         row["material"] = material.name
@@ -198,6 +213,8 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
         )
     shape = SURFACES[kind]
     try:
+        if is_paraxial_lens(row):
+            row = with_power(row)
         names = shape.parameter_names(row)
         check_keys(row, (*_SURFACE_KEYS, *names), place)
         values = {
@@ -209,7 +226,12 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
             values["curvature"] = _curvature(row)
         elif not math.isinf(as_number(row.get("radius", math.inf), "'radius'")):
             raise InputError(f"a surface of type '{kind}' has no 'radius'")
-        return shape(clear_aperture(row, place), values, dtype)
+        surface = shape(clear_aperture(row, place), values, dtype)
+        if row.get(PHASE_KEY) is not None:
+            if shape.law is not None:
+                raise InputError(f"a surface of type '{kind}' cannot have a 'phase'")
+            surface.phase = phase_from(row[PHASE_KEY], place, dtype)
+        return surface
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None

@@ -78,6 +78,7 @@ def _aperture_planes(prescription: Prescription, new: str) -> list[str]:
     before = prescription.get("object_material", "air")
     for n, row in prescription["surfaces"].items():
         flat = row.get("type", "sphere") in ("plane", "sphere") and _is_flat(row)
+        flat = flat and row.get("phase") is None
         empty = canonical(str(row.get("material"))) == canonical(str(before))
         before = row.get("material")
         if row.get("type") == "aperture" and str(n) != stop:

@@ -183,4 +183,4 @@ def _refuse_own_axes(block: SurfaceBlock) -> None:
 
 def _is_dummy(row: dict[str, Any], before: str | None) -> bool:
     flat = row["type"] == "plane" or (row["type"] == "sphere" and row.get("radius") == math.inf)
-    return flat and row["material"] == before
+    return flat and "phase" not in row and row["material"] == before

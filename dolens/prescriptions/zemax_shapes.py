@@ -11,6 +11,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_diffractive import BINARY_1, BINARY_2, GRATING, PARAXIAL
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_shape import ZemaxShape
 from dolens.prescriptions.zemax_standard import STANDARD
@@ -19,7 +20,11 @@ from dolens.prescriptions.zemax_xy_polynomial import XY_POLYNOMIAL
 
 # One line here makes a shape known to the reader and the writer.
 SHAPES: dict[str, ZemaxShape] = {
-    shape.type: shape for shape in (STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL)
+    shape.type: shape
+    for shape in (
+        *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL),
+        *(PARAXIAL, GRATING, BINARY_1, BINARY_2),
+    )
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
 _NOT_HELD = {
@@ -33,7 +38,6 @@ _NOT_HELD = {
     "CONJUGAT": "a surface given by two conjugate points",
     "CUBICSPL": "a cubic spline",
     "CYLINDER": "a cylinder",
-    "DGRATING": "a diffraction grating",
     "EASPHERE": "an extended asphere",
     "EGRATING": "an elliptical grating",
     "ELLIPGRA": "an elliptical grating",
@@ -53,7 +57,7 @@ _NOT_HELD = {
     "NONSEQCO": "a non-sequential component",
     "ODDASPHE": "an odd asphere",
     "ODDCOSIN": "an odd cosine surface",
-    "PARAX": "a paraxial lens",
+    "PARAX_XY": "a paraxial lens of two focal lengths",
     "PERIODIC": "a periodic surface",
     "POLYNOMI": "a polynomial surface",
     "QED_TYPE": "a Forbes asphere",
@@ -107,11 +111,17 @@ def shape_of_row(row: Mapping[str, Any], place: str) -> ZemaxShape:
     Raises:
         InputError: a `.zmx` file cannot hold its `type`.
     """
-    kind = str(row.get("type", "sphere"))
+    kind, phase = str(row.get("type", "sphere")), (row.get("phase") or {}).get("type", "")
     for shape in SHAPES.values():
-        if kind in shape.kinds:
+        if kind in shape.kinds and shape.phase == phase:
             return shape
-    allowed = dict.fromkeys(kind for shape in SHAPES.values() for kind in shape.kinds)
+    if phase:
+        raise InputError(
+            f"{place}: a .zmx file cannot hold a phase of type '{phase}' on a surface of type "
+            f"'{kind}'"
+        )
+    plain = (shape for shape in SHAPES.values() if not shape.phase)
+    allowed = dict.fromkeys(kind for shape in plain for kind in shape.kinds)
     raise InputError(
         f"{place}: a .zmx file cannot hold type '{kind}' (allowed: {', '.join(allowed)})"
     )

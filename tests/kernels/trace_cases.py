@@ -148,6 +148,37 @@ def _clipped():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
 
 
+def _diffractive():
+    """A radial phase on an asphere and an XY phase on a conic, and an ideal lens behind them."""
+    front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "phase": {
+        "type": "radial", "norm_radius": 5.0, "p2": -250.0, "p4": 30.0, "p6": -8.0}}  # fmt: skip
+    back = {"type": "conic", "radius": -70.0, "conic": 0.6, "thickness": 4.0, "phase": {
+        "type": "xy", "order": -1, "norm_radius": 4.0, "x": 60.0, "x2": 30.0, "xy": -9.0,
+        "y2": 25.0, "x2y": 4.0, "y4": -3.0}}  # fmt: skip
+    lens = {"type": "paraxial_lens", "focal_length": 60.0, "semi_diameter": 6.0, "material": 1.3}
+    surfaces = {
+        "1": {"semi_diameter": 5.0, "thickness": 3.0, "material": _GLASS, **front},
+        "2": {"semi_diameter": 5.0, "material": "air", **back},
+        "3": lens,
+    }
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 25.0}})
+
+
+def _spectrometer():
+    """A grating that transmits, one on a concave mirror, whose higher orders vanish, and an ideal
+    lens that the light comes back to.
+    """
+    surfaces = {
+        "1": {"type": "plane", "semi_diameter": 6.0, "thickness": 40.0, "material": "air",
+              "phase": {"type": "grating", "grooves": 100.0, "order": -1}},
+        "2": {"type": "sphere", "radius": -150.0, "semi_diameter": 12.0, "thickness": -30.0,
+              "material": "mirror", "phase": {"type": "grating", "grooves": 1740.0}},
+        "3": {"type": "paraxial_lens", "focal_length": 50.0, "semi_diameter": 90.0,
+              "material": "air"},
+    }  # fmt: skip
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": -20.0}})
+
+
 def _plate(root):
     lens = load_lens(root / "conf/lens/wavefront_coding.yaml", F64)
     with torch.no_grad():
@@ -171,6 +202,8 @@ LENSES = {
     "even_aspheres": lambda root: _aspheres(),
     "clipped": lambda root: _clipped(),
     "own_surface": lambda root: _own_surface(),
+    "diffractive": lambda root: _diffractive(),
+    "spectrometer": lambda root: _spectrometer(),
     "mirrors": lambda root: _mirrors(),
     "folded": lambda root: _folded(),
 }

@@ -13,6 +13,7 @@ import mpmath
 import numpy as np
 
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
+from tests.optics import exact_deflection as deflection
 
 mp = mpmath.mp.clone()  # a precision of its own
 mp.dps = 80
@@ -71,9 +72,9 @@ def trace(lens, values, origin, direction, wavelength, near=None):
         own = {
             name.rsplit(".", 1)[1]: v
             for name, v in values.items()
-            if name.startswith(f"surfaces.{number}.")
+            if name.startswith(f"surfaces.{number}.") and ".phase." not in name
         }
-        own |= {name: tuple(mp.mpf(float(k)) for k in b) for name, b in surface.named_buffers()}
+        own |= {name: tuple(mp.mpf(float(k)) for k in b) for name, b in surface._buffers.items()}
         guess = None if near is None else near[i]
         t, sx, sy = _meet(surface.kind, own, surface.semi_diameter, q, e, guess, sense)
         if t is None:
@@ -86,7 +87,15 @@ def trace(lens, values, origin, direction, wavelength, near=None):
             status, surface_number = VIGNETTED, i + 1
         normal = mp.matrix([-sx, -sy, 1]) / mp.sqrt(1 + sx**2 + sy**2)
         cosine = (e.T * normal)[0]
-        if lens.materials[i + 1].name == "mirror":
+        if deflection.stands_on(surface):
+            behind = -sense if lens.materials[i + 1].name == "mirror" else sense
+            length = mp.mpf(wavelength) / 10**6
+            at = deflection.Place(mp, lens, values, i, indices, length, sense, behind, _sag)
+            e, more = deflection.deflect(at, q, e, normal)
+            if e is None:
+                return TIR, i + 1, None, None, None
+            path, sense = path + more, behind
+        elif lens.materials[i + 1].name == "mirror":
             e = e - 2 * cosine * normal
             sense = -sense
         else:
@@ -170,7 +179,7 @@ def _sag(kind, p, x, y):
         return mp.fsum(
             p[f"coefficients[{j},{i}]"] * v * u for j, v in by.items() for i, u in bx.items()
         )
-    if kind in ("plane", "aperture"):
+    if kind in ("plane", "aperture", "paraxial_lens"):
         return mp.mpf(0)
     if kind == "xy_polynomial":
         total = mp.mpf(0)
@@ -216,7 +225,7 @@ def _meet(kind, p, semi_diameter, q, e, guess, sense):
 
     With the sag's slopes there; three times None where there is no such point.
     """
-    if kind in ("plane", "aperture"):
+    if kind in ("plane", "aperture", "paraxial_lens"):
         return (None,) * 3 if sense * e[2] <= 0 else (-q[2] / e[2], mp.mpf(0), mp.mpf(0))
     roots = _quadric_roots if kind in ("sphere", "conic") else _bracketed_roots
     crossing = []

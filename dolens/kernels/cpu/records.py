@@ -21,13 +21,16 @@ KIND, OFFSET, LENGTH = Code.KIND, Code.OFFSET, Code.LENGTH
 BEFORE, AFTER, REFRACTS = Code.BEFORE, Code.AFTER, Code.REFRACTS
 OUTLINE, HOLE = Code.EDGE, Code.HOLE
 COUNT, COLUMNS, DEGREE = Code.COUNT, Code.COLUMNS, Code.DEGREE
+WAVE, NUMBERS = Code.WAVE, Code.NUMBERS
 # The CPU's rows go on with addresses: of the step's compiled functions, and of its extras.
 FORWARD, ADJOINT, SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS, EXTRAS_ADDRESS = range(
     Code.ROW, Code.ROW + 6
 )
 # Whether a surface given by its sag is met from its conic, and whether it has a stencil.
 STARTS_ON_CONIC, STENCIL = Code.ROW + 6, Code.ROW + 7
-CODE_ROW = Code.ROW + 8
+# Block functions of a phase.
+PHASE_AND_SLOPES, PHASE_HESSIAN, PHASE_PARAMETERS = range(Code.ROW + 8, Code.ROW + 11)
+CODE_ROW = Code.ROW + 11
 
 CHANGE_AXES, LENS_AXES = int(Kind.CHANGE_AXES), int(Kind.LENS_AXES)
 CIRCLE, RECTANGLE = int(Outline.CIRCLE), int(Outline.RECTANGLE)

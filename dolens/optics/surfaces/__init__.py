@@ -6,26 +6,35 @@ from dolens.optics.surfaces.base import PackedShape, Surface
 from dolens.optics.surfaces.conic import Conic, Sphere
 from dolens.optics.surfaces.coordinate_break import BREAKS, CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.even_asphere import EvenAsphere
+from dolens.optics.surfaces.paraxial_lens import ParaxialLens
+from dolens.optics.surfaces.phase import PHASES, Grating, Phase, RadialPhase, XYPhase
 from dolens.optics.surfaces.plane import Aperture, Plane
 from dolens.optics.surfaces.registry import SURFACES, register_surface, unregister_surface
-from dolens.optics.surfaces.state import SurfaceState
+from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
 __all__ = [
     "BREAKS",
+    "PHASES",
     "SURFACES",
     "Aperture",
     "BSpline",
     "Conic",
     "CoordinateBreak",
     "EvenAsphere",
+    "Grating",
+    "LawState",
     "PackedShape",
+    "ParaxialLens",
+    "Phase",
     "Plane",
+    "RadialPhase",
     "Sphere",
     "Surface",
     "SurfaceKernel",
     "SurfaceState",
     "TiltFirstBreak",
+    "XYPhase",
     "XYPolynomial",
     "register_surface",
     "unregister_surface",

@@ -8,7 +8,7 @@ reaches; their gradient is cut off where the trace ends.
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,10 @@ from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay, Refraction, snell
+
+if TYPE_CHECKING:
+    from dolens.optics.surfaces.deflection import Law
+    from dolens.optics.surfaces.phase import Phase
 
 Parameters = Mapping[str, Tensor]
 
@@ -82,6 +86,9 @@ class Surface(nn.Module):
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
             These three are not inherited, since a subclass may have another sag.
         changes_axes: whether this is a coordinate break, which light does not meet.
+        law: what deflects light in the place of Snell's law, by the surface's own parameters; see
+            `dolens.optics.surfaces.deflection`.
+        phase: a grating or a diffractive lens on this surface, or None.
     """
 
     kind: ClassVar[str] = ""
@@ -92,6 +99,8 @@ class Surface(nn.Module):
     rotational: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
     changes_axes: ClassVar[bool] = False
+    law: ClassVar["type[Law] | None"] = None
+    phase: "Phase | None"
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -109,6 +118,7 @@ class Surface(nn.Module):
         if not isinstance(aperture, ClearAperture):
             aperture = ClearAperture(Circle(float(aperture)))
         self.aperture = aperture
+        self.phase = None
         for name, value in parameters.items():
             tensor = tensor_of(value, name, dtype)
             if name in self.constants:
