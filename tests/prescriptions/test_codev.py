@@ -312,3 +312,35 @@ def test_a_tilted_image():
     }  # fmt: skip
     assert found["surfaces"]["2"]["thickness"] == 40.0
     assert found["sensor"]["distance"] == 1.5
+
+
+def test_a_polynomial_in_x_and_y():
+    """Coefficient ((m + n)² + m + 3n)/2 + 1 is that of x^m·y^n."""
+    first = "S 0 4 517.642\n STO\n SPS XYP\n SCO C1 0.0; SCO C4 1e-3; SCO C5 0.0; SCO C8 -2e-5"
+    found = prescription(first, "S 0 40", head="RDM;EPD 8;DIM C\n")
+    row = found["surfaces"]["1"]
+    assert row["type"] == "xy_polynomial"
+    assert {key: row[key] for key in row if key[0] in "xy"} == {
+        "x2": 1e-4,
+        "x2y": pytest.approx(-2e-7, rel=1e-15),
+    }
+
+
+def test_a_forbes_asphere():
+    """The numbers of CODE V's listing of a three-mirror anastigmat: NRADIUS, QB4, QB6."""
+    first = "S -449.67012 9 REFL\n STO\n SPS QBF\n SCO C1 189.86; SCC C1 100; SCO C3 0.42605"
+    row = prescription(first + "\n SCO C4 -0.016782", "S 0 40")["surfaces"]["1"]
+    assert row["type"] == "q_bfs"
+    assert row["normalization_radius"] == 189.86
+    assert (row["q0"], row["q1"]) == (0.42605, -0.016782)
+
+
+def test_a_diffractive_lens(tmp_path):
+    """A kinoform's power is -2·m·C1·λ/HWL: the numbers of Edmund Optics' hybrid 65-988."""
+    doe = "DIF DOE\n HOR 1.0\n HWL 587.5618; HCT R\n HCO C1 -0.001807322521767816; HCC C1 100"
+    path = tmp_path / "lens.seq"
+    path.write_text(system(f"S 0 1\n STO\n CIR 6\n {doe}", "S 0 99\n CIR 8"))
+    lens = load_lens(path)
+    for wavelength in (486.1327, 587.5618, 656.2725):
+        power = 2.0 * 0.001807322521767816 * wavelength / 587.5618
+        assert float(lens.first_order(wavelength).efl) == pytest.approx(1.0 / power, rel=1e-12)

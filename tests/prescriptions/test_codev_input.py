@@ -8,9 +8,10 @@ from tests.prescriptions.samples import require_refused
 
 LAST = "S -50 40\n CIR 5"
 REFUSED = {
-    "S 50 4 517.642\n STO\n SPS ODD": "SPS ODD: a special surface is not held",
+    "S 50 4 517.642\n STO\n SPS ODD": "an odd asphere is not held (SPS ODD)",
     "S 50 4 517.642\n STO\n XTO": "a toroid is not held",
-    "S 50 4 517.642\n DIF DOE": "DIF DOE: a diffractive surface is not held",
+    "S 50 4 517.642\n DIF HOE": "a diffractive surface of this kind is not held (DIF HOE R",
+    "S 50 4 517.642\n SPS XYP; SCO C4 1": "a polynomial in x and y on a curved surface",
     "S 50 4 517.642\n GRT": "a diffraction grating is not held",
     "S 50 4 517.642\n ASP; CUF 0.1": "a Fresnel surface is not held (CUF)",
     "S 50 4 517.642\n FOO 1": "command FOO is not known, and may bend rays",

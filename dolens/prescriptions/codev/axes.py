@@ -70,6 +70,11 @@ class Axes:
                 raise InputError(f"{place}: BEN about two axes at once is not held")
             self.after = _break(turns)
 
+    @property
+    def is_single(self) -> bool:
+        """Return whether there is one break, in front of the surface or behind it."""
+        return (self.before is None) != (self.after is None)
+
 
 def break_words(row: dict[str, Any], place: str) -> list[str]:
     """Return the lines of a dummy surface whose axes, read again, are those of a break.

@@ -9,7 +9,8 @@ SYSTEM = (
 # Of one surface: the one whose lines they follow, or the one that `S4` names.
 SURFACE = (
     *("RDY", "CUY", "THI", "GLA", "RMD", "STO", "SLB", "SPH", "CON", "ASP", "K", "PIM"),
-    *("A", "B", "C", "D", "E", "F", "G", "H", "J", "CUF"),
+    *("A", "B", "C", "D", "E", "F", "G", "H", "J", "CUF", "SPS", "SCO"),
+    *("DIF", "HOR", "HWL", "HCT", "HCO"),
     *("CIR", "REX", "REY", "ELX", "ELY", "ADX", "ADY", "ARO"),
     *("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "XOD", "YOD", "ZOD", "DAR", "BEN", "REV"),
 )
@@ -31,17 +32,10 @@ REFUSED = {
     "AAS": "an anamorphic asphere",
     "CUX": "a second radius, across x",
     "RDX": "a second radius, across x",
-    "SPS": "a special surface",
-    "SCO": "the coefficients of a special surface",
     "SPL": "a spline surface",
     "UDS": "a surface of the user's own program",
     "ZRN": "a Zernike surface",
-    "DIF": "a diffractive surface",
     "HOE": "a hologram",
-    "HOR": "a diffraction order",
-    "HWL": "the wavelength of a diffractive surface",
-    "HCT": "a diffractive phase",
-    "HCO": "the coefficients of a diffractive phase",
     "GRT": "a diffraction grating",
     "GRO": "a diffraction order",
     "GRS": "the spacing of a diffraction grating",

@@ -109,20 +109,16 @@ def _rows(
         else:
             shift = own.shift_before
         gap = surface.gap + own.shift_after
-        idle = medium == surface.material and _is_idle(block, surface)
-        if own.before is not None:
-            found.append(own.before, gap if idle and own.after is None else Fraction(0))
-            if idle and own.after is None:
-                continue
-        if own.before is None and own.after is not None and idle:
-            found.append(own.after, gap)
+        note = {"note": surface.label} if surface.label else {}
+        if medium == surface.material and _is_idle(block, surface) and own.is_single:
+            found.append((own.before or own.after or {}) | note, gap)
             continue
+        if own.before is not None:
+            found.append(own.before, Fraction(0))
         place = f"{where}: surface {block.label}"
-        row = surface.row | {"material": surface.material}
+        row = surface.row | {"material": surface.material} | note
         if not (beam and surface.stop) or has_apertures(block):
             row |= read_apertures(block, factor, place)
-        if surface.label:
-            row["note"] = surface.label
         if surface.stop:
             found.stop = len(found.rows) + 1
         found.append(row, gap if own.after is None else Fraction(0))

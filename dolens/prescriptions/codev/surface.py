@@ -8,6 +8,7 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.prescriptions.codev.file import Block, CodeVFile
 from dolens.prescriptions.codev.glass import read_glass
+from dolens.prescriptions.codev.special import phase_row, special_shape
 from dolens.prescriptions.codev.text import unquoted
 from dolens.prescriptions.decimals import (
     curvature_in_text,
@@ -72,7 +73,8 @@ def read_surface(
     material = _material(block, file, before, used, place)
     medium = before if material == "mirror" else material
     size = _curvature(block, factor, place)
-    row = _shape(block, size, stop and material == before, factor, place)
+    phase = phase_row(block, factor, place)
+    row = _shape(block, size, stop and material == before and not phase, factor, place) | phase
     slb = block.commands.get("SLB")
     label = " ".join(map(unquoted, slb[-1].words)).strip() if slb else ""
     curvature = row.get("curvature", 1.0 / row["radius"] if row.get("radius") else 0.0)
@@ -89,7 +91,7 @@ def curvature_row(block: Block, factor: Fraction, place: str) -> dict[str, float
 
 def shape_is_given(block: Block) -> bool:
     """Return whether a block names a shape or coefficients."""
-    return any(key in block.commands for key in ("SPH", "CON", "ASP", "K", *_COEFFICIENTS))
+    return any(key in block.commands for key in ("SPH", "CON", "ASP", "K", "SPS", *_COEFFICIENTS))
 
 
 def conic_constant(block: Block, place: str) -> float:
@@ -136,6 +138,8 @@ def _shape(
     """Return type, radius, conic constant and coefficients."""
     if any(exact(word, f"{place}: CUF") for word in _words(block, "CUF")):
         raise InputError(f"{place}: a Fresnel surface is not held (CUF)")
+    if "SPS" in block.commands:
+        return special_shape(block, size, factor, place)
     if "ASP" in block.commands or any(key in block.commands for key in _COEFFICIENTS):
         conic = {"conic": conic_constant(block, place)}
         return {"type": "even_asphere", **_given(size), **conic} | _powers(block, factor, place)
