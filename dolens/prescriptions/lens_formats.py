@@ -109,7 +109,7 @@ def read_lens(data: bytes, path: str | Path) -> ReadPrescription:
     named = next((each for each in FORMATS if suffix in each.suffixes), None)
     if named is not None and named.name == "dolens YAML":
         # Anything may stand in YAML's texts, and its loader says best what is wrong with it.
-        return named.read(_decoded_yaml(data, where), where)
+        return named.read(_utf_8(data, where, "YAML"), where)
     text = decode_zemax(data, where).removeprefix("\ufeff")
     begin = text[:_LOOKED_AT]
     by_content = next((each for each in FORMATS if each.signs and each.signs.search(begin)), None)
@@ -118,6 +118,8 @@ def read_lens(data: bytes, path: str | Path) -> ReadPrescription:
         raise InputError(
             f"{where}: is no lens file that is known here; lens files end in {', '.join(SUFFIXES)}"
         )
+    if chosen.name == "dO text":
+        text = _utf_8(data, where, "text")
     return chosen.read(text, where)
 
 
@@ -136,8 +138,8 @@ def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
     return chosen.write(prescription, str(path))
 
 
-def _decoded_yaml(data: bytes, where: str) -> str:
+def _utf_8(data: bytes, where: str, kind: str) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: is not valid YAML ({error})") from None
+        raise InputError(f"{where}: is not valid {kind} ({error})") from None

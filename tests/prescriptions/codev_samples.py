@@ -3,7 +3,7 @@
 # The supplement's triplet, as CODE V writes.
 TRIPLET = """RDM;LEN       "VERSION: 11.2   LENS VERSION: 84   Creation Date: 1-May-2019"
 TITLE 'Cooke triplet'
-EPD   10.0
+EPD   10.2
 DIM   M
 WL    656.2725 587.5618 486.1327
 REF   2

@@ -80,9 +80,9 @@ def test_the_first_zoom_position_must_be_the_lens(tmp_path):
         ("S     20.292", f"S {'9' * 5000}", "must be a number, not 5000 letters"),
         ("S     20.292", "S 2_0", "must be a finite number"),
         ("SI    0.0", f"! {'x' * 200_000}\nSI 0.0", "is longer than 100000 letters"),
-        ("SI    0.0", "& \n" * 40_000 + "\nSI 0.0", "needs an object (SO)"),
+        ("SI    0.0", "& \n" * 200_000 + "\nSI 0.0", "is longer than 100000 letters"),
         ("SI    0.0", "S 0 1\n" * 2100 + "SI 0.0", "more than 2000 surfaces"),
-        ("SO    0.0 0.1e14", "", "expected SO, not S"),
+        ("SO    0.0 0.1e14", "", "expected SO or S0, not S"),
     ],
 )  # fmt: skip
 def test_hostile_text_ends_in_one_line(old, new, said, tmp_path):

@@ -9,6 +9,8 @@ from dolens.prescriptions.codev.text import Command, commands_of
 
 _NUMBERED = re.compile(r"S(O|I|S|[0-9]+)")
 _MOST_SURFACES = 2000
+# Variables and functions of macros begin with these.
+_VARIABLES = ("^", "@", "(")
 
 
 @dataclass
@@ -65,6 +67,8 @@ def parse_codev(text: str, where: str) -> CodeVFile:
     for command in commands_of(text, where):
         key, words = command.key, command.words
         place = f"{where}: line {command.at}"
+        if key[:1] in _VARIABLES or any(word[:1] in _VARIABLES for word in words):
+            raise InputError(_macro(command, place))
         if private:
             private = key != "END"
             _private(file, command, place)
@@ -102,13 +106,12 @@ def _is_surface(key: str) -> bool:
 def _begin(file: CodeVFile, command: Command, radii: bool | None, place: str) -> None:
     """Begin the block of the next surface, or go back to one by its number."""
     number = len(file.surfaces)
-    label = f"S{number}" if command.key in ("S", f"S{number}") else command.key
     if number and file.surfaces[-1].label == "SI":
         raise InputError(f"{place}: {command.key} stands behind the image surface (SI)")
-    if label in ("SO", "S0"):
-        label = "SO"
-    if (number == 0) != (label == "SO") or label not in ("SO", "SI", f"S{number}"):
-        raise InputError(f"{place}: expected {'SO' if not number else 'S'}, not {command.key}")
+    allowed = ("S", f"S{number}", "SI") if number else ("SO", "S0")
+    if command.key not in allowed:
+        raise InputError(f"{place}: expected {' or '.join(allowed)}, not {command.key}")
+    label = "SI" if command.key == "SI" else f"S{number}" if number else "SO"
     if number > _MOST_SURFACES:
         raise InputError(f"{place}: more than {_MOST_SURFACES} surfaces")
     file.surfaces.append(Block(label, command.at, radii, command.words))
@@ -146,9 +149,15 @@ def _private(file: CodeVFile, command: Command, place: str) -> None:
 
 def _refusal(command: Command, place: str) -> str:
     key = command.key
-    if key in MACRO or key[:1] in ("^", "@"):
-        return f"{place}: is a macro of CODE V ({key}), no lens; save the lens as .seq in CODE V"
+    if key in MACRO:
+        return _macro(command, place)
     if key in REFUSED:
         shown = " ".join((key, *command.words[:1]))
         return f"{place}: {shown}: {REFUSED[key]} is not held"
     return f"{place}: command {key} is not known, and may bend rays"
+
+
+def _macro(command: Command, place: str) -> str:
+    return (
+        f"{place}: is a macro of CODE V ({command.key}), no lens; save the lens as .seq in CODE V"
+    )

@@ -11,7 +11,7 @@ A file that does not say `RDM` gives curvatures, as CODE V then takes them.
 another last surface had, it is computed.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
@@ -72,7 +72,7 @@ def read_codev(text: str, where: str = "lens") -> ReadPrescription:
     used = (min(waves), max(waves))
     word = target.words[2] if len(target.words) > 2 else ""
     medium = found["object_material"] = read_glass(word, file, used, f"{where}: surface SO")
-    stop = _stop(blocks, where)
+    stop = _stop(file.surfaces, where)
     surfaces, axes = [], []
     for block in blocks:
         place = f"{where}: surface {block.label}"
@@ -83,8 +83,7 @@ def read_codev(text: str, where: str = "lens") -> ReadPrescription:
     axes.append(Axes(image, factor, f"{where}: surface SI"))
     if file.solved:
         surfaces[-1] = _solved(surfaces, axes, found, distance, where)
-    beam = not found.keys().isdisjoint(PUPIL_KEYS)
-    rows, shift = _rows(blocks, surfaces, axes, beam, factor, where)
+    rows, shift = _rows(blocks, surfaces, axes, found, factor, where)
     if distance is not None:
         found["object_distance"] = summed(distance, shift, where)
     prescription = _with_sensor(found, rows, axes[-1], image, factor, where)
@@ -95,37 +94,38 @@ def _rows(
     blocks: list[Block],
     surfaces: list[Surface],
     axes: list[Axes],
-    beam: bool,
+    found: dict[str, Any],
     factor: Fraction,
     where: str,
 ) -> tuple[_Rows, Fraction]:
     """Return the rows, and how far the first surface is moved from the object along z."""
-    found = _Rows()
+    rows = _Rows()
     shift = Fraction(0)
-    medium = None
+    medium = found["object_material"]
+    beam = not found.keys().isdisjoint(PUPIL_KEYS)
     for block, surface, own in zip(blocks, surfaces, axes, strict=False):
-        if found.gaps:
-            found.gaps[-1] += own.shift_before
+        if rows.gaps:
+            rows.gaps[-1] += own.shift_before
         else:
             shift = own.shift_before
         gap = surface.gap + own.shift_after
         note = {"note": surface.label} if surface.label else {}
         if medium == surface.material and _is_idle(block, surface) and own.is_single:
-            found.append((own.before or own.after or {}) | note, gap)
+            rows.append((own.before or own.after or {}) | note, gap)
             continue
         if own.before is not None:
-            found.append(own.before, Fraction(0))
+            rows.append(own.before, Fraction(0))
         place = f"{where}: surface {block.label}"
         row = surface.row | {"material": surface.material} | note
         if not (beam and surface.stop) or has_apertures(block):
             row |= read_apertures(block, factor, place)
         if surface.stop:
-            found.stop = len(found.rows) + 1
-        found.append(row, gap if own.after is None else Fraction(0))
+            rows.stop = len(rows.rows) + 1
+        rows.append(row, gap if own.after is None else Fraction(0))
         if own.after is not None:
-            found.append(own.after, gap)
+            rows.append(own.after, gap)
         medium = surface.medium
-    return found, shift
+    return rows, shift
 
 
 def _is_idle(block: Block, surface: Surface) -> bool:
@@ -167,6 +167,15 @@ def _solved(
     where: str,
 ) -> Surface:
     """Return the last surface with the gap that the paraxial image solve gives it."""
+    last = surfaces[-1]
+    for surface in surfaces:
+        if surface.row["type"] == "xy_polynomial" or "phase" in surface.row:
+            if not last.gap:
+                raise InputError(
+                    f"{where}: PIM: the paraxial image behind a phase or a polynomial in x and y "
+                    "is not computed, and no value is written"
+                )
+            return last
     model = index_model("dfc")
     wavelength = found.get("reference_wavelength", _D_LINE)
     sense, indices = 1.0, []
@@ -183,13 +192,10 @@ def _solved(
     place = f"{where}: PIM"
     curvatures = [surface.curvature for surface in surfaces]
     solved = paraxial_image(curvatures, gaps[:-1], indices, start, place)
-    written = float(surfaces[-1].gap)
-    near = abs(written - solved.distance) <= _OWN_SOLVE * min(abs(solved.focal_length), 1e6)
-    if written and near:
-        return surfaces[-1]
-    last = surfaces[-1]
-    gap = Fraction(solved.distance)
-    return Surface(last.row, last.curvature, gap, last.material, last.medium, last.stop, last.label)
+    near = _OWN_SOLVE * abs(solved.focal_length)
+    if last.gap and abs(float(last.gap) - solved.distance) <= near:
+        return last
+    return replace(last, gap=Fraction(solved.distance))
 
 
 def _object_distance(target: Block, factor: Fraction, where: str) -> Fraction | None:
@@ -197,8 +203,8 @@ def _object_distance(target: Block, factor: Fraction, where: str) -> Fraction | 
     place = f"{where}: surface SO (the object)"
     if curvature_row(target, factor, place) or shape_is_given(target):
         raise InputError(f"{place}: a curved object is not held")
-    Axes(target, factor, place)
-    if any(key in target.commands for key in ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")):
+    own = Axes(target, factor, place)
+    if own.before or own.after or own.shift_before:
         raise InputError(f"{place}: a decentred or tilted object is not held")
     words = target.words[1:2]
     thickness = target.commands.get("THI")
@@ -216,7 +222,9 @@ def _stop(blocks: list[Block], where: str) -> Block:
     if len(stops) > 1:
         names = " and ".join(block.label for block in stops)
         raise InputError(f"{where}: {names} are both the stop (STO)")
-    return stops[0] if stops else blocks[0]
+    if stops and stops[0].label in ("SO", "SI"):
+        raise InputError(f"{where}: {stops[0].label} cannot be the stop (STO)")
+    return stops[0] if stops else blocks[1]
 
 
 def _require_curvatures(blocks: list[Block], factor: Fraction, where: str) -> None:

@@ -13,10 +13,14 @@ from dolens.prescriptions.codev.apertures import aperture_lines
 from dolens.prescriptions.codev.axes import break_words
 from dolens.prescriptions.codev.glass import canonical, glass_word, private_glass
 from dolens.prescriptions.codev.reader import read_codev
+from dolens.prescriptions.codev.special import special_lines
 from dolens.prescriptions.compare import require_same
 from dolens.prescriptions.system_data import PUPIL_KEYS
 
-_TYPES = ("plane", "aperture", "sphere", "conic", "even_asphere", "coordinate_break")
+_TYPES = (
+    *("plane", "aperture", "sphere", "conic", "even_asphere", "xy_polynomial", "q_bfs"),
+    "coordinate_break",
+)
 _D_LINE = 587.5618
 _INFINITY = "1e13"
 _POWER = re.compile(r"a(\d+)")
@@ -110,16 +114,23 @@ def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
     for key in PUPIL_KEYS:
         if prescription.get(key) is not None and key in _PUPILS:
             return [*lines, f"{_PUPILS[key]:5} {_text(prescription[key], where)}"]
+    return [*lines, f"EPD   {_entrance_pupil(prescription, where)}"]
+
+
+def _entrance_pupil(prescription: Mapping[str, Any], where: str) -> str:
+    """Return the diameter of the entrance pupil, mm: the stop's own, or the next above it that has
+    a short text, so that the stop's size is what clips.
+    """
     lens = lens_from_prescription(prescription, where=where)
-    pupil = lens.first_order(lens.primary_wavelength).entrance_pupil
-    diameter = float(pupil.diameter)
-    if not math.isfinite(diameter):
+    diameter = float(lens.first_order(lens.primary_wavelength).entrance_pupil.diameter)
+    if not math.isfinite(diameter) or diameter <= 0.0:
         raise InputError(
-            f"{where}: a .seq file needs an aperture, and the entrance pupil of the stop is at "
-            "infinity; give 'object_na'"
+            f"{where}: a .seq file needs an aperture, and the stop of this lens has no entrance "
+            "pupil of finite size; give 'object_na'"
         )
-    # The stop's own size clips, so the beam is rounded up.
-    return [*lines, f"EPD   {diameter * (1.0 + 1e-9):.9g}"]
+    size = lens.surfaces[str(lens.stop)].semi_diameter
+    texts = (f"{diameter * (1.0 + margin):.12g}" for margin in (0.0, 1e-11, 1e-9))
+    return next(text for text in texts if size * float(text) / diameter >= size)
 
 
 def _fields(fields: Mapping[str, Any], where: str) -> list[str]:
@@ -168,7 +179,7 @@ def _surface(row: Mapping[str, Any], gap: str, stop: bool, place: str) -> list[s
     radius, more = "0.0", []
     if row.get("curvature") is not None:
         more.append(f"  CUY {_text(row['curvature'], place)}")
-    elif kind not in ("plane", "aperture"):
+    elif kind not in ("plane", "aperture", "xy_polynomial"):
         number = as_number(row.get("radius", math.inf), f"{place}: 'radius'", finite=False)
         if number == 0.0:
             raise InputError(f"{place}: 'radius' is 0; write .inf for a plane")
@@ -182,6 +193,8 @@ def _surface(row: Mapping[str, Any], gap: str, stop: bool, place: str) -> list[s
         asphere = ["  ASP"] if kind == "even_asphere" else []
         lines += [*asphere, f"  K {_text(row.get('conic', 0.0), place)}"]
         lines += _coefficients(row, place)
+    if kind in ("xy_polynomial", "q_bfs"):
+        lines += special_lines(row, place)
     return lines + aperture_lines(row, place)
 
 
