@@ -11,9 +11,23 @@ from dolens.errors import InputError, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.lens_formats import MOST_BYTES, encode_lens, read_lens
+from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.yaml_text import plain_values
+
+__all__ = [
+    "SUFFIXES",
+    "decode_prescription",
+    "decode_yaml",
+    "encode_prescription",
+    "find_lens",
+    "lens_names",
+    "load_lens",
+    "load_prescription",
+    "read_lens_data",
+    "read_lens_file",
+    "save_lens",
+]
 
 logger = logging.getLogger(__name__)
 

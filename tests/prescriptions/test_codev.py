@@ -202,8 +202,13 @@ def test_apertures():
         "S -50 2\n REX 3; REY 4",
         "S 0 2\n CIR EDG 6",
         "S 0 40",
+        "S 0 1\n CIR 3; ADY 20\n ELX OBS 1; ELY OBS 2; ADY OBS 20",
     )
     rows = found["surfaces"]
+    assert rows["5"]["aperture"] == {"semi_diameter": 3.0, "decenter_y": 20.0}
+    assert rows["5"]["obscuration"] == {
+        "semi_axis_x": 1.0, "semi_axis_y": 2.0, "decenter_y": 20.0,
+    }  # fmt: skip
     assert rows["1"]["semi_diameter"] == 5.0
     assert rows["1"]["obscuration"] == {"semi_diameter": 1.0}
     assert rows["2"]["aperture"] == {"half_width_x": 3.0, "half_width_y": 4.0}

@@ -1,7 +1,8 @@
-"""Apertures of a CODE V surface: circles and rectangles that clip, block, or are only drawn.
+"""Apertures of a CODE V surface: circles, rectangles and ellipses that clip, block, or are drawn.
 
-`CIR` is a circle, `REX` and `REY` are the half widths of a rectangle; `OBS` behind them makes an
-obscuration.  `EDG` (a lens's edge) and `HOL` (a hole) are mechanical: CODE V draws them.
+`CIR` is a circle, `REX` and `REY` are half widths of a rectangle, `ELX` and `ELY` semi-axes of an
+ellipse; `ADX` and `ADY` move them.  `OBS` behind them makes an obscuration.  `EDG` (a lens's edge)
+and `HOL` (a hole) are mechanical: CODE V draws them.
 """
 
 from collections.abc import Mapping
@@ -13,10 +14,15 @@ from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.codev.file import Block
 from dolens.prescriptions.decimals import number_in_text, scaled
 
-_KEYS = ("CIR", "REX", "REY")
-_MOVED = {"ADX": "a decentred aperture", "ADY": "a decentred aperture", "ARO": "a turned aperture"}
+# Commands of an outline → what a prescription calls them.
+_OUTLINES: dict[tuple[str, ...], tuple[str, ...]] = {
+    ("CIR",): ("semi_diameter",),
+    ("REX", "REY"): ("half_width_x", "half_width_y"),
+    ("ELX", "ELY"): ("semi_axis_x", "semi_axis_y"),
+}
+_KEYS = tuple(key for keys in _OUTLINES for key in keys)
+_CENTER = {"ADX": "decenter_x", "ADY": "decenter_y"}
 _USES = ("CLR", "OBS", "EDG", "HOL")
-_HALF_WIDTHS = ("half_width_x", "half_width_y")
 
 
 def read_apertures(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
@@ -27,12 +33,12 @@ def read_apertures(block: Block, factor: Fraction, place: str) -> dict[str, Any]
         a semi-diameter that does not clip; without any, the semi-diameter is `auto`.
 
     Raises:
-        InputError: an ellipse, a decentred aperture, or two shapes of one use.
+        InputError: a turned aperture, or two outlines of one use.
     """
     found = _lengths(block, factor, place)
     row: dict[str, Any] = {}
     clear, hole = _outline(found, "CLR", place), _outline(found, "OBS", place)
-    if "semi_diameter" in clear:
+    if list(clear) == ["semi_diameter"]:
         row |= clear
     elif clear:
         row["aperture"] = clear
@@ -47,7 +53,7 @@ def read_apertures(block: Block, factor: Fraction, place: str) -> dict[str, Any]
 
 def has_apertures(block: Block) -> bool:
     """Return whether a surface's block says anything about its size."""
-    return any(key in block.commands for key in (*_KEYS, "ELX", "ELY"))
+    return any(key in block.commands for key in _KEYS)
 
 
 def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
@@ -57,29 +63,32 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
     if size is not None and size != "auto":
         use = "" if row.get("clips", True) else "EDG "
         lines.append(f"  CIR {use}{_text(size, place)}")
-    if edge and all(key in edge for key in _HALF_WIDTHS):
-        x, y = (_text(edge[key], place) for key in _HALF_WIDTHS)
-        lines.append(f"  REX {x}; REY {y}")
-    if hole and "semi_diameter" in hole:
-        lines.append(f"  CIR OBS {_text(hole['semi_diameter'], place)}")
-    elif hole and all(key in hole for key in _HALF_WIDTHS):
-        x, y = (_text(hole[key], place) for key in _HALF_WIDTHS)
-        lines.append(f"  REX OBS {x}; REY OBS {y}")
-    return lines
+    return lines + _lines(edge or {}, "", place) + _lines(hole or {}, "OBS ", place)
+
+
+def _lines(outline: Mapping[str, Any], use: str, place: str) -> list[str]:
+    lines = []
+    for keys, names in _OUTLINES.items():
+        if all(name in outline for name in names):
+            lines += [
+                f"  {key} {use}{_text(outline[name], place)}"
+                for key, name in zip(keys, names, strict=True)
+            ]
+    return lines + [
+        f"  {key} {use}{_text(outline[name], place)}"
+        for key, name in _CENTER.items()
+        if outline.get(name)
+    ]
 
 
 def _lengths(block: Block, factor: Fraction, place: str) -> dict[str, dict[str, float]]:
     """Return use → key → mm."""
     found: dict[str, dict[str, float]] = {use: {} for use in _USES}
-    for key in ("ELX", "ELY"):
-        if key in block.commands:
-            raise InputError(f"{place}: an elliptical aperture is not held ({key})")
-    for key, what in _MOVED.items():
-        for command in block.commands.get(key, []):
-            use, words = _use(command.words)
-            if use in ("CLR", "OBS") and any(number_in_text(w, f"{place}: {key}") for w in words):
-                raise InputError(f"{place}: {what} is not held ({key})")
-    for key in _KEYS:
+    for command in block.commands.get("ARO", []):
+        use, words = _use(command.words)
+        if use in ("CLR", "OBS") and any(number_in_text(w, f"{place}: ARO") for w in words):
+            raise InputError(f"{place}: a turned aperture is not held (ARO)")
+    for key in (*_KEYS, *_CENTER):
         for command in block.commands.get(key, []):
             use, words = _use(command.words)
             what = f"{place}: {key} (line {command.at})"
@@ -99,14 +108,19 @@ def _use(words: list[str]) -> tuple[str, list[str]]:
 
 
 def _outline(found: dict[str, dict[str, float]], use: str, place: str) -> dict[str, float]:
+    """Return the outline of a use as a prescription has it; empty where there is none."""
     lengths = found[use]
-    if "CIR" in lengths and len(lengths) > 1:
-        raise InputError(f"{place}: a circle cut by a rectangle is not held (CIR, REX, REY)")
-    if "CIR" in lengths:
-        return {"semi_diameter": lengths["CIR"]}
-    if len(lengths) == 1:
-        raise InputError(f"{place}: a rectangular aperture needs REX and REY")
-    return dict(zip(_HALF_WIDTHS, (lengths["REX"], lengths["REY"]), strict=True)) if lengths else {}
+    given = [keys for keys in _OUTLINES if any(key in lengths for key in keys)]
+    if len(given) > 1:
+        names = " and ".join(keys[0] for keys in given)
+        raise InputError(f"{place}: an aperture of two outlines is not held ({names})")
+    if not given:
+        return {}
+    for key in given[0]:
+        if key not in lengths:
+            raise InputError(f"{place}: the aperture needs {' and '.join(given[0])}")
+    outline = {n: lengths[key] for key, n in zip(given[0], _OUTLINES[given[0]], strict=True)}
+    return outline | {name: lengths[key] for key, name in _CENTER.items() if lengths.get(key)}
 
 
 def _text(value: object, place: str) -> str:
