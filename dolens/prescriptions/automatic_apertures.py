@@ -36,7 +36,9 @@ def set_automatic_semi_diameters(lens: Lens, prescription: Mapping[str, Any]) ->
     says.
     """
     rows = {str(n): row for n, row in prescription["surfaces"].items()}
-    automatic = [n for n in lens.surfaces if n in rows and is_automatic(rows[n])]
+    # The stop has its size from the pupil, and clips.
+    others = [n for n in lens.surfaces if n in rows and n != str(lens.stop)]
+    automatic = [n for n in others if is_automatic(rows[n])]
     if automatic:
         heights = _paraxial_heights(lens)
         for n in automatic:
