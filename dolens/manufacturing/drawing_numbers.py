@@ -11,7 +11,7 @@ from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
 from dolens.optics.glass_catalog import Glass
 from dolens.optics.materials import abbe_number, index_d
 from dolens.optics.surfaces.b_spline import BSpline
-from dolens.optics.surfaces.clear_aperture import Circle, Rectangle
+from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Rectangle
 from dolens.optics.surfaces.conic import Conic
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
@@ -155,6 +155,8 @@ def clear_aperture_text(face: Face) -> str:
     text = (
         f"{length(2.0 * edge.half_width_x)} × {length(2.0 * edge.half_width_y)}"
         if isinstance(edge, Rectangle)
+        else f"ellipse {length(2.0 * edge.semi_axis_x)} × {length(2.0 * edge.semi_axis_y)}"
+        if isinstance(edge, Ellipse)
         else f"Ø {length(2.0 * edge.semi_diameter)}"
     )
     obscured = face.aperture.obscuration

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from dolens.errors import InputError
 from dolens.prescriptions.checks import as_number
+from dolens.prescriptions.deflections import power_of
 
 _DEFAULTS = {"index_model": "dfc", "stop": 1, "object_material": "air"}
 
@@ -108,6 +109,8 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
             radius = as_number(plain.pop(key), f"'{key}'", finite=False)
             if plain["type"] not in ("plane", "aperture"):
                 plain[key.replace("radius", "curvature")] = 1.0 / radius
+    if "focal_length" in plain:
+        plain["power"] = power_of(plain.pop("focal_length"))
     return plain
 
 

@@ -12,6 +12,8 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.prescriptions.zemax_biconic_toroid import BICONIC, TOROID
 from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_coordinate_break import COORDINATE_BREAK
+from dolens.prescriptions.zemax_diffractive import BINARY_1, BINARY_2, GRATING, PARAXIAL
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_grid_sag import GRID_SAG
 from dolens.prescriptions.zemax_polynomials import (
@@ -30,6 +32,8 @@ from dolens.prescriptions.zemax_zernike import ZERNIKE_FRINGE, ZERNIKE_STANDARD
 SHAPES: dict[str, ZemaxShape] = {
     shape.type: shape
     for shape in (
+        *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL, COORDINATE_BREAK),
+        *(PARAXIAL, GRATING, BINARY_1, BINARY_2),
         STANDARD,
         EVEN_ASPHERE,
         TILTED_PLANE,
@@ -52,11 +56,9 @@ _NOT_HELD = {
     "BINARY": "a diffractive phase",
     "BIRE": "a birefringent medium",
     "CADPART": "a part from a CAD program",
-    "COORDBRK": "a coordinate break (decentred and tilted axes)",
     "CONJUGAT": "a surface given by two conjugate points",
     "CUBICSPL": "a cubic spline",
     "CYLINDER": "a cylinder",
-    "DGRATING": "a diffraction grating",
     "EASPHERE": "an extended asphere",
     "EGRATING": "an elliptical grating",
     "ELLIPGRA": "an elliptical grating",
@@ -73,7 +75,7 @@ _NOT_HELD = {
     "JONESMAT": "a Jones matrix",
     "NONSEQCO": "a non-sequential component",
     "ODDCOSIN": "an odd cosine surface",
-    "PARAX": "a paraxial lens",
+    "PARAX_XY": "a paraxial lens of two focal lengths",
     "PERIODIC": "a periodic surface",
     "POLYNOMI": "a polynomial surface",
     "RADIALGR": "a radial grating",
@@ -124,11 +126,17 @@ def shape_of_row(row: Mapping[str, Any], place: str) -> ZemaxShape:
     Raises:
         InputError: a `.zmx` file cannot hold its `type`.
     """
-    kind = str(row.get("type", "sphere"))
+    kind, phase = str(row.get("type", "sphere")), (row.get("phase") or {}).get("type", "")
     for shape in SHAPES.values():
-        if kind in shape.kinds:
+        if kind in shape.kinds and shape.phase == phase:
             return shape
-    allowed = dict.fromkeys(kind for shape in SHAPES.values() for kind in shape.kinds)
+    if phase:
+        raise InputError(
+            f"{place}: a .zmx file cannot hold a phase of type '{phase}' on a surface of type "
+            f"'{kind}'"
+        )
+    plain = (shape for shape in SHAPES.values() if not shape.phase)
+    allowed = dict.fromkeys(kind for shape in plain for kind in shape.kinds)
     raise InputError(
         f"{place}: a .zmx file cannot hold type '{kind}' (allowed: {', '.join(allowed)})"
     )

@@ -56,6 +56,65 @@ def _aspheres():
     )
 
 
+def _mirrors():
+    """A Mangin mirror, then mirrors of every kind, and glass behind them."""
+
+    def row(kind, thickness, material="mirror", **more):
+        return {"type": kind, "semi_diameter": 6.0, "thickness": thickness, "material": material,
+                **more}  # fmt: skip
+
+    surfaces = [
+        row("sphere", 2.0, _GLASS, radius=-40.0),
+        row("conic", -2.0, radius=-70.0, conic=-0.6),
+        row("sphere", -12.0, "air", radius=-40.0),
+        row("even_asphere", 12.0, radius=90.0, conic=0.3, a4=1e-5, a6=-1e-8),
+        row("sphere", -12.0, radius=-80.0),
+        row("plane", 12.0),
+        row("xy_polynomial", -12.0, x2=-0.004, y2=-0.005, xy=1e-4, x3=1e-5, y4=-1e-7),
+        row("conic", 8.0, radius=200.0, conic=-3.0),
+        row("sphere", 2.0, _GLASS, radius=60.0),
+        row("plane", None, "air"),
+    ]
+    surfaces[-1].pop("thickness")
+    return lens_from_prescription(
+        {"surfaces": {str(n): r for n, r in enumerate(surfaces, 1)}, "sensor": {"distance": 15.0}}
+    )
+
+
+def _folded():
+    """Breaks before, between and behind mirrors and a lens that is out of place."""
+
+    def broken(**row):
+        return {"type": "coordinate_break", "thickness": 0.0, **row}
+
+    glass = {"semi_diameter": 5.0, "material": _GLASS}
+    mirror = {"semi_diameter": 9.0, "material": "mirror", "thickness": 0.0}
+    surfaces = [
+        broken(tilt_x=2.0, decenter_x=0.2, thickness=1.0),
+        {"type": "sphere", "radius": 60.0, "thickness": 2.0, **glass},
+        {"type": "sphere", "radius": -90.0, "thickness": 20.0, **glass, "material": "air"},
+        broken(tilt_x=45.0, decenter_y=0.3),
+        {"type": "plane", **mirror},
+        broken(tilt_x=45.0, thickness=-15.0),
+        broken(tilt_y=-20.0, tilt_z=10.0),
+        {"type": "conic", "radius": 90.0, "conic": -0.8, **mirror},
+        broken(tilt_y=-20.0, tilt_x=3.0, order="tilt_first", decenter_x=-0.4, thickness=10.0),
+        {"type": "even_asphere", "radius": 80.0, "conic": 0.0, "a4": 1e-5, **glass,
+         "thickness": 3.0},
+        {"type": "sphere", "radius": -70.0, **glass, "material": "air", "thickness": 4.0},
+        broken(tilt_x=-8.0),
+    ]  # fmt: skip
+    surfaces[-1].pop("thickness", None)
+    elements = {
+        "1": {"surfaces": [2, 3], "tilt_x": 1.0, "decenter_x": 0.1, "shift_z": 0.05},
+        "2": {"surfaces": [8, 11], "tilt_y": 0.5, "decenter_y": -0.1, "pivot": [0.0, 1.0, 2.0]},
+    }
+    return lens_from_prescription(
+        {"surfaces": {str(n): r for n, r in enumerate(surfaces, 1)}, "elements": elements,
+         "sensor": {"distance": 12.0}, "stop": 2}
+    )  # fmt: skip
+
+
 def _odd_aspheres():
     """An axicon's cusp under many powers, and an asphere with one odd power."""
     front = {"type": "odd_asphere", "radius": 35.0, "conic": -0.5, "a1": 0.01, "a2": 1e-4,
@@ -146,6 +205,37 @@ def _clipped():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
 
 
+def _diffractive():
+    """A radial phase on an asphere and an XY phase on a conic, and an ideal lens behind them."""
+    front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "phase": {
+        "type": "radial", "norm_radius": 5.0, "p2": -250.0, "p4": 30.0, "p6": -8.0}}  # fmt: skip
+    back = {"type": "conic", "radius": -70.0, "conic": 0.6, "thickness": 4.0, "phase": {
+        "type": "xy", "order": -1, "norm_radius": 4.0, "x": 60.0, "x2": 30.0, "xy": -9.0,
+        "y2": 25.0, "x2y": 4.0, "y4": -3.0}}  # fmt: skip
+    lens = {"type": "paraxial_lens", "focal_length": 60.0, "semi_diameter": 6.0, "material": 1.3}
+    surfaces = {
+        "1": {"semi_diameter": 5.0, "thickness": 3.0, "material": _GLASS, **front},
+        "2": {"semi_diameter": 5.0, "material": "air", **back},
+        "3": lens,
+    }
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 25.0}})
+
+
+def _spectrometer():
+    """A grating that transmits, one on a concave mirror, whose higher orders vanish, and an ideal
+    lens that the light comes back to.
+    """
+    surfaces = {
+        "1": {"type": "plane", "semi_diameter": 6.0, "thickness": 40.0, "material": "air",
+              "phase": {"type": "grating", "grooves": 100.0, "order": -1}},
+        "2": {"type": "sphere", "radius": -150.0, "semi_diameter": 12.0, "thickness": -30.0,
+              "material": "mirror", "phase": {"type": "grating", "grooves": 1740.0}},
+        "3": {"type": "paraxial_lens", "focal_length": 50.0, "semi_diameter": 90.0,
+              "material": "air"},
+    }  # fmt: skip
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": -20.0}})
+
+
 def _plate(root):
     lens = load_lens(root / "conf/lens/wavefront_coding.yaml", F64)
     with torch.no_grad():
@@ -175,6 +265,10 @@ LENSES = {
     "grid": lambda root: _grid(),
     "clipped": lambda root: _clipped(),
     "own_surface": lambda root: _own_surface(),
+    "diffractive": lambda root: _diffractive(),
+    "spectrometer": lambda root: _spectrometer(),
+    "mirrors": lambda root: _mirrors(),
+    "folded": lambda root: _folded(),
 }
 
 

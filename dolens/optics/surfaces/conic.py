@@ -98,6 +98,14 @@ class Conic(Surface):
         """Check that the clear aperture ends where the sag does: (1+k)·c²·r² ≤ 1."""
         check_reach(self)
 
+    @property
+    def reach(self) -> float:
+        """Return 1/√((1+k)c²), mm; `inf` of a plane, a paraboloid and a hyperboloid."""
+        stored = {name: float(value.detach()) for name, value in self.named_parameters()}
+        c = stored["curvature"]
+        alpha = (1.0 + stored.get("conic", 0.0)) * c * c
+        return 1.0 / math.sqrt(alpha) if alpha > 0.0 else math.inf
+
     @classmethod
     def conic_constant(cls, p: Parameters) -> Tensor | float:
         """Return the conic constant k."""
