@@ -13,7 +13,7 @@ from dolens.errors import InputError
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-from dolens.optics.surfaces.clear_aperture import Outline
+from dolens.optics.surfaces.clear_aperture import Ellipse, Outline
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.section import sag_of
 
@@ -120,6 +120,8 @@ def _edge(outline: Outline) -> np.ndarray:
         return outline.semi_diameter * unit
     half = np.array(outline.extent)
     # Azimuths of a square hit all four corners; stretched, they hit those of the rectangle.
+    if isinstance(outline, Ellipse):
+        return half * unit
     return half * unit / np.abs(unit).max(-1, keepdims=True)
 
 

@@ -15,7 +15,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.prescription_table import SurfaceRow, prescription_table
 from dolens.optics.surfaces import CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.base import Surface
-from dolens.optics.surfaces.clear_aperture import Circle, Outline, Rectangle, Unlimited
+from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Outline, Rectangle, Unlimited
 from dolens.optics.surfaces.coordinate_break import BREAK
 
 # Columns of coefficients that a page is wide enough for.
@@ -237,14 +237,24 @@ def _fixed(value: float) -> str:
 def _aperture(surface: Surface) -> str:
     if surface.changes_axes:
         return ""
-    inner = surface.aperture.obscuration
-    return _outline(surface.aperture.edge) + (f", obscured {_outline(inner)}" if inner else "")
+    aperture = surface.aperture
+    words = [_outline(aperture.edge)]
+    if aperture.window is not None:
+        words.append(f"within {_outline(aperture.window)}")
+    if aperture.obscuration is not None:
+        words.append(f"obscured {_outline(aperture.obscuration)}")
+    if any(aperture.center):
+        x, y = (number(value) for value in aperture.center)
+        words.append(f"about ({x}, {y})")
+    return ", ".join(words)
 
 
 def _outline(outline: Outline) -> str:
     match outline:
         case Rectangle():
             return f"{number(outline.half_width_x)} × {number(outline.half_width_y)}"
+        case Ellipse():
+            return f"ellipse {number(outline.semi_axis_x)} × {number(outline.semi_axis_y)}"
         case Unlimited():
             return f"({number(outline.semi_diameter)}, does not clip)"
         case Circle():

@@ -11,7 +11,7 @@ from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
 from dolens.optics.mirrors import MIRROR
 from dolens.optics.parameter_units import to_file_units
 from dolens.optics.surfaces import CoordinateBreak
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse, Rectangle
 from dolens.optics.tables import html_table, printable, text_table
 
 HEADINGS = (
@@ -242,8 +242,14 @@ def _aperture(aperture: ClearAperture) -> str:
     edge = aperture.edge
     if isinstance(edge, Rectangle):
         found = f"rectangle {_number(2.0 * edge.half_width_x)} × {_number(2.0 * edge.half_width_y)}"
+    elif isinstance(edge, Ellipse):
+        found = f"ellipse {_number(2.0 * edge.semi_axis_x)} × {_number(2.0 * edge.semi_axis_y)}"
     else:
         found = "circle" if isinstance(edge, Circle) else "no edge"
+    if aperture.window is not None:
+        found = f"{found} and {_aperture(ClearAperture(aperture.window))}"
+    if any(aperture.center):
+        found = f"{found} about ({', '.join(_number(value) for value in aperture.center)})"
     return f"{found}, obscured" if aperture.obscuration is not None else found
 
 

@@ -41,16 +41,21 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
     """
     if number in system.breaks:
         return np.zeros(0), np.zeros(0)
-    return _cut(system, number, system.surfaces[number - 1].aperture.edge)
+    aperture = system.surfaces[number - 1].aperture
+    centred = aperture.edge.rotational
+    return _cut(system, number, aperture.edge, (0.0, 0.0) if centred else aperture.center)
 
 
 def obscuration_profile(system: OpticalSystem, number: int) -> Profile | None:
     """Return the profile over the surface's obscuration; None where it has none."""
-    obscuration = system.surfaces[number - 1].aperture.obscuration
-    return None if obscuration is None else _cut(system, number, obscuration)
+    aperture = system.surfaces[number - 1].aperture
+    obscuration = aperture.obscuration
+    return None if obscuration is None else _cut(system, number, obscuration, aperture.center)
 
 
-def _cut(system: OpticalSystem, number: int, outline: Outline) -> Profile:
+def _cut(
+    system: OpticalSystem, number: int, outline: Outline, center: tuple[float, float]
+) -> Profile:
     rotation, origin = _place(system, number)
     # In the surface's axes the plane is a·p + o = 0, with a the lens's x seen from the surface.
     ax, ay, az = rotation[0]
@@ -77,14 +82,16 @@ def _cut(system: OpticalSystem, number: int, outline: Outline) -> Profile:
 
     def inside(q: Tensor) -> Tensor:
         x, y, _, _ = point(q)
-        return outline.margin(x, y) >= 0.0
+        return outline.margin(x - center[0], y - center[1]) >= 0.0
 
-    middle = torch.zeros(1, dtype=torch.float64)
+    # Along the cut, the place nearest to the outline's centre.
+    begin = float(vx) * center[0] + float(vy) * center[1]
+    middle = torch.full((1,), begin, dtype=torch.float64)
     if not bool(inside(middle)):
         return np.zeros(0), np.zeros(0)
     # The rims: the last point inside on either side.
-    near = torch.zeros(2, dtype=torch.float64)
-    far = 1.5 * outline.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    near = middle.expand(2)
+    far = begin + 1.5 * outline.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
     for _ in range(_BISECTIONS):
         half = 0.5 * (near + far)
         kept = inside(half)

@@ -162,7 +162,7 @@ def test_a_folded_lens_is_written_and_read_back_to_the_last_bit(name):
 def test_what_no_break_can_be_is_refused(change, said):
     text = HEAD + OBJECT + (
         surf(1, *(() if change == ("STOP",) else ("STOP",)), "CURV 0.0", "DISZ 3", "DIAM 2 1 0 0 1")
-        + broken(2, 0, 0, 10, gap=4, lines=change) + mirror(3, -0.1, -1) + image(4)
+        + broken(2, 0, 0, 10, gap=4, lines=change) + mirror(3, -0.001, -1) + image(4)
     )  # fmt: skip
     with pytest.raises(InputError, match=said):
         lens_of(text)
