@@ -17,6 +17,7 @@ from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.mirrors import MIRROR, media_of
+from dolens.optics.paraxial import vergence
 from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
@@ -233,7 +234,7 @@ class Lens(LensRays, LensViews, nn.Module):
             mirrors,
             self.reversals,
         )
-        return with_vergences(system, self.primary_wavelength, self.object_distance)
+        return with_vergences(system, self.primary_wavelength, vergence(self.object_distance))
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""
