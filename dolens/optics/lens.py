@@ -19,6 +19,7 @@ from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
+from dolens.optics.thermal_lens import lens_at
 
 
 class Lens(LensRays, LensViews, nn.Module):
@@ -46,6 +47,10 @@ class Lens(LensRays, LensViews, nn.Module):
         reference_wavelength: nm, one of them; the first unless it is given.
         fields: field points that the prescription is meant for.
         object_distance: mm from the object to the first vertex; None is infinity.
+        temperature: °C, of the lens in use; None where the prescription does not say.
+        pressure: atm, of the air around it; likewise.
+        thermal_expansions: 1e-6/K, of the mount of the air gap behind each surface, or of glass
+            there whose catalogue does not say; None where nothing is known.
         backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
     """
 
@@ -65,6 +70,9 @@ class Lens(LensRays, LensViews, nn.Module):
         reference_wavelength: float | None = None,
         fields: Fields | None = None,
         object_distance: float | None = None,
+        temperature: float | None = None,
+        pressure: float | None = None,
+        thermal_expansions: Sequence[float | None] | None = None,
         backend: str = "auto",
     ) -> None:
         super().__init__()
@@ -86,6 +94,9 @@ class Lens(LensRays, LensViews, nn.Module):
         self.reference_wavelength = reference_wavelength
         self.fields = fields
         self.object_distance = object_distance
+        self.temperature = temperature
+        self.pressure = pressure
+        self.thermal_expansions = tuple(thermal_expansions or (None,) * count)
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
         self.surfaces = nn.ModuleDict(
@@ -185,6 +196,10 @@ class Lens(LensRays, LensViews, nn.Module):
             elements,
             self.backend,
         )
+
+    def at(self, temperature: float, pressure: float | None = None) -> "Lens":
+        """Return this lens at another temperature (°C) and pressure (atm); see `lens_at`."""
+        return lens_at(self, temperature, pressure)
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""

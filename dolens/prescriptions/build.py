@@ -14,6 +14,7 @@ A prescription is a mapping::
 
 Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
 `occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+`thermal_expansion` (1e-6/K) is that of the mount of an air gap (see `dolens.optics.thermal_lens`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
@@ -31,6 +32,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
 from dolens.optics.surfaces import SURFACES, Surface
+from dolens.optics.thermal import Environment
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
 from dolens.prescriptions.checks import (
     as_integer,
@@ -41,6 +43,7 @@ from dolens.prescriptions.checks import (
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
+    environment_of,
     set_stop_semi_diameter,
     stop_row,
     system_data,
@@ -58,7 +61,9 @@ _LENS_KEYS = (
     "sensor",
     *SYSTEM_DATA_KEYS,
 )
-_SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, "thickness", "material", "note")
+_SURFACE_KEYS = (
+    *("type", "radius", *APERTURE_KEYS, "thickness", "material", "thermal_expansion", "note"),
+)
 _SENSOR_KEYS = ("distance", "diameter")
 
 
@@ -96,12 +101,18 @@ def lens_from_prescription(
         raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
     check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
     data = system_data(prescription, where)
-    surfaces, thicknesses = [], []
-    materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
+    air = environment_of(prescription, where)
+    surfaces, thicknesses, expansions = [], [], []
+    first = prescription.get("object_material", "air")
+    materials = [_material(first, model, f"{where}: object", air)]
     for number, row in enumerate(rows, 1):
         place = f"{where}: surface {number}"
         surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
-        materials.append(_material(row.get("material"), model, place))
+        materials.append(_material(row.get("material"), model, place, air))
+        rate = row.get("thermal_expansion")
+        expansions.append(
+            None if rate is None else as_number(rate, f"{place}: 'thermal_expansion'")
+        )
         if number < len(rows):
             if row.get("thickness") is None:
                 raise InputError(f"{place}: 'thickness' is missing (mm to surface {number + 1})")
@@ -123,6 +134,7 @@ def lens_from_prescription(
             None if diameter is None else as_number(diameter, f"{where}: 'sensor.diameter'"),
             dtype,
             elements_from(prescription.get("elements"), dtype, where),
+            thermal_expansions=expansions,
             backend=backend,
             **data,
         )
@@ -155,6 +167,9 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         if number in lens.thicknesses:
             row["thickness"] = float(lens.thicknesses[number].detach())
         row["material"] = material.name
+        rate = lens.thermal_expansions[int(number) - 1]
+        if rate is not None:
+            row["thermal_expansion"] = rate
         rows[number] = row
     sensor: dict[str, Any] = {"distance": float(lens.sensor_distance.detach())}
     if lens.sensor_diameter is not None:
@@ -229,10 +244,10 @@ def _rows(prescription: Mapping[str, Any], where: str) -> list[Mapping[str, Any]
     return [rows[str(number)] for number in range(1, len(rows) + 1)]
 
 
-def _material(value: object, model: Any, place: str) -> Any:
+def _material(value: object, model: Any, place: str, air: Environment | None) -> Any:
     if value is None:
         raise InputError(f"{place}: 'material' is missing (the medium behind the surface)")
     try:
-        return parse_material(str(value), model)
+        return parse_material(str(value), model, air)
     except InputError as error:
         raise InputError(f"{place}: {error}") from None

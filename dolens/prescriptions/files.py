@@ -1,6 +1,6 @@
 """Lens files are read and written."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +8,7 @@ import torch
 import yaml
 
 from dolens.errors import InputError, did_you_mean, one_line
+from dolens.optics.glass_folders import glass_folders
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
@@ -15,6 +16,8 @@ from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescriptio
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
+
+GlassPlaces = Sequence[str | Path] | str | Path | None
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
@@ -152,6 +155,7 @@ def load_lens(
     dtype: torch.dtype = torch.float64,
     index_model: str | None = None,
     backend: str = "auto",
+    glass_catalogues: GlassPlaces = None,
 ) -> Lens:
     """Read a lens from a prescription in YAML, diffoptics's `.txt` or Zemax's `.zmx`.
 
@@ -163,25 +167,35 @@ def load_lens(
 
     Rarely needed:
         backend: auto, reference, cpu or cuda.
+        glass_catalogues: folders of `.agf` files, or such files, besides those that the environment
+            variable `DOLENS_GLASS` names (see `dolens.optics.glass_folders`).
 
     Raises:
         InputError: the file is missing, not valid, or no prescription; the message is one line
             that names the file, and the surface and key where there is one.
     """
     path = find_lens(path)
-    return lens_from_prescription(load_prescription(path), dtype, index_model, str(path), backend)
+    with glass_folders(glass_catalogues):
+        prescription = load_prescription(path)
+        return lens_from_prescription(prescription, dtype, index_model, str(path), backend)
 
 
-def save_lens(lens: Lens, path: str | Path) -> None:
+def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None) -> None:
     """Write a lens in the format that the suffix names (.yaml, .yml, .txt or .zmx).
 
     Reading it back gives the same parameters to the last bit.
+
+    Args:
+        lens: as it is now.
+        path: the file.
+        glass_catalogues: as for `load_lens`; a `.zmx` file needs them to name their glasses.
 
     Raises:
         InputError: the format cannot hold the lens; the message names the surface and key.
     """
     path = Path(path)
-    path.write_bytes(encode_prescription(prescription_of(lens), path))
+    with glass_folders(glass_catalogues):
+        path.write_bytes(encode_prescription(prescription_of(lens), path))
 
 
 def _suffix(path: Path) -> str:

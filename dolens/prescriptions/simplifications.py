@@ -34,7 +34,8 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
     said: dict[str, tuple[str, float, list[str]]] = {}
     for n, row in prescription["surfaces"].items():
         name = str(row.get("material")).strip()
-        if name.lower() in _KNOWN_MEDIA or name[:1].isdigit():
+        # nd/Vd and a constant index are as simple as can be; nd/Vd/ΔPgF is not.
+        if name.lower() in _KNOWN_MEDIA or (name[:1].isdigit() and name.count("/") < 2):
             continue
         medium = parse_material(name, model)
         pair = f"{index_d(medium):.6f}/{abbe_number(medium):.4f}"

@@ -9,6 +9,8 @@ In a prescription, every key optional::
     object_distance: 650                          # mm in front of the first vertex; else infinity
     entrance_pupil_diameter: 20                   # mm; or
     f_number: 2.8                                 # EFL over the diameter of the entrance pupil
+    temperature: 20                               # °C
+    pressure: 1                                   # atm
 
 A pupil closes the stop: its semi-diameter becomes the one whose paraxial image has that diameter
 at the reference wavelength, and stays what the prescription says where that is smaller.
@@ -25,6 +27,7 @@ from dolens.errors import InputError, check_keys
 from dolens.optics.fields import Fields
 from dolens.optics.lens import Lens
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optics.thermal import Environment
 from dolens.prescriptions.checks import as_number, as_positive, require_mapping
 
 PUPIL_KEYS = ("entrance_pupil_diameter", "f_number")
@@ -34,6 +37,8 @@ SYSTEM_DATA_KEYS = (
     "fields",
     "object_distance",
     *PUPIL_KEYS,
+    "temperature",
+    "pressure",
 )
 _FIELD_KINDS = ("angles", "heights")
 # Stands for a stop's semi-diameter (mm) until the pupil decides: within any surface's sag branch.
@@ -73,6 +78,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
         "reference_wavelength": reference,
         "fields": fields,
         "object_distance": distance,
+        **_surroundings(prescription, where),
     }
 
 
@@ -84,9 +90,31 @@ def system_data_of(lens: Lens) -> dict[str, Any]:
         found["reference_wavelength"] = lens.reference_wavelength
     if lens.fields is not None:
         found["fields"] = {lens.fields.kind: [list(point) for point in lens.fields.points]}
-    if lens.object_distance is not None:
-        found["object_distance"] = lens.object_distance
+    for key in ("object_distance", "temperature", "pressure"):
+        if getattr(lens, key) is not None:
+            found[key] = getattr(lens, key)
     return found
+
+
+def environment_of(prescription: Mapping[str, Any], where: str) -> Environment | None:
+    """Return the temperature and pressure that a prescription gives; None where it gives neither.
+
+    Raises:
+        InputError: they are no numbers, or impossible.
+    """
+    given = {key: v for key, v in _surroundings(prescription, where).items() if v is not None}
+    try:
+        return Environment(**given) if given else None
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _surroundings(prescription: Mapping[str, Any], where: str) -> dict[str, float | None]:
+    values = {key: prescription.get(key) for key in ("temperature", "pressure")}
+    return {
+        key: None if value is None else as_number(value, f"{where}: '{key}'")
+        for key, value in values.items()
+    }
 
 
 def stop_row(row: Mapping[str, Any], number: int, prescription: Mapping[str, Any]) -> Any:
