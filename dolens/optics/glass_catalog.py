@@ -24,6 +24,7 @@ __all__ = [
     "find_glass",
     "glass_names",
     "is_old_name",
+    "likely_makers",
     "makers_of",
     "suggestion",
 ]
@@ -113,6 +114,11 @@ def makers_of(name: str) -> tuple[str, ...]:
     found = tuple(catalogue for catalogue in catalogues() if _has(catalogue, key, own))
     alias = _ALIASES.get(key)
     return (_PLASTIC, *found) if alias and _PLASTIC not in found else found
+
+
+def likely_makers(name: str) -> tuple[str, ...]:
+    """Return the catalogues that a name without one most likely means (see the module's text)."""
+    return tuple(_meant(_key(name), list(makers_of(name))))
 
 
 def is_old_name(name: str) -> bool:

@@ -11,6 +11,7 @@ from dolens.optics.glass_catalog import (
     find_glass,
     glass_names,
     is_old_name,
+    likely_makers,
     makers_of,
     suggestion,
 )
@@ -96,9 +97,10 @@ def named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, 
 
 
 def _without_catalogues(name: str, having: Sequence[str], pair: Pair | None, place: str) -> str:
-    agreeing = [maker for maker in having if pair and _agrees(_of(maker, name), pair)]
-    if len(agreeing) == 1:
-        return _of(agreeing[0], name)
+    for makers in (likely_makers(name), having):
+        agreeing = [maker for maker in makers if pair and _agrees(_of(maker, name), pair)]
+        if len(agreeing) == 1:
+            return _of(agreeing[0], name)
     try:
         return find_glass(name).name
     except InputError as error:

@@ -30,6 +30,7 @@ def doublet(first="1.6/50", rates=(8.0, 8.0, 8.0), **keys):
     return lens_from_prescription({"surfaces": rows, "sensor": {"distance": 50.0}, **keys})
 
 
+@torch.no_grad()
 def test_all_of_one_expansion_grows_alike():
     """Glass without dn/dT and a mount of one coefficient: every length is scaled by 1 + αΔT."""
     lens = doublet()
@@ -61,6 +62,7 @@ def plano_convex(**keys):
     return lens_from_prescription({"surfaces": rows, "sensor": {"distance": 90.0}, **keys})
 
 
+@torch.no_grad()
 def test_the_focal_length_of_a_singlet():
     """1/f = (n - 1)/R with Schott's dn/dT and expansion, 7.1e-6/K."""
     warm = plano_convex().at(70.0)
@@ -72,6 +74,7 @@ def test_the_focal_length_of_a_singlet():
     assert float(warm.sensor_distance) == 90.0
 
 
+@torch.no_grad()
 def test_an_air_gap_is_held_at_the_edges():
     """Two spheres face each other; the mount is between the edges of their clear apertures."""
     rows = {
@@ -93,6 +96,7 @@ def test_an_air_gap_is_held_at_the_edges():
     assert float(lens.at(80.0).thicknesses["2"]) == pytest.approx(expected, rel=1e-13)
 
 
+@torch.no_grad()
 def test_the_lens_stays_as_it_is_and_comes_back():
     lens = plano_convex()
     kept = prescription_of(lens)
@@ -105,6 +109,7 @@ def test_the_lens_stays_as_it_is_and_comes_back():
     )
 
 
+@torch.no_grad()
 def test_keys_of_a_prescription(tmp_path):
     lens = plano_convex(temperature=70.0, pressure=0.5)
     n = find_glass("N-BK7").at(Environment(70.0, 0.5)).index(WAVE)
