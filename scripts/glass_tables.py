@@ -100,9 +100,9 @@ class Row:
         if not all(isinstance(n, float) and 0.99 < n < 8.0 for n in indices):
             return "indices out of bounds within its range"
         blue, red = (self.formula(w, self.constant, self.terms) for w in (0.4861, 0.6563))
-        if self.terms and self.constant >= 0.0 and first <= 0.4861 and last >= 0.6563:
-            if self.name != "VACUUM" and not blue > red:
-                return "no normal dispersion"
+        visible = first <= 0.4861 and last >= 0.6563
+        if visible and self.terms and self.name != "VACUUM" and not blue > red:
+            return "no normal dispersion"
         if not first <= D_LINE <= last or not 1.01 < self.nd < 3.0:
             return ""
         index = self.formula(D_LINE, self.constant, self.terms)

@@ -75,7 +75,8 @@ def find_glass(text: str, air: float = 1.0, environment: Environment | None = No
     makers = [maker] if maker in having else [] if maker else _meant(name, having)
     if not makers:
         elsewhere = f"; it is a glass of {' and '.join(having)}" if having else ""
-        hint = elsewhere + suggestion(name, _names(maker))
+        near = suggestion(name, _names(maker)) or ("" if maker else suggestion(name, _further()))
+        hint = elsewhere + near
         raise InputError(
             f"unknown material '{text}'{hint} (allowed: air, occluder, a number from 0.1 to 10, "
             "glass as nd/Vd or nd/Vd/ΔPgF, for example 1.5168/64.17, or by its catalogue name, "
@@ -177,7 +178,13 @@ def glass_names(catalogue: str) -> list[str]:
 
 
 def _names(maker: str) -> list[str]:
-    """Return what a misspelt name may have meant: a glass of that maker, or anything."""
+    """Return what a misspelt name may have meant first: a glass of that maker, or of any."""
     media = [] if maker else ["air", "occluder"]
-    chosen = [maker] if maker else catalogues()
+    chosen = [maker] if maker else MAKERS
     return media + [name for catalogue in chosen for name in glass_names(catalogue)]
+
+
+def _further() -> list[str]:
+    """Return the names of all other catalogues."""
+    others = [catalogue for catalogue in catalogues() if catalogue not in MAKERS]
+    return [name for catalogue in others for name in glass_names(catalogue)]

@@ -49,8 +49,8 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 # No optical medium is denser; the bound also catches a wavelength or a glass code.  Vacuum has
 # 0.9997 relative to air, and some crystals in the infrared have less than 1.
 _LOWEST_INDEX, _HIGHEST_INDEX = 0.1, 10.0
-# Catalogue glasses deviate from the normal line by less than 0.1.
-_LARGEST_DEVIATION = 1.0
+# Of ΔPgF: catalogue glasses deviate from the normal line by less than 0.1.
+LARGEST_DEVIATION = 1.0
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def abbe_number(medium: Medium) -> float:
 def _with_partial_dispersion(
     name: str, nd: float, vd: float, deviation: float, model: IndexModel
 ) -> ModelGlass:
-    if not abs(deviation) <= _LARGEST_DEVIATION:
+    if not abs(deviation) <= LARGEST_DEVIATION:
         raise InputError(f"material '{name}': ΔPgF must be from -1 to 1 (glasses have about ±0.05)")
     return model_glass(name, nd, vd, deviation, model.lines)
 

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass, makers_of
-from dolens.optics.materials import Medium, index_model, parse_material
+from dolens.optics.materials import LARGEST_DEVIATION, Medium, index_model, parse_material
 from dolens.optics.model_glass import deviation_of_two_terms
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.glass_order import catalogue_order
@@ -170,6 +170,8 @@ def _model(words: Sequence[str], place: str) -> str:
         raise InputError(f"{place} needs nd and Vd: '{_BLANK} 1 0 nd Vd'")
     nd, vd = (_plain(word, place) for word in words[3:5])
     deviation = _plain(words[5], place) if len(words) > 5 else "0"
+    if not abs(float(deviation)) <= LARGEST_DEVIATION:
+        raise InputError(f"{place}: ΔPgF must be from -1 to 1, not {deviation}")
     if float(vd) != 0.0 and abs(float(deviation) - _deviation_of_two_terms(vd)) < _SAME_DEVIATION:
         return f"{nd}/{vd}"
     return _with_vd(nd, vd, deviation)
