@@ -9,7 +9,7 @@ import typer
 
 
 def convert(
-    old: Annotated[Path, typer.Argument(metavar="A", help="Lens file: .yaml, .txt or .zmx.")],
+    old: Annotated[Path, typer.Argument(metavar="A", help="Lens file of any format below.")],
     new: Annotated[
         Path, typer.Argument(metavar="B", help="File to write; its suffix says the format.")
     ],
@@ -21,7 +21,9 @@ def convert(
 ) -> None:
     """Convert a lens file to another format, and say what was changed or lost.
 
-    Formats: dolens's own YAML (.yaml, .yml), dO's text (.txt) and Zemax's (.zmx).
+    Read and written: dolens's own YAML (.yaml, .yml) and JSON (.json), Zemax (.zmx), CODE V
+    (.seq) and dO's text (.txt). Only read: OSLO (.len), and the JSON of Optiland, DeepLens
+    and ray-optics (.json, .roa). What a file holds counts, and not its name alone.
 
     B is read again and compared with A key by key. What its format
     cannot hold is dropped and listed, if it is a name or a remark. If light
@@ -33,10 +35,9 @@ def convert(
 
     from dolens.errors import InputError
     from dolens.prescriptions.conversion import converted
-    from dolens.prescriptions.files import load_prescription
-    from dolens.prescriptions.zemax_unread import unread_in_zemax
+    from dolens.prescriptions.files import read_lens_file
 
-    prescription = load_prescription(old)
+    prescription, passed_over = read_lens_file(old)
     if not force and new.exists():
         same = new.samefile(old)
         raise InputError(
@@ -44,10 +45,8 @@ def convert(
         )
     found = converted(prescription, str(old), str(new), index_model)
     changes = list(found.changes)
-    if old.suffix.lower() == ".zmx":
-        unread = unread_in_zemax(old.read_bytes())
-        if unread:
-            changes.append(f"not read from {old.name}: {', '.join(unread)}")
+    if passed_over:
+        changes.append(f"passed over in {old.name}: {'; '.join(passed_over)}")
     _write(found.data, new)
 
     console = Console(highlight=False, soft_wrap=True)

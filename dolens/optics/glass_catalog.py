@@ -179,7 +179,7 @@ def glass_names(catalogue: str) -> list[str]:
 
 def _names(maker: str) -> list[str]:
     """Return what a misspelt name may have meant first: a glass of that maker, or of any."""
-    media = [] if maker else ["air", "occluder"]
+    media = [] if maker else ["air", "occluder", "mirror"]
     chosen = [maker] if maker else MAKERS
     return media + [name for catalogue in chosen for name in glass_names(catalogue)]
 

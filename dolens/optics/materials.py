@@ -12,6 +12,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.glass import Glass
 from dolens.optics.glass_catalog import find_glass
+from dolens.optics.mirrors import MIRROR, Mirror
 from dolens.optics.model_glass import ModelGlass, model_glass
 from dolens.optics.thermal import Environment
 
@@ -74,7 +75,7 @@ class Material:
 
 # What light may travel through: hashable, equal when it is the same medium, and with a name that a
 # prescription reads back as the same.
-Medium = Material | ModelGlass | Glass
+Medium = Material | ModelGlass | Glass | Mirror
 
 
 def index_model(name: str) -> IndexModel:
@@ -88,9 +89,10 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
     """Read a material as a prescription writes it.
 
     Args:
-        text: `air`; `occluder`; a number, the same index at every wavelength; glass as nd/Vd, for
-            example `1.5168/64.17`, or as nd/Vd/ΔPgF (see `model_glass`); or a catalogue glass, for
-            example `N-BK7` or `SCHOTT:N-BK7` (see `find_glass`).  Case is ignored.
+        text: `air`; `occluder`; `mirror`, where a surface reflects; a number, the same index at
+            every wavelength; glass as nd/Vd, for example `1.5168/64.17`, or as nd/Vd/ΔPgF (see
+            `model_glass`); or a catalogue glass, for example `N-BK7` or `SCHOTT:N-BK7` (see
+            `find_glass`).  Case is ignored.
         model: which lines nd and Vd stand for, and the index of air.  A constant index, nd/Vd and
             nd/Vd/ΔPgF are taken as written; a catalogue glass is relative to air (see `Glass`).
         environment: temperature and pressure of a catalogue glass; None: those of its catalogue.
@@ -110,6 +112,8 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
         return Material("occluder", model.occluder)
     if _NUMBER.fullmatch(name):
         return _constant(name)
+    if name.lower() == MIRROR.name:
+        return MIRROR
     match = _GLASS.fullmatch(name)
     if match is None:
         return find_glass(name, model.air, environment)

@@ -30,14 +30,21 @@ logger = logging.getLogger(__name__)
 _PER_KELVIN = 1e-6
 _EMPTY = ("air", "occluder", "MISC:VACUUM")
 _MIRROR = "mirror"
-# The power of length that a parameter has, by its name.
+# The power of length that a parameter has, by its name; a diffractive phase stays the same at the
+# point of the surface that has moved.
 _POWERS = {
-    **dict.fromkeys(("curvature", "curvature_x", "curvature_y", "b"), -1),
-    **dict.fromkeys(("conic", "conic_x", "conic_y"), 0),
-    **dict.fromkeys(("coefficients", "knots_x", "knots_y"), 1),
-    **dict.fromkeys(("half_width", "half_width_x", "half_width_y"), 1),
+    **dict.fromkeys(("curvature", "curvature_x", "curvature_y", "b", "phase.grooves", "twist"), -1),
+    **dict.fromkeys(("conic", "conic_x", "conic_y", "slope_x", "slope_y"), 0),
+    **dict.fromkeys(("coefficients", "knots_x", "knots_y", "sag", "spacing_x", "spacing_y"), 1),
+    **dict.fromkeys(("half_width", "half_width_x", "half_width_y", "normalization_radius"), 1),
+    **dict.fromkeys(("decenter_x", "decenter_y", "phase.norm_radius"), 1),
+    # An ideal lens is no body that expands.
+    "power": 0,
 }
 _ASPHERIC = re.compile(r"a(\d+)")
+# Zernike's and Forbes's coefficients are lengths.
+_LENGTH = re.compile(r"[zq]\d+")
+_PHASE = "phase."
 
 
 def medium_at(medium: Medium, environment: Environment | None) -> Medium:
@@ -113,8 +120,8 @@ def _expansion(medium: Medium, given: float) -> float | None:
 def _edge_sag(surface: Surface) -> Tensor | float:
     """Return the sag at the edge of a surface along y, mm; 0 where it has no edge."""
     reach = surface.aperture.edge.extent[1]
-    values = {**dict(surface.named_parameters()), **dict(surface.named_buffers())}
-    if not values or not reach < float("inf"):
+    values = {**surface._parameters, **surface._buffers}
+    if surface.changes_axes or not values:
         return 0.0
     like = next(iter(values.values()))
     x, y = like.new_zeros(1), like.new_full((1,), reach)
@@ -123,22 +130,23 @@ def _edge_sag(surface: Surface) -> Tensor | float:
 
 def _expand(surface: Surface, factor: float, place: str) -> None:
     """Make a surface larger in all directions by a factor."""
-    if factor == 1.0:
+    if factor == 1.0 or surface.changes_axes:
         return
     for name, value in (*surface.named_parameters(), *surface.named_buffers()):
         value.mul_(factor ** _power(name, place))
     aperture = surface.aperture
-    obscuration = aperture.obscuration
+    outlines = {name: getattr(aperture, name) for name in ("edge", "obscuration", "window")}
     surface.aperture = replace(
         aperture,
-        edge=_scaled(aperture.edge, factor),
-        obscuration=None if obscuration is None else _scaled(obscuration, factor),
+        center=(factor * aperture.center[0], factor * aperture.center[1]),
+        **{name: outline and _scaled(outline, factor) for name, outline in outlines.items()},
     )
 
 
 def _scaled(outline: Any, factor: float) -> Any:
-    sizes = {field.name: getattr(outline, field.name) for field in fields(outline)}
-    return replace(outline, **{n: v * factor for n, v in sizes.items() if isinstance(v, float)})
+    """Return an outline whose sizes, all of them lengths, are multiplied by a factor."""
+    sizes = {field.name: factor * getattr(outline, field.name) for field in fields(outline)}
+    return replace(outline, **sizes)
 
 
 def _power(name: str, place: str) -> int:
@@ -148,6 +156,10 @@ def _power(name: str, place: str) -> int:
     aspheric = _ASPHERIC.fullmatch(name)
     if aspheric:
         return 1 - int(aspheric[1])
+    if name.startswith(_PHASE):
+        return 0
+    if _LENGTH.fullmatch(name):
+        return 1
     powers = monomial_powers(name)
     if powers is None:
         raise InputError(f"{place}: how its parameter '{name}' expands is not known")

@@ -12,12 +12,19 @@ A prescription is a mapping::
       '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
     sensor: {distance: 96.0, diameter: 1.7664}
 
-Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
-`occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+Lengths are in mm; `radius: .inf` is a plane (some shapes have `radius_x` and `radius_y`);
+`material` is the medium behind the surface: `air`, `occluder`, a constant index (`1.5`), glass as
+nd/Vd or nd/Vd/ΔPgF, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+`material: mirror` makes the surface reflect; behind it light travels towards -z, and thicknesses
+are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
+that stands behind them (see breaks.py).
+A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
+lens (see deflections.py).
 `thermal_expansion` (1e-6/K) is that of the mount of an air gap (see `dolens.optics.thermal_lens`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
+So are the numbers that its source publishes (see `dolens.prescriptions.published`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -30,20 +37,31 @@ import torch
 from dolens.errors import InputError, check_keys, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
-from dolens.optics.materials import parse_material
+from dolens.optics.mirrors import media_of
 from dolens.optics.surfaces import SURFACES, Surface
-from dolens.optics.thermal import Environment
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
+from dolens.prescriptions.automatic_apertures import set_automatic_semi_diameters
+from dolens.prescriptions.breaks import KIND, break_from, break_row, is_break
 from dolens.prescriptions.checks import (
     as_integer,
     as_number,
     as_numbers,
     require_mapping,
 )
+from dolens.prescriptions.deflections import (
+    PHASE_KEY,
+    is_paraxial_lens,
+    phase_from,
+    phase_row,
+    power_row,
+    with_power,
+)
+from dolens.prescriptions.field_data import set_object_fields
+from dolens.prescriptions.media import EXPANSION_KEY, environment_of, expansion_of, medium_of
 from dolens.prescriptions.poses import element_rows, elements_from
+from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
-    environment_of,
     set_stop_semi_diameter,
     stop_row,
     system_data,
@@ -53,6 +71,7 @@ from dolens.prescriptions.system_data import (
 _LENS_KEYS = (
     "name",
     "source",
+    PUBLISHED_KEY,
     "index_model",
     "stop",
     "object_material",
@@ -62,9 +81,11 @@ _LENS_KEYS = (
     *SYSTEM_DATA_KEYS,
 )
 _SURFACE_KEYS = (
-    *("type", "radius", *APERTURE_KEYS, "thickness", "material", "thermal_expansion", "note"),
+    *("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", EXPANSION_KEY, "note"),
 )
 _SENSOR_KEYS = ("distance", "diameter")
+# A prescription may give the radius of the same name instead: `radius_x` for `curvature_x`.
+CURVATURES = ("curvature", "curvature_x", "curvature_y")
 
 
 def lens_from_prescription(
@@ -104,15 +125,16 @@ def lens_from_prescription(
     air = environment_of(prescription, where)
     surfaces, thicknesses, expansions = [], [], []
     first = prescription.get("object_material", "air")
-    materials = [_material(first, model, f"{where}: object", air)]
+    materials = [medium_of(first, model, f"{where}: object", air)]
     for number, row in enumerate(rows, 1):
         place = f"{where}: surface {number}"
-        surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
-        materials.append(_material(row.get("material"), model, place, air))
-        rate = row.get("thermal_expansion")
-        expansions.append(
-            None if rate is None else as_number(rate, f"{place}: 'thermal_expansion'")
-        )
+        if is_break(row):
+            surfaces.append(break_from(row, place, dtype))
+            materials.append(media_of(materials).materials[-1])
+        else:
+            surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
+            materials.append(medium_of(row.get("material"), model, place, air))
+        expansions.append(expansion_of(row, place))
         if number < len(rows):
             if row.get("thickness") is None:
                 raise InputError(f"{place}: 'thickness' is missing (mm to surface {number + 1})")
@@ -136,9 +158,12 @@ def lens_from_prescription(
             elements_from(prescription.get("elements"), dtype, where),
             thermal_expansions=expansions,
             backend=backend,
+            source=str(prescription.get("source") or ""),
+            published=published_from(prescription.get(PUBLISHED_KEY), where),
             **data,
         )
-        return set_stop_semi_diameter(lens, prescription)
+        lens = set_object_fields(set_stop_semi_diameter(lens, prescription))
+        return set_automatic_semi_diameters(lens, prescription)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(where) else f"{where}: {message}") from None
@@ -152,30 +177,39 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
     """
     rows: dict[str, dict[str, Any]] = {}
     for (number, surface), material in zip(lens.surfaces.items(), lens.materials[1:], strict=True):
+        if surface.changes_axes:
+            rows[number] = break_row(surface) | _gap(lens, number)
+            continue
         row: dict[str, Any] = {"type": surface.kind}
-        for key, value in (*surface.named_parameters(), *surface.named_buffers()):
+        for key, value in (*surface._parameters.items(), *surface._buffers.items()):
             number_value = value.detach().tolist()
-            if key == "curvature":
-                row["radius"] = _radius(number_value)
-                if 1.0 / row["radius"] != number_value:
+            if key == "power" and surface.law is not None:
+                row |= power_row(number_value)
+                continue
+            if key in CURVATURES:
+                radius = _radius_key(key)
+                row[radius] = _radius(number_value)
+                if 1.0 / row[radius] != number_value:
                     # Rounding of 1/(1/c) loses a bit for some c: keep the parameter itself.
-                    del row["radius"]
-                    row["curvature"] = number_value
+                    del row[radius]
+                    row[key] = number_value
             else:
                 row[key] = number_value
+        if surface.phase is not None:
+            row[PHASE_KEY] = phase_row(surface.phase)
         row |= aperture_rows(surface.aperture)
-        if number in lens.thicknesses:
-            row["thickness"] = float(lens.thicknesses[number].detach())
+        row |= _gap(lens, number)
         row["material"] = material.name
-        rate = lens.thermal_expansions[int(number) - 1]
-        if rate is not None:
-            row["thermal_expansion"] = rate
+        if lens.thermal_expansions[int(number) - 1] is not None:
+            row[EXPANSION_KEY] = lens.thermal_expansions[int(number) - 1]
         rows[number] = row
     sensor: dict[str, Any] = {"distance": float(lens.sensor_distance.detach())}
     if lens.sensor_diameter is not None:
         sensor["diameter"] = lens.sensor_diameter
     return {
         "name": lens.name,
+        **({"source": lens.source} if lens.source else {}),
+        **published_rows(lens.published),
         "index_model": lens.index_model,
         "stop": lens.stop,
         "object_material": lens.materials[0].name,
@@ -186,43 +220,66 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
     }
 
 
+def _gap(lens: Lens, number: str) -> dict[str, float]:
+    """Return the thickness behind a surface, which the last has not."""
+    if number not in lens.thicknesses:
+        return {}
+    return {"thickness": float(lens.thicknesses[number].detach())}
+
+
 def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     kind = str(row.get("type", "sphere"))
     if kind not in SURFACES:
         raise InputError(
             f"{place}: type '{kind}' is unknown{did_you_mean(kind, SURFACES)} "
-            f"(allowed: {', '.join(SURFACES)})"
+            f"(allowed: {', '.join((*SURFACES, KIND))})"
         )
     shape = SURFACES[kind]
     try:
+        if is_paraxial_lens(row):
+            row = with_power(row)
         names = shape.parameter_names(row)
-        check_keys(row, (*_SURFACE_KEYS, *names), place)
+        radii = [_radius_key(name) for name in names if name in CURVATURES]
+        check_keys(row, (*_SURFACE_KEYS, *names, *radii), place)
         values = {
             key: (as_numbers if key in shape.arrays else as_number)(row.get(key, 0.0), f"'{key}'")
             for key in names
             if key in row or key not in shape.optional
         }
-        if "curvature" in names:
-            values["curvature"] = _curvature(row)
-        elif not math.isinf(as_number(row.get("radius", math.inf), "'radius'")):
+        values |= {name: _curvature(row, name) for name in names if name in CURVATURES}
+        if "curvature" not in names and not math.isinf(
+            as_number(row.get("radius", math.inf), "'radius'")
+        ):
             raise InputError(f"a surface of type '{kind}' has no 'radius'")
-        return shape(clear_aperture(row, place), values, dtype)
+        surface = shape(clear_aperture(row, place), values, dtype)
+        if row.get(PHASE_KEY) is not None:
+            if shape.law is not None:
+                raise InputError(f"a surface of type '{kind}' cannot have a 'phase'")
+            surface.phase = phase_from(row[PHASE_KEY], place, dtype)
+        return surface
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None
 
 
-def _curvature(row: Mapping[str, Any]) -> float:
-    if row.get("curvature") is not None and row.get("radius") is not None:
-        raise InputError("give 'radius' or 'curvature', not both")
-    if row.get("curvature") is not None:
-        return as_number(row["curvature"], "'curvature'")
-    if row.get("radius") is None:
-        raise InputError("'radius' is missing (mm; .inf for a plane)")
-    radius = as_number(row["radius"], "'radius'", finite=False)
+def _curvature(row: Mapping[str, Any], name: str) -> float:
+    """Return a curvature of a row, which gives it or the radius of the same name."""
+    key = _radius_key(name)
+    if row.get(name) is not None and row.get(key) is not None:
+        raise InputError(f"give '{key}' or '{name}', not both")
+    if row.get(name) is not None:
+        return as_number(row[name], f"'{name}'")
+    if row.get(key) is None:
+        raise InputError(f"'{key}' is missing (mm; .inf for a plane)")
+    radius = as_number(row[key], f"'{key}'", finite=False)
     if radius == 0.0:
-        raise InputError("'radius' is 0; write .inf for a plane")
+        raise InputError(f"'{key}' is 0; write .inf for a plane")
     return 1.0 / radius
+
+
+def _radius_key(name: str) -> str:
+    """Return `radius_x` for `curvature_x`."""
+    return name.replace("curvature", "radius")
 
 
 def _radius(curvature: float) -> float:
@@ -242,12 +299,3 @@ def _rows(prescription: Mapping[str, Any], where: str) -> list[Mapping[str, Any]
             )
         require_mapping(rows[str(number)], f"{where}: surface {number}")
     return [rows[str(number)] for number in range(1, len(rows) + 1)]
-
-
-def _material(value: object, model: Any, place: str, air: Environment | None) -> Any:
-    if value is None:
-        raise InputError(f"{place}: 'material' is missing (the medium behind the surface)")
-    try:
-        return parse_material(str(value), model, air)
-    except InputError as error:
-        raise InputError(f"{place}: {error}") from None

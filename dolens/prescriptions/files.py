@@ -1,68 +1,95 @@
 """Lens files are read and written."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
-from dolens.errors import InputError, did_you_mean, one_line
+from dolens.errors import InputError, did_you_mean
 from dolens.optics.glass_folders import glass_folders
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
-from dolens.prescriptions.zemax import decode_zemax, encode_zemax
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
+from dolens.prescriptions.published import PUBLISHED_KEY
+from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.yaml_text import plain_values
+
+__all__ = [
+    "SUFFIXES",
+    "decode_prescription",
+    "decode_yaml",
+    "encode_prescription",
+    "find_lens",
+    "lens_names",
+    "load_lens",
+    "load_prescription",
+    "read_lens_data",
+    "read_lens_file",
+    "save_lens",
+]
+
+logger = logging.getLogger(__name__)
 
 GlassPlaces = Sequence[str | Path] | str | Path | None
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
-_SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """This safe YAML loader also refuses a key written twice: the first would be lost."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        seen = set()
-        scalars = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for key_node in scalars:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
-                line = key_node.start_mark.line + 1
-                raise yaml.YAMLError(f"key '{key}' is given twice, again in line {line}")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+# Of these, prescriptions from patents and books lie in a folder of their own.
+_PUBLISHED = "published"
+# What holds the numbers that a source publishes.
+_WHOLE = (".yaml", ".yml", ".json")
 
 
 def lens_names() -> list[str]:
-    """Return the names of the lenses that come with dolens, as `load_lens` takes them."""
-    return sorted(path.stem for path in (packaged_configuration() / _LENSES).glob("*.yaml"))
+    """Return the names of the lenses that come with dolens, as `load_lens` takes them.
+
+    Those from patents and books are listed apart, by `published_lens_names`.
+    """
+    return _names(".")
+
+
+def published_lens_names() -> list[str]:
+    """Return the names of the lenses from patents and books, such as `published/tessar_us2838978`.
+
+    Each holds the numbers that its source prints beside the prescription, as `Lens.published`.
+    """
+    return [f"{_PUBLISHED}/{name}" for name in _names(_PUBLISHED)]
+
+
+def _names(folder: str) -> list[str]:
+    return sorted(
+        path.stem for path in (packaged_configuration() / _LENSES / folder).glob("*.yaml")
+    )
 
 
 def find_lens(path: str | Path) -> Path:
     """Return the file of a lens: the path itself, or that of a lens that comes with dolens.
 
     Args:
-        path: a file, or a bare name without suffix, such as `cooke_triplet`, that is no file here.
+        path: a file, or a bare name without suffix, such as `cooke_triplet` or
+            `published/tessar_us2838978`, that is no file here.
 
     Raises:
-        InputError: a bare name that is neither; the message offers near ones and lists all.
+        InputError: a bare name that is neither; the message offers near ones, and lists those of
+            the lenses that are not in a folder.
     """
     path = Path(path)
-    if path.suffix or path.name != str(path) or path.is_file():
+    name = path.as_posix()
+    published = path.parent.as_posix() == _PUBLISHED
+    if path.suffix or path.is_file() or not (path.name == name or published):
         return path
-    names = lens_names()
-    if path.name not in names:
+    allowed = published_lens_names() if published else lens_names()
+    if name not in allowed:
+        near = did_you_mean(name, [*allowed, *published_lens_names()])
+        some = "those of docs/lenses.md" if published else ", ".join(allowed)
         raise InputError(
-            f"lens '{path}': no such file, and no lens of that name comes with dolens"
-            f"{did_you_mean(path.name, names)} (allowed: {', '.join(names)})"
+            f"lens '{path}': no such file, and no lens of that name comes with dolens{near} "
+            f"(allowed: {some})"
         )
-    return packaged_configuration() / _LENSES / f"{path.name}.yaml"
+    return packaged_configuration() / _LENSES / f"{name}.yaml"
 
 
 def load_prescription(path: str | Path) -> Any:
@@ -70,37 +97,43 @@ def load_prescription(path: str | Path) -> Any:
 
     Args:
         path: a file in YAML (.yaml, .yml), the diffoptics format (.txt) or Zemax's (.zmx), or the
-            name of a lens that comes with dolens (`lens_names`).
+            name of a lens that comes with dolens (`lens_names`, `published_lens_names`).
 
     Raises:
         InputError: the file is missing, of another kind, or not valid; the message is one line
             that names the file, and the line, surface and key where there is one.
     """
+    return read_lens_file(path).prescription
+
+
+def read_lens_file(path: str | Path) -> ReadPrescription:
+    """Read a lens file as plain data, and list what is passed over; see `load_prescription`."""
     path = find_lens(path)
-    _suffix(path)
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: is larger than {MOST_BYTES // 2**20} MB, and no lens")
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return decode_prescription(data, path)
+    return read_lens_data(data, path)
 
 
 def decode_prescription(data: bytes, path: str | Path) -> Any:
-    """Read the content of a lens file as plain data.
+    """Read the content of a lens file as plain data; see `read_lens_data`."""
+    return read_lens_data(data, path).prescription
+
+
+def read_lens_data(data: bytes, path: str | Path) -> ReadPrescription:
+    """Read the content of a lens file as plain data, and list what is passed over.
 
     Args:
         data: what the file holds.
-        path: its suffix says which format that is; messages name it.
+        path: its name; see `dolens.prescriptions.lens_formats.read_lens`.
 
     Raises:
         InputError: see `load_prescription`.
     """
-    suffix = _suffix(Path(path))
-    if suffix == ".zmx":
-        return prescription_from_zemax(decode_zemax(data, str(path)), str(path))
-    if suffix == ".txt":
-        return prescription_from_diffoptics(_text(data, path, "text"), str(path))
-    return decode_yaml(data, path)
+    return read_lens(data, path)
 
 
 def decode_yaml(data: bytes, where: str | Path) -> Any:
@@ -113,20 +146,11 @@ def decode_yaml(data: bytes, where: str | Path) -> Any:
     Raises:
         InputError: it is not valid YAML; the message is one line.
     """
-    text = _text(data, where, "YAML")
     try:
-        # A subclass of the safe loader: it builds plain values only.
-        return yaml.load(text, Loader=_UniqueKeyLoader)
-    except yaml.YAMLError as error:
-        reason = one_line(error)
-        raise InputError(f"{where}: is not valid YAML ({reason})") from None
-
-
-def _text(data: bytes, where: str | Path, kind: str) -> str:
-    try:
-        return data.decode("utf-8")
+        text = data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: is not valid {kind} ({error})") from None
+        raise InputError(f"{where}: is not valid YAML ({error})") from None
+    return plain_values(text, str(where))
 
 
 def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:
@@ -139,15 +163,7 @@ def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> by
     Raises:
         InputError: the format cannot hold the lens; the message names the surface and key.
     """
-    suffix = _suffix(Path(path))
-    if suffix == ".zmx":
-        return encode_zemax(zemax_of(prescription, str(path)))
-    if suffix == ".txt":
-        return diffoptics_text_of(prescription, str(path)).encode()
-    text = yaml.safe_dump(
-        prescription, sort_keys=False, default_flow_style=None, width=200, allow_unicode=True
-    )
-    return text.encode()
+    return encode_lens(prescription, path)
 
 
 def load_lens(
@@ -176,30 +192,29 @@ def load_lens(
     """
     path = find_lens(path)
     with glass_folders(glass_catalogues):
-        prescription = load_prescription(path)
+        prescription, passed_over = read_lens_file(path)
+        if passed_over:
+            logger.info("%s: passed over: %s", path, "; ".join(passed_over))
         return lens_from_prescription(prescription, dtype, index_model, str(path), backend)
 
 
 def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None) -> None:
     """Write a lens in the format that the suffix names (.yaml, .yml, .txt or .zmx).
 
-    Reading it back gives the same parameters to the last bit.
+    Reading it back gives the same parameters to the last bit.  YAML alone holds the numbers that
+    the lens's source publishes.
 
     Args:
         lens: as it is now.
         path: the file.
-        glass_catalogues: as for `load_lens`; a `.zmx` file needs them to name their glasses.
+        glass_catalogues: as for `load_lens`; another program's file needs them to name their glass.
 
     Raises:
         InputError: the format cannot hold the lens; the message names the surface and key.
     """
     path = Path(path)
+    prescription = prescription_of(lens)
+    if path.suffix.lower() not in _WHOLE:
+        prescription.pop(PUBLISHED_KEY, None)
     with glass_folders(glass_catalogues):
-        path.write_bytes(encode_prescription(prescription_of(lens), path))
-
-
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise InputError(f"{path}: lens files end in {', '.join(_SUFFIXES)}")
-    return suffix
+        path.write_bytes(encode_prescription(prescription, path))

@@ -2,7 +2,11 @@
 
 A file is a list of lines, each an operand of capital letters and its arguments.  The first ones
 describe the system; from `SURF n` on they describe surface n, usually indented.  Surface 0 is the
-object, the last one the image.  Merit functions and tolerances may follow.
+object, the last one the image.  The merit function, tolerances and configurations may follow.
+
+Programs of thirty years have written these files, each with operands of its own.  What changes the
+way of light is a closed table (`SURFACE_OPERANDS`, `SYSTEM_OPERANDS`); every other operand is
+passed over, and counted.
 """
 
 import codecs
@@ -12,16 +16,28 @@ from typing import NamedTuple
 
 from dolens.errors import InputError
 
-# What a surface's block may say and a prescription holds.
-HELD = (
-    *("TYPE", "COMM", "STOP", "CURV", "CONI", "PARM", "DISZ", "GLAS"),
-    *("DIAM", "CLAP", "FLAP", "SQAP", "OBSC", "SQOB", "OBDC"),
+# What a surface's block may say about the way of light.
+SHAPE_OPERANDS = ("TYPE", "CURV", "CONI", "PARM", "XDAT", "DISZ", "GLAS")
+SURFACE_OPERANDS = (
+    *("STOP", "COMM", *SHAPE_OPERANDS, "HIDE", "SCBD", "GDAT", "GARR"),
+    *("DIAM", "CLAP", "FLAP", "SQAP", "ELAP", "OBSC", "SQOB", "ELOB", "SPID", "OBDC"),
+    *("USAP", "USOB", "UDAD"),
 )
-# What bends no ray: drawing, coatings, mechanical size, and solves whose result is written anyway.
-WITHOUT_EFFECT = (
-    *("FIMP", "HIDE", "MIRR", "SLAB", "POPS", "MEMA", "OEMA", "COAT", "BORD", "DRAW", "SCAT"),
-    *("TCEX", "TCE", "MAZH", "MAZA", "CHZH", "CHZA", "EDGE", "EDGV", "PIKC", "PIKT", "PIKD"),
-    *("PIKG", "PIKK", "PIKP", "PZUP", "RAYS", "UNIF", "QTYP"),
+# What a surface's block may say and bends no ray.  Others are passed over too, but where nothing is
+# indented only these are known to belong to a surface.
+UNREAD_OF_SURFACES = (
+    *("SSID", "FIMP", "MIRR", "SLAB", "MEMA", "OEMA", "POPS", "COAT", "SCAT", "SCOL", "BORD"),
+    *("DRAW", "EDGE", "EDGV", "MAZH", "MAZA", "CHZH", "CHZA", "PZUP", "PPAR", "PKUP", "VDSZ"),
+    *("VCON", "VPAR", "TOLE", "TCOM", "TCED", "TCEX", "TCE", "BOOK", "RAYS", "UNIF", "QTYP"),
+)
+# What describes the whole system: title, unit, air, aperture, fields, wavelengths.
+SYSTEM_OPERANDS = (
+    *("MODE", "NAME", "NOTE", "UNIT", "GCAT", "ENVD"),
+    *("ENPD", "FNUM", "OBNA", "FLOA"),
+    *("FTYP", "XFLN", "YFLN", "XFLD", "YFLD", "FWGN", "FWGT", "FENF", "FEFD"),
+    *("VDXN", "VDYN", "VCXN", "VCYN", "VANN", "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN"),
+    *("WAVM", "WAVL", "WAVN", "WWGT", "WWGN", "PWAV"),
+    "MNUM",
 )
 # Not str.splitlines: it also breaks at letters that Latin-1 text may hold.
 _LINE_END = re.compile(r"\r\n|\r|\n")
@@ -43,12 +59,18 @@ class ZemaxFile:
     """A `ZemaxFile` holds the lines of a file.
 
     Attributes:
-        system: operand → its lines, before and after the surfaces.
+        system: operand → its lines, of the operands of the system.
         surfaces: the same for each surface, from the object to the image.
+        tail: the lines behind the surfaces: merit function, tolerances, configurations.
+        passed_over: operand → its lines in the system and the surfaces, which are not read.
+        skipped: numbers of surfaces that the file leaves out.
     """
 
     system: dict[str, list[Line]] = field(default_factory=dict)
     surfaces: list[dict[str, list[Line]]] = field(default_factory=list)
+    tail: list[Line] = field(default_factory=list)
+    passed_over: dict[str, list[Line]] = field(default_factory=dict)
+    skipped: list[int] = field(default_factory=list)
 
 
 def decode_zemax(data: bytes, where: str = "lens") -> str:
@@ -85,35 +107,57 @@ def encode_zemax(text: str) -> bytes:
     return codecs.BOM_UTF16_LE + text.encode("utf-16-le")
 
 
+def _check_number(file: ZemaxFile, line: Line, where: str) -> None:
+    """Check that a surface has the number that is due.
+
+    Some programs skip a number, which leaves a plane of no thickness in air: that must be what it
+    would be, with air before it.
+    """
+    expected = len(file.surfaces) + len(file.skipped)
+    number = line.arguments[0] if line.arguments else ""
+    if number == str(expected):
+        return
+    skips = number == str(expected + 1) and file.surfaces and "GLAS" not in file.surfaces[-1]
+    if not skips:
+        raise InputError(f"{where}: line {line.at}: expected SURF {expected}, not 'SURF {number}'")
+    file.skipped.append(expected)
+
+
 def parse_zemax(text: str, where: str) -> ZemaxFile:
     """Sort the lines of a file by surface and operand.
 
+    A surface's block reaches as far as lines are indented more than its SURF; behind it, operands
+    of surfaces still belong to it, since some programs indent nothing.
+
     Raises:
-        InputError: a surface's block holds an operand that may bend rays and is not known, or
-            surfaces are not numbered from 0.
+        InputError: surfaces are not numbered from 0, or the shape of a surface is spoken of behind
+            the last one.
     """
     file = ZemaxFile()
-    block = file.system
+    block: dict[str, list[Line]] | None = None
+    margin = 0
     for at, raw in enumerate(_LINE_END.split(text), 1):
         words = raw.split()
         if not words:
             continue
         line = Line(at, words[0].upper(), words[1:], raw.strip()[len(words[0]) :].strip())
+        indent = len(raw) - len(raw.lstrip())
         if line.operand == "SURF":
-            expected = str(len(file.surfaces))
-            if line.arguments[:1] != [expected]:
-                raise InputError(
-                    f"{where}: line {at}: expected SURF {expected}, not '{raw.strip()}'"
-                )
-            block = {}
+            _check_number(file, line, where)
+            block, margin = {}, indent
             file.surfaces.append(block)
-        elif block is not file.system and line.operand not in HELD:
-            if line.operand in WITHOUT_EFFECT:
-                continue
-            if raw[0].isspace():
-                place = f"{where}: surface {len(file.surfaces) - 1}: operand {line.operand}"
-                raise InputError(f"{place} (line {at}) is not held (allowed: {', '.join(HELD)})")
-            # What is not indented and no property of a surface ends the surfaces.
-            block = file.system
-        block.setdefault(line.operand, []).append(line)
+        elif block is not None and line.operand in SURFACE_OPERANDS:
+            block.setdefault(line.operand, []).append(line)
+        elif line.operand in SYSTEM_OPERANDS:
+            file.system.setdefault(line.operand, []).append(line)
+            block = block if indent > margin else None
+        elif not file.surfaces or (
+            block is not None and (indent > margin or line.operand in UNREAD_OF_SURFACES)
+        ):
+            file.passed_over.setdefault(line.operand, []).append(line)
+        elif line.operand in SHAPE_OPERANDS:
+            raise InputError(f"{where}: line {at}: {line.operand} stands behind the surfaces")
+        else:
+            file.tail.append(line)
+            block = None
     return file

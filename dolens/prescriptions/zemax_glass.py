@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass, makers_of
 from dolens.optics.materials import LARGEST_DEVIATION, Medium, index_model, parse_material
+from dolens.optics.mirrors import MIRROR
 from dolens.optics.model_glass import deviation_of_two_terms
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.glass_order import catalogue_order
@@ -63,17 +64,18 @@ def read_glass(
         surfaces: the arguments of GLAS of all surfaces from 0, for pick-ups.
 
     Returns:
-        `air`, nd/Vd/ΔPgF, nd/Vd, a constant index (a model whose Vd is 0), or catalogue and name.
+        `air`, `mirror`, nd/Vd/ΔPgF, nd/Vd, a constant index (a model whose Vd is 0), or catalogue
+        and name.
 
     Raises:
-        InputError: a mirror, half a model, or a name that cannot be read as the file means it.
+        InputError: half a model, or a name that cannot be read as the file means it.
     """
     words = _picked_up(words, place, surfaces)
     if not words or words[0].upper() == "AIR":
         return "air"
     name, how = words[0], words[1] if len(words) > 1 else "0"
     if name.upper() == "MIRROR":
-        raise InputError(f"{place}: GLAS MIRROR is not held (allowed: refracting surfaces)")
+        return MIRROR.name
     place = f"{place}: GLAS {name}"
     if name == _BLANK or how == _MODEL:
         return _model(words, place)
@@ -101,6 +103,8 @@ def glass_line(material: object, place: str) -> list[str]:
     name = medium.name
     if name in ("air", "occluder"):
         return []
+    if medium is MIRROR:
+        return ["  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]
     _, colon, word = name.partition(":")
     if colon:
         nd, vd = index_and_abbe_number(medium) or (1.5, 40.0)

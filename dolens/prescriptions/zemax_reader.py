@@ -1,43 +1,58 @@
 """The text of a Zemax `.zmx` file is converted to a prescription.
 
-Held: sequential systems of STANDARD and EVENASPH surfaces, glass by model (nd, Vd) or by its name
+Held: sequential systems of the shapes in `zemax_shapes`, glass by model (nd, Vd) or by its name
 in the catalogues of GCAT (`zemax_glass`), circular and rectangular apertures and obscurations
-(`zemax_apertures`), fields as angles or object heights, wavelengths, and UNIT MM, CM, IN or METER.
-Everything else that bends rays is an error that says so.
+(`zemax_apertures`), fields and wavelengths with their weights (`zemax_fields`), and UNIT MM, CM, IN
+or METER.
+Everything else that bends rays is an error that names it.  What bends no ray is passed over, and
+listed (`zemax_passed_over`).
 
-CURV 0, without a decimal point, is a plane; Zemax itself writes 0.0, and that is a curvature
-that an optimizer may change.  Surfaces keep their numbers.  Only planes before the image that
-neither refract nor clip are left out, and their gaps added to the sensor's distance.
+Surfaces keep their numbers, but for those that the file says to ignore.  Only planes before the
+image that neither refract nor clip are left out, and their gaps added to the sensor's distance.
 
-A CLAP clips, so it gives the semi-diameter; else DIAM does.  In Zemax a DIAM without CLAP or FLAP
-draws and does not clip: here it clips.  A missing or zero DIAM is an error, because ENPD and FNUM
-size the beam of the axis alone, and its semi-diameters would vignette the fields.
-ENPD and FNUM close the stop (see `dolens.prescriptions.system_data`), which then needs no DIAM.
-Vignetting factors, weights, ray aiming, temperature and coatings are not read.
+As in Zemax, apertures clip (CLAP, SQAP, and FLAP at a DIAM of the user's own), and a DIAM alone
+draws and clips nothing.  ENPD, FNUM and OBNA close the stop (see
+`dolens.prescriptions.system_data`); with FLOA its DIAM does.
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.prescriptions.decimals import number_in_text, radius_of, scaled
+from dolens.optics.mirrors import MIRROR
+from dolens.prescriptions.apertures import AUTOMATIC
+from dolens.prescriptions.decimals import number_in_text
+from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
+from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_configurations import other_configurations
 from dolens.prescriptions.zemax_glass import read_glass
+from dolens.prescriptions.zemax_passed_over import passed_over
+from dolens.prescriptions.zemax_shape import Row
+from dolens.prescriptions.zemax_shapes import shape_of_block
 from dolens.prescriptions.zemax_system import factor_to_mm, read_system
 
-_TYPES = ("STANDARD", "EVENASPH")
-_COEFFICIENTS = 8
 # Zemax writes INFINITY, and takes any distance from here on for it.
 _INFINITE = 1e10
+
+GlassReader = Callable[..., str]
 
 Block = dict[str, list[Line]]
 
 
 def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:
-    """Read a lens from the text of a `.zmx` file.
+    """Read a lens from the text of a `.zmx` file; see `read_zemax`."""
+    return read_zemax(text, where).prescription
+
+
+def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
+    """Read a lens from the text of a `.zmx` file, and list what is passed over.
 
     Args:
         text: the file's content, decoded (see `decode_zemax`).
@@ -53,176 +68,174 @@ def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:
     if len(file.surfaces) < 3:
         raise InputError(f"{where}: needs an object, a surface and an image as SURF blocks")
     factor = factor_to_mm(file, where)
-    prescription = read_system(file, factor, where)
-    stops = [n for n, block in enumerate(file.surfaces) if "STOP" in block]
-    if len(stops) != 1 or not 1 <= stops[0] <= len(file.surfaces) - 2:
-        raise InputError(
-            f"{where}: one surface from 1 to {len(file.surfaces) - 2} must be the STOP, not "
-            f"{', '.join(map(str, stops)) or 'none'}"
-        )
-    prescription["stop"] = stops[0]
-    catalogues = [word for line in file.system.get("GCAT", []) for word in line.arguments] or None
-    distance = _object(prescription, file, catalogues, factor, where)
-    if distance is not None:
-        prescription["object_distance"] = distance
-    rows, hard = [], []
-    before = prescription["object_material"]
-    for n, block in enumerate(file.surfaces[1:-1], 1):
-        place = f"{where}: surface {n}"
-        material = read_glass(_arguments(block, "GLAS"), catalogues, place)
-        row = _row(block, before, material, factor, place)
-        aperture, clips = read_apertures(block, factor, place)
-        beam = n == stops[0] and not prescription.keys().isdisjoint(PUPIL_KEYS)
-        sized = not aperture.keys().isdisjoint(("semi_diameter", "aperture"))
-        if clips or not beam:
-            row |= aperture
-        if not sized and not beam and not _is_dummy(row, before):
-            raise InputError(
-                f"{place}: DIAM is missing or 0; write the semi-diameter (a beam on the axis "
-                "alone, which ENPD or FNUM would give, vignettes the fields)"
-            )
-        row["thickness"] = _length(block, "DISZ", factor, place)
+    glass = _glass_reader(file)
+    medium, distance = _object(file, glass, factor, where)
+    prescription = read_system(file, factor, distance is not None, where)
+    prescription["stop"] = 1
+    prescription["object_material"] = medium
+    pupil = not prescription.keys().isdisjoint(PUPIL_KEYS)
+    rows, hard, stops = [], [], []
+    for n, lines in enumerate(file.surfaces[1:-1], 1):
+        if _is_ignored(lines):
+            continue
+        block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
+        row, clips = _row(block, glass, pupil)
+        # Behind a mirror, and behind a coordinate break, is the medium in front of it.
+        if row.get("material", MIRROR.name) != MIRROR.name:
+            medium = row["material"]
         rows.append(row)
         hard.append(clips)
-        before = row["material"]
-    return _with_sensor(prescription, rows, hard, file.surfaces[-1], factor, where)
+        if block.stop:
+            stops.append(len(rows))
+    if len(stops) != 1:
+        said = [n for n, lines in enumerate(file.surfaces) if "STOP" in lines]
+        raise InputError(
+            f"{where}: one surface from 1 to {len(file.surfaces) - 2} must be the STOP, not "
+            f"{', '.join(map(str, said)) or 'none'}"
+        )
+    prescription["stop"] = stops[0]
+    if distance is not None:
+        prescription["object_distance"] = _in_front(distance, prescription, rows, hard, where)
+    found = _with_sensor(prescription, rows, hard, file.surfaces[-1], factor, where)
+    return ReadPrescription(found, [*passed_over(file), *other_configurations(file, where)])
+
+
+def _glass_reader(file: ZemaxFile) -> GlassReader:
+    """Return what reads a surface's glass, given the words of its GLAS and its name in messages."""
+    catalogues = [word for line in file.system.get("GCAT", []) for word in line.arguments]
+    words = [lines["GLAS"][-1].arguments if "GLAS" in lines else [] for lines in file.surfaces]
+    return partial(read_glass, catalogues=catalogues or None, surfaces=words)
+
+
+def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, bool]:
+    """Return the row of a surface, and whether its aperture stops light.
+
+    Args:
+        block: its lines.
+        glass: reads the words of GLAS.
+        pupil: whether the file gives the pupil, which then sizes the stop.
+    """
+    shape = shape_of_block(block)
+    _refuse_own_axes(block)
+    row: Row = {}
+    aperture: Row = {}
+    clips = False
+    if shape.surface:
+        material = glass(block.words("GLAS"), place=block.place)
+        block = replace(block, material=material)
+        row["material"] = material
+        sizing = block.stop and not pupil
+        aperture, clips = read_apertures(block.lines, block.factor, block.place, sizing)
+        if block.stop and not aperture.get("clips", True):
+            aperture = {key: aperture[key] for key in aperture.keys() - {"semi_diameter", "clips"}}
+        if block.stop and aperture.get("semi_diameter") == AUTOMATIC:
+            del aperture["semi_diameter"]
+        if sizing and aperture.keys().isdisjoint(("semi_diameter", "aperture")):
+            raise InputError(
+                f"{block.place}: the stop has no size: neither its DIAM nor the system's aperture "
+                "(ENPD, FNUM, OBNA) gives one"
+            )
+    row = shape.read(block) | row
+    comment = " ".join(line.text for line in block.lines.get("COMM", []))
+    if comment:
+        row["note"] = comment
+    return row | aperture | {"thickness": block.length("DISZ")}, clips
+
+
+def _in_front(
+    distance: float,
+    prescription: dict[str, Any],
+    rows: list[Row],
+    hard: list[bool],
+    where: str,
+) -> float:
+    """Return the distance (mm) of the object, after the planes that do nothing are left out where
+    the object lies on one of them or behind it.
+
+    Raises:
+        InputError: the object is virtual: light would meet the lens before it.
+    """
+    while distance <= 0.0:
+        if (
+            prescription["stop"] == 1
+            or hard[0]
+            or not _is_dummy(rows[0], prescription["object_material"])
+        ):
+            raise InputError(
+                f"{where}: an object on or behind the first surface is not held (DISZ {distance:g})"
+            )
+        distance += rows.pop(0)["thickness"]
+        hard.pop(0)
+        prescription["stop"] -= 1
+    return distance
 
 
 def _with_sensor(
     prescription: dict[str, Any],
-    rows: list[dict[str, Any]],
+    rows: list[Row],
     hard: list[bool],
     image: Block,
     factor: Fraction,
     where: str,
 ) -> dict[str, Any]:
     """Leave out the planes before the image that do nothing; put the image where it is."""
-    place = f"{where}: surface {len(rows) + 1} (the image)"
-    if _type(image, place) != "STANDARD" or _value(image, "CURV", place) != 0.0:
+    place = f"{where}: the image"
+    block = SurfaceBlock(image, factor, place)
+    if block.type != "STANDARD" or block.curvature != 0.0:
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
     gaps = [rows[-1].pop("thickness")]
     while len(rows) > 1 and len(rows) != prescription["stop"] and not hard[len(rows) - 1]:
-        if not _is_dummy(rows[-1], rows[-2]["material"]):
+        if not _is_dummy(rows[-1], _medium_behind(rows[:-1], prescription)):
             break
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
-    for n, row in enumerate(rows, 1):
-        if not ("semi_diameter" in row or "aperture" in row) and n != prescription["stop"]:
-            raise InputError(f"{where}: surface {n}: DIAM is missing or 0; write the semi-diameter")
     sensor = {"distance": math.fsum(gaps)}
     size = read_apertures(image, factor, place)[0].get("semi_diameter")
-    if size and is_fixed(image):
+    if is_fixed(image) and size != AUTOMATIC:
         sensor["diameter"] = 2.0 * size
     surfaces = {str(n): row for n, row in enumerate(rows, 1)}
     return {**prescription, "surfaces": surfaces, "sensor": sensor}
 
 
 def _object(
-    prescription: dict[str, Any],
-    file: ZemaxFile,
-    catalogues: list[str] | None,
-    factor: Fraction,
-    where: str,
-) -> float | None:
-    """Set the medium before surface 1; return the object's distance, or None for infinity."""
-    block, place = file.surfaces[0], f"{where}: surface 0 (the object)"
-    if _type(block, place) != "STANDARD" or _value(block, "CURV", place) != 0.0:
+    file: ZemaxFile, glass: GlassReader, factor: Fraction, where: str
+) -> tuple[str, float | None]:
+    """Return the medium before surface 1, and the object's distance, None for infinity."""
+    place = f"{where}: the object"
+    block = SurfaceBlock(file.surfaces[0], factor, place)
+    if block.type != "STANDARD" or block.curvature != 0.0:
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
-    prescription["object_material"] = read_glass(_arguments(block, "GLAS"), catalogues, place)
-    words = _arguments(block, "DISZ")
+    medium = glass(block.words("GLAS"), place=place)
+    words = block.words("DISZ")
     if not words or words[0].upper() == "INFINITY":
-        return None
-    distance = _length(block, "DISZ", factor, place)
-    return None if abs(distance) >= _INFINITE else distance
+        return medium, None
+    distance = block.length("DISZ")
+    return medium, None if abs(distance) >= _INFINITE else distance
 
 
-def _row(block: Block, before: str, material: str, factor: Fraction, place: str) -> dict[str, Any]:
-    """Return type, radius, coefficients and medium of a surface between two media."""
-    kind = _type(block, place)
-    row: dict[str, Any] = {"type": "sphere"}
-    curvature = scaled(_arguments(block, "CURV", "0")[0], 1 / factor, f"{place}: CURV")
-    conic = _value(block, "CONI", place)
-    coefficients = _coefficients(block, factor, place)
-    if kind == "EVENASPH":
-        curvature, conic = _without_square(curvature, conic, coefficients.pop("a2", 0.0), place)
-        row = {"type": "even_asphere", **_curvature(curvature), "conic": conic, **coefficients}
-    elif any(coefficients.values()):
-        raise InputError(f"{place}: TYPE STANDARD has no PARM")
-    elif "CONI" in block:
-        row = {"type": "conic", **_curvature(curvature), "conic": conic}
-    elif curvature == 0.0 and "STOP" in block and material == before:
-        row = {"type": "aperture"}
-    elif _arguments(block, "CURV", "0")[0] == "0":
-        row = {"type": "plane"}
-    else:
-        row |= _curvature(curvature)
-    comment = " ".join(line.text for line in block.get("COMM", []))
-    return row | {"material": material} | ({"note": comment} if comment else {})
+def _medium_behind(rows: list[dict[str, Any]], prescription: dict[str, Any]) -> str:
+    """Return the medium behind the last of some rows: mirrors and breaks leave it as it is."""
+    media = (row.get("material", MIRROR.name) for row in reversed(rows))
+    return next((m for m in media if m != MIRROR.name), prescription["object_material"])
 
 
-def _coefficients(block: Block, factor: Fraction, place: str) -> dict[str, float]:
-    """Return the coefficients of r², r⁴, ... by name (a2, a4, ...), in mm.
-
-    Zemax lists all eight, used or not: then the zeros behind the last that is used are left out.
+def _is_ignored(lines: Block) -> bool:
+    """Return whether a surface is there for another configuration alone: the sixth switch of
+    HIDE.
     """
-    found: dict[str, float] = {}
-    for line in block.get("PARM", []):
-        what = f"{place}: PARM (line {line.at})"
-        if len(line.arguments) < 2:
-            raise InputError(f"{what}: needs a number from 1 to {_COEFFICIENTS} and a value")
-        n = number_in_text(line.arguments[0], what)
-        if n not in range(1, _COEFFICIENTS + 1):
-            raise InputError(f"{what}: must be from 1 to {_COEFFICIENTS}, not {line.arguments[0]}")
-        found[f"a{2 * int(n)}"] = scaled(line.arguments[1], factor ** (1 - 2 * int(n)), what)
-    if "a2" in found:
-        used = max((int(name[1:]) for name, value in found.items() if value), default=0)
-        return {name: value for name, value in found.items() if int(name[1:]) <= used}
-    return found
+    return "HIDE" in lines and lines["HIDE"][-1].arguments[5:6] == ["1"]
 
 
-def _without_square(
-    curvature: float, conic: float, square: float, place: str
-) -> tuple[float, float]:
-    """Return curvature and conic constant of the surface whose r² term is part of the conic.
-
-    A paraboloid (conic -1) of curvature c is c·r²/2, as a plane is for c = 0, so a term α·r² adds
-    2α to c exactly.  Any other conic plus a paraboloid is no conic.
-    """
-    if square == 0.0:
-        return curvature, conic
-    if curvature != 0.0 and conic != -1.0:
-        raise InputError(
-            f"{place}: PARM 1, the r² term of EVENASPH, must be 0 unless CURV is 0 or CONI is -1: "
-            "it is no curvature, as the conic goes on differently"
-        )
-    return curvature + 2.0 * square, -1.0
+def _refuse_own_axes(block: SurfaceBlock) -> None:
+    """Refuse the decenters and tilts that a surface has among its properties (SCBD)."""
+    for line in block.lines.get("SCBD", []):
+        if any(number_in_text(w, f"{block.place}: SCBD") for w in line.arguments[3:]):
+            raise InputError(
+                f"{block.place}: a surface with its own decenter or tilt is not held (SCBD)"
+            )
 
 
-def _is_dummy(row: dict[str, Any], before: str) -> bool:
+def _is_dummy(row: Row, before: str | None) -> bool:
+    """Return whether a row is a plane between one medium and the same."""
     flat = row["type"] == "plane" or (row["type"] == "sphere" and row.get("radius") == math.inf)
-    return flat and row["material"] == before
-
-
-def _curvature(curvature: float) -> dict[str, float]:
-    radius = radius_of(curvature)
-    return {"curvature": curvature} if radius is None else {"radius": radius}
-
-
-def _type(block: Block, place: str) -> str:
-    kind = _arguments(block, "TYPE", "STANDARD")[0].upper()
-    if kind not in _TYPES:
-        raise InputError(f"{place}: TYPE {kind} is not held (allowed: {', '.join(_TYPES)})")
-    return kind
-
-
-def _length(block: Block, operand: str, factor: Fraction, place: str) -> float:
-    return scaled(_arguments(block, operand, "0")[0], factor, f"{place}: {operand}")
-
-
-def _value(block: Block, operand: str, place: str) -> float:
-    return number_in_text(_arguments(block, operand, "0")[0], f"{place}: {operand}")
-
-
-def _arguments(block: Block, operand: str, *default: str) -> list[str]:
-    """Return the arguments of an operand's last line."""
-    return (block[operand][-1].arguments if operand in block else []) or list(default)
+    return flat and "phase" not in row and row["material"] == before

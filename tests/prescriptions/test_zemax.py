@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dolens import Rays, Status, load_lens
-from dolens.prescriptions.zemax_reader import prescription_from_zemax
+from dolens.prescriptions.zemax_reader import prescription_from_zemax, read_zemax
 from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet, surface, triplet
 
 
@@ -176,9 +176,9 @@ def test_unused_coefficients_are_not_parameters():
     assert {key: row[key] for key in row if key[0] == "a"} == {"a4": 0.0, "a6": 1e-6}
 
 
-@pytest.mark.parametrize(("c", "k"), [(0.0, 0.0), (0.0, 3.0), (0.02, -1.0)])
-def test_a_square_term_that_is_a_curvature(c, k, tmp_path):
-    """On a plane or a paraboloid, α·r² makes a paraboloid: sag (c/2 + α)·r² + a4·r⁴."""
+@pytest.mark.parametrize(("c", "k"), [(0.0, 0.0), (0.0, 3.0), (0.02, -1.0), (0.04, 0.5)])
+def test_a_square_term_is_a_coefficient(c, k, tmp_path):
+    """The sag is the conic's, plus α·r² + a4·r⁴."""
     alpha, a4 = 0.004, 1e-6
     text = singlet(
         "TYPE EVENASPH", f"CURV {c}", f"CONI {k}", f"PARM 1 {alpha}", f"PARM 2 {a4}", "DIAM 5"
@@ -187,8 +187,74 @@ def test_a_square_term_that_is_a_curvature(c, k, tmp_path):
     shape = lens.surfaces["1"]
     r = torch.linspace(0.0, 5.0, 11, dtype=torch.float64)
     sag, *_ = shape.sag_and_gradient(dict(shape.named_parameters()), r, torch.zeros_like(r))
-    expected = (c / 2 + alpha) * r**2 + a4 * r**4
-    assert (sag - expected).abs().max() < 1e-15
+    conic = c * r**2 / (1 + (1 - (1 + k) * c**2 * r**2).sqrt())
+    assert (sag - conic - alpha * r**2 - a4 * r**4).abs().max() < 1e-15
+
+
+def test_a_tilted_plane_is_a_polynomial():
+    found = prescription_from_zemax(singlet("TYPE TILTSURF", "PARM 1 0.1", "PARM 2 -0.2", "DIAM 5"))
+    row = found["surfaces"]["1"]
+    assert (row["type"], row["x"], row["y"]) == ("xy_polynomial", 0.1, -0.2)
+
+
+def test_a_polynomial_is_read_with_its_radius_of_normalization():
+    """A coefficient A of (x/R)²·(y/R), a length u·A, is u·A/(u·R)³ in mm^-2."""
+    data = [5.0, 2.0, *(0.0,) * 5, 8.0]
+    lines = [f"XDAT {n} {value}" for n, value in enumerate([6, *data[1:]], 1)]
+    text = singlet("TYPE XPOLYNOM", *lines, "DIAM 5", head="UNIT CM\nFLOA\n")
+    row = prescription_from_zemax(text)["surfaces"]["1"]
+    assert row["x3"] == pytest.approx(8.0 * 10.0 / 20.0**3, rel=1e-15)
+
+
+def test_a_surface_that_another_configuration_has_is_left_out():
+    """The sixth switch of HIDE: light, gap and number pass it over."""
+    text = singlet("CURV 0.02", "DISZ 4", GLASS, "DIAM 5").replace("SURF 3", "SURF 4")
+    text = text.replace("SURF 2", "SURF 3")
+    extra = surface(2, "CURV 0.3", "DISZ 7", "GLAS MIRROR 0 0").replace(
+        "HIDE 0 0 0 0 0 0", "HIDE 0 0 0 0 0 1"
+    )
+    found = prescription_from_zemax(text.replace("SURF 3", extra + "SURF 3"))
+    assert list(found["surfaces"]) == ["1", "2"]
+    assert found["surfaces"]["1"]["thickness"] == 4.0
+
+
+PASSED_OVER = """SSID 3
+VDSZ -1 1
+VCON
+VPAR 2
+SCOL 1 0 0
+TOLE 12 0
+BOOK Page 3
+TCED 23 0 0
+POPS 1 0 0
+WOBBLE 3
+COAT AR
+PPAR 3 -1 1 0"""
+
+
+def test_what_bends_no_ray_is_passed_over_and_listed():
+    lines = ("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
+    plain = read_zemax(singlet(*lines))
+    more = read_zemax(singlet(*lines, *PASSED_OVER.splitlines()))
+    assert more.prescription == plain.prescription
+    said = "; ".join(more.passed_over)
+    for words in ("coatings (COAT)", "operands unknown here (WOBBLE)", "TCED", "physical optics"):
+        assert words in said
+
+
+def test_configurations_are_listed_and_the_current_one_is_read():
+    text = singlet("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
+    more = "MNUM 2 1\nTHIC 1 1 4.0 0\nTHIC 1 2 5.0 0\nCRVT 2 1 -0.02\nCRVT 2 2 -0.02\n"
+    found = read_zemax(text + more)
+    assert found.prescription["surfaces"]["1"]["thickness"] == 4.0
+    assert found.passed_over[-1] == (
+        "the other 1 of 2 configurations, which set THIC 1 (read: the current one, 1)"
+    )
+
+
+def test_files_that_indent_nothing(tmp_path):
+    text = "\n".join(line.strip() for line in triplet().splitlines())
+    assert prescription_from_zemax(text) == prescription_from_zemax(triplet())
 
 
 def test_a_distance_of_ten_million_metres_is_infinity():

@@ -16,7 +16,10 @@ HALF_X = tl.constexpr(int(Slot.HALF_X))
 HALF_Y = tl.constexpr(int(Slot.HALF_Y))
 HOLE_X = tl.constexpr(int(Slot.HOLE_X))
 HOLE_Y = tl.constexpr(int(Slot.HOLE_Y))
+CENTER_X = tl.constexpr(int(Slot.CENTER_X))
+CENTER_Y = tl.constexpr(int(Slot.CENTER_Y))
 SENSE = tl.constexpr(int(Slot.SENSE))
+SENSE_BEHIND = tl.constexpr(int(Slot.SENSE_BEHIND))
 TAG = tl.constexpr(int(Slot.TAG))
 SHAPE = tl.constexpr(int(Slot.HEADER))  # the first number of a shape
 
@@ -31,6 +34,10 @@ COUNT = tl.constexpr(int(Code.COUNT))
 COLUMNS = tl.constexpr(int(Code.COLUMNS))
 EXTRAS = tl.constexpr(int(Code.EXTRAS))
 DEGREE = tl.constexpr(int(Code.DEGREE))
+LAW = tl.constexpr(int(Code.LAW))
+BASE = tl.constexpr(int(Code.BASE))
+NUMBERS = tl.constexpr(int(Code.NUMBERS))
+LENGTH = tl.constexpr(int(Code.LENGTH))
 ROW = tl.constexpr(int(Code.ROW))
 
 PLANE = tl.constexpr(int(Kind.PLANE))
@@ -39,6 +46,7 @@ CONIC = tl.constexpr(int(Kind.CONIC))
 CHANGE_AXES = tl.constexpr(int(Kind.CHANGE_AXES))
 LENS_AXES = tl.constexpr(int(Kind.LENS_AXES))
 SENSOR = tl.constexpr(int(Kind.SENSOR))
+DEFLECT = tl.constexpr(int(Kind.DEFLECT))
 
 # Bits of `KINDS`, the kinds of step that a lens has: a kernel is compiled for those.
 HAS_SPHERE = tl.constexpr(1 << int(Kind.SPHERE))
@@ -46,9 +54,11 @@ HAS_CONIC = tl.constexpr(1 << int(Kind.CONIC))
 HAS_CHANGE_AXES = tl.constexpr(1 << int(Kind.CHANGE_AXES))
 HAS_LENS_AXES = tl.constexpr(1 << int(Kind.LENS_AXES))
 HAS_SENSOR = tl.constexpr(1 << int(Kind.SENSOR))
+HAS_DEFLECT = tl.constexpr(1 << int(Kind.DEFLECT))
 
 CIRCLE = tl.constexpr(int(Outline.CIRCLE))
 RECTANGLE = tl.constexpr(int(Outline.RECTANGLE))
+ELLIPSE = tl.constexpr(int(Outline.ELLIPSE))
 
 # Added to a surface's tag where a ray fails; `dolens.optics.rays.Status`.
 VIGNETTED = tl.constexpr(int(Failure.VIGNETTED))

@@ -1,0 +1,105 @@
+"""What a Zemax `.zmx` file says and no lens needs is listed in words."""
+
+from collections.abc import Callable
+
+from dolens.errors import InputError
+from dolens.prescriptions.decimals import number_in_text
+from dolens.prescriptions.zemax import Line, ZemaxFile
+
+# Operands that a surface's block may hold, and what they are about.  They bend no ray.
+_OF_SURFACES = {
+    "drawing and colours": ("MIRR", "SLAB", "SCOL", "DRAW", "SSID", "BOOK", "LAYR", "SUBS"),
+    "mechanical sizes": ("MEMA", "OEMA", "BORD", "MECH", "TPDR"),
+    "coatings": ("COAT",),
+    "scatter models": ("SCAT", "SCSF"),
+    "physical optics": ("POPS", "POPD"),
+    "variables and solves, whose results are written": (
+        *("VDSZ", "VCON", "VPAR", "VCUR", "VXDT", "PPAR", "PZUP", "PKUP", "PCON", "PXDT", "PIKC"),
+        *("MAZH", "MAZA", "CHZH", "CHZA", "EDGE", "EDGV", "OPDS", "PIKT", "PIKD", "PIKG", "PIKK"),
+        *("PIKP", "POSI", "COMP", "COCU", "PUPS", "EVAL", "ZPLM", "TZPL", "CZPL", "XZPL"),
+    ),
+    "expansion with temperature": ("TCED", "TCEX", "TCE"),
+    "tolerances": ("TOLE", "TCOM", "UNIF", "QTYP"),
+    "files of its own": ("FIMP", "RAYS"),
+}
+# Operands of the system.
+_OF_THE_SYSTEM = {
+    "apodization": ("GFAC",),
+    "polarization": ("POLS",),
+    "ray aiming, which is always on here": ("RAIM", "PUSH", "XAIM", "YAIM", "ZAIM"),
+    "coating and scatter files": ("COFN", "IWDP"),
+    "variables and solves, whose results are written": ("FSVX", "FSVY"),
+    "settings of the program": (
+        *("VERS", "PFIL", "LANG", "ROPD", "PICB", "SDMA", "GLRS", "GSTD", "NSCD", "HYPR", "OMMA"),
+        *("AUTH", "LUID", "EERA", "STUD", "FCOM", "DBDT", "CSUM", "PUPD", "SDIA"),
+    ),
+}
+_GROUPS = {**_OF_SURFACES}
+for _group, _operands in _OF_THE_SYSTEM.items():
+    _GROUPS[_group] = (*_GROUPS.get(_group, ()), *_operands)
+_GROUP_OF = {operand: group for group, operands in _GROUPS.items() for operand in operands}
+_UNKNOWN = "operands unknown here"
+
+
+def _first_number(line: Line) -> bool:
+    return bool(line.arguments) and _number(line.arguments[0]) != 0.0
+
+
+# Lines that are always there, and which of them say anything.
+_SAYS: dict[str, Callable[[Line], bool]] = {
+    "GFAC": _first_number,
+    "COAT": lambda line: bool(line.text),
+    "SCAT": lambda line: bool(line.text),
+    "FIMP": lambda line: bool(line.text),
+    "POPS": _first_number,
+    "POLS": lambda line: False,
+    "RAIM": lambda line: len(line.arguments) > 1 and _number(line.arguments[1]) != 0.0,
+    "PUSH": lambda line: any(_number(word) for word in line.arguments),
+    "SCOL": _first_number,
+}
+# Said of every file, and of no lens.
+_SILENT = ("settings of the program", "coating and scatter files", "mechanical sizes")
+
+
+def passed_over(file: ZemaxFile) -> list[str]:
+    """Return what a file says that is not read and bends no ray, in words.
+
+    Each entry names a group, and the operands behind it.  The program's own settings and sizes
+    for drawing, which all files have, are left out.
+    """
+    groups: dict[str, dict[str, None]] = {}
+    for operand, lines in file.passed_over.items():
+        says = _SAYS.get(operand, lambda line: True)
+        group = _GROUP_OF.get(operand, _UNKNOWN)
+        if group not in _SILENT and any(says(line) for line in lines):
+            groups.setdefault(group, {})[operand] = None
+    for number in file.skipped:
+        groups.setdefault(f"surface {number}, which the file leaves out", {})
+    for group in _behind_the_surfaces(file):
+        groups.setdefault(group, {})
+    return [
+        f"{group} ({', '.join(operands)})" if operands else group
+        for group, operands in groups.items()
+    ]
+
+
+def _behind_the_surfaces(file: ZemaxFile) -> list[str]:
+    """Return which of merit function and tolerances the lines behind the surfaces hold."""
+    found: dict[str, None] = {}
+    begin = file.system.get("MNUM")
+    for line in file.tail:
+        if line.operand == "TOL":
+            if line.arguments[:1] not in ([], ["TOFF"]):
+                found["tolerances"] = None
+        elif begin and line.at > begin[-1].at:
+            break
+        elif line.operand not in ("TCMM", "CSUM", "BLNK") or (line.operand == "BLNK" and line.text):
+            found["the merit function"] = None
+    return list(found)
+
+
+def _number(word: str) -> float:
+    try:
+        return number_in_text(word, "")
+    except InputError:
+        return 0.0
