@@ -14,7 +14,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
-from dolens.optics.trace import trace_surfaces, trace_to_plane
+from dolens.optics.trace import trace_surfaces, trace_to_sensor
 
 # Where the sensor is, mm: across, where it is from where it should be, and along the axis.
 SENSOR = ("sensor_x", "sensor_y", "sensor_distance")
@@ -205,7 +205,7 @@ def moment_model(
     def land(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         system = lens.system(dict(zip(names, values.unbind(), strict=True)))
         last = trace_surfaces(system, ray, wavelength)
-        traced = trace_to_plane(system, last, system.vertices[-1], wavelength, 1.0)
+        traced = trace_to_sensor(system, last, wavelength)
         ends = [m for row in traced.margins for m in (row.met, row.transmitted) if m is not None]
         margin = torch.stack([end.detach().amin() for end in ends]).amin()
         at = traced.ray

@@ -14,7 +14,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium
 
 # Media that are no glass, and have no melt that could be off.
-_NO_GLASS = ("air", "occluder")
+_NO_GLASS = ("air", "occluder", "mirror")
 
 
 @dataclass(frozen=True)

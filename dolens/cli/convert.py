@@ -9,7 +9,7 @@ import typer
 
 
 def convert(
-    old: Annotated[Path, typer.Argument(metavar="A", help="Lens file: .yaml, .txt or .zmx.")],
+    old: Annotated[Path, typer.Argument(metavar="A", help="Lens file of any format below.")],
     new: Annotated[
         Path, typer.Argument(metavar="B", help="File to write; its suffix says the format.")
     ],
@@ -21,7 +21,9 @@ def convert(
 ) -> None:
     """Convert a lens file to another format, and say what was changed or lost.
 
-    Formats: dolens's own YAML (.yaml, .yml), dO's text (.txt) and Zemax's (.zmx).
+    Read and written: dolens's own YAML (.yaml, .yml) and JSON (.json), Zemax (.zmx), CODE V
+    (.seq) and dO's text (.txt). Only read: OSLO (.len), and the JSON of Optiland, DeepLens
+    and ray-optics (.json, .roa). What a file holds counts, and not its name alone.
 
     B is read again and compared with A key by key. What its format
     cannot hold is dropped and listed, if it is a name or a remark. If light

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 def show(
     lens: Annotated[
         str,
-        typer.Argument(help="A lens file (.yaml, .txt, .zmx), or the name of a lens of dolens."),
+        typer.Argument(
+            help="A lens file (.yaml, .json, .zmx, .seq, .len, .roa, .txt), or the name of a "
+            "lens of dolens."
+        ),
     ],
     html: Annotated[
         Path | None,
@@ -67,6 +70,7 @@ def show(
     from dolens.lens_page.preparation import prepared_lens
     from dolens.optics.tables import printable
     from dolens.prescriptions import load_lens
+    from dolens.prescriptions.files import read_lens_file
 
     if tolerances is not None and html is None and figures is None:
         raise InputError("--tolerances needs --html or --figures, where its figure goes")
@@ -85,6 +89,9 @@ def show(
     console.print()
     console.print(printable(overview.name), style="bold", markup=False)
     console.print(overview.summary, style="dim", markup=False)
+    passed_over = read_lens_file(lens).passed_over
+    if passed_over:
+        console.print(f"passed over: {'; '.join(passed_over)}", style="dim", markup=False)
     for section in overview.sections:
         console.print()
         console.print(section.title, style="bold cyan", markup=False)

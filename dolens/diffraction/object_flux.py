@@ -56,7 +56,7 @@ def axial_flux(system: OpticalSystem, points: ObjectPoints, wavelength: Tensor) 
     rows = []
     for w in distinct.tolist():
         (a, b), _ = matrix_to_stop(system, w)
-        rows.append(torch.stack((a, b * system.indices(w)[0])))
+        rows.append(torch.stack((a, b * system.signed_indices(w)[0])))
     a, b = torch.stack(rows)[which].unbind(-1)
     near, r = points.vergence, system.surfaces[system.stop - 1].edge_radius
     return torch.pi * r * r / ((a + near * b).square() + (near * r).square())

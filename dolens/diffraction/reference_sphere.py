@@ -82,7 +82,8 @@ def sphere_curvature(
         InputError: a radius of zero, or the paraxial exit pupil lies in the sensor.
     """
     if radius is None:
-        to_pupil = system.vertices[-1] - exit_pupil(system, wavelength).z
+        # Against the light's own travel, which goes towards -z behind an odd number of mirrors.
+        to_pupil = system.senses[-1] * (system.vertices[-1] - exit_pupil(system, wavelength).z)
         length = torch.sqrt(to_pupil.square() + centre.square().sum(-1))
         radius = length * to_pupil.sign()
     if bool((radius == 0.0).any()):

@@ -1,6 +1,8 @@
 """Kernels see a lens as a table of numbers and codes, with one record for every step of a ray.
 
-A step is a surface, or a change of axes between elements of different poses, or the sensor plane.
+A step is a surface, or a change of axes between elements of different poses, or the sensor plane,
+or a deflection: a surface whose light a law deflects has two steps, one that carries rays to it and
+leaves their directions alone, and one that changes these.
 Steps come in the order that light meets them, so that backward mode is another table, not another
 kernel.  Every step has a row of `codes` (integers) and a record in `values` (numbers): a header of
 fixed slots and then the numbers of its shape.
@@ -23,10 +25,11 @@ class Kind(IntEnum):
     CHANGE_AXES = 0  # the ray is carried to the plane of the next vertex, then turned
     LENS_AXES = 1  # position ← turn·position + step, direction ← turn·direction
     SENSOR = 2  # carried along the line to z = 0, after the shift
-    PLANE = 3  # no numbers
-    SPHERE = 4  # c
-    CONIC = 5  # c, k
-    BY_SAG = 6  # the first code of a `SurfaceKernel` of its own
+    DEFLECT = 3  # where it stands on a surface, a law changes its direction and path
+    PLANE = 4  # no numbers
+    SPHERE = 5  # c
+    CONIC = 6  # c, k
+    BY_SAG = 7  # the first code of a `SurfaceKernel` of its own
 
 
 class Slot:
@@ -44,9 +47,10 @@ class Slot:
     HALF_X = 15  # rectangle: half widths, mm; ellipse: 1/a² and 1/b²; see also HALF_Y
     HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; others: as HALF_X
     HOLE_Y = 17
-    SENSE = 18  # +1 towards the sensor, -1 from it
+    SENSE = 18  # +1 for light that comes towards +z, -1 towards -z
     TAG = 19  # 4·surface number; a status is added to it where a ray fails
     HALF_Y = 20
+    SENSE_BEHIND = 21  # as SENSE, of the light that leaves: the other one behind a mirror
     CENTER_X = 22  # of the rectangle, the ellipse and the obscuration, mm
     CENTER_Y = 23
     HEADER = 24  # length of the header: the shape's first number
@@ -57,16 +61,21 @@ class Code:
 
     KIND = 0
     OFFSET = 1  # of the record in `values`
-    LENGTH = 2  # of the record
+    LENGTH = 2  # of the record, up to data that have no cotangents
     BEFORE = 3  # row of `indices`: medium in front, in the order of travel
     AFTER = 4  # and behind
-    REFRACTS = 5  # 0: the same medium on both sides
+    REFRACTS = 5  # 0: the same medium on both sides, and no mirror
     EDGE = 6  # an `Outline`
     HOLE = 7
     COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
-    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term, or an asphere a2
+    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
+    # Of a deflection.  Its record holds its surface's shape, padded to two numbers, then the law's.
+    LAW = 12  # the code of its `LawKernel`
+    BASE = 13  # the kind of the surface that it stands on
+    WAVE = 14  # row of `indices` that holds λ/2π, mm
+    NUMBERS = 15  # where the law's numbers begin in the record
     ROW = 16  # length of a row
 
 
@@ -100,7 +109,8 @@ class SurfaceTable:
     Attributes:
         values: (V,), the records one after the other, and last of all what is added to z of the
             rays that leave the last step, mm; in the rays' precision; differentiable.
-        indices: (media, wavelengths), float64, in the order of travel; differentiable.
+        indices: (media, wavelengths), float64, in the order of travel; differentiable.  Of a lens
+            with deflections a last row holds λ/2π, mm.
         codes: (steps, Code.ROW), int64, on the CPU.
         extras: (E,), int64, on the CPU.
     """

@@ -171,7 +171,7 @@ def _all_around(fields: list[list[float]]) -> list[tuple[float, float]]:
 def _add_elements(lens: Lens) -> None:
     """Make an element of every group of cemented glass that belongs to none."""
     taken = {n for e in lens.elements.values() for n in range(e.first, e.last + 1)}
-    glass = [medium.name not in ("air", "occluder") for medium in lens.materials]
+    glass = [medium.name not in ("air", "occluder", "mirror") for medium in lens.materials]
     first = None
     for n in range(1, len(lens.surfaces) + 1):
         if first is None and glass[n]:
@@ -198,7 +198,7 @@ def _usual(lens: Lens, notes: list[str]) -> dict[str, Any]:
         given["elements.*.decenter_[xy]"] = length
         given["elements.*.shift_z"] = length
     for n, medium in enumerate(lens.materials[1:-1], 1):
-        if medium.name not in ("air", "occluder"):
+        if medium.name not in ("air", "occluder", "mirror"):
             given[f"thicknesses.{n}"] = length
     for n, surface in lens.surfaces.items():
         curvature = getattr(surface, "curvature", None)

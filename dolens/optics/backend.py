@@ -63,6 +63,8 @@ def choose_backend(
         and _transformed(chain(_tensors(system, rays), others))
     ):
         reason = "kernels do not follow torch.func or forward mode"
+    elif reason is None and rays is not None and _differs_by_colour(system, rays):
+        reason = "kernels give no derivatives of a diffractive lens with respect to wavelengths"
     if requested != "auto":
         if device != requested:
             raise InputError(f"backend '{requested}' cannot trace a lens on {device}")
@@ -126,6 +128,8 @@ def cpu_kernels_serve(system: OpticalSystem, others: Iterable[Tensor] = ()) -> b
 def _tensors(system: OpticalSystem, rays: Rays | None) -> Iterator[Tensor]:
     for surface in system.surfaces:
         yield from surface.parameters.values()
+        if surface.deflection is not None:
+            yield from surface.deflection.parameters.values()
     yield from system.thicknesses
     yield system.sensor_distance
     for element in system.elements:
@@ -133,6 +137,13 @@ def _tensors(system: OpticalSystem, rays: Rays | None) -> Iterator[Tensor]:
     if rays is not None:
         given = (rays.position, rays.direction, rays.wavelength)
         yield from (t for t in given if isinstance(t, Tensor))
+
+
+def _differs_by_colour(system: OpticalSystem, rays: Rays) -> bool:
+    """Return whether wavelengths ask for a gradient that passes through a law of deflection."""
+    wavelength = rays.wavelength
+    asked = isinstance(wavelength, Tensor) and wavelength.requires_grad
+    return asked and any(s.deflection is not None for s in system.surfaces)
 
 
 def _transformed(tensors: Iterable[Tensor]) -> bool:

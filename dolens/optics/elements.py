@@ -75,12 +75,19 @@ class Axes(NamedTuple):
         z: of the vertex as designed, mm.
         rotation: (3, 3), or None where nothing carries the surface.
         origin: the vertex, (3,), mm, or None: (0, 0, z).
+        segment: how many coordinate breaks stand in front; behind one, rotation and origin are
+            double.
     """
 
     elements: tuple[int, ...]
     z: Tensor | float
     rotation: Tensor | None = None
     origin: Tensor | None = None
+    segment: int = 0
+
+    def together(self, other: "Axes") -> bool:
+        """Return whether these axes and others lie along one line, and differ in z alone."""
+        return self.elements == other.elements and self.segment == other.segment
 
 
 LENS_AXES = Axes((), 0.0)
@@ -161,7 +168,8 @@ def relative_axes(now: Axes, then: Axes) -> tuple[Tensor, Tensor]:
 
     Returns:
         step (3,), mm: from vertex to vertex, along the axes `now`; and turn (3, 3): a direction v
-        along `now` is turn·v along `then`.
+        along `now` is turn·v along `then`.  Both are double where a coordinate break stands in
+        front of one of the two.
     """
     like = then.rotation if now.rotation is None else now.rotation
     step = _origin(then, like) - _origin(now, like)
@@ -174,10 +182,10 @@ def relative_axes(now: Axes, then: Axes) -> tuple[Tensor, Tensor]:
 def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Tensor | None]:
     """Rays in the axes of one surface, seen from those of the next.
 
-    Within one element, and between surfaces that nothing carries, only z changes.  Otherwise the
-    rays are first carried along their line to the level of the next vertex: turning a point that
-    is metres away would lose in float32 what the lens needs.  Rays that run along that level never
-    reach it, and are turned where they are.
+    Within one element, and between surfaces that nothing carries, only z changes, unless a
+    coordinate break stands between them.  Otherwise the rays are first carried along their line to
+    the level of the next vertex: turning a point that is metres away would lose in float32 what the
+    lens needs.  Rays that run along that level never reach it, and are turned where they are.
 
     Args:
         ray: mm, in the axes `now`.
@@ -188,9 +196,9 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
         The rays in the axes `then`, and the distance (mm) that they were carried, or None.
     """
     x, y, z, l, m, n = ray  # noqa: E741
-    if now.elements == then.elements:
+    if now.together(then):
         return Components(x, y, z + (now.z - then.z), l, m, n), None
-    step, turn = relative_axes(now, then)
+    step, turn = (found.to(n.dtype) for found in relative_axes(now, then))
     along = n.abs() <= _GRAZING
     below = step[2] - z
     distance = (below / n.masked_fill(along, 1.0)).masked_fill(along, 0.0)
@@ -205,11 +213,11 @@ def to_lens_axes(ray: Components, axes: Axes) -> Components:
     x, y, z, l, m, n = ray  # noqa: E741
     if axes.rotation is None:
         return Components(x, y, z + axes.z, l, m, n)
-    position = _turn(axes.rotation, x, y, z)
-    origin = axes.origin
+    rotation, origin = axes.rotation.to(n.dtype), axes.origin.to(n.dtype)
+    position = _turn(rotation, x, y, z)
     return Components(
         *(p + o for p, o in zip(position, origin.unbind(), strict=True)),
-        *_turn(axes.rotation, l, m, n),
+        *_turn(rotation, l, m, n),
     )
 
 
@@ -218,8 +226,8 @@ def from_lens_axes(ray: Components, axes: Axes) -> Components:
     x, y, z, l, m, n = ray  # noqa: E741
     if axes.rotation is None:
         return Components(x, y, z - axes.z, l, m, n)
-    turn = axes.rotation.mT
-    ox, oy, oz = axes.origin.unbind()
+    turn = axes.rotation.to(n.dtype).mT
+    ox, oy, oz = axes.origin.to(n.dtype).unbind()
     return Components(*_turn(turn, x - ox, y - oy, z - oz), *_turn(turn, l, m, n))
 
 

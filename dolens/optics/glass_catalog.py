@@ -210,7 +210,7 @@ def _catalog() -> dict[str, dict[str, tuple[str, tuple[str, str, str]]]]:
 def _names(maker: str) -> list[str]:
     """Suggest what a misspelt name may have meant: a glass of that maker, or anything."""
     makers = [maker] if maker else list(_catalog())
-    media = [] if maker else ["air", "occluder"]
+    media = [] if maker else ["air", "occluder", "mirror"]
     return media + [name for known in makers for name, _ in _catalog()[known].values()]
 
 

@@ -8,18 +8,22 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.optics.axial_ray import reversals
 from dolens.optics.backend import check_backend, is_few
+from dolens.optics.broken_axes import GlobalAxes
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
+from dolens.optics.mirrors import MIRROR, media_of
 from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
-from dolens.optics.surfaces.state import SurfaceState
+from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
+from dolens.optics.vergence import with_vergences
 
 
 class Lens(LensRays, LensViews, nn.Module):
@@ -36,7 +40,7 @@ class Lens(LensRays, LensViews, nn.Module):
         surfaces: in the order that light meets them; the first vertex is at z = 0.
         thicknesses: gaps between neighbouring vertices, mm, one fewer than surfaces.
         sensor_distance: last vertex to sensor, mm.
-        materials: before surface 1 and after each surface.
+        materials: before surface 1 and after each surface; `MIRROR` after one that reflects.
         stop: number of the stop surface, from 1.
         index_model: the model that the materials were made with.
         name: for titles and messages.
@@ -108,6 +112,15 @@ class Lens(LensRays, LensViews, nn.Module):
         self.telecentric_object = telecentric_object
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
+        try:
+            media_of(self.materials)
+        except InputError as error:
+            raise InputError(f"lens '{name}': {error}") from None
+        for number, (surface, medium) in enumerate(zip(surfaces, materials[1:], strict=True), 1):
+            if surface.law is not None and medium is MIRROR:
+                raise InputError(
+                    f"lens '{name}': surface {number}: a {surface.law.kind} cannot be a mirror"
+                )
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
         )
@@ -122,6 +135,9 @@ class Lens(LensRays, LensViews, nn.Module):
         self.elements = nn.ModuleDict(dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.to(dtype)
+        self.reversals: tuple[int, ...] = ()
+        self._check_breaks()
+        self.reversals = reversals(self.system(), self.primary_wavelength)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -180,7 +196,16 @@ class Lens(LensRays, LensViews, nn.Module):
             aperture = surface.aperture
             if edge is not None:
                 aperture = aperture.resized(float(edge.detach()))
-            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge))
+            law = surface.law and LawState(surface.law, parameters)
+            if surface.phase is not None:
+                own = {**surface.phase._parameters, **surface.phase._buffers}
+                if values:
+                    own = {
+                        name: values.pop(f"surfaces.{number}.phase.{name}", value)
+                        for name, value in own.items()
+                    }
+                law = LawState(type(surface.phase), own)
+            surfaces.append(SurfaceState(type(surface), parameters, aperture, edge, law))
         thicknesses = [
             values.pop(f"thicknesses.{number}", gap) for number, gap in self.thicknesses.items()
         ]
@@ -196,15 +221,19 @@ class Lens(LensRays, LensViews, nn.Module):
         sensor_distance = values.pop("sensor_distance", self.sensor_distance)
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
-        return OpticalSystem(
+        materials, mirrors = media_of(self.materials)
+        system = OpticalSystem(
             surfaces,
             thicknesses,
             sensor_distance,
-            self.materials,
+            materials,
             self.stop,
             elements,
             self.backend,
+            mirrors,
+            self.reversals,
         )
+        return with_vergences(system, self.primary_wavelength, self.object_distance)
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""
@@ -220,9 +249,10 @@ class Lens(LensRays, LensViews, nn.Module):
         few rays is faster with the kernels: set `backend` to `cpu`.
 
         Args:
-            rays: travelling towards +z in the medium before surface `first`; they may start
-                anywhere, and are first moved along their own line to that surface.  Rays in double
-                precision are moved in double precision, whatever the lens's.
+            rays: travelling with the light in the medium before surface `first`: towards +z, or
+                towards -z behind an odd number of mirrors; they may start anywhere, and are first
+                moved along their own line to that surface.  Rays in double precision are moved in
+                double precision, whatever the lens's.
             record: whether to keep the intersection with every surface.
             first: number of the first surface that they meet.
             last: number of the last; given, the trace ends there, in the medium behind it.
@@ -236,13 +266,14 @@ class Lens(LensRays, LensViews, nn.Module):
         """Trace rays backwards, from the sensor's side through every surface into object space.
 
         Args:
-            rays: travelling towards -z in the medium behind surface `last`.
+            rays: travelling against the light in the medium behind surface `last`: towards -z, or
+                towards +z behind an odd number of mirrors.
             record: whether to keep the intersection with every surface, last surface first.
             first: number of the surface where the trace ends.
             last: number of the surface that they meet first; None: the lens's last.
 
         Returns:
-            The rays on surface `first`, travelling towards -z in the medium before it.
+            The rays on surface `first`, in the medium before it, travelling against the light.
         """
         self._check_range(first, last)
         return trace_rays(self._system_for(rays), rays, -1.0, record, first, last)
@@ -251,6 +282,27 @@ class Lens(LensRays, LensViews, nn.Module):
         """The lens, traced by the reference if these rays are few."""
         system = self.system()
         return system.traced_by("reference") if is_few(system, rays) else system
+
+    def global_axes(self) -> GlobalAxes:
+        """Return vertex and rotation of every surface, and of the sensor, in the lens's axes.
+
+        These are the axes of the first row, in front of any coordinate break.  All are double, and
+        differentiable.
+        """
+        return self.system().global_axes()
+
+    def _check_breaks(self) -> None:
+        """Raise `InputError` where breaks are all there is, the stop, or have a medium."""
+        media = media_of(self.materials).materials
+        breaks = [int(n) for n, surface in self.surfaces.items() if surface.changes_axes]
+        if len(breaks) == len(self.surfaces):
+            raise InputError(f"lens '{self.name}': there is no surface but coordinate breaks")
+        for number in breaks:
+            place = f"lens '{self.name}': surface {number} is a coordinate break"
+            if number == self.stop:
+                raise InputError(f"{place}, and cannot be the stop")
+            if media[number] != media[number - 1]:
+                raise InputError(f"{place}; the medium behind it is the one in front of it")
 
     def _check_range(self, first: int, last: int | None) -> None:
         count = len(self.surfaces)

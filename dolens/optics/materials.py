@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.glass_catalog import Glass, find_glass
+from dolens.optics.mirrors import MIRROR, Mirror
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Material:
 
 # What light may travel through: hashable, equal when it is the same medium, and with a name that a
 # prescription reads back as the same.
-Medium = Material | Glass
+Medium = Material | Glass | Mirror
 
 
 def index_model(name: str) -> IndexModel:
@@ -77,9 +78,9 @@ def parse_material(text: str, model: IndexModel) -> Medium:
     """Read a material as a prescription writes it.
 
     Args:
-        text: `air`; `occluder`; a number, the same index at every wavelength; glass as nd/Vd, for
-            example `1.5168/64.17`; or a catalogue glass, for example `N-BK7` or `SCHOTT:N-BK7`
-            (see `find_glass`).  Case is ignored.
+        text: `air`; `occluder`; `mirror`, where a surface reflects; a number, the same index at
+            every wavelength; glass as nd/Vd, for example `1.5168/64.17`; or a catalogue glass, for
+            example `N-BK7` or `SCHOTT:N-BK7` (see `find_glass`).  Case is ignored.
         model: which lines nd and Vd stand for, and the index of air.  A constant index and nd/Vd
             are taken as written; a catalogue glass is relative to air (see `Glass`).
 
@@ -97,6 +98,8 @@ def parse_material(text: str, model: IndexModel) -> Medium:
         return Material("occluder", model.occluder)
     if _NUMBER.fullmatch(name):
         return _constant(name)
+    if name.lower() == MIRROR.name:
+        return MIRROR
     match = _GLASS.fullmatch(name)
     if match is None:
         return find_glass(name, model.air)

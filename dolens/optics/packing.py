@@ -4,6 +4,7 @@ Every number of the table is a sum of parameters with signs, or comes from the p
 gradients flow back through ordinary tensor operations, and derivatives by parameters are known.
 """
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate
@@ -17,9 +18,9 @@ from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 from dolens.optics.elements import LENS_AXES, relative_axes
 from dolens.optics.materials import Medium
-from dolens.optics.records import Form, Records, Structure, records, tensor
+from dolens.optics.records import BREAK, Form, LawForm, Records, Structure, records, tensor
 from dolens.optics.row_jacobian import jacobian_of
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, per_radian
 
 Wavelength = float | Sequence[float] | Tensor
 
@@ -33,6 +34,11 @@ def unsupported(system: OpticalSystem) -> str | None:
             return f"surface {number} ({surface.shape.kind}) has no kernel"
         if not kernel.serves(device):
             return f"surface {number} ({surface.shape.kind}) has no kernel for {device}"
+        law = surface.deflection
+        if law is not None and law.law.kernel is None:
+            return f"surface {number} ({law.law.kind}) has no kernel"
+        if law is not None and surface.shape.arrays:
+            return f"surface {number} ({law.law.kind} on {surface.shape.kind}) has no kernel"
     return None
 
 
@@ -88,34 +94,47 @@ def _lay_out(
     """Return the layout of the records, and the lens's numbers: scalars, then arrays."""
     scalars: list[Tensor] = []
     arrays: list[Tensor] = []
-    forms, apertures = [], []
+    of_laws: list[Tensor] = []
+    forms, apertures, laws = [], [], []
     for number, surface in enumerate(system.surfaces, 1):
         shape = surface.shape
         if shape.kernel is None:
             raise InputError(f"surface {number} ({shape.kind}) has no kernel")
-        numbers, count, columns, degree, extras = shape.packed(surface.parameters)
+        code = BREAK if shape.changes_axes else shape.kernel.code
+        numbers, count, columns, degree, extras, data = shape.packed(surface.parameters)
         sizes = []
         for value in numbers:
             sizes.append(None if value is None else value.shape)
             if value is not None:
                 (arrays if value.ndim else scalars).append(value)
-        forms.append(Form(shape.kernel.code, count, columns, degree, extras, tuple(sizes)))
+        forms.append(Form(code, count, columns, degree, extras, tuple(sizes), data))
         apertures.append(surface.aperture)
-    scalars += (*system.thicknesses, system.sensor_distance)
+        law = surface.deflection
+        if law is None:
+            laws.append(None)
+        else:
+            own = law.law.packed(law.parameters, sense > 0.0)
+            sizes = tuple(None if value is None else value.shape for value in own)
+            laws.append(LawForm(law.law.kernel.code, sizes))
+            of_laws += [value for value in own if value is not None]
+    scalars += (*of_laws, *system.thicknesses, system.sensor_distance)
     layout = records(
         Structure(
             tuple(forms),
             tuple(apertures),
             tuple(system.materials),
             tuple((element.first, element.last) for element in system.elements),
+            system.mirrors,
+            system.senses,
             sense,
             first,
             last,
             to_sensor,
+            tuple(laws),
         )
     )
     if layout.turns:
-        axes = (LENS_AXES, *system.axes)
+        axes = (LENS_AXES, *system.all_axes)
         for now, then in layout.turns:
             if then:
                 arrays += relative_axes(axes[now], axes[then])
@@ -138,7 +157,8 @@ def _values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]
 def _table(
     layout: Records, system: OpticalSystem, wavelength: Wavelength, values: Tensor
 ) -> SurfaceTable:
-    indices = _indices(system.materials, wavelength, layout.media, system.device)
+    used = tuple(system.materials[k] for k in layout.media)
+    indices = _indices(used, wavelength, layout.waves, system.device)
     return SurfaceTable(values, indices, layout.codes, layout.extras)
 
 
@@ -206,23 +226,26 @@ def _derivatives(
 
 
 def _indices(
-    materials: Sequence[Medium],
-    wavelength: Wavelength,
-    media: tuple[int, ...],
-    device: torch.device,
+    used: tuple[Medium, ...], wavelength: Wavelength, waves: bool, device: torch.device
 ) -> Tensor:
-    """Return the indices (media, wavelengths), in double precision whatever the lens's."""
-    used = tuple(materials[k] for k in media)
+    """Return the indices (media, wavelengths), in double precision whatever the lens's.
+
+    With `waves`, a last row holds λ/2π, mm.
+    """
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)
         one = torch.ones_like(wavelength)
         found = {medium: medium.index(wavelength) * one for medium in set(used)}
-        return torch.stack([found[medium] for medium in used])
+        last = [per_radian(wavelength, wavelength)] if waves else []
+        return torch.stack([found[medium] for medium in used] + last)
     several = (wavelength,) if isinstance(wavelength, (int, float)) else tuple(wavelength)
-    return tensor(_index_rows(used, several), np.float64).to(device)
+    return tensor(_index_rows(used, several, waves), np.float64).to(device)
 
 
 @lru_cache(maxsize=256)
-def _index_rows(media: tuple[Medium, ...], wavelengths: tuple[float, ...]) -> np.ndarray:
+def _index_rows(
+    media: tuple[Medium, ...], wavelengths: tuple[float, ...], waves: bool
+) -> np.ndarray:
     found = {medium: [float(medium.index(w)) for w in wavelengths] for medium in set(media)}
-    return np.array([found[medium] for medium in media], dtype=np.float64)
+    last = [[w * (1e-6 / (2.0 * math.pi)) for w in wavelengths]] if waves else []
+    return np.array([found[medium] for medium in media] + last, dtype=np.float64)

@@ -31,12 +31,16 @@ class Unit(NamedTuple):
 DEGREE = Unit("deg", math.pi / 180.0)
 MILLIMETRE = Unit("mm")
 PER_MILLIMETRE = Unit("1/mm")
+RADIAN = Unit("rad")
 UNNAMED = Unit("")
 _UNIT_OF = {
     **dict.fromkeys(TILTS, DEGREE),
     **dict.fromkeys(DISPLACEMENTS, MILLIMETRE),
     "sensor_distance": MILLIMETRE,
-    "curvature": PER_MILLIMETRE,
+    "power": PER_MILLIMETRE,
+    "grooves": PER_MILLIMETRE,
+    **dict.fromkeys(("curvature", "curvature_x", "curvature_y"), PER_MILLIMETRE),
+    "normalization_radius": MILLIMETRE,
 }
 # Of names whose last part is a number or a coordinate.
 _UNIT_OF_GROUP = {"thicknesses": MILLIMETRE, "sources": MILLIMETRE}
@@ -49,8 +53,9 @@ def unit_of(name: str) -> Unit:
         name: as `surfaces.1.curvature`, `elements.front.tilt_x` or `sources.1.z`.
     """
     first, _, _ = name.partition(".")
-    _, _, last = name.rpartition(".")
-    return _UNIT_OF_GROUP.get(first) or _UNIT_OF.get(last, UNNAMED)
+    group, _, last = name.rpartition(".")
+    others = RADIAN if group.endswith(".phase") else UNNAMED
+    return _UNIT_OF_GROUP.get(first) or _UNIT_OF.get(last, others)
 
 
 def to_lens_units(name: str, value: Value) -> Value:

@@ -1,5 +1,10 @@
 """First-order optics: focal length, cardinal points, pupils.  Everything is differentiable.
 
+Light that travels towards -z, behind an odd number of mirrors, has a negative index there and gaps
+of negative thickness: then every equation of refraction holds, and a concave mirror of R = -200 mm
+has a focal length of +100.  Coordinate breaks count as planes that do nothing: it is the optics of
+the lens unfolded along its axis.
+
 What lies at infinity (the foci of an afocal lens, the pupil of a telecentric one) is `inf` and
 carries a zero gradient, so that one infinite quantity leaves the gradients of the others alone.
 Only a power that is exactly zero counts: a telescope whose power is a rounding error has an EFL of
@@ -15,6 +20,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.paraxial_recurrence import TwoRays, behind_surfaces
+from dolens.optics.paraxial_surfaces import curvatures_of, powers_of
 from dolens.optics.system import OpticalSystem
 
 
@@ -29,8 +35,11 @@ class Pupil(NamedTuple):
 class FirstOrder:
     """First-order properties at one wavelength, mm; z is measured from the first vertex.
 
+    It counts along the axis with its thicknesses as written: towards -z behind a mirror.
+
     With the reduced matrix [[A, B], [C, D]] from the first vertex to the last, and n and n' the
-    indices of the object's and the sensor's medium:
+    indices of the object's and the sensor's medium, n' being negative behind an odd number of
+    mirrors:
 
     Attributes:
         efl: effective focal length, 1/power; positive if converging.  The rear focal length is
@@ -85,11 +94,11 @@ def _unit_rays_behind(
     system: OpticalSystem, wavelength: float | Tensor, first: int, last: int
 ) -> TwoRays:
     """Trace the unit rays from just before surface `first` to just after `last`."""
-    surfaces = system.surfaces[first - 1 : last]
     return behind_surfaces(
-        [s.shape.paraxial_curvature(s.parameters) for s in surfaces],
+        curvatures_of(system, first, last),
         system.thicknesses[first - 1 : max(last - 1, 0)],
-        system.indices(wavelength)[first - 1 : last + 1],
+        system.signed_indices(wavelength)[first - 1 : last + 1],
+        powers_of(system, wavelength, first, last),
     )
 
 
@@ -99,7 +108,7 @@ def matrix_to_stop(system: OpticalSystem, wavelength: float | Tensor) -> Tensor:
     # The stop's own refraction belongs to the light behind it.
     rays = _unit_rays_behind(system, wavelength, 1, stop - 1)
     if stop > 1:
-        index = system.indices(wavelength)[stop - 1]
+        index = system.signed_indices(wavelength)[stop - 1]
         rays = rays.transferred(system.thicknesses[stop - 2], index)
     return _matrix(rays, system)
 
@@ -133,7 +142,7 @@ def entrance_pupil(system: OpticalSystem, wavelength: float | Tensor) -> Pupil:
     # A ray with y = 0 on the stop crosses the axis where the object space sees the stop.
     a, b = matrix[0, 0], matrix[0, 1]
     diameter = 2.0 * system.surfaces[system.stop - 1].semi_diameter
-    return Pupil(ratio(b * system.indices(wavelength)[0], a), _over(diameter, a.abs()))
+    return Pupil(ratio(b * system.signed_indices(wavelength)[0], a), _over(diameter, a.abs()))
 
 
 def exit_pupil(system: OpticalSystem, wavelength: float | Tensor) -> Pupil:
@@ -141,7 +150,7 @@ def exit_pupil(system: OpticalSystem, wavelength: float | Tensor) -> Pupil:
     stop, count = system.stop, len(system.surfaces)
     matrix = surface_matrix(system, wavelength, stop, count)
     b, d = matrix[0, 1], matrix[1, 1]
-    n = system.indices(wavelength)[-1]
+    n = system.signed_indices(wavelength)[-1]
     # From the axis at the stop: height b and slope d/n at the last vertex, per unit of n·u.
     diameter = 2.0 * system.surfaces[stop - 1].semi_diameter
     return Pupil(system.vertices[count - 1] + ratio(-b * n, d), _over(diameter, d.abs()))
@@ -162,7 +171,7 @@ def first_order(
     count = len(system.surfaces)
     matrix = surface_matrix(system, wavelength, 1, count)
     (a, b), (c, d) = matrix[0].unbind(), matrix[1].unbind()
-    indices = system.indices(wavelength)
+    indices = system.signed_indices(wavelength)
     before, behind = indices[0], indices[-1]
     power = -c
     last = system.vertices[count - 1]
@@ -194,7 +203,7 @@ def first_order(
 
 def image_distance(system: OpticalSystem, wavelength: float | Tensor, depth: float) -> Tensor:
     """z (mm from the first vertex) of the paraxial image of an object at -depth mm."""
-    indices = system.indices(wavelength)
+    indices = system.signed_indices(wavelength)
     matrix = surface_matrix(system, wavelength, 1, len(system.surfaces))
     # From the axial object point: the height at the first vertex, per unit of reduced slope.
     gap = depth / indices[0]
@@ -217,7 +226,7 @@ def chief_ray_magnification(
         depth: distance of the object in front of the first vertex, mm.
     """
     pupil = entrance_pupil(system, wavelength)
-    indices = system.indices(wavelength)
+    indices = system.signed_indices(wavelength)
     # Object height 1: the chief ray heads from (z = -depth, y = 1) to the entrance pupil's centre.
     slope = -1.0 / (pupil.z + depth)
     height = 1.0 + slope * depth

@@ -1,13 +1,18 @@
 """First-order optics in scalar arithmetic: plain numbers, or tensors where gradients are wanted."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from dolens.optics.materials import Medium
 from dolens.optics.paraxial_recurrence import TwoRays, behind_surfaces
+from dolens.optics.paraxial_surfaces import curvatures_of, deflects
 from dolens.optics.system import OpticalSystem
+
+Number = TypeVar("Number", float, Tensor)
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,9 @@ class ParaxialNumbers:
         materials: before surface 1 and after each surface.
         stop: number of the stop surface, from 1.
         stop_radius: mm.
+        senses: +1 where light travels towards +z, -1 towards -z; of each medium.
+        powers: what each surface adds to the power of refraction, a constant (1/mm) and a
+            coefficient of the wavelength (1/(mm nm)); None where none adds any.
     """
 
     curvatures: tuple[float | Tensor, ...]
@@ -32,24 +40,28 @@ class ParaxialNumbers:
     materials: tuple[Medium, ...]
     stop: int
     stop_radius: float | Tensor
+    senses: tuple[float, ...]
+    powers: tuple[tuple[float | Tensor, float | Tensor], ...] | None = None
 
     @classmethod
     @torch.no_grad()
     def of(cls, system: OpticalSystem) -> "ParaxialNumbers":
         """The numbers of a lens."""
-        curvatures = [s.shape.paraxial_curvature(s.parameters) for s in system.surfaces]
-        scalars = [*curvatures, *system.thicknesses, system.sensor_distance]
+        curvatures, powers = curvatures_of(system), _powers(system)
+        scalars = [*curvatures, *system.thicknesses, system.sensor_distance, *powers]
         numbers = torch.stack(
             [torch.as_tensor(s, dtype=torch.float64, device=system.device) for s in scalars]
         ).tolist()
         count = len(curvatures)
         return cls(
             tuple(numbers[:count]),
-            tuple(numbers[count:-1]),
-            numbers[-1],
+            tuple(numbers[count : 2 * count - 1]),
+            numbers[2 * count - 1],
             tuple(system.materials),
             system.stop,
             float(system.surfaces[system.stop - 1].semi_diameter),
+            system.senses,
+            _pairs(numbers[2 * count :]),
         )
 
     @classmethod
@@ -57,20 +69,22 @@ class ParaxialNumbers:
         """The same numbers as tensors, in double precision on the CPU; None where no gradient
         would come of them.
         """
-        curvatures = [s.shape.paraxial_curvature(s.parameters) for s in system.surfaces]
+        curvatures, powers = curvatures_of(system), _powers(system)
         radius = system.surfaces[system.stop - 1].edge_radius
-        scalars = [*curvatures, *system.thicknesses, system.sensor_distance, radius]
+        scalars = [*curvatures, *system.thicknesses, system.sensor_distance, radius, *powers]
         if not any(isinstance(s, Tensor) and s.requires_grad for s in scalars):
             return None
         numbers = [torch.as_tensor(s, dtype=torch.float64).cpu() for s in scalars]
         count = len(curvatures)
         return cls(
             tuple(numbers[:count]),
-            tuple(numbers[count:-2]),
-            numbers[-2],
+            tuple(numbers[count : 2 * count - 1]),
+            numbers[2 * count - 1],
             tuple(system.materials),
             system.stop,
-            numbers[-1],
+            numbers[2 * count],
+            system.senses,
+            _pairs(numbers[2 * count + 1 :]),
         )
 
     @property
@@ -83,13 +97,12 @@ class ParaxialNumbers:
         _, b, _, d = self._unit_rays_behind(wavelength, self.stop, len(self.curvatures))
         if d == 0.0:
             return float("inf"), float("inf")
-        image_index = float(self.materials[-1].index(wavelength))
+        image_index = self._index(-1, wavelength)
         return self.length - b * image_index / d, 2.0 * self.stop_radius / abs(d)
 
     def chief_ray_magnification(self, wavelength: float, depth: float) -> float | Tensor:
         """Height on the sensor over height on an object at a depth in mm, by the chief ray."""
-        before = float(self.materials[0].index(wavelength))
-        behind = float(self.materials[-1].index(wavelength))
+        before, behind = self._index(0, wavelength), self._index(-1, wavelength)
         a, b, _, _ = self._unit_rays_at_stop(wavelength)
         # The chief ray heads for the entrance pupil at z = n b/a: from height 1 at -depth.
         slope = -a / (b * before + depth * a)
@@ -103,14 +116,37 @@ class ParaxialNumbers:
         rays = self._unit_rays_behind(wavelength, 1, self.stop - 1)
         if self.stop == 1:
             return rays
-        index = float(self.materials[self.stop - 1].index(wavelength))
+        index = self._index(self.stop - 1, wavelength)
         return rays.transferred(self.thicknesses[self.stop - 2], index)
 
     def _unit_rays_behind(self, wavelength: float, first: int, last: int) -> TwoRays:
         """Trace the unit rays from just before surface `first` to just after `last`."""
-        media = self.materials[first - 1 : last + 1]
+        powers = None
+        if self.powers is not None:
+            powers = [constant + k * wavelength for constant, k in self.powers[first - 1 : last]]
         return behind_surfaces(
             self.curvatures[first - 1 : last],
             self.thicknesses[first - 1 : max(last - 1, 0)],
-            [float(medium.index(wavelength)) for medium in media],
+            [self._index(medium, wavelength) for medium in range(first - 1, last + 1)],
+            powers,
         )
+
+    def _index(self, medium: int, wavelength: float) -> float:
+        """Return a medium's index, negative where light travels towards -z."""
+        return self.senses[medium] * float(self.materials[medium].index(wavelength))
+
+
+def _powers(system: OpticalSystem) -> list[float | Tensor]:
+    """Return constant and coefficient of every surface's added power; nothing without any."""
+    if not deflects(system.surfaces):
+        return []
+    found: list[float | Tensor] = []
+    for surface in system.surfaces:
+        law = surface.deflection
+        found += (0.0, 0.0) if law is None else law.law.paraxial_power(law.parameters)
+    return found
+
+
+def _pairs(numbers: Sequence[Number]) -> tuple[tuple[Number, Number], ...] | None:
+    """Pair numbers that follow each other; None where there are none."""
+    return tuple(zip(numbers[::2], numbers[1::2], strict=True)) or None

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.optics.paraxial import matrix_to_stop, ratio, vergence
 from dolens.optics.paraxial_recurrence import TwoRays, through_surfaces
+from dolens.optics.paraxial_surfaces import curvatures_of, powers_of
 from dolens.optics.system import OpticalSystem
 
 
@@ -76,7 +77,7 @@ def paraxial_rays(
     """
     matrix = matrix_to_stop(system, wavelength)
     a, b = matrix[0, 0], matrix[0, 1]
-    n = system.indices(wavelength)
+    n = system.signed_indices(wavelength)
     near = vergence(object_distance)
     tangent = field_tangent(field, object_distance, matrix)
     at_stop = a + b * (n[0] * near)
@@ -87,8 +88,8 @@ def paraxial_rays(
     chief_y, chief_u = ratio(-b * n[0] * tangent, at_stop), ratio(a * tangent, at_stop)
 
     start = TwoRays(y, chief_y, n[0] * (y * near), n[0] * chief_u)
-    curvatures = [s.shape.paraxial_curvature(s.parameters) for s in system.surfaces]
-    behind = list(through_surfaces(start, curvatures, system.thicknesses, n))
+    powers = powers_of(system, wavelength)
+    behind = list(through_surfaces(start, curvatures_of(system), system.thicknesses, n, powers))
     reduced = [start, *behind]
     marginal = _ray([s.y for s in behind], [s.nu for s in reduced], n)
     chief = _ray([s.y2 for s in behind], [s.nu2 for s in reduced], n)

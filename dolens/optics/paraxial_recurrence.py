@@ -3,7 +3,8 @@
 A paraxial ray at a surface is its height y and its reduced slope n·u.  Refraction leaves the height
 alone, n'u' = nu - y(n' - n)c; transfer leaves the reduced slope alone, y' = y + (t/n)·nu (Welford,
 ch. 3).  Any two rays give all others, so that two are traced at a time.  Everything here is
-arithmetic of numbers and tensors alike.
+arithmetic of numbers and tensors alike.  Where light travels towards -z the index is negative.
+What adds to a surface's power (n' - n)c, a diffractive phase or an ideal lens, adds to it here.
 """
 
 from collections import deque
@@ -45,6 +46,7 @@ def through_surfaces(
     curvatures: Sequence[Number],
     thicknesses: Sequence[Number],
     indices: Sequence[Number],
+    powers: Sequence[Number] | None = None,
 ) -> Iterator[TwoRays]:
     """Trace two rays from just before the first of some surfaces to just behind the last.
 
@@ -53,6 +55,7 @@ def through_surfaces(
         curvatures: paraxial, of N surfaces, 1/mm.
         thicknesses: of the N - 1 gaps between them, mm.
         indices: of the N + 1 media around them.
+        powers: of the N surfaces besides that of refraction, 1/mm; None: they have none.
 
     Yields:
         The rays just behind each surface, at the heights that they have on it.
@@ -64,16 +67,22 @@ def through_surfaces(
             gap = thicknesses[i - 1] / before
             y, y2 = y + gap * nu, y2 + gap * nu2
         power = (behind - before) * curvature
+        if powers is not None:
+            power = power + powers[i]
         nu, nu2 = nu - power * y, nu2 - power * y2
         yield TwoRays(y, y2, nu, nu2)
 
 
 def behind_surfaces(
-    curvatures: Sequence[Number], thicknesses: Sequence[Number], indices: Sequence[Number]
+    curvatures: Sequence[Number],
+    thicknesses: Sequence[Number],
+    indices: Sequence[Number],
+    powers: Sequence[Number] | None = None,
 ) -> TwoRays:
     """Trace the unit rays to just behind the last of some surfaces; themselves where there is none.
 
     Arguments as of `through_surfaces`.
     """
-    last = deque(through_surfaces(UNIT_RAYS, curvatures, thicknesses, indices), maxlen=1)
+    every = through_surfaces(UNIT_RAYS, curvatures, thicknesses, indices, powers)
+    last = deque(every, maxlen=1)
     return last[0] if last else UNIT_RAYS

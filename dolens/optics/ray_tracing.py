@@ -8,10 +8,11 @@ from torch import Tensor
 
 from dolens.kernels import operators
 from dolens.optics.backend import choose_backend
+from dolens.optics.elements import to_lens_axes
 from dolens.optics.packing import pack
 from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_plane, traced_rays
+from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_sensor, traced_rays
 
 # So many wavelengths are not searched for equal ones.
 _FEW = 64
@@ -38,6 +39,8 @@ def trace_rays(
     Raises:
         InputError: the lens asks for kernels by name that cannot serve.
     """
+    if last is None and sense < 0.0:
+        rays = from_sensor(system, rays)
     end = len(system.surfaces) if last is None else last
     to_sensor = last is None and sense > 0.0
     reference = record or choose_backend(system, rays) == "reference"
@@ -50,7 +53,7 @@ def trace_rays(
             system, ray, rays.wavelength, sense, True, record, first=first, last=last
         )
         if to_sensor:
-            traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, sense)
+            traced = trace_to_sensor(system, traced, rays.wavelength)
         return traced_rays(traced, before)
     position, direction, shape = _joined(system, rays, ray, before)
     table = pack(system, rays.wavelength, sense, first, end, to_sensor)
@@ -77,6 +80,20 @@ def trace_rays(
     )
 
 
+def from_sensor(system: OpticalSystem, rays: Rays) -> Rays:
+    """Return rays that are given in the sensor's axes, z being the sum of all thicknesses there, in
+    the lens's axes; these are the same without coordinate breaks.
+    """
+    if not system.breaks:
+        return rays
+    ray = rays.components()
+    # In double precision, a sensor metres away loses nothing that a surface needs.
+    ray = Components(*(c.to(device=system.device, dtype=torch.float64) for c in ray))
+    z = sum(gap.double() for gap in (*system.thicknesses, system.sensor_distance))
+    placed = to_lens_axes(ray._replace(z=ray.z - z), system.all_axes[-1])
+    return Rays.from_components(placed, rays.wavelength)
+
+
 def trace_components(
     system: OpticalSystem, ray: Components, wavelength: float | Tensor, sense: float
 ) -> tuple[Components, Tensor]:
@@ -93,7 +110,7 @@ def trace_components(
         are valid, as in `TracedRays`.
     """
     rays = Rays.from_components(ray, wavelength)
-    if sense < 0.0 and choose_backend(system, rays) == "reference":
+    if sense < 0.0 and not system.breaks and choose_backend(system, rays) == "reference":
         traced = trace_surfaces(system, ray, wavelength, sense)
         return traced.ray, traced.valid
     hit = trace_rays(system, rays, sense)

@@ -19,17 +19,21 @@ from dolens.optics.materials import Medium
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.refraction import FAR
 
+# Stands in a `Form` for the code of a kernel.
+BREAK = -1
+
 
 class Form(NamedTuple):
     """A shape without its numbers; see `PackedShape`.
 
     Attributes:
-        kind: the code of its kernel.
+        kind: the code of its kernel, or `BREAK` of a coordinate break, which is no step.
         count: as in `PackedShape`, and the three that follow.
         columns: of a spline; 1 for a polynomial with a b·z² term.
         degree: highest power of x or y.
         extras: further integers.
         sizes: the shape of each number's tensor; None: the number is zero.
+        data: as in `PackedShape`.
     """
 
     kind: int
@@ -37,6 +41,19 @@ class Form(NamedTuple):
     columns: int
     degree: int
     extras: tuple[int, ...]
+    sizes: tuple[torch.Size | None, ...]
+    data: int = 0
+
+
+class LawForm(NamedTuple):
+    """A law of deflection without its numbers.
+
+    Attributes:
+        code: of its kernel.
+        sizes: the shape of each number's tensor; None: the number is zero.
+    """
+
+    code: int
     sizes: tuple[torch.Size | None, ...]
 
 
@@ -48,28 +65,35 @@ class Structure(NamedTuple):
         apertures: of all of them.
         materials: before surface 1 and after each surface.
         elements: first and last surface of each element.
+        mirrors: numbers of the surfaces that reflect.
+        senses: of the light in each medium, +1 towards +z and -1 towards -z, in forward mode.
         sense: +1 from the object towards the sensor, -1 backwards.
         first: number of the first surface that is packed, as the prescription counts.
         last: number of the last.
         to_sensor: go on to the sensor plane (forward only).
+        laws: what deflects light at each surface in the place of Snell's law, or None.
     """
 
     forms: tuple[Form, ...]
     apertures: tuple[ClearAperture, ...]
     materials: tuple[Medium, ...]
     elements: tuple[tuple[int, int], ...]
+    mirrors: tuple[int, ...]
+    senses: tuple[float, ...]
     sense: float
     first: int
     last: int
     to_sensor: bool
+    laws: tuple[LawForm | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Records:
     """Records as constants plus signed numbers of the lens: values[places] += signs·x[sources].
 
-    The lens's numbers x come in this order: the scalars of all surfaces, the gaps and the sensor's
-    distance; the arrays of all surfaces; then step (3) and turn (9) of each change of axes.
+    The lens's numbers x come in this order: the scalars of all surfaces, those of all laws, the
+    gaps and the sensor's distance; the arrays of all surfaces; then step (3) and turn (9) of each
+    change of axes.
 
     Attributes:
         constants: (V,), float64.
@@ -79,8 +103,9 @@ class Records:
         codes: (steps, Code.ROW), int64; shared, not to be written to.
         extras: int64; likewise.
         media: places in `materials`, in the order of travel.
-        turns: surfaces whose axes rays leave and enter; 0 stands for the lens's own axes, and a
-            last pair (number, 0) for rays that end in them.
+        waves: whether a row of λ/2π follows those of the media.
+        turns: surfaces whose axes rays leave and enter, the sensor's being last of all; 0 stands
+            for the lens's own axes, and a last pair (number, 0) for rays that end in them.
     """
 
     constants: Tensor
@@ -90,6 +115,7 @@ class Records:
     codes: Tensor
     extras: Tensor
     media: tuple[int, ...]
+    waves: bool
     turns: tuple[tuple[int, int], ...]
 
 
@@ -114,12 +140,17 @@ class _Writer:
         self.extras: list[int] = []
         self.entries: list[tuple[int, int, float]] = []  # place, source, sign
         self.turns: list[tuple[int, int]] = []
+        self.media: list[int] = []  # places in `materials`, in the order of travel
         # Where the numbers of each surface, the gaps, and those of the turns begin in x.
         sizes = [[size for size in form.sizes if size is not None] for form in structure.forms]
         self.scalar, self.array, place = [], [], 0
         for of_surface in sizes:
             self.scalar.append(place)
             place += sum(size == () for size in of_surface)
+        self.of_law, self.waves = [], False
+        for law in structure.laws:
+            self.of_law.append(place)
+            place += 0 if law is None else sum(size is not None for size in law.sizes)
         self.gaps = place
         place += len(structure.forms)
         for of_surface in sizes:
@@ -130,28 +161,43 @@ class _Writer:
     def write(self) -> Records:
         """All records, and the last number, which is added to z of the rays that leave."""
         s = self.structure
-        numbers = list(range(s.first, s.last + 1))
+        numbers = [n for n in range(s.first, s.last + 1) if s.forms[n - 1].kind != BREAK]
         if s.sense < 0.0:
             numbers.reverse()
-        carried: tuple[int, ...] = ()  # the elements whose axes the rays are in
+        line = self.line(0)  # that the rays' axes lie along
         now, at = 0, 1  # the surface that rays left last, and the vertex that z counts from
-        media = []
         for medium, number in enumerate(numbers):
             before, behind = (number - 1, number) if s.sense > 0.0 else (number, number - 1)
-            media.append(before)
-            then = carriers(s.elements, number)
-            if then != carried:
+            self.media.append(before)
+            then = self.line(number)
+            if then != line:
                 row = self.step(Kind.CHANGE_AXES, medium, medium, number)
                 self.turn(row, now, number)
             row = self.step(s.forms[number - 1].kind, medium, medium + 1, number)
-            if then == carried:
+            if then == line:
                 self.shift(row, at, number)
-            row[Code.REFRACTS] = int(s.materials[before] != s.materials[behind])
+            sense_behind = s.sense * s.senses[behind]
+            self.constants[row[Code.OFFSET] + Slot.SENSE_BEHIND] = sense_behind
+            law = s.laws[number - 1]
+            bends = s.materials[before] != s.materials[behind] or number in s.mirrors
+            row[Code.REFRACTS] = int(bends and law is None)
             self.aperture(row, s.apertures[number - 1])
             self.shape(row, number)
-            carried, now, at = then, number, number
-        media.append(numbers[-1] if s.sense > 0.0 else numbers[-1] - 1)
-        self.leave(now if carried else 0, at, len(numbers))
+            if law is not None:
+                row = self.step(Kind.DEFLECT, medium, medium + 1, number)
+                self.constants[row[Code.OFFSET] + Slot.SENSE_BEHIND] = sense_behind
+                self.deflection(row, number, law)
+            line, now, at = then, number, number
+        if s.to_sensor:
+            self.media.append(len(s.forms))
+        elif numbers:
+            self.media.append(numbers[-1] if s.sense > 0.0 else numbers[-1] - 1)
+        else:
+            self.media.append(s.first - 1)
+        self.leave(line, now, at, len(numbers))
+        for row in self.codes:
+            if row[Code.KIND] == Kind.DEFLECT:
+                row[Code.WAVE] = len(self.media)
         places, sources, signs = zip(*self.entries, strict=True) if self.entries else ((), (), ())
         return Records(
             constants=tensor(self.constants, np.float64),
@@ -160,9 +206,18 @@ class _Writer:
             signs=tensor(signs, np.float64),
             codes=tensor(self.codes, np.int64).reshape(-1, Code.ROW),
             extras=tensor([*self.extras, 0], np.int64),
-            media=tuple(media),
+            media=tuple(self.media),
+            waves=self.waves,
             turns=tuple(self.turns),
         )
+
+    def line(self, number: int) -> tuple[int, tuple[int, ...]]:
+        """Return what a surface's axes share with others that differ from them in z alone: how many
+        breaks stand in front, and which elements carry them; of number 0 the lens's own axes.
+        """
+        s = self.structure
+        breaks = sum(form.kind == BREAK for form in s.forms[: max(number - 1, 0)])
+        return breaks, carriers(s.elements, number) if 0 < number <= len(s.forms) else ()
 
     def step(self, kind: int, before: int, after: int, number: int) -> list[int]:
         """Begin a record; its row of codes, to be filled in further."""
@@ -171,7 +226,8 @@ class _Writer:
         row[Code.LENGTH] = Slot.HEADER
         row[Code.BEFORE], row[Code.AFTER] = before, after
         header = [0.0] * Slot.HEADER
-        header[Slot.SENSE], header[Slot.TAG] = self.structure.sense, 4.0 * number
+        sense = self.structure.sense * self.structure.senses[self.media[before]]
+        header[Slot.SENSE], header[Slot.TAG] = sense, 4.0 * number
         self.constants += header
         self.codes.append(row)
         return row
@@ -190,6 +246,22 @@ class _Writer:
                 self.add(len(self.constants), source, count)
                 scalar, array = (scalar + 1, array) if size == () else (scalar, array + count)
             self.constants += [0.0] * count
+        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET] - form.data
+
+    def deflection(self, row: list[int], number: int, law: LawForm) -> None:
+        """The numbers of a surface's shape, and those of its law."""
+        self.waves = True
+        form = self.structure.forms[number - 1]
+        self.shape(row, number)
+        self.constants += [0.0] * (2 - len(form.sizes))
+        row[Code.LAW], row[Code.BASE] = law.code, form.kind
+        row[Code.NUMBERS] = len(self.constants) - row[Code.OFFSET]
+        source = self.of_law[number - 1]
+        for size in law.sizes:
+            if size is not None:
+                self.add(len(self.constants), source)
+                source += 1
+            self.constants.append(0.0)
         row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET]
 
     def add(self, place: int, source: int, count: int = 1, sign: float = 1.0) -> None:
@@ -234,13 +306,21 @@ class _Writer:
             row[Code.HOLE], *numbers = hole.packed()
             values[record + Slot.HOLE_X], values[record + Slot.HOLE_Y] = numbers
 
-    def leave(self, carried: int, at: int, medium: int) -> None:
-        """From the last surface, which an element may carry, to the lens's axes or the sensor."""
+    def leave(self, line: tuple[int, tuple[int, ...]], now: int, at: int, medium: int) -> None:
+        """From the last surface, which an element may carry, to the lens's axes or the sensor.
+
+        A sensor behind coordinate breaks has axes of its own.
+        """
         sensor = len(self.structure.forms) + 1
-        if carried:
-            self.turn(self.step(Kind.LENS_AXES, medium, medium, at), carried, 0)
+        own = self.structure.to_sensor and self.line(sensor) != self.line(0)
+        if own and line != self.line(sensor):
+            self.turn(self.step(Kind.CHANGE_AXES, medium, medium, sensor), now, sensor)
+            self.step(Kind.SENSOR, medium, medium, sensor)
+            at = sensor
+        elif not own and line != self.line(0):
+            self.turn(self.step(Kind.LENS_AXES, medium, medium, at), now, 0)
             at = 1
-        if self.structure.to_sensor:
+        if self.structure.to_sensor and at != sensor:
             self.shift(self.step(Kind.SENSOR, medium, medium, sensor), at, sensor)
             at = sensor
         exit_z = len(self.constants)

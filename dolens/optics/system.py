@@ -1,5 +1,6 @@
 """A lens as pure functions see it: tensors and names, no state."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -7,14 +8,25 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dolens.optics.broken_axes import GlobalAxes, broken_axes
 from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.materials import Medium
 from dolens.optics.surfaces.state import SurfaceState
 
 
+def per_radian(wavelength: float | Tensor, like: Tensor) -> float | Tensor:
+    """Return λ/2π in mm, the path in vacuum of one radian, of a wavelength in nm.
+
+    A tensor of wavelengths gives one in the precision of `like`, and on its device.
+    """
+    length = wavelength * (1e-6 / (2.0 * math.pi))
+    return length.to(like) if isinstance(length, Tensor) else length
+
+
 @dataclass(frozen=True)
 class OpticalSystem:
-    """A sequence of surfaces and a sensor plane, centred but for the poses of its elements.
+    """A sequence of surfaces and a sensor plane, centred but for coordinate breaks and the poses of
+    elements.
 
     Attributes:
         surfaces: in the order that light meets them.
@@ -23,6 +35,9 @@ class OpticalSystem:
         materials: before surface 1 and after each surface.
         stop: number of the stop surface, from 1.
         elements: groups of surfaces with a pose of their own.
+        mirrors: numbers of the surfaces that reflect; the medium behind one is the one in front.
+        reversals: numbers of the coordinate breaks that turn the axes so far that light travels the
+            other way along z behind them.
         backend: the implementation that traces rays through it: `reference`, `cpu`, `cuda`, or
             `auto`; see `dolens.optics.backend.choose_backend`.
     """
@@ -34,6 +49,39 @@ class OpticalSystem:
     stop: int
     elements: Sequence[ElementState] = ()
     backend: str = "auto"
+    mirrors: tuple[int, ...] = ()
+    reversals: tuple[int, ...] = ()
+
+    @cached_property
+    def senses(self) -> tuple[float, ...]:
+        """Return +1 where light travels towards +z and -1 where towards -z, in forward mode: before
+        surface 1 and behind each surface.
+        """
+        found = [1.0]
+        for number in range(1, len(self.surfaces) + 1):
+            turned = number in self.mirrors or number in self.reversals
+            found.append(-found[-1] if turned else found[-1])
+        return tuple(found)
+
+    @cached_property
+    def breaks(self) -> tuple[int, ...]:
+        """Return the numbers of the coordinate breaks."""
+        return tuple(n for n, s in enumerate(self.surfaces, 1) if s.shape.changes_axes)
+
+    @cached_property
+    def met(self) -> tuple[int, ...]:
+        """Return the numbers of the surfaces that light meets: all but coordinate breaks."""
+        return tuple(n for n in range(1, len(self.surfaces) + 1) if n not in self.breaks)
+
+    @cached_property
+    def neighbours(self) -> tuple[tuple[int, int], ...]:
+        """Return the numbers of surfaces that light meets one after the other."""
+        return tuple(zip(self.met, self.met[1:], strict=False))
+
+    def refracts(self, number: int) -> bool:
+        """Return whether a surface changes the direction of light, by refraction or reflection."""
+        before, behind = self.materials[number - 1], self.materials[number]
+        return number in self.mirrors or before != behind
 
     def indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
         """Indices before surface 1 and after each surface, at a wavelength in nm.
@@ -49,9 +97,17 @@ class OpticalSystem:
         ordered = [indices[medium] for medium in self.materials]
         return [n.to(self.dtype) if isinstance(n, Tensor) else n for n in ordered]
 
+    def signed_indices(self, wavelength: float | Tensor) -> list[float | Tensor]:
+        """Indices as paraxial optics takes them: negative where light travels towards -z."""
+        found = zip(self.indices(wavelength), self.senses, strict=True)
+        return [n if sense > 0.0 else -n for n, sense in found]
+
     @property
     def vertices(self) -> list[Tensor]:
-        """z of every vertex as designed, then of the sensor, in mm; the first is at 0."""
+        """z of every vertex as designed, then of the sensor, in mm; the first is at 0.
+
+        Along the axis as if no coordinate break turned it: thicknesses with their signs.
+        """
         positions = [torch.zeros_like(self.sensor_distance)]
         for gap in (*self.thicknesses, self.sensor_distance):
             positions.append(positions[-1] + gap)
@@ -59,8 +115,34 @@ class OpticalSystem:
 
     @property
     def axes(self) -> list[Axes]:
-        """The axes of every surface, with the poses of the elements that carry it."""
-        return surface_axes(self.elements, self.vertices, len(self.surfaces))
+        """The axes of every surface, with the poses of the elements that carry it, behind the
+        coordinate breaks in front of it.
+        """
+        return self.all_axes[:-1]
+
+    @property
+    def all_axes(self) -> list[Axes]:
+        """The axes of every surface, and of the sensor last."""
+        vertices = self.vertices
+        if self.breaks:
+            gaps = [*self.thicknesses, self.sensor_distance]
+            return broken_axes(self.surfaces, gaps, self.elements, vertices)
+        placed = surface_axes(self.elements, vertices, len(self.surfaces))
+        return [*placed, Axes((), vertices[-1])]
+
+    def global_axes(self) -> GlobalAxes:
+        """Return vertex and rotation of every surface, and of the sensor, in the lens's axes."""
+        origins, rotations = [], []
+        for axes in self.all_axes:
+            like = torch.zeros((), dtype=torch.float64, device=self.device)
+            if axes.rotation is None:
+                origin = torch.stack([like, like, torch.as_tensor(axes.z).to(like)])
+                rotation = torch.eye(3, dtype=torch.float64, device=self.device)
+            else:
+                origin, rotation = axes.origin.double(), axes.rotation.double()
+            origins.append(origin)
+            rotations.append(rotation)
+        return GlobalAxes(torch.stack(origins), torch.stack(rotations))
 
     @property
     def dtype(self) -> torch.dtype:
@@ -76,7 +158,8 @@ class OpticalSystem:
     def rotationally_symmetric(self) -> bool:
         """Return whether nothing in the lens singles out a direction across the axis."""
         surfaces = all(s.shape.rotational and s.aperture.rotational for s in self.surfaces)
-        return surfaces and not self.elements
+        laws = all(s.deflection is None or s.deflection.law.rotational for s in self.surfaces)
+        return surfaces and laws and not self.elements
 
     def traced_by(self, backend: str) -> "OpticalSystem":
         """The same lens, traced by another implementation."""
@@ -86,10 +169,7 @@ class OpticalSystem:
         """The same lens in double precision; gradients flow back to its own tensors."""
         return replace(
             self,
-            surfaces=[
-                replace(s, parameters={n: p.double() for n, p in s.parameters.items()})
-                for s in self.surfaces
-            ],
+            surfaces=[s.double() for s in self.surfaces],
             thicknesses=[gap.double() for gap in self.thicknesses],
             sensor_distance=self.sensor_distance.double(),
             elements=[

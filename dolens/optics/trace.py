@@ -1,16 +1,17 @@
 """Sequential tracing, forward and backward (Algorithm 1 of the source)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dolens.optics.elements import LENS_AXES, change_axes, to_lens_axes
+from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
 from dolens.optics.rays import Components, Rays, Status, TracedRays
+from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay
-from dolens.optics.system import OpticalSystem
+from dolens.optics.system import OpticalSystem, per_radian
 
 
 class Margins(NamedTuple):
@@ -27,11 +28,16 @@ class Trace:
     """Rays after the last surface (or on the sensor), as components.
 
     Attributes:
-        ray: z is measured from the vertex of the first surface.
+        ray: in the lens's axes, z from the vertex of the first surface; on the sensor in the
+            sensor's own axes, which are the same but for coordinate breaks; z is then the sum of
+            all thicknesses.
         valid: bool.
         margins: per surface met.
         path_length: Σ n·t in mm, or None when it was not asked for.
-        points: per surface met, x, y, z; empty when not recorded.
+        points: per surface met, x, y, z in the lens's axes; empty when not recorded.  At a
+            coordinate break it is where the ray crosses the plane z = 0 behind it.
+        local: the rays on the last surface met, in its axes.
+        axes: of that surface.
     """
 
     ray: Components
@@ -39,6 +45,8 @@ class Trace:
     margins: list[Margins]
     path_length: Tensor | None
     points: list[tuple[Tensor, Tensor, Tensor]]
+    local: Components
+    axes: Axes
 
 
 def transfer(ray: Components, distance: Tensor) -> Components:
@@ -70,8 +78,14 @@ def enter_lens(
     finer = torch.promote_types(ray.x.dtype, system.dtype)
     if finer == system.dtype:
         return Components(*(c.to(system.dtype) for c in ray)), None
-    distance, _ = distance_to_plane(ray, system.vertices[number - 1].to(finer), sense)
-    index = system.indices(rays.wavelength)[number - 1 if sense > 0.0 else number]
+    front = number - 1 if sense > 0.0 else number
+    towards = sense * system.senses[number if number in system.breaks else front]
+    axes = system.axes[number - 1]
+    if axes.segment:
+        distance, _ = distance_to_plane(from_lens_axes(ray, axes), 0.0, towards)
+    else:
+        distance, _ = distance_to_plane(ray, system.vertices[number - 1].to(finer), towards)
+    index = system.indices(rays.wavelength)[front]
     moved = Components(*(c.to(system.dtype) for c in transfer(ray, distance)))
     return moved, (index * distance).to(system.dtype)
 
@@ -101,9 +115,10 @@ def trace_surfaces(
     Returns:
         The rays on the last surface met, travelling in the medium behind it.
     """
-    indices, places = system.indices(wavelength), system.axes
+    indices, places, senses = system.indices(wavelength), system.axes, system.senses
     numbers = range(first, (len(system.surfaces) if last is None else last) + 1)
     path = torch.zeros_like(ray.n) if path_length else None
+    forward = sense > 0.0
     margins: list[Margins] = []
     points: list[tuple[Tensor, Tensor, Tensor]] = []
     # Positions count from the vertex at hand: float32 then errs by the sag's rounding only.
@@ -112,15 +127,23 @@ def trace_surfaces(
         i = number - 1
         surface = system.surfaces[i]
         shape, parameters = surface.shape, surface.parameters
-        before, after = (indices[i], indices[i + 1]) if sense > 0 else (indices[i + 1], indices[i])
+        if shape.changes_axes:
+            if record:
+                crossing, _ = change_axes(ray, axes, places[i])
+                points.append(to_lens_axes(crossing, places[i])[:3])
+            continue
+        front, back = (i, i + 1) if sense > 0 else (i + 1, i)
+        before, after = indices[front], indices[back]
+        arriving, leaving = sense * senses[front], sense * senses[back]
         here, carried = change_axes(ray, axes, places[i])
         axes = places[i]
-        to_plane, towards = distance_to_plane(here, 0.0, sense)
+        to_plane, towards = distance_to_plane(here, 0.0, arriving)
         limit = FAR * surface.semi_diameter
         l, m, n = here[3:]  # noqa: E741
         x = torch.addcmul(here.x, to_plane, l).clamp(-limit, limit)
         y = torch.addcmul(here.y, to_plane, m).clamp(-limit, limit)
-        t, met = shape.intersect(parameters, PlaneRay(x, y, l, m, n), sense, surface.semi_diameter)
+        ray_here = PlaneRay(x, y, l, m, n)
+        t, met = shape.intersect(parameters, ray_here, arriving, surface.semi_diameter)
         met = towards if met is None else torch.minimum(towards, met)
         t = t.clamp(-limit, limit)
         # What was held at the limit is not where the ray goes.
@@ -138,13 +161,21 @@ def trace_surfaces(
         if record:
             points.append(to_lens_axes(Components(x, y, z, l, m, n), axes)[:3])
         transmitted = None
-        if system.materials[i] != system.materials[i + 1]:
+        if surface.deflection is not None:
+            media = Media(before, after, per_radian(wavelength, ray.n))
+            travel = Travel(arriving, leaving, forward)
+            l, m, n, transmitted, added = surface.deflect(  # noqa: E741
+                (x, y, z), (l, m, n), media, travel
+            )
+            path = None if path is None else path + added
+        elif system.refracts(number):
             l, m, n, transmitted = shape.refract(  # noqa: E741
-                parameters, (x, y, z), (l, m, n), before / after, sense
+                parameters, (x, y, z), (l, m, n), before / after, leaving
             )
         margins.append(Margins(number, met, inside, transmitted))
         ray = Components(x, y, z, l, m, n)
-    return Trace(to_lens_axes(ray, axes), _all_positive(margins, ray.n), margins, path, points)
+    valid = _all_positive(margins, ray.n)
+    return Trace(to_lens_axes(ray, axes), valid, margins, path, points, ray, axes)
 
 
 def _all_positive(margins: list[Margins], like: Tensor) -> Tensor:
@@ -155,27 +186,31 @@ def _all_positive(margins: list[Margins], like: Tensor) -> Tensor:
     return reduce(torch.minimum, kept) > 0.0
 
 
-def trace_to_plane(
-    system: OpticalSystem,
-    traced: Trace,
-    z: Tensor | float,
-    wavelength: float | Tensor,
-    sense: float,
-) -> Trace:
-    """Carry rays on from the last surface to the plane at z (mm from the first vertex).
+def trace_to_sensor(system: OpticalSystem, traced: Trace, wavelength: float | Tensor) -> Trace:
+    """Carry rays on from the last surface to the sensor plane, and into the sensor's axes.
 
-    Rays that do not travel towards it are no longer valid.
+    Rays that do not travel in the sense of the light there are no longer valid.
     """
-    distance, towards = distance_to_plane(traced.ray, z, sense)
+    z = system.vertices[-1]
+    if system.breaks:
+        # Carried to the level of the sensor's vertex before they are turned.
+        at_level, carried = change_axes(traced.local, traced.axes, system.all_axes[-1])
+        to_plane, towards = distance_to_plane(at_level, 0.0, system.senses[-1])
+        distance = to_plane if carried is None else carried + to_plane
+        landed = transfer(at_level, to_plane)
+        ray = landed._replace(z=landed.z + z)
+    else:
+        distance, towards = distance_to_plane(traced.ray, z, system.senses[-1])
+        ray = transfer(traced.ray, distance)
     path = traced.path_length
     if path is not None:
-        path = path + system.indices(wavelength)[-1 if sense > 0 else 0] * distance
-    return Trace(
-        transfer(traced.ray, distance),
-        traced.valid & (towards > 0.0),
-        [*traced.margins, Margins(len(system.surfaces) + 1, towards, None, None)],
-        path,
-        traced.points,
+        path = path + system.indices(wavelength)[-1] * distance
+    return replace(
+        traced,
+        ray=ray,
+        valid=traced.valid & (towards > 0.0),
+        margins=[*traced.margins, Margins(len(system.surfaces) + 1, towards, None, None)],
+        path_length=path,
     )
 
 

@@ -84,7 +84,7 @@ class WavefrontResiduals(ImageQuality):
 
     def _index(self, lens: Lens) -> Tensor:
         """Return the index n' (N,) before the sensor."""
-        return lens.materials[-1].index(self._wavelengths)
+        return lens.system().materials[-1].index(self._wavelengths)
 
     def _path_before(self, lens: Lens) -> Tensor:
         """Return the path (N,), mm, from the object's wavefront to where the rays begin."""

@@ -12,8 +12,14 @@ A prescription is a mapping::
       '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
     sensor: {distance: 96.0, diameter: 1.7664}
 
-Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
-`occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+Lengths are in mm; `radius: .inf` is a plane (some shapes have `radius_x` and `radius_y`);
+`material` is the medium behind the surface: `air`, `occluder`, a constant index (`1.5`), glass as
+nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+`material: mirror` makes the surface reflect; behind it light travels towards -z, and thicknesses
+are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
+that stands behind them (see breaks.py).
+A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
+lens (see deflections.py).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
@@ -31,14 +37,24 @@ from dolens.errors import InputError, check_keys, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.materials import parse_material
+from dolens.optics.mirrors import media_of
 from dolens.optics.surfaces import SURFACES, Surface
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
 from dolens.prescriptions.automatic_apertures import set_automatic_semi_diameters
+from dolens.prescriptions.breaks import KIND, break_from, break_row, is_break
 from dolens.prescriptions.checks import (
     as_integer,
     as_number,
     as_numbers,
     require_mapping,
+)
+from dolens.prescriptions.deflections import (
+    PHASE_KEY,
+    is_paraxial_lens,
+    phase_from,
+    phase_row,
+    power_row,
+    with_power,
 )
 from dolens.prescriptions.field_data import set_object_fields
 from dolens.prescriptions.poses import element_rows, elements_from
@@ -63,8 +79,10 @@ _LENS_KEYS = (
     "sensor",
     *SYSTEM_DATA_KEYS,
 )
-_SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, "thickness", "material", "note")
+_SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
+# A prescription may give the radius of the same name instead: `radius_x` for `curvature_x`.
+CURVATURES = ("curvature", "curvature_x", "curvature_y")
 
 
 def lens_from_prescription(
@@ -105,8 +123,12 @@ def lens_from_prescription(
     materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
     for number, row in enumerate(rows, 1):
         place = f"{where}: surface {number}"
-        surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
-        materials.append(_material(row.get("material"), model, place))
+        if is_break(row):
+            surfaces.append(break_from(row, place, dtype))
+            materials.append(media_of(materials).materials[-1])
+        else:
+            surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
+            materials.append(_material(row.get("material"), model, place))
         if number < len(rows):
             if row.get("thickness") is None:
                 raise InputError(f"{place}: 'thickness' is missing (mm to surface {number + 1})")
@@ -148,20 +170,28 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
     """
     rows: dict[str, dict[str, Any]] = {}
     for (number, surface), material in zip(lens.surfaces.items(), lens.materials[1:], strict=True):
+        if surface.changes_axes:
+            rows[number] = break_row(surface) | _gap(lens, number)
+            continue
         row: dict[str, Any] = {"type": surface.kind}
-        for key, value in (*surface.named_parameters(), *surface.named_buffers()):
+        for key, value in (*surface._parameters.items(), *surface._buffers.items()):
             number_value = value.detach().tolist()
-            if key == "curvature":
-                row["radius"] = _radius(number_value)
-                if 1.0 / row["radius"] != number_value:
+            if key == "power" and surface.law is not None:
+                row |= power_row(number_value)
+                continue
+            if key in CURVATURES:
+                radius = _radius_key(key)
+                row[radius] = _radius(number_value)
+                if 1.0 / row[radius] != number_value:
                     # Rounding of 1/(1/c) loses a bit for some c: keep the parameter itself.
-                    del row["radius"]
-                    row["curvature"] = number_value
+                    del row[radius]
+                    row[key] = number_value
             else:
                 row[key] = number_value
+        if surface.phase is not None:
+            row[PHASE_KEY] = phase_row(surface.phase)
         row |= aperture_rows(surface.aperture)
-        if number in lens.thicknesses:
-            row["thickness"] = float(lens.thicknesses[number].detach())
+        row |= _gap(lens, number)
         row["material"] = material.name
         rows[number] = row
     sensor: dict[str, Any] = {"distance": float(lens.sensor_distance.detach())}
@@ -181,43 +211,66 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
     }
 
 
+def _gap(lens: Lens, number: str) -> dict[str, float]:
+    """Return the thickness behind a surface, which the last has not."""
+    if number not in lens.thicknesses:
+        return {}
+    return {"thickness": float(lens.thicknesses[number].detach())}
+
+
 def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     kind = str(row.get("type", "sphere"))
     if kind not in SURFACES:
         raise InputError(
             f"{place}: type '{kind}' is unknown{did_you_mean(kind, SURFACES)} "
-            f"(allowed: {', '.join(SURFACES)})"
+            f"(allowed: {', '.join((*SURFACES, KIND))})"
         )
     shape = SURFACES[kind]
     try:
+        if is_paraxial_lens(row):
+            row = with_power(row)
         names = shape.parameter_names(row)
-        check_keys(row, (*_SURFACE_KEYS, *names), place)
+        radii = [_radius_key(name) for name in names if name in CURVATURES]
+        check_keys(row, (*_SURFACE_KEYS, *names, *radii), place)
         values = {
             key: (as_numbers if key in shape.arrays else as_number)(row.get(key, 0.0), f"'{key}'")
             for key in names
             if key in row or key not in shape.optional
         }
-        if "curvature" in names:
-            values["curvature"] = _curvature(row)
-        elif not math.isinf(as_number(row.get("radius", math.inf), "'radius'")):
+        values |= {name: _curvature(row, name) for name in names if name in CURVATURES}
+        if "curvature" not in names and not math.isinf(
+            as_number(row.get("radius", math.inf), "'radius'")
+        ):
             raise InputError(f"a surface of type '{kind}' has no 'radius'")
-        return shape(clear_aperture(row, place), values, dtype)
+        surface = shape(clear_aperture(row, place), values, dtype)
+        if row.get(PHASE_KEY) is not None:
+            if shape.law is not None:
+                raise InputError(f"a surface of type '{kind}' cannot have a 'phase'")
+            surface.phase = phase_from(row[PHASE_KEY], place, dtype)
+        return surface
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None
 
 
-def _curvature(row: Mapping[str, Any]) -> float:
-    if row.get("curvature") is not None and row.get("radius") is not None:
-        raise InputError("give 'radius' or 'curvature', not both")
-    if row.get("curvature") is not None:
-        return as_number(row["curvature"], "'curvature'")
-    if row.get("radius") is None:
-        raise InputError("'radius' is missing (mm; .inf for a plane)")
-    radius = as_number(row["radius"], "'radius'", finite=False)
+def _curvature(row: Mapping[str, Any], name: str) -> float:
+    """Return a curvature of a row, which gives it or the radius of the same name."""
+    key = _radius_key(name)
+    if row.get(name) is not None and row.get(key) is not None:
+        raise InputError(f"give '{key}' or '{name}', not both")
+    if row.get(name) is not None:
+        return as_number(row[name], f"'{name}'")
+    if row.get(key) is None:
+        raise InputError(f"'{key}' is missing (mm; .inf for a plane)")
+    radius = as_number(row[key], f"'{key}'", finite=False)
     if radius == 0.0:
-        raise InputError("'radius' is 0; write .inf for a plane")
+        raise InputError(f"'{key}' is 0; write .inf for a plane")
     return 1.0 / radius
+
+
+def _radius_key(name: str) -> str:
+    """Return `radius_x` for `curvature_x`."""
+    return name.replace("curvature", "radius")
 
 
 def _radius(curvature: float) -> float:

@@ -10,6 +10,7 @@ import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import PurePath
 from typing import Any
 
 import torch
@@ -24,7 +25,7 @@ from dolens.prescriptions.simplifications import (
     COMPARED_WAVELENGTHS,
     SIMPLIFICATIONS,
     Prescription,
-    is_zemax,
+    of_other_program,
     surfaces_text,
 )
 from dolens.prescriptions.zemax_glass import canonical
@@ -129,7 +130,7 @@ def _sentences(found: list[Difference], new: str) -> list[str]:
     for place, key, before, after in found:
         if before is None:
             what = f"added: {key} {_shown(after)}" + (
-                ", which a .zmx file always has" if is_zemax(new) else ""
+                f", which a {PurePath(new).suffix} file always has" if of_other_program(new) else ""
             )
         elif after is None:
             what = f"lost: {key} {_shown(before)}"
@@ -154,6 +155,7 @@ def _same_numbers(before: Lens, after: Lens) -> bool:
         and all(torch.equal(value, second[name]) for name, value in first.items())
         and before.stop == after.stop
         and _indices(before) == _indices(after)
+        and before.system().mirrors == after.system().mirrors
         and [s.aperture for s in before.surfaces.values()]
         == [s.aperture for s in after.surfaces.values()]
     )
@@ -169,7 +171,8 @@ def _parameters(lens: Lens) -> dict[str, torch.Tensor]:
 
 
 def _indices(lens: Lens) -> list[list[float]]:
-    return [[float(m.index(wave)) for wave in COMPARED_WAVELENGTHS] for m in lens.materials]
+    media = lens.system().materials
+    return [[float(m.index(wave)) for wave in COMPARED_WAVELENGTHS] for m in media]
 
 
 @torch.no_grad()

@@ -9,10 +9,14 @@ from dolens.errors import InputError
 # Any radius with more digits than this was written for its curvature's sake.
 _DIGITS_OF_A_DOUBLE = 17
 _RECIPROCAL = Context(prec=40)
+# Longer text is no number that a program writes, and is slow to read.
+_LONGEST = 400
 
 
 def number_in_text(text: str, place: str) -> float:
     """Read a finite number as files write it (`1.5`, `-2E-3`); `InputError` names the place."""
+    if len(text) > _LONGEST:
+        raise InputError(f"{place} must be a number, not {len(text)} letters")
     try:
         value = float(text)
     except ValueError:
@@ -26,7 +30,12 @@ def scaled(text: str, factor: Fraction, place: str) -> float:
     """Return the double nearest to the decimal number times an exact factor (a change of units)."""
     value = number_in_text(text, place)
     # Zero and exponents out of range ended above: the exact fraction below stays small.
-    return value if value == 0.0 or factor == 1 else _nearest(Fraction(text) * factor, place)
+    return value if value == 0.0 or factor == 1 else nearest(Fraction(text) * factor, place)
+
+
+def exact(text: str, place: str) -> Fraction:
+    """Return the decimal number itself; `InputError` where it is none of double precision."""
+    return Fraction(text) if number_in_text(text, place) else Fraction(0)
 
 
 def shifted(value: float, places: int) -> str:
@@ -47,12 +56,13 @@ def curvature_in_text(text: str, place: str) -> float | None:
     digits = Decimal(text).normalize().as_tuple().digits
     if radius == 0.0 or len(digits) <= _DIGITS_OF_A_DOUBLE:
         return None
-    return _nearest(1 / Fraction(text), place)
+    return nearest(1 / Fraction(text), place)
 
 
-def _nearest(exact: Fraction, place: str) -> float:
+def nearest(number: Fraction, place: str) -> float:
+    """Return the double nearest to a fraction; `InputError` where it is out of range."""
     try:
-        return float(exact)
+        return float(number)
     except OverflowError:
         raise InputError(f"{place} is out of the range of double precision") from None
 

@@ -6,41 +6,38 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
-from dolens.errors import InputError, did_you_mean, one_line
+from dolens.errors import InputError, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
-from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
+from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
 from dolens.prescriptions.published import PUBLISHED_KEY
 from dolens.prescriptions.read_file import ReadPrescription
-from dolens.prescriptions.zemax import decode_zemax, encode_zemax
-from dolens.prescriptions.zemax_reader import read_zemax
-from dolens.prescriptions.zemax_writer import zemax_of
+from dolens.prescriptions.yaml_text import plain_values
+
+__all__ = [
+    "SUFFIXES",
+    "decode_prescription",
+    "decode_yaml",
+    "encode_prescription",
+    "find_lens",
+    "lens_names",
+    "load_lens",
+    "load_prescription",
+    "read_lens_data",
+    "read_lens_file",
+    "save_lens",
+]
 
 logger = logging.getLogger(__name__)
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
-SUFFIXES = (".yaml", ".yml", ".txt", ".zmx")
 # Of these, prescriptions from patents and books lie in a folder of their own.
 _PUBLISHED = "published"
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """This safe YAML loader also refuses a key written twice: the first would be lost."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        seen = set()
-        scalars = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for key_node in scalars:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
-                line = key_node.start_mark.line + 1
-                raise yaml.YAMLError(f"key '{key}' is given twice, again in line {line}")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+# What holds the numbers that a source publishes.
+_WHOLE = (".yaml", ".yml", ".json")
 
 
 def lens_names() -> list[str]:
@@ -109,8 +106,9 @@ def load_prescription(path: str | Path) -> Any:
 def read_lens_file(path: str | Path) -> ReadPrescription:
     """Read a lens file as plain data, and list what is passed over; see `load_prescription`."""
     path = find_lens(path)
-    _suffix(path)
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: is larger than {MOST_BYTES // 2**20} MB, and no lens")
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
@@ -127,18 +125,12 @@ def read_lens_data(data: bytes, path: str | Path) -> ReadPrescription:
 
     Args:
         data: what the file holds.
-        path: its suffix says which format that is; messages name it.
+        path: its name; see `dolens.prescriptions.lens_formats.read_lens`.
 
     Raises:
         InputError: see `load_prescription`.
     """
-    suffix = _suffix(Path(path))
-    if suffix == ".zmx":
-        return read_zemax(decode_zemax(data, str(path)), str(path))
-    if suffix == ".txt":
-        found = prescription_from_diffoptics(_text(data, path, "text"), str(path))
-        return ReadPrescription(found, [])
-    return ReadPrescription(decode_yaml(data, path), [])
+    return read_lens(data, path)
 
 
 def decode_yaml(data: bytes, where: str | Path) -> Any:
@@ -151,20 +143,11 @@ def decode_yaml(data: bytes, where: str | Path) -> Any:
     Raises:
         InputError: it is not valid YAML; the message is one line.
     """
-    text = _text(data, where, "YAML")
     try:
-        # A subclass of the safe loader: it builds plain values only.
-        return yaml.load(text, Loader=_UniqueKeyLoader)
-    except yaml.YAMLError as error:
-        reason = one_line(error)
-        raise InputError(f"{where}: is not valid YAML ({reason})") from None
-
-
-def _text(data: bytes, where: str | Path, kind: str) -> str:
-    try:
-        return data.decode("utf-8")
+        text = data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{where}: is not valid {kind} ({error})") from None
+        raise InputError(f"{where}: is not valid YAML ({error})") from None
+    return plain_values(text, str(where))
 
 
 def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> bytes:
@@ -177,15 +160,7 @@ def encode_prescription(prescription: Mapping[str, Any], path: str | Path) -> by
     Raises:
         InputError: the format cannot hold the lens; the message names the surface and key.
     """
-    suffix = _suffix(Path(path))
-    if suffix == ".zmx":
-        return encode_zemax(zemax_of(prescription, str(path)))
-    if suffix == ".txt":
-        return diffoptics_text_of(prescription, str(path)).encode()
-    text = yaml.safe_dump(
-        prescription, sort_keys=False, default_flow_style=None, width=200, allow_unicode=True
-    )
-    return text.encode()
+    return encode_lens(prescription, path)
 
 
 def load_lens(
@@ -227,13 +202,6 @@ def save_lens(lens: Lens, path: str | Path) -> None:
     """
     path = Path(path)
     prescription = prescription_of(lens)
-    if _suffix(path) not in (".yaml", ".yml"):
+    if path.suffix.lower() not in _WHOLE:
         prescription.pop(PUBLISHED_KEY, None)
     path.write_bytes(encode_prescription(prescription, path))
-
-
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path}: lens files end in {', '.join(SUFFIXES)}")
-    return suffix

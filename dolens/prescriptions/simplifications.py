@@ -1,40 +1,44 @@
 """A prescription is simplified for a format that cannot hold it, and what changes is said."""
 
 from collections.abc import Callable, Mapping
+from pathlib import PurePath
 from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.materials import abbe_number, index_d, parse_material
 from dolens.optics.materials import index_model as find_index_model
+from dolens.prescriptions.codev.glass import glass_word
 from dolens.prescriptions.zemax_glass import canonical
 
 Prescription = dict[str, Any]
 # Indices are compared at these wavelengths, nm.
 COMPARED_WAVELENGTHS = (400.0, 450.0, 486.1327, 546.074, 587.5618, 656.2725, 700.0)
-_KNOWN_MEDIA = ("air", "occluder")
+_KNOWN_MEDIA = ("air", "occluder", "mirror")
 
 
 def _dfc_indices(prescription: Prescription, new: str) -> list[str]:
-    """Take the only index model that a .zmx file knows."""
+    """Take the only index model that the files of other programs know."""
     model = str(prescription.get("index_model", "dfc"))
-    if not is_zemax(new) or model == "dfc":
+    if not of_other_program(new) or model == "dfc":
         return []
     prescription["index_model"] = "dfc"
     return [
-        f"the index model '{model}' became 'dfc', the only one that a .zmx file knows: nd and Vd "
-        "are those of the lines C, d and F, and air has index 1"
+        f"the index model '{model}' became 'dfc', the only one that a {_suffix(new)} file knows: "
+        "nd and Vd are those of the lines C, d and F, and air has index 1"
     ]
 
 
 def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
-    """Write glass of a catalogue as nd/Vd."""
-    if not new.lower().endswith(".txt"):
+    """Write glass as nd/Vd: of a catalogue for dO's text, which no name of CODE V means for its
+    files, where nd has six and Vd four decimals.
+    """
+    if _suffix(new) not in (".txt", ".seq"):
         return []
     model = find_index_model(str(prescription.get("index_model", "dfc")))
     said: dict[str, tuple[str, float, list[str]]] = {}
     for n, row in prescription["surfaces"].items():
         name = str(row.get("material")).strip()
-        if name.lower() in _KNOWN_MEDIA or name[:1].isdigit():
+        if row.get("material") is None or not _needs_numbers(name, new):
             continue
         medium = parse_material(name, model)
         pair = f"{index_d(medium):.6f}/{abbe_number(medium):.4f}"
@@ -52,22 +56,38 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
     ]
 
 
+def _needs_numbers(name: str, new: str) -> bool:
+    """Return whether a medium has no name in a format, and needs nd and Vd there."""
+    if name.lower() in _KNOWN_MEDIA or (name[:1].isdigit() and "/" not in name):
+        return False
+    if _suffix(new) == ".txt":
+        return not name[:1].isdigit()
+    try:
+        glass_word(name, new)
+    except InputError:
+        return True
+    return False
+
+
 def _aperture_planes(prescription: Prescription, new: str) -> list[str]:
-    """Write aperture planes as a .zmx file knows them: the stop is one, any other is a plane."""
-    if not is_zemax(new):
+    """Write aperture planes as other programs know them: the stop is one, any other is a plane."""
+    if not of_other_program(new):
         return []
     said = []
     stop = str(prescription.get("stop", 1))
     before = prescription.get("object_material", "air")
     for n, row in prescription["surfaces"].items():
         flat = row.get("type", "sphere") in ("plane", "sphere") and _is_flat(row)
+        flat = flat and row.get("phase") is None
         empty = canonical(str(row.get("material"))) == canonical(str(before))
-        before = row.get("material")
+        # A mirror and a coordinate break leave the medium as it is.
+        if str(row.get("material", "mirror")).strip().lower() != "mirror":
+            before = row["material"]
         if row.get("type") == "aperture" and str(n) != stop:
             row["type"] = "plane"
             said.append(
                 f"surface {n}, an aperture, became a plane of the same size, which clips the same "
-                "rays: the one aperture of a .zmx file is the stop"
+                f"rays: the one aperture of a {_suffix(new)} file is the stop"
             )
         elif flat and empty and str(n) == stop:
             row["type"] = "aperture"
@@ -131,9 +151,13 @@ SIMPLIFICATIONS: tuple[Callable[[Prescription, str], list[str]], ...] = (
 )
 
 
-def is_zemax(path: str) -> bool:
-    """Return whether a file is named as one of Zemax."""
-    return path.lower().endswith(".zmx")
+def of_other_program(path: str) -> bool:
+    """Return whether a file is named as one of Zemax or CODE V."""
+    return _suffix(path) in (".zmx", ".seq")
+
+
+def _suffix(path: str) -> str:
+    return PurePath(path).suffix.lower()
 
 
 def _is_flat(row: Mapping[str, Any]) -> bool:

@@ -21,6 +21,7 @@ from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.mirrors import MIRROR
 from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.read_file import ReadPrescription
@@ -75,7 +76,9 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
             continue
         block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
         row, clips = _row(block, catalogues, pupil)
-        medium = row.get("material", medium)
+        # Behind a mirror, and behind a coordinate break, is the medium in front of it.
+        if row.get("material", MIRROR.name) != MIRROR.name:
+            medium = row["material"]
         rows.append(row)
         hard.append(clips)
         if block.stop:
@@ -171,7 +174,7 @@ def _with_sensor(
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
     gaps = [rows[-1].pop("thickness")]
     while len(rows) > 1 and len(rows) != prescription["stop"] and not hard[len(rows) - 1]:
-        if not _is_dummy(rows[-1], rows[-2].get("material")):
+        if not _is_dummy(rows[-1], _medium_behind(rows[:-1], prescription)):
             break
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
@@ -199,6 +202,12 @@ def _object(
     return medium, None if abs(distance) >= _INFINITE else distance
 
 
+def _medium_behind(rows: list[dict[str, Any]], prescription: dict[str, Any]) -> str:
+    """Return the medium behind the last of some rows: mirrors and breaks leave it as it is."""
+    media = (row.get("material", MIRROR.name) for row in reversed(rows))
+    return next((m for m in media if m != MIRROR.name), prescription["object_material"])
+
+
 def _is_ignored(lines: Block) -> bool:
     """Return whether a surface is there for another configuration alone: the sixth switch of
     HIDE.
@@ -218,4 +227,4 @@ def _refuse_own_axes(block: SurfaceBlock) -> None:
 def _is_dummy(row: Row, before: str | None) -> bool:
     """Return whether a row is a plane between one medium and the same."""
     flat = row["type"] == "plane" or (row["type"] == "sphere" and row.get("radius") == math.inf)
-    return flat and row["material"] == before
+    return flat and "phase" not in row and row["material"] == before

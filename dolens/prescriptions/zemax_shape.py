@@ -22,6 +22,8 @@ class ZemaxShape(NamedTuple):
         parameters: the numbers of PARM that it reads; any other that is not zero refuses a file.
             None: all are passed over.
         extra_data: the same for XDAT.
+        phase: the `type` of the phase that a row must have to be written as this TYPE; none: it
+            must have no phase.
         surface: whether light meets a surface there, which has a medium behind it and an aperture;
             a change of axes has a gap only.
     """
@@ -33,3 +35,4 @@ class ZemaxShape(NamedTuple):
     parameters: Sequence[int] | None = ()
     extra_data: Sequence[int] | None = ()
     surface: bool = True
+    phase: str = ""

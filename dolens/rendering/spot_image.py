@@ -15,8 +15,9 @@ from torch.utils.checkpoint import checkpoint
 from dolens.errors import InputError
 from dolens.optics.elements import from_lens_axes, to_lens_axes
 from dolens.optics.rays import Components
+from dolens.optics.straight import require_refracting
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import Trace, trace_surfaces, trace_to_plane
+from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.rendering.binning import bin_rays
 from dolens.sensor.pixels import Sensor
 
@@ -98,9 +99,11 @@ class SpotImager:
             source: (3,), mm, in the lens's axes; in front of the lens.
 
         Raises:
-            InputError: no light reaches the sensor plane, or some passes the rim of the disc that
+            InputError: the lens has mirrors or coordinate breaks, no light reaches the sensor
+                plane, or some passes the rim of the disc that
                 rays aim at.
         """
+        require_refracting(system, "images of point sources")
         options = {"dtype": system.dtype, "device": system.device}
         grid = torch.zeros(self.sensor.height, self.sensor.width, **options)
         sums = torch.zeros(3, **options)
@@ -147,7 +150,7 @@ class SpotImager:
         cosine = from_lens_axes(ray, axes).n
         trace = trace_surfaces(system, ray, self.wavelength, record=True)
         light = area * cosine / distance**2 * self._passed(system, trace, u * u + v * v)
-        on_sensor = trace_to_plane(system, trace, system.vertices[-1], self.wavelength, 1.0)
+        on_sensor = trace_to_sensor(system, trace, self.wavelength)
         return SensorIntercepts(on_sensor.ray.x, on_sensor.ray.y, light)
 
     def _passed(self, system: OpticalSystem, trace: Trace, aimed: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
-from dolens.optics.trace import Trace, trace_surfaces, trace_to_plane
+from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.tolerancing.linear_spots import check_whole_pupil
 from dolens.tolerancing.through_focus import FocusCurves
 
@@ -81,7 +81,7 @@ def trace_perturbed(
     def traced(values: Tensor) -> Trace:
         system = lens.system(dict(zip(names, values.unbind(), strict=True)))
         at_last = trace_surfaces(system, ray, wavelength)
-        return trace_to_plane(system, at_last, system.vertices[-1], wavelength, 1.0)
+        return trace_to_sensor(system, at_last, wavelength)
 
     # Sums are formed about the design's centroids, so that squares of distances lose no digits.
     design = _intercepts(traced(start).ray)

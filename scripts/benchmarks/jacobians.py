@@ -11,7 +11,7 @@ from benchmarks.results import Results, Row
 from benchmarks.timing import Contender, by_turns
 from benchmarks.tracing import Plan, ratio_to, row_of_timing
 from dolens import Lens, Rays
-from dolens.optics.trace import trace_surfaces, trace_to_plane, traced_rays
+from dolens.optics.trace import trace_surfaces, trace_to_sensor, traced_rays
 
 JACOBIAN, NORMAL_EQUATIONS = "Jacobian", "normal equations"
 LENS = "nikon"
@@ -63,7 +63,7 @@ def by_two_sweeps(lens: Lens, rays: Rays, names: list[str]) -> Tensor:
     }
     system = lens.system(values)
     traced = trace_surfaces(system, ray, rays.wavelength, 1.0, path_length=True)
-    traced = trace_to_plane(system, traced, system.vertices[-1], rays.wavelength, 1.0)
+    traced = trace_to_sensor(system, traced, rays.wavelength)
     position = traced_rays(traced, None).position
     inputs = list(values.values())
     rows = [

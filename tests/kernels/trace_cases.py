@@ -56,6 +56,122 @@ def _aspheres():
     )
 
 
+def _mirrors():
+    """A Mangin mirror, then mirrors of every kind, and glass behind them."""
+
+    def row(kind, thickness, material="mirror", **more):
+        return {"type": kind, "semi_diameter": 6.0, "thickness": thickness, "material": material,
+                **more}  # fmt: skip
+
+    surfaces = [
+        row("sphere", 2.0, _GLASS, radius=-40.0),
+        row("conic", -2.0, radius=-70.0, conic=-0.6),
+        row("sphere", -12.0, "air", radius=-40.0),
+        row("even_asphere", 12.0, radius=90.0, conic=0.3, a4=1e-5, a6=-1e-8),
+        row("sphere", -12.0, radius=-80.0),
+        row("plane", 12.0),
+        row("xy_polynomial", -12.0, x2=-0.004, y2=-0.005, xy=1e-4, x3=1e-5, y4=-1e-7),
+        row("conic", 8.0, radius=200.0, conic=-3.0),
+        row("sphere", 2.0, _GLASS, radius=60.0),
+        row("plane", None, "air"),
+    ]
+    surfaces[-1].pop("thickness")
+    return lens_from_prescription(
+        {"surfaces": {str(n): r for n, r in enumerate(surfaces, 1)}, "sensor": {"distance": 15.0}}
+    )
+
+
+def _folded():
+    """Breaks before, between and behind mirrors and a lens that is out of place."""
+
+    def broken(**row):
+        return {"type": "coordinate_break", "thickness": 0.0, **row}
+
+    glass = {"semi_diameter": 5.0, "material": _GLASS}
+    mirror = {"semi_diameter": 9.0, "material": "mirror", "thickness": 0.0}
+    surfaces = [
+        broken(tilt_x=2.0, decenter_x=0.2, thickness=1.0),
+        {"type": "sphere", "radius": 60.0, "thickness": 2.0, **glass},
+        {"type": "sphere", "radius": -90.0, "thickness": 20.0, **glass, "material": "air"},
+        broken(tilt_x=45.0, decenter_y=0.3),
+        {"type": "plane", **mirror},
+        broken(tilt_x=45.0, thickness=-15.0),
+        broken(tilt_y=-20.0, tilt_z=10.0),
+        {"type": "conic", "radius": 90.0, "conic": -0.8, **mirror},
+        broken(tilt_y=-20.0, tilt_x=3.0, order="tilt_first", decenter_x=-0.4, thickness=10.0),
+        {"type": "even_asphere", "radius": 80.0, "conic": 0.0, "a4": 1e-5, **glass,
+         "thickness": 3.0},
+        {"type": "sphere", "radius": -70.0, **glass, "material": "air", "thickness": 4.0},
+        broken(tilt_x=-8.0),
+    ]  # fmt: skip
+    surfaces[-1].pop("thickness", None)
+    elements = {
+        "1": {"surfaces": [2, 3], "tilt_x": 1.0, "decenter_x": 0.1, "shift_z": 0.05},
+        "2": {"surfaces": [8, 11], "tilt_y": 0.5, "decenter_y": -0.1, "pivot": [0.0, 1.0, 2.0]},
+    }
+    return lens_from_prescription(
+        {"surfaces": {str(n): r for n, r in enumerate(surfaces, 1)}, "elements": elements,
+         "sensor": {"distance": 12.0}, "stop": 2}
+    )  # fmt: skip
+
+
+def _odd_aspheres():
+    """An axicon's cusp under many powers, and an asphere with one odd power."""
+    front = {"type": "odd_asphere", "radius": 35.0, "conic": -0.5, "a1": 0.01, "a2": 1e-4,
+             "a3": 1e-5, "a4": 1e-6, "a5": -1e-7, "a7": 1e-9, "a9": 1e-11,
+             "a11": -1e-13}  # fmt: skip
+    return _singlet(front, {"type": "odd_asphere", "radius": -60.0, "conic": 0.0, "a3": 2e-5})
+
+
+def _anamorphic():
+    """A toroid and a biconic, crossed."""
+    front = {"type": "toroid", "radius_x": 30.0, "radius_y": 80.0, "conic_y": -0.5, "a2": 1e-3,
+             "a4": 1e-5, "a6": -1e-7}  # fmt: skip
+    back = {
+        "type": "biconic",
+        "radius_x": -90.0,
+        "radius_y": -40.0,
+        "conic_x": 1.5,
+        "conic_y": -2.0,
+    }
+    return _singlet(front, back)
+
+
+def _cylinders():
+    """Two crossed cylinders, one of them with its curve in x."""
+    front = {"type": "toroid", "radius_x": math.inf, "radius_y": 40.0, "conic_y": 0.2}
+    back = {"type": "biconic", "radius_x": -40.0, "radius_y": math.inf, "conic_x": -0.6}
+    return _singlet(front, back)
+
+
+def _zernike():
+    """Terms of several orders with gaps between them, decentred; and some of the other table."""
+    front = {"type": "zernike_standard", "radius": 35.0, "conic": -0.4, "a4": 1e-6, "z1": 0.1,
+             "z2": -2e-3, "z4": 4e-3, "z5": 2e-3, "z11": -1e-3, "z17": 5e-4, "z24": 2e-4,
+             "normalization_radius": 5.5, "decenter_x": 0.4, "decenter_y": -0.2}  # fmt: skip
+    back = {"type": "zernike_fringe", "radius": -60.0, "z3": 1e-3, "z9": 2e-3, "z12": -1e-3,
+            "z37": 1e-4, "normalization_radius": 5.0}  # fmt: skip
+    return _singlet(front, back)
+
+
+def _forbes():
+    """Both families, with orders left out."""
+    front = {"type": "q_bfs", "radius": 25.0, "conic": -0.6, "q0": 0.05, "q1": -0.01, "q4": 2e-3,
+             "normalization_radius": 5.2}  # fmt: skip
+    back = {"type": "q_con", "radius": -50.0, "conic": 0.5, "q0": 0.03, "q3": -2e-3, "q5": 1e-3,
+            "normalization_radius": 5.0}  # fmt: skip
+    return _singlet(front, back)
+
+
+def _grid():
+    """A smooth bump with ripples on a conic, off its middle."""
+    u = torch.linspace(-6.0, 6.0, 13, dtype=F64)
+    ripple = 0.003 * _random(13, 13, seed=6) - 0.002 * (u[:, None] ** 2 + 0.5 * u[None] ** 2)
+    back = {"type": "grid_sag", "radius": -60.0, "conic": 0.4, "a4": 1e-6, "sag": ripple.tolist(),
+            "spacing_x": 1.0, "spacing_y": 1.0, "decenter_x": 0.5, "decenter_y": -0.3}  # fmt: skip
+    return _singlet({"type": "sphere", "radius": 40.0}, back)
+
+
 def _own_surface():
     """A surface of a user's own behind a sphere; it is registered while the lens is made."""
     back = {"type": "paraboloid", "curvature_x": -0.02, "curvature_y": -0.015, "twist": 0.002}
@@ -89,6 +205,37 @@ def _clipped():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
 
 
+def _diffractive():
+    """A radial phase on an asphere and an XY phase on a conic, and an ideal lens behind them."""
+    front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "phase": {
+        "type": "radial", "norm_radius": 5.0, "p2": -250.0, "p4": 30.0, "p6": -8.0}}  # fmt: skip
+    back = {"type": "conic", "radius": -70.0, "conic": 0.6, "thickness": 4.0, "phase": {
+        "type": "xy", "order": -1, "norm_radius": 4.0, "x": 60.0, "x2": 30.0, "xy": -9.0,
+        "y2": 25.0, "x2y": 4.0, "y4": -3.0}}  # fmt: skip
+    lens = {"type": "paraxial_lens", "focal_length": 60.0, "semi_diameter": 6.0, "material": 1.3}
+    surfaces = {
+        "1": {"semi_diameter": 5.0, "thickness": 3.0, "material": _GLASS, **front},
+        "2": {"semi_diameter": 5.0, "material": "air", **back},
+        "3": lens,
+    }
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 25.0}})
+
+
+def _spectrometer():
+    """A grating that transmits, one on a concave mirror, whose higher orders vanish, and an ideal
+    lens that the light comes back to.
+    """
+    surfaces = {
+        "1": {"type": "plane", "semi_diameter": 6.0, "thickness": 40.0, "material": "air",
+              "phase": {"type": "grating", "grooves": 100.0, "order": -1}},
+        "2": {"type": "sphere", "radius": -150.0, "semi_diameter": 12.0, "thickness": -30.0,
+              "material": "mirror", "phase": {"type": "grating", "grooves": 1740.0}},
+        "3": {"type": "paraxial_lens", "focal_length": 50.0, "semi_diameter": 90.0,
+              "material": "air"},
+    }  # fmt: skip
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": -20.0}})
+
+
 def _plate(root):
     lens = load_lens(root / "conf/lens/wavefront_coding.yaml", F64)
     with torch.no_grad():
@@ -110,8 +257,18 @@ LENSES = {
     "b_spline": lambda root: _spline(),
     "polynomial": lambda root: _polynomial(),
     "even_aspheres": lambda root: _aspheres(),
+    "odd_aspheres": lambda root: _odd_aspheres(),
+    "anamorphic": lambda root: _anamorphic(),
+    "cylinders": lambda root: _cylinders(),
+    "zernike": lambda root: _zernike(),
+    "forbes": lambda root: _forbes(),
+    "grid": lambda root: _grid(),
     "clipped": lambda root: _clipped(),
     "own_surface": lambda root: _own_surface(),
+    "diffractive": lambda root: _diffractive(),
+    "spectrometer": lambda root: _spectrometer(),
+    "mirrors": lambda root: _mirrors(),
+    "folded": lambda root: _folded(),
 }
 
 

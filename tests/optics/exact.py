@@ -9,13 +9,11 @@ quadric or by bracketing, and derivatives are differences at 80 digits.  It take
 import random
 from functools import lru_cache
 
-import mpmath
 import numpy as np
 
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
-
-mp = mpmath.mp.clone()  # a precision of its own
-mp.dps = 80
+from tests.optics import exact_deflection as deflection
+from tests.optics.exact_sags import SAGS, even_asphere_sag, mp
 
 OK, VIGNETTED, TIR, MISSED = 0, 1, 2, 3
 SAMPLES = 24
@@ -56,20 +54,29 @@ def trace(lens, values, origin, direction, wavelength, near=None):
     """
     p, d = mp.matrix(origin), mp.matrix(direction)
     status, surface_number, path = OK, 0, mp.mpf(0)
-    z = mp.mpf(0)
     distances = []
-    indices = [mp.mpf(m.a) + mp.mpf(m.b) / mp.mpf(wavelength) ** 2 for m in lens.materials]
+    indices = _indices(lens, wavelength)
+    places = _designed(lens, values)
+    # Light comes towards +z; a mirror sends it back, and a break shows it from elsewhere.
+    sense = 1
     for i, (number, surface) in enumerate(lens.surfaces.items()):
+        rotation, vertex = _place(lens, values, i + 1, places)
+        q, e = rotation.T * (p - vertex), rotation.T * d
+        if surface.changes_axes:
+            sense = mp.sign(e[2])
+            distances.append(mp.mpf(0))
+            continue
         own = {
             name.rsplit(".", 1)[1]: v
             for name, v in values.items()
-            if name.startswith(f"surfaces.{number}.")
+            if name.startswith(f"surfaces.{number}.") and ".phase." not in name
         }
-        own |= {name: tuple(mp.mpf(float(k)) for k in b) for name, b in surface.named_buffers()}
-        rotation, vertex = _place(lens, values, i + 1, z)
-        q, e = rotation.T * (p - vertex), rotation.T * d
+        own |= {
+            name: mp.mpf(float(b)) if b.dim() == 0 else tuple(mp.mpf(float(k)) for k in b)
+            for name, b in surface.named_buffers()
+        }
         guess = None if near is None else near[i]
-        t, sx, sy = _meet(surface.kind, own, surface.semi_diameter, q, e, guess)
+        t, sx, sy = _meet(surface.kind, own, surface.semi_diameter, q, e, guess, sense)
         if t is None:
             return MISSED, i + 1, None, None, None
         distances.append(t)
@@ -79,20 +86,78 @@ def trace(lens, values, origin, direction, wavelength, near=None):
         if rho >= surface.semi_diameter and status == OK:
             status, surface_number = VIGNETTED, i + 1
         normal = mp.matrix([-sx, -sy, 1]) / mp.sqrt(1 + sx**2 + sy**2)
-        ratio = indices[i] / indices[i + 1]
         cosine = (e.T * normal)[0]
-        squared = 1 - ratio**2 * (1 - cosine**2)
-        if squared <= 0:
-            return TIR, i + 1, None, None, None
-        e = ratio * e + (mp.sqrt(squared) - ratio * cosine) * normal
+        if deflection.stands_on(surface):
+            behind = -sense if lens.materials[i + 1].name == "mirror" else sense
+            length = mp.mpf(wavelength) / 10**6
+            at = deflection.Place(mp, lens, values, i, indices, length, sense, behind, sag_of)
+            e, more = deflection.deflect(at, q, e, normal)
+            if e is None:
+                return TIR, i + 1, None, None, None
+            path, sense = path + more, behind
+        elif lens.materials[i + 1].name == "mirror":
+            e = e - 2 * cosine * normal
+            sense = -sense
+        else:
+            ratio = indices[i] / indices[i + 1]
+            squared = 1 - ratio**2 * (1 - cosine**2)
+            if squared <= 0:
+                return TIR, i + 1, None, None, None
+            e = ratio * e + (sense * mp.sqrt(squared) - ratio * cosine) * normal
         p, d = rotation * q + vertex, rotation * e
-        key = f"thicknesses.{number}"
-        z += values.get(key, mp.mpf(0))
-    z += values["sensor_distance"]
-    if d[2] <= 0:
+    rotation, vertex = places[-1]
+    p, d = rotation.T * (p - vertex), rotation.T * d
+    if sense * d[2] <= 0:
         return MISSED, len(lens.surfaces) + 1, None, None, None
-    t = (z - p[2]) / d[2]
-    return status, surface_number, p + t * d, path + indices[-1] * t, distances
+    t = -p[2] / d[2]
+    p = p + t * d
+    p[2] += mp.fsum(v for k, v in values.items() if k.startswith("thicknesses."))
+    p[2] += values["sensor_distance"]
+    return status, surface_number, p, path + indices[-1] * t, distances
+
+
+def _indices(lens, wavelength):
+    """Before surface 1 and behind each; behind a mirror is the medium in front of it."""
+    found = []
+    for m in lens.materials:
+        mirror = m.name == "mirror"
+        found.append(found[-1] if mirror else mp.mpf(m.a) + mp.mpf(m.b) / mp.mpf(wavelength) ** 2)
+    return found
+
+
+def _designed(lens, values):
+    """Rotation and vertex of every surface and of the sensor, before elements are posed.
+
+    A break's own are those behind it.
+    """
+    rotation, vertex, places = mp.eye(3), mp.matrix([0, 0, 0]), []
+    for number, surface in lens.surfaces.items():
+        if surface.changes_axes:
+            prefix = f"surfaces.{number}."
+            v = {name: values[prefix + name] for name, _ in surface.named_parameters()}
+            shift = mp.matrix([v["decenter_x"], v["decenter_y"], 0])
+            turns = [_about(axis, v[f"tilt_{'xyz'[axis]}"]) for axis in range(3)]
+            if surface.order == "decenter_first":
+                vertex = vertex + rotation * shift
+                rotation = rotation * turns[0] * turns[1] * turns[2]
+            else:
+                rotation = rotation * turns[2] * turns[1] * turns[0]
+                vertex = vertex + rotation * shift
+        places.append((rotation, vertex))
+        gap = values.get(f"thicknesses.{number}", mp.mpf(0))
+        if int(number) == len(lens.surfaces):
+            gap = values["sensor_distance"]
+        vertex = vertex + rotation * mp.matrix([0, 0, gap])
+    return [*places, (rotation, vertex)]
+
+
+def _about(axis, angle):
+    """The right-handed rotation about x, y or z."""
+    turn = mp.eye(3)
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    turn[a, a], turn[a, b] = mp.cos(angle), -mp.sin(angle)
+    turn[b, a], turn[b, b] = mp.sin(angle), mp.cos(angle)
+    return turn
 
 
 def derivatives(function, values):
@@ -105,8 +170,8 @@ def derivatives(function, values):
     return result
 
 
-def _sag(kind, p, x, y):
-    """Sag, or None beyond the knots of a B-spline."""
+def sag_of(kind, p, x, y):
+    """Sag, or None beyond the knots of a B-spline or the end of a branch."""
     if kind == "b_spline":
         bx, by = (_basis(p[f"knots_{axis}"], u) for axis, u in (("x", x), ("y", y)))
         if not (bx and by):
@@ -114,7 +179,7 @@ def _sag(kind, p, x, y):
         return mp.fsum(
             p[f"coefficients[{j},{i}]"] * v * u for j, v in by.items() for i, u in bx.items()
         )
-    if kind in ("plane", "aperture"):
+    if kind in ("plane", "aperture", "paraxial_lens"):
         return mp.mpf(0)
     if kind == "xy_polynomial":
         total = mp.mpf(0)
@@ -125,10 +190,9 @@ def _sag(kind, p, x, y):
         b = p.get("b", mp.mpf(0))
         # The branch through the vertex of b·z² - z + P = 0.
         return total if b == 0 else 2 * total / (1 + mp.sqrt(1 - 4 * b * total))
-    c, k = p["curvature"], p.get("conic", mp.mpf(0))
-    r2 = x**2 + y**2
-    sag = c * r2 / (1 + mp.sqrt(1 - (1 + k) * c**2 * r2))
-    return sag + sum(a * r2 ** (int(n[1:]) // 2) for n, a in p.items() if n[0] == "a")
+    if kind in SAGS:
+        return SAGS[kind](p, x, y)
+    return even_asphere_sag(p, x, y)
 
 
 @lru_cache(maxsize=4096)  # most derivatives leave the place on the surface where it was
@@ -150,23 +214,23 @@ def _basis(knots, u):
 def _slopes(kind, p, x, y):
     h = SLOPE_STEP
     return tuple(
-        (_sag(kind, p, x + h * u, y + h * v) - _sag(kind, p, x - h * u, y - h * v)) / (2 * h)
+        (sag_of(kind, p, x + h * u, y + h * v) - sag_of(kind, p, x - h * u, y - h * v)) / (2 * h)
         for u, v in ((1, 0), (0, 1))
     )
 
 
-def _meet(kind, p, semi_diameter, q, e, guess):
+def _meet(kind, p, semi_diameter, q, e, guess, sense):
     """Distance to the point where the ray crosses the sag branch in the light's direction.
 
     With the sag's slopes there; three times None where there is no such point.
     """
-    if kind in ("plane", "aperture"):
-        return (None,) * 3 if e[2] <= 0 else (-q[2] / e[2], mp.mpf(0), mp.mpf(0))
+    if kind in ("plane", "aperture", "paraxial_lens"):
+        return (None,) * 3 if sense * e[2] <= 0 else (-q[2] / e[2], mp.mpf(0), mp.mpf(0))
     roots = _quadric_roots if kind in ("sphere", "conic") else _bracketed_roots
     crossing = []
     for t in roots(kind, p, semi_diameter, q, e, guess):
         sx, sy = _slopes(kind, p, q[0] + t * e[0], q[1] + t * e[1])
-        if e[2] - e[0] * sx - e[1] * sy > 0:
+        if sense * (e[2] - e[0] * sx - e[1] * sy) > 0:
             crossing.append((t, sx, sy))
     assert len(crossing) <= 1, "the case is ambiguous"
     return crossing[0] if crossing else (None,) * 3
@@ -199,7 +263,7 @@ def _bracketed_roots(kind, p, semi_diameter, q, e, guess):
     """
 
     def f(t):
-        sag = _sag(kind, p, q[0] + t * e[0], q[1] + t * e[1])
+        sag = sag_of(kind, p, q[0] + t * e[0], q[1] + t * e[1])
         return None if sag is None else q[2] + t * e[2] - sag
 
     def zero(low, high):
@@ -213,7 +277,7 @@ def _bracketed_roots(kind, p, semi_diameter, q, e, guess):
         if bracketed([f(t) for t in around]):
             return [zero(*around)]
     reach = mp.mpf("1.2") * semi_diameter
-    low, high = (-q[2] - 2 * reach) / e[2], (-q[2] + 2 * reach) / e[2]
+    low, high = sorted(((-q[2] - 2 * reach) / e[2], (-q[2] + 2 * reach) / e[2]))
     a = e[0] ** 2 + e[1] ** 2
     if a > 0:
         b = q[0] * e[0] + q[1] * e[1]
@@ -227,23 +291,17 @@ def _bracketed_roots(kind, p, semi_diameter, q, e, guess):
     return [zero(ts[i], ts[i + 1]) for i in range(SAMPLES) if bracketed(fs[i : i + 2])]
 
 
-def _place(lens, values, number, z):
+def _place(lens, values, number, places):
     """Rotation and vertex of a surface, the elements that carry it applied from the inside out."""
-    rotation, vertex = mp.eye(3), mp.matrix([0, 0, z])
+    rotation, vertex = places[number - 1]
     carrying = [(name, e) for name, e in lens.elements.items() if e.first <= number <= e.last]
     for name, element in sorted(carrying, key=lambda item: item[1].last - item[1].first):
         v = {k.rsplit(".", 1)[1]: x for k, x in values.items() if k.startswith(f"elements.{name}.")}
-        first_z = mp.fsum(values[f"thicknesses.{i}"] for i in range(1, element.first))
-        pivot = mp.matrix([element.pivot[0], element.pivot[1], first_z + element.pivot[2]])
-        cx, sx = mp.cos(v["tilt_x"]), mp.sin(v["tilt_x"])
-        cy, sy = mp.cos(v["tilt_y"]), mp.sin(v["tilt_y"])
-        cz, sz = mp.cos(v["tilt_z"]), mp.sin(v["tilt_z"])
-        turn = (
-            mp.matrix([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-            * mp.matrix([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-            * mp.matrix([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        )
-        shift = mp.matrix([v["decenter_x"], v["decenter_y"], v["shift_z"]])
+        own, first = places[element.first - 1]
+        pivot = first + own * mp.matrix(element.pivot)
+        turn = _about(0, v["tilt_x"]) * _about(1, v["tilt_y"]) * _about(2, v["tilt_z"])
+        turn = own * turn * own.T
+        shift = own * mp.matrix([v["decenter_x"], v["decenter_y"], v["shift_z"]])
         rotation, vertex = turn * rotation, pivot + turn * (vertex - pivot) + shift
     return rotation, vertex
 

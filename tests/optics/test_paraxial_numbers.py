@@ -36,8 +36,9 @@ def test_the_lenses_pupils_and_magnifications(root, name, wavelength):
 def test_a_stop_at_the_front_focus_is_seen_at_infinity():
     """Telecentric: D = 1 - t/f is nothing at t = f, and a stop there magnifies as the lens does."""
     lens = ParaxialNumbers(
-        (0.0, 0.02, 0.0), (100.0, 0.0), 120.0, (_Air(), _Air(), _Glass(), _Air()), 1, 5.0
-    )
+        (0.0, 0.02, 0.0), (100.0, 0.0), 120.0, (_Air(), _Air(), _Glass(), _Air()), 1, 5.0,
+        (1.0, 1.0, 1.0, 1.0),
+    )  # fmt: skip
     assert lens.exit_pupil(550.0) == (math.inf, math.inf)
     # Chief rays through the front focus leave parallel to the axis: -f/(depth) for f = 100.
     assert lens.chief_ray_magnification(550.0, 400.0) == pytest.approx(-100.0 / 400.0)

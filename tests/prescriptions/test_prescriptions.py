@@ -229,8 +229,8 @@ def test_a_missing_file(tmp_path):
 
 
 def test_another_kind_of_file(tmp_path):
-    path = tmp_path / "lens.json"
-    path.write_text("{}")
-    with pytest.raises(InputError, match=r"\.yaml") as error:
+    path = tmp_path / "lens.doc"
+    path.write_text("Dear reader")
+    with pytest.raises(InputError, match=r"lens files end in \.yaml") as error:
         load_lens(path)
     one_line(error, path)

@@ -12,21 +12,27 @@ from hypothesis import strategies as st
 
 from dolens import InputError, load_lens, save_lens
 from dolens.prescriptions import lens_from_prescription, prescription_of
+from dolens.prescriptions.codev.reader import read_codev
+from dolens.prescriptions.codev.writer import codev_of
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
+from dolens.prescriptions.json_lenses import json_of, read_json
 from dolens.prescriptions.zemax import decode_zemax, encode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
 from tests.prescriptions.samples import SINGLET
 
 LENSES = sorted((Path(__file__).resolve().parents[2] / "conf" / "lens").glob("*.yaml"))
-# What a .zmx file cannot hold, and which surface says so.
+# What a format cannot hold, and which surface says so.
 REFUSED = {
     ("freeform_corrector", ".zmx"): "surface 2: a .zmx file cannot hold type 'b_spline'",
     ("freeform_corrector", ".txt"): "surface 2: a .txt file cannot hold type 'b_spline'",
+    ("freeform_corrector", ".seq"): "surface 2: a .seq file cannot hold type 'b_spline'",
 }
 FORMATS = {
     ".txt": lambda data: prescription_from_diffoptics(diffoptics_text_of(data)),
     ".zmx": lambda data: prescription_from_zemax(decode_zemax(encode_zemax(zemax_of(data)))),
+    ".seq": lambda data: read_codev(codev_of(data), "lens").prescription,
+    ".json": lambda data: read_json(json_of(data, "lens").decode(), "lens").prescription,
     ".yaml": lambda data: yaml.safe_load(yaml.safe_dump(data)),
 }
 
@@ -72,7 +78,7 @@ def test_every_lens_through_every_format(path, dtype, suffix, tmp_path):
 def test_the_tables_of_the_supplement_read_the_same_in_every_format(root):
     """Numbers come back as they are printed: 22.014 and not 22.014000000000003."""
     data = yaml.safe_load((root / "conf/lens/nikon.yaml").read_text())
-    for suffix in (".txt", ".zmx"):
+    for suffix in (".txt", ".zmx", ".seq"):
         rows = FORMATS[suffix](data)["surfaces"]
         for n, row in data["surfaces"].items():
             for key in row.keys() - {"type", "material"}:
@@ -150,6 +156,33 @@ def test_any_lens_through_the_source_s_format(data):
 @relaxed
 @given(prescriptions(ROTATIONAL, ["dfc"]))
 def test_any_lens_through_zemax(data):
+    data = with_aperture(data, zemax_of, ".zmx")
+    require_equal(lens_from_prescription(FORMATS[".zmx"](data)), lens_from_prescription(data))
+
+
+@relaxed
+@given(prescriptions(ROTATIONAL, ["dfc"]))
+def test_any_lens_through_code_v(data):
+    """CODE V's codes of glass end at nd 2 and Vd 100, and its aspheres begin at r⁴."""
+    data["entrance_pupil_diameter"] = 1e-9
+    for row in data["surfaces"].values():
+        row.pop("a2", None)
+    for holder, key in (
+        (data, "object_material"),
+        *((row, "material") for row in data["surfaces"].values()),
+    ):
+        nd, slash, vd = holder[key].partition("/")
+        if slash and (float(nd) >= 2.0 or float(vd) >= 100.0):
+            holder[key] = "1.62/36.37"
+    data = with_aperture(data, codev_of, ".seq")
+    del data["entrance_pupil_diameter"]
+    found = FORMATS[".seq"](data | {"entrance_pupil_diameter": 1e9})
+    del found["entrance_pupil_diameter"]
+    require_equal(lens_from_prescription(found), lens_from_prescription(data))
+
+
+def with_aperture(data, write, suffix):
+    """A flat stop in one medium can be written in no other way than as an aperture."""
     media = [data["object_material"], *(row["material"] for row in data["surfaces"].values())]
     flat = [
         row["type"] == "plane"
@@ -159,16 +192,15 @@ def test_any_lens_through_zemax(data):
         for row in data["surfaces"].values()
     ]
     n = data["stop"] - 1
-    if flat[n] and media[n] == media[n + 1]:
-        # Zemax has no other way to write an aperture.
-        with pytest.raises(InputError, match=rf"surface {n + 1}: a .zmx file cannot hold"):
-            zemax_of(data)
-        data["surfaces"][str(n + 1)] = {
-            key: value
-            for key, value in data["surfaces"][str(n + 1)].items()
-            if key not in ("radius", "curvature")
-        } | {"type": "aperture"}
-    require_equal(lens_from_prescription(FORMATS[".zmx"](data)), lens_from_prescription(data))
+    if not flat[n] or media[n] != media[n + 1]:
+        return data
+    row = data["surfaces"][str(n + 1)]
+    if suffix == ".zmx" or row["type"] == "plane":
+        with pytest.raises(InputError, match=rf"surface {n + 1}: a {suffix} file cannot hold"):
+            write(data)
+    shape = {key: value for key, value in row.items() if key not in ("radius", "curvature")}
+    data["surfaces"][str(n + 1)] = shape | {"type": "aperture"}
+    return data
 
 
 def with_row(n="1", **keys):
@@ -250,6 +282,8 @@ def test_text_beyond_ascii_is_written_as_utf_16():
 
 def test_an_unknown_suffix_is_refused(tmp_path):
     lens = lens_from_prescription(SINGLET)
-    with pytest.raises(InputError, match=r"lens files end in \.yaml, \.yml, \.txt, \.zmx"):
-        save_lens(lens, tmp_path / "lens.json")
+    with pytest.raises(InputError, match=r"lens files are written as \.yaml, \.yml, \.zmx"):
+        save_lens(lens, tmp_path / "lens.pdf")
+    with pytest.raises(InputError, match="OSLO is read, not written"):
+        save_lens(lens, tmp_path / "lens.len")
     assert prescription_of(lens)["name"] == "Singlet"

@@ -21,7 +21,7 @@ BAD = {
                  "surface 1: a kind of surface that is not known here is not held (TYPE WOBBLE"),
     "own axes": (singlet(*GOOD, "SCBD 1 0 0 0.0 0.1 0.0 0.0 0.0"),
                  "surface 1: a surface with its own decenter or tilt is not held (SCBD)"),
-    "mirror": (singlet("CURV 0.02", "DIAM 5", "GLAS MIRROR 0 0"), "surface 1: GLAS MIRROR"),
+
     "spider": (singlet(*GOOD, "SPID 3 4"), "surface 1: a spider, which blocks light"),
     "drawn outline": (singlet(*GOOD, "USAP 0 0 0"), "surface 1: an aperture whose outline"),
     "half a rectangle": (singlet(*GOOD, "SQAP 3"), "surface 1: SQAP needs two numbers"),

@@ -1,6 +1,6 @@
 """Rays change their axes between surfaces of different poses, and are carried to the sensor.
 
-They mirror `change_axes` and `to_lens_axes` of `dolens.optics.elements`, and `trace_to_plane`.
+They mirror `change_axes` and `to_lens_axes` of `dolens.optics.elements`, and `trace_to_sensor`.
 """
 
 import math

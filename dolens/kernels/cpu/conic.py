@@ -41,6 +41,7 @@ from dolens.kernels.cpu.records import (
     LIMIT,
     REFRACTS,
     SENSE,
+    SENSE_BEHIND,
     SHAPE,
     SHIFT,
     SHORT_RECORD,
@@ -81,7 +82,7 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
         p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
         shift, limit, sense, tag, c = p[SHIFT], p[LIMIT], p[SENSE], p[TAG], p[SHAPE]
         k = p[SHAPE + 1]
-        edge, refracts = p[EDGE], q[REFRACTS] != 0
+        edge, behind, refracts = p[EDGE], p[SENSE_BEHIND], q[REFRACTS] != 0
         bent = (one + k) * c
         for i in range(BLOCK):
             l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
@@ -106,7 +107,7 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
             transmitted = one
             if refracts:
                 l, m, n, transmitted = refract(  # noqa: E741
-                    l, m, n, gx * inverse, gy * inverse, branch * inverse, w[RATIO + i], sense
+                    l, m, n, gx * inverse, gy * inverse, branch * inverse, w[RATIO + i], behind
                 )
             dst[L + i], dst[M + i], dst[N + i] = l, m, n
             set_status(src, dst, i, tag, edge, x, y, met, zero, transmitted)

@@ -60,6 +60,7 @@ from dolens.kernels.cpu.records import (
     SAG_HESSIAN,
     SCALE,
     SENSE,
+    SENSE_BEHIND,
     SHAPE,
     SHIFT,
     SHORT_RECORD,
@@ -86,7 +87,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
         src, dst = carray(before, STATE), carray(after, STATE)
         p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
         shift, limit, scale, sense, tag = p[SHIFT], p[LIMIT], p[SCALE], p[SENSE], p[TAG]
-        edge = p[EDGE]
+        edge, behind = p[EDGE], p[SENSE_BEHIND]
         refracts = q[REFRACTS] != 0
         # The point on the vertex plane, and its margin, stay in the rows that they end in.
         for i in range(BLOCK):
@@ -164,7 +165,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
             met = dst[ENDED + i]
             dst[PATH + i] = src[PATH + i] + w[INDEX + i] * dst[TRAVELLED + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
-            l2, m2, n2, transmitted = refract(l, m, n, -sx * nz, -sy * nz, nz, w[RATIO + i], sense)
+            l2, m2, n2, transmitted = refract(l, m, n, -sx * nz, -sy * nz, nz, w[RATIO + i], behind)
             if refracts:
                 l, m, n = l2, m2, n2  # noqa: E741
             else:

@@ -25,6 +25,7 @@ from dolens.kernels.cpu.layout import (
     INDEX,
     INVERSE_INDEX,
     PATH,
+    PER_RADIAN,
     RATIO,
     STATE,
     UNBOUNDED,
@@ -48,6 +49,7 @@ from dolens.kernels.cpu.records import (
     RECTANGLE,
     STATUS_BITS,
     STATUS_MASK,
+    WAVE,
 )
 
 
@@ -143,6 +145,12 @@ def streams(real: types.Type) -> Streams:
                 w[INDEX + i] = index
                 w[RATIO + i] = ratio
                 w[INVERSE_INDEX + i] = inverse
+            if codes[WAVE] != 0:
+                waves = carray(
+                    shifted(real64_at(job[jobs.INDICES]), codes[WAVE] * count), UNBOUNDED
+                )
+                for i in range(BLOCK):
+                    w[PER_RADIAN + i] = real(waves[common])
         else:
             which = carray(int32_at(job[jobs.WHICH]), UNBOUNDED)
             for i in range(BLOCK):
@@ -150,6 +158,12 @@ def streams(real: types.Type) -> Streams:
                 w[INDEX + i] = real(before[wavelength])
                 w[RATIO + i] = real(before[wavelength] / after[wavelength])
                 w[INVERSE_INDEX + i] = real(types.float64(1.0) / before[wavelength])
+            if codes[WAVE] != 0:
+                waves = carray(
+                    shifted(real64_at(job[jobs.INDICES]), codes[WAVE] * count), UNBOUNDED
+                )
+                for i in range(BLOCK):
+                    w[PER_RADIAN + i] = real(waves[which[lanes[i]]])
 
     @njit(**OPTIONS)
     def step(job, k, lanes, before, after, cotangents, work):  # noqa: ANN001, ANN202

@@ -37,7 +37,13 @@ OWN = _rows(16, 8)
 # Its first number is zero when a ray comes to the surface, and one when a spline's stencil is here.
 (STENCIL_IS_HERE,) = _rows(25, 1)
 (CUBIC,) = _rows(26, 1)  # the coefficients of a cubic polynomial
-WORK_ROWS = 48  # those above
+# Of a deflection: λ/2π (mm); the phase (radians), its gradient and second derivatives at the
+# points; cotangents of phase and gradient; six rows of a phase's own.
+(PER_RADIAN,) = _rows(48, 1)
+PHASE, PHASE_X, PHASE_Y, PHASE_XX, PHASE_XY, PHASE_YY = _rows(49, 6)
+OF_PHASE, OF_PHASE_X, OF_PHASE_Y = _rows(55, 3)
+OWN_OF_PHASE = _rows(58, 6)
+WORK_ROWS = 64  # those above
 WORK_SIZE = WORK_ROWS * BLOCK
 # As many more as a shape asks for: a polynomial's powers, a spline's stencil.
 (FURTHER,) = _rows(WORK_ROWS, 1)

@@ -45,6 +45,7 @@ from dolens.kernels.cpu.records import (
     RECTANGLE,
     REFRACTS,
     SENSE,
+    SENSE_BEHIND,
     SHIFT,
     SHORT_RECORD,
     STOPPED,
@@ -61,6 +62,7 @@ def plane_forward(real: types.Type) -> Callable[..., None]:
         src, dst = carray(before, STATE), carray(after, STATE)
         p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
         shift, limit, sense, tag = p[SHIFT], p[LIMIT], p[SENSE], p[TAG]
+        behind = p[SENSE_BEHIND]
         refracts = q[REFRACTS] != 0
         edge = p[EDGE]
         for i in range(BLOCK):
@@ -72,7 +74,7 @@ def plane_forward(real: types.Type) -> Callable[..., None]:
             ratio = w[RATIO + i]
             squared = (one - ratio * ratio) + (ratio * ratio) * (n * n)
             if refracts:
-                l, m, n = ratio * l, ratio * m, sense * safe_sqrt(squared)  # noqa: E741
+                l, m, n = ratio * l, ratio * m, behind * safe_sqrt(squared)  # noqa: E741
             else:
                 squared = one
             dst[L + i], dst[M + i], dst[N + i] = l, m, n

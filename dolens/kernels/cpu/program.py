@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.kernels.cpu import compiler, jobs
+from dolens.kernels.cpu import compiler, even_asphere, jobs
 from dolens.kernels.cpu.axes import (
     change_axes_adjoint,
     change_axes_forward,
@@ -17,7 +17,8 @@ from dolens.kernels.cpu.axes import (
     lens_axes_forward,
     sensor_forward,
 )
-from dolens.kernels.cpu.functions import StepFunctions
+from dolens.kernels.cpu.deflection import phase_adjoint, phase_forward
+from dolens.kernels.cpu.functions import LawFunctions, StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
     COTANGENT_HEADER,
@@ -32,12 +33,16 @@ from dolens.kernels.cpu.records import (
     EXTRAS_ADDRESS,
     FORWARD,
     PARAMETERS,
+    PHASE_AND_SLOPES,
+    PHASE_HESSIAN,
+    PHASE_PARAMETERS,
     SAG_AND_SLOPES,
     SAG_HESSIAN,
     STARTS_ON_CONIC,
     STENCIL,
 )
 from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
+from dolens.kernels.law_kernel import law_kernels_of
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
 
@@ -49,6 +54,8 @@ _STEPS = {
     Kind.CHANGE_AXES: StepFunctions(change_axes_forward, change_axes_adjoint),
     Kind.LENS_AXES: StepFunctions(lens_axes_forward, lens_axes_adjoint),
     Kind.SENSOR: StepFunctions(sensor_forward, plane_adjoint),
+    # In general; a law has functions of its own.
+    Kind.DEFLECT: StepFunctions(phase_forward, phase_adjoint),
 }
 
 
@@ -82,6 +89,10 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     rows[: len(table), : Code.ROW] = table
     longest, scratch = Slot.HEADER, 0
     for row in rows[: len(table)]:
+        if row[Code.KIND] == Kind.DEFLECT:
+            _compile_law(row, real, derivatives)
+            longest = max(longest, int(row[Code.LENGTH]))
+            continue
         functions = functions_of(int(row[Code.KIND]))
         numbers = int(row[Code.LENGTH]) - Slot.HEADER
         if functions.numbers not in (None, numbers):
@@ -107,6 +118,27 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     clips = (rows[:, Code.EDGE] >= Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
     address = compiler.compile_block(clip, real) if clips.any() else 0
     return Steps(rows, longest, scratch, address)
+
+
+def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
+    """Compile a deflection's law, and for a phase the sag of the surface that it stands on."""
+    law: LawFunctions = law_kernels_of(int(row[Code.LAW]), "cpu")
+    base = functions_of(int(row[Code.BASE]))
+    if base.sag is None:
+        # Planes, spheres and conics are aspheres without coefficients: their two numbers are c, k.
+        base = even_asphere.KERNELS
+    always = [(FORWARD, law.forward), (PHASE_AND_SLOPES, law.phase)]
+    for_adjoint = [
+        (ADJOINT, law.adjoint),
+        (PHASE_HESSIAN, law.phase_hessian),
+        (PHASE_PARAMETERS, law.phase_parameters),
+    ]
+    if law.phase is not None:
+        always.append((SAG_AND_SLOPES, base.sag))
+        for_adjoint += [(SAG_HESSIAN, base.sag_hessian), (PARAMETERS, base.parameters)]
+    for place, function in always + (for_adjoint if derivatives else []):
+        if function is not None:
+            row[place] = compiler.compile_block(function, real)
 
 
 class Program:

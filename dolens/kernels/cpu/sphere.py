@@ -38,6 +38,7 @@ from dolens.kernels.cpu.records import (
     LIMIT,
     REFRACTS,
     SENSE,
+    SENSE_BEHIND,
     SHAPE,
     SHIFT,
     SHORT_RECORD,
@@ -54,7 +55,7 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
         src, dst = carray(before, STATE), carray(after, STATE)
         p, w, q = carray(record, SHORT_RECORD), carray(work, WORK_SIZE), carray(codes, CODE_ROW)
         shift, limit, sense, tag, c = p[SHIFT], p[LIMIT], p[SENSE], p[TAG], p[SHAPE]
-        edge, refracts = p[EDGE], q[REFRACTS] != 0
+        edge, behind, refracts = p[EDGE], p[SENSE_BEHIND], q[REFRACTS] != 0
         # Three loops: a processor looks only so far ahead, and this way finds several iterations'
         # divisions and roots to work on at once.
         for i in range(BLOCK):
@@ -83,7 +84,7 @@ def sphere_forward(real: types.Type) -> Callable[..., None]:
             l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
             transmitted = one
             if refracts:
-                l, m, n, transmitted = refract(l, m, n, nx, ny, nz, w[RATIO + i], sense)  # noqa: E741
+                l, m, n, transmitted = refract(l, m, n, nx, ny, nz, w[RATIO + i], behind)  # noqa: E741
             dst[L + i], dst[M + i], dst[N + i] = l, m, n
             set_status(src, dst, i, tag, edge, x, y, met, zero, transmitted)
 

@@ -86,7 +86,8 @@ def adjoint_kernel(
     status, of_position, of_position_row, of_position_column,
     of_direction, of_direction_row, of_direction_column, of_path, of_path_row,
     position_gradient, direction_gradient, sums, sum_length, scratch,
-    KINDS: tl.constexpr, FORMS: tl.constexpr, INDICES: tl.constexpr, BLOCK: tl.constexpr,
+    KINDS: tl.constexpr, FORMS: tl.constexpr, LAWS: tl.constexpr, INDICES: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sweep cotangents back; see `dolens.kernels.cuda.backend.trace_adjoint`.
 
@@ -98,7 +99,7 @@ def adjoint_kernel(
         sums: (programs, sum_length), float64, zero at first: cotangents of `values`, then of the
             indices (media, wavelengths).
         scratch: (programs, steps + 1, STATE, BLOCK).
-        KINDS: see `step`, and FORMS.
+        KINDS: see `step`, and FORMS and LAWS.
         INDICES: whether cotangents of the indices are summed.
         BLOCK: rays a block.
     """
@@ -121,10 +122,10 @@ def adjoint_kernel(
             for k in range(steps):
                 row = codes + k * ROW
                 record = values + tl.load(row + OFFSET)
-                index, ratio = load_media(media, k, wavelengths, columns)
+                index, ratio, per_radian = load_media(media, k, wavelengths, columns)
                 x, y, z, l, m, n, path, ended, vignetted, travelled = step(
-                    row, record, extras, index, ratio,
-                    x, y, z, l, m, n, path, ended, vignetted, KINDS, FORMS,
+                    row, record, extras, index, ratio, per_radian,
+                    x, y, z, l, m, n, path, ended, vignetted, KINDS, FORMS, LAWS,
                 )  # fmt: skip
                 _keep(states + (k + 1) * STATE * BLOCK, BLOCK, x, y, z, l, m, n, travelled)
             # What one thread kept, another may read.
@@ -144,12 +145,12 @@ def adjoint_kernel(
                 k = steps - 1 - back
                 row = codes + k * ROW
                 offset = tl.load(row + OFFSET)
-                index, ratio = load_media(media, k, wavelengths, columns)
+                index, ratio, per_radian = load_media(media, k, wavelengths, columns)
                 before = _kept(states + k * STATE * BLOCK, BLOCK)
                 after = _kept(states + (k + 1) * STATE * BLOCK, BLOCK)
                 px, py, pz, a, b, c, of_front, of_behind = step_adjoint(
-                    row, values + offset, extras, own_sums + offset, index, ratio,
-                    before, after, px, py, pz, a, b, c, of_length, alive, KINDS, FORMS,
+                    row, values + offset, extras, own_sums + offset, index, ratio, per_radian,
+                    before, after, px, py, pz, a, b, c, of_length, alive, KINDS, FORMS, LAWS,
                 )  # fmt: skip
                 if INDICES:
                     front = of_indices + tl.load(row + BEFORE) * wavelengths

@@ -14,8 +14,9 @@ from triton.runtime.interpreter import InterpretedFunction
 from dolens.errors import InputError
 from dolens.kernels.cuda.adjoint import adjoint_kernel
 from dolens.kernels.cuda.forward import forward_kernel
-from dolens.kernels.cuda.functions import SagFunctions, Shape, shape_of
+from dolens.kernels.cuda.functions import LawShape, SagFunctions, Shape, law_of, shape_of
 from dolens.kernels.cuda.layout import STATE
+from dolens.kernels.law_kernel import law_kernels_of
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Code, Kind, SurfaceTable
 
@@ -44,6 +45,8 @@ class DeviceCodes(NamedTuple):
         after: and behind.
         kinds: bit k is set where there is a step of kind k.
         forms: of the surfaces given by their sag; see `functions.shape_of`.
+        waves: (steps,), int64, the row of the indices that holds λ/2π; 0 where a step needs none.
+        laws: of deflection; see `functions.law_of`.
     """
 
     codes: Tensor
@@ -52,6 +55,8 @@ class DeviceCodes(NamedTuple):
     after: Tensor
     kinds: int
     forms: tuple[Shape, ...]
+    waves: Tensor
+    laws: tuple[LawShape, ...]
 
 
 @lru_cache(maxsize=128)
@@ -59,11 +64,15 @@ def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCo
     """Copy a lens's codes once, from int64: an optimization changes its numbers, not its codes."""
     rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()
     own = np.frombuffer(extras, dtype=np.int64).tolist()
-    device_extras, kinds, forms = list(own), 0, set()
+    device_extras, kinds, forms, laws = list(own), 0, set(), set()
     for row in rows:
         kind = row[Code.KIND]
         if kind < Kind.BY_SAG:
             kinds |= 1 << kind
+        if kind == Kind.DEFLECT:
+            laws.add(law_of(row[Code.LAW], law_kernels_of(row[Code.LAW], "cuda")))
+            kind = row[Code.BASE]
+        if kind < Kind.BY_SAG:
             continue
         functions: SagFunctions = kernels_of(kind, "cuda")
         forms.add(shape_of(kind, functions))
@@ -79,12 +88,14 @@ def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCo
         table[:, Code.AFTER].long().to(device),
         kinds,
         tuple(sorted(forms, key=lambda form: form[0])),
+        table[:, Code.WAVE].long().to(device),
+        tuple(sorted(laws, key=lambda law: law[0])),
     )
 
 
 def _prepared(table: SurfaceTable, like: Tensor) -> tuple[DeviceCodes, Tensor]:
-    """Return the codes, and (steps, 2, wavelengths): index in front and ratio, in the rays'
-    precision.
+    """Return the codes, and (steps, 3, wavelengths): index in front, ratio, and λ/2π of the steps
+    that need it, in the rays' precision.
     """
     if like.device.type != "cuda" and not isinstance(forward_kernel, InterpretedFunction):
         raise InputError(
@@ -96,7 +107,7 @@ def _prepared(table: SurfaceTable, like: Tensor) -> tuple[DeviceCodes, Tensor]:
     )
     front = table.indices[codes.before]
     ratio = front / table.indices[codes.after]
-    return codes, torch.stack((front, ratio), 1).to(like.dtype)
+    return codes, torch.stack((front, ratio, table.indices[codes.waves]), 1).to(like.dtype)
 
 
 @cache
@@ -146,7 +157,8 @@ def trace(
             table.values, table.values.numel() - 1, media, table.indices.shape[1],
             codes.codes, codes.extras, codes.codes.shape[0], count,
             position, *position.stride(), direction, *direction.stride(), which,
-            *out, KINDS=codes.kinds, FORMS=codes.forms, BLOCK=FORWARD_BLOCK, **_OPTIONS,
+            *out, KINDS=codes.kinds, FORMS=codes.forms, LAWS=codes.laws,
+            BLOCK=FORWARD_BLOCK, **_OPTIONS,
         )  # fmt: skip
     return out
 
@@ -221,7 +233,8 @@ def trace_adjoint(
                 of_position, *_strides(of_position, 2), of_direction, *_strides(of_direction, 2),
                 of_path, *_strides(of_path, 1), *gradients, sums, length,
                 values.new_empty(programs * kept),
-                KINDS=codes.kinds, FORMS=codes.forms, INDICES=wanted[2], BLOCK=block, **_OPTIONS,
+                KINDS=codes.kinds, FORMS=codes.forms, LAWS=codes.laws, INDICES=wanted[2],
+                BLOCK=block, **_OPTIONS,
             )  # fmt: skip
     total, cut = sums.sum(0), values.numel()
     return (

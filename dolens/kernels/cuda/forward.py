@@ -28,14 +28,14 @@ def forward_kernel(
     values, exit_place, media, wavelengths, codes, extras, steps, count,
     position, position_row, position_column, direction, direction_row, direction_column, which,
     out_position, out_direction, out_path, out_status, out_surface,
-    KINDS: tl.constexpr, FORMS: tl.constexpr, BLOCK: tl.constexpr,
+    KINDS: tl.constexpr, FORMS: tl.constexpr, LAWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Trace `count` rays; see `dolens.kernels.cuda.backend.trace`.
 
     Args:
         values: the table's records.
         exit_place: where in `values` the number lies that is added to z in the end.
-        media: (steps, 2, wavelengths): index in front and ratio μ.
+        media: (steps, 3, wavelengths): index in front, ratio μ, and λ/2π of a deflection.
         wavelengths: columns of `media`.
         codes: (steps, ROW), int32.
         extras: int32.
@@ -44,7 +44,7 @@ def forward_kernel(
         position: (count, 3), with its strides; and so on for the direction.
         which: (count,), int32, or None.
         out_position: and the other results, contiguous.
-        KINDS: see `step`, and FORMS.
+        KINDS: see `step`, and FORMS and LAWS.
         BLOCK: rays a program.
     """
     rays = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -58,13 +58,14 @@ def forward_kernel(
     for k in range(steps):
         row = codes + k * ROW
         record = values + tl.load(row + OFFSET)
-        index, ratio = load_media(media, k, wavelengths, columns)
+        index, ratio, per_radian = load_media(media, k, wavelengths, columns)
         x, y, z, l, m, n, path, ended, vignetted, _ = step(
             row,
             record,
             extras,
             index,
             ratio,
+            per_radian,
             x,
             y,
             z,
@@ -76,6 +77,7 @@ def forward_kernel(
             vignetted,
             KINDS,
             FORMS,
+            LAWS,
         )
     z = z + tl.load(values + exit_place)
     # Rays that are not valid may overflow.

@@ -39,6 +39,37 @@ class SagFunctions(NamedTuple):
     extras: Callable[[Row, Sequence[int]], list[int] | None] = _as_they_are
 
 
+class LawFunctions(NamedTuple):
+    """A law's module offers these functions, compiled by `triton.jit`, as `KERNELS`.
+
+    Both take a pointer to the law's numbers, the step's row of codes, points x, y (mm) of the
+    block's rays, their directions l, m, n, the unit normal nx, ny, nz there, the index in front,
+    the ratio μ, λ/2π (mm), and the sense of the light behind.
+
+    Attributes:
+        forward: gives l, m, n behind, a number that is positive where the light goes on, and what
+            is added to the path.
+        adjoint: takes a pointer to the sums of the law's numbers too, and at last the directions
+            behind, the cotangents a, b, c of these and that of the path, and which rays count;
+            it adds the cotangents of its numbers with `sums.add_sum`, and gives those of x and y,
+            of the direction in front, of the normal, and of the indices in front and behind.
+    """
+
+    forward: Any
+    adjoint: Any
+
+
+# A law as the kernels take it: its code, its functions, and a digest of these.
+LAW_CODE, LAW_FORWARD, LAW_ADJOINT = (tl.constexpr(place) for place in range(3))
+LawShape = tuple[int, Any, Any, str]
+
+
+def law_of(code: int, functions: LawFunctions) -> LawShape:
+    """Return a law's code and functions as the kernels take them."""
+    digest = "".join(getattr(function, "cache_key", "") for function in functions)
+    return (code, *functions, digest)
+
+
 # A shape as the kernels take it, a tuple of constants: its code and its functions, and at last a
 # digest of these, since Triton's cache on disk goes by the names of functions in a tuple.
 CODE, SAG, HESSIAN, SUMS, ON_CONIC = (tl.constexpr(place) for place in range(5))

@@ -43,6 +43,8 @@ def load_columns(which, rays, mask):
 
 @triton.jit
 def load_media(media, k, wavelengths, columns):
-    """Load the index in front of step k, and its ratio μ to the one behind."""
-    front = media + 2 * k * wavelengths + columns
-    return tl.load(front), tl.load(front + wavelengths)
+    """Load the index in front of step k, its ratio μ to the one behind, and λ/2π (mm), which only
+    the steps of a deflection have.
+    """
+    front = media + 3 * k * wavelengths + columns
+    return tl.load(front), tl.load(front + wavelengths), tl.load(front + 2 * wavelengths)

@@ -7,19 +7,23 @@ from dolens.kernels.cuda.arithmetic import clamp, distance_to_plane, refract
 from dolens.kernels.cuda.axes import change_axes, lens_axes
 from dolens.kernels.cuda.conic import conic_intersect, sphere_intersect
 from dolens.kernels.cuda.explicit import explicit_intersect
-from dolens.kernels.cuda.functions import CODE
+from dolens.kernels.cuda.functions import CODE, LAW_CODE, LAW_FORWARD
+from dolens.kernels.cuda.gradient import surface_gradient
 from dolens.kernels.cuda.layout import (
+    BASE,
     CENTER_X,
     CENTER_Y,
     CHANGE_AXES,
     CIRCLE,
     CONIC,
+    DEFLECT,
     EDGE,
     ELLIPSE,
     HALF_X,
     HALF_Y,
     HAS_CHANGE_AXES,
     HAS_CONIC,
+    HAS_DEFLECT,
     HAS_LENS_AXES,
     HAS_SENSOR,
     HAS_SPHERE,
@@ -27,15 +31,18 @@ from dolens.kernels.cuda.layout import (
     HOLE_X,
     HOLE_Y,
     KIND,
+    LAW,
     LENS_AXES,
     LIMIT,
     MISSED,
+    NUMBERS,
     OUTLINE,
     PLANE,
     RECTANGLE,
     REFRACTS,
     SCALE,
     SENSE,
+    SENSE_BEHIND,
     SENSOR,
     SHIFT,
     SPHERE,
@@ -94,8 +101,9 @@ def passes(record, codes, x, y):
 
 @triton.jit
 def step(
-    codes, record, extras, index, ratio,
-    x, y, z, l, m, n, path, ended, vignetted, KINDS: tl.constexpr, FORMS: tl.constexpr,
+    codes, record, extras, index, ratio, per_radian,
+    x, y, z, l, m, n, path, ended, vignetted,
+    KINDS: tl.constexpr, FORMS: tl.constexpr, LAWS: tl.constexpr,
 ):  # fmt: skip
     """Carry a block through one step.
 
@@ -105,12 +113,14 @@ def step(
         extras: places of polynomials' coefficients.
         index: in front.
         ratio: μ.
+        per_radian: λ/2π, mm.
         x: to n: the ray, in the axes of the step before.
         path: optical path so far, mm.
         ended: tag and status of a miss or a total reflection, else 0; int32.
         vignetted: of the first aperture that stopped the ray, else 0.
         KINDS: bit k is set where the lens has steps of kind k; code for no others is made.
         FORMS: of the surfaces given by their sag that the lens has; see `functions.shape_of`.
+        LAWS: of deflection that the lens has; see `functions.law_of`.
 
     Returns:
         x to vignetted behind the step, and the distance travelled to it.
@@ -135,8 +145,25 @@ def step(
             (vignetted > 0) | passes(record, codes, x, y), vignetted, tag + VIGNETTED
         )
         if tl.load(codes + REFRACTS) != 0:
-            l, m, n, transmitted = refract(l, m, n, nx, ny, nz, ratio, sense)
+            behind = tl.load(record + SENSE_BEHIND)
+            l, m, n, transmitted = refract(l, m, n, nx, ny, nz, ratio, behind)
             ended = tl.where((ended > 0) | (transmitted > 0.0), ended, tag + TOTALLY_REFLECTED)
+    if HAS_DEFLECT & KINDS:
+        if kind == DEFLECT:
+            gx, gy, gz, inverse, _, _, _, _ = surface_gradient(
+                record, codes, extras, tl.load(codes + BASE), x, y, z, KINDS, FORMS
+            )
+            for k in tl.static_range(len(LAWS)):
+                if tl.load(codes + LAW) == LAWS[k][LAW_CODE]:
+                    l, m, n, transmitted, added = LAWS[k][LAW_FORWARD](
+                        record + tl.load(codes + NUMBERS), codes, x, y, l, m, n,
+                        gx * inverse, gy * inverse, gz * inverse,
+                        index, ratio, per_radian, tl.load(record + SENSE_BEHIND),
+                    )  # fmt: skip
+                    path = path + added
+                    ended = tl.where(
+                        (ended > 0) | (transmitted > 0.0), ended, tag + TOTALLY_REFLECTED
+                    )
     if HAS_CHANGE_AXES & KINDS:
         if kind == CHANGE_AXES:
             x, y, z, l, m, n, travelled = change_axes(record, x, y, z, l, m, n)

@@ -9,97 +9,47 @@ N = g/|g| passes its cotangent on to g, and g to P by F's second derivatives and
 import triton
 import triton.language as tl
 
-from dolens.kernels.cuda.arithmetic import divide, refract_adjoint, safe_sqrt
+from dolens.kernels.cuda.arithmetic import divide, refract_adjoint
 from dolens.kernels.cuda.axes import change_axes_adjoint, lens_axes_adjoint
-from dolens.kernels.cuda.conic import conic_curvature_cotangent, conic_gradient, conic_sums
-from dolens.kernels.cuda.functions import CODE, HESSIAN, SUMS
+from dolens.kernels.cuda.functions import LAW_ADJOINT, LAW_CODE
+from dolens.kernels.cuda.gradient import shape_sums, surface_gradient
 from dolens.kernels.cuda.layout import (
+    BASE,
     CHANGE_AXES,
-    CONIC,
+    DEFLECT,
     HAS_CHANGE_AXES,
-    HAS_CONIC,
+    HAS_DEFLECT,
     HAS_LENS_AXES,
-    HAS_SPHERE,
     KIND,
+    LAW,
     LENS_AXES,
+    NUMBERS,
     PLANE,
     REFRACTS,
+    SENSE_BEHIND,
     SENSOR,
-    SHAPE,
     SHIFT,
-    SPHERE,
 )
 from dolens.kernels.cuda.sums import add_sum
 
 
 @triton.jit
-def _explicit_gradient(record, codes, extras, x, y, FORM: tl.constexpr):
-    """Return g = (-s_x, -s_y, 1), 1/|g|, and F's second derivatives xx, xy, yy and zz."""
-    sx, sy, sxx, sxy, syy = FORM[HESSIAN](record, codes, extras, x, y)
-    gz = 1.0 + tl.zeros_like(x)
-    inverse = divide(1.0, safe_sqrt(1.0 + sx * sx + sy * sy))
-    return -sx, -sy, gz, inverse, -sxx, -sxy, -syy, tl.zeros_like(x)
-
-
-@triton.jit
-def surface_gradient(
-    record, codes, extras, kind, x, y, z, KINDS: tl.constexpr, FORMS: tl.constexpr
-):
-    """Return g, 1/|g|, and F's second derivatives xx, xy, yy and zz, at a point of any surface."""
-    gx, gy, gz = tl.zeros_like(x), tl.zeros_like(x), 1.0 + tl.zeros_like(x)
-    inverse = 1.0 + tl.zeros_like(x)
-    xx, xy, yy, zz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
-    if HAS_SPHERE & KINDS:
-        if kind == SPHERE:
-            gx, gy, gz, _, xx, zz = conic_gradient(tl.load(record + SHAPE), 0.0, x, y, z)
-            yy = xx
-    if HAS_CONIC & KINDS:
-        if kind == CONIC:
-            c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
-            gx, gy, gz, inverse, xx, zz = conic_gradient(c, k, x, y, z)
-            yy = xx
-    for k in tl.static_range(len(FORMS)):
-        if kind == FORMS[k][CODE]:
-            gx, gy, gz, inverse, xx, xy, yy, zz = _explicit_gradient(
-                record, codes, extras, x, y, FORMS[k]
-            )
-    return gx, gy, gz, inverse, xx, xy, yy, zz
-
-
-@triton.jit
-def shape_sums(
-    record, codes, extras, sums, kind, x, y, z, along, ux, uy, uz, alive,
-    KINDS: tl.constexpr, FORMS: tl.constexpr,
-):  # fmt: skip
-    """Add the cotangents of a shape's numbers, from τ and (ux, uy, uz), the cotangent of g."""
-    if HAS_SPHERE & KINDS:
-        if kind == SPHERE:
-            of_c = conic_curvature_cotangent(0.0, x, y, z, along, ux, uy, uz)
-            add_sum(sums + SHAPE, of_c, alive)
-    if HAS_CONIC & KINDS:
-        if kind == CONIC:
-            conic_sums(record, sums, x, y, z, along, ux, uy, uz, alive)
-    for k in tl.static_range(len(FORMS)):
-        if kind == FORMS[k][CODE]:
-            FORMS[k][SUMS](record, codes, extras, sums, x, y, along, -ux, -uy, alive)
-
-
-@triton.jit
 def step_adjoint(
-    codes, record, extras, sums, index, ratio,
-    before, after, px, py, pz, a, b, c, path, alive, KINDS: tl.constexpr, FORMS: tl.constexpr,
+    codes, record, extras, sums, index, ratio, per_radian,
+    before, after, px, py, pz, a, b, c, path, alive,
+    KINDS: tl.constexpr, FORMS: tl.constexpr, LAWS: tl.constexpr,
 ):  # fmt: skip
     """Return the cotangents in front of a step from those behind it; its own are added to `sums`.
 
     Args:
-        codes: to `ratio`: as in `step`; `sums` lie as the record does.
+        codes: to `per_radian`: as in `step`; `sums` lie as the record does.
         before: the kept state in front: x, y, z, l, m, n, distance.
         after: and behind.
         px: to pz: cotangents of the position behind.
         a: to c: of the direction behind.
         path: of the optical path.
         alive: which rays count.
-        KINDS: see `step`, and FORMS.
+        KINDS: see `step`, and FORMS and LAWS.
 
     Returns:
         Cotangents of position and direction in front, and of the indices in front and behind.
@@ -132,6 +82,32 @@ def step_adjoint(
         a, b, c = a + t * px, b + t * py, c + t * pz
         of_front += path * t
         add_sum(sums + SHIFT, pz, alive)
+    if HAS_DEFLECT & KINDS:
+        if kind == DEFLECT:
+            base = tl.load(codes + BASE)
+            gx, gy, gz, inverse, xx, xy, yy, zz = surface_gradient(
+                record, codes, extras, base, x, y, z, KINDS, FORMS
+            )
+            nx, ny, nz = gx * inverse, gy * inverse, gz * inverse
+            place = tl.load(codes + NUMBERS)
+            vx, vy, vz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
+            for k in tl.static_range(len(LAWS)):
+                if tl.load(codes + LAW) == LAWS[k][LAW_CODE]:
+                    qx, qy, a, b, c, vx, vy, vz, of_front, of_behind = LAWS[k][LAW_ADJOINT](
+                        record + place, codes, sums + place, x, y, l, m, n, nx, ny, nz,
+                        index, ratio, per_radian, tl.load(record + SENSE_BEHIND),
+                        out_l, out_m, out_n, a, b, c, path, alive,
+                    )  # fmt: skip
+                    px, py = px + qx, py + qy
+            across = vx * nx + vy * ny + vz * nz
+            ux = (vx - across * nx) * inverse
+            uy = (vy - across * ny) * inverse
+            uz = (vz - across * nz) * inverse
+            px, py, pz = px + xx * ux + xy * uy, py + xy * ux + yy * uy, pz + zz * uz
+            shape_sums(
+                record, codes, extras, sums, base, x, y, z, tl.zeros_like(x), ux, uy, uz, alive,
+                KINDS, FORMS,
+            )  # fmt: skip
     if HAS_CHANGE_AXES & KINDS:
         if kind == CHANGE_AXES:
             px, py, pz, a, b, c, of_front = change_axes_adjoint(

@@ -8,7 +8,7 @@ reaches; their gradient is cut off where the trace ends.
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,10 @@ from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay, Refraction, snell
+
+if TYPE_CHECKING:
+    from dolens.optics.surfaces.deflection import Law
+    from dolens.optics.surfaces.phase import Phase
 
 Parameters = Mapping[str, Tensor]
 
@@ -31,9 +35,11 @@ class PackedShape(NamedTuple):
     Attributes:
         numbers: scalars and arrays, the latter by rows; None: zero.
         count: coefficients of an asphere or a polynomial, or rows of a spline.
-        columns: of a spline; 1 for a polynomial with a b·z² term, or an asphere with a2.
-        degree: highest power of x or y.
+        columns: of a spline; 1 for a polynomial with a b·z² term; of other shapes what their kernel
+            says.
+        degree: highest power of x or y, or what the kernel says.
         extras: further integers.
+        data: so many numbers at the end are data, which have no cotangents.
     """
 
     numbers: tuple[Tensor | None, ...]
@@ -41,6 +47,7 @@ class PackedShape(NamedTuple):
     columns: int = 0
     degree: int = 0
     extras: tuple[int, ...] = ()
+    data: int = 0
 
 
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
@@ -81,6 +88,10 @@ class Surface(nn.Module):
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
             These three are not inherited, since a subclass may have another sag.
+        changes_axes: whether this is a coordinate break, which light does not meet.
+        law: what deflects light in the place of Snell's law, by the surface's own parameters; see
+            `dolens.optics.surfaces.deflection`.
+        phase: a grating or a diffractive lens on this surface, or None.
     """
 
     kind: ClassVar[str] = ""
@@ -90,6 +101,9 @@ class Surface(nn.Module):
     optional: ClassVar[tuple[str, ...]] = ()
     rotational: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
+    changes_axes: ClassVar[bool] = False
+    law: ClassVar["type[Law] | None"] = None
+    phase: "Phase | None"
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -107,6 +121,7 @@ class Surface(nn.Module):
         if not isinstance(aperture, ClearAperture):
             aperture = ClearAperture(Circle(float(aperture)))
         self.aperture = aperture
+        self.phase = None
         for name, value in parameters.items():
             tensor = tensor_of(value, name, dtype)
             if name in self.constants:
@@ -216,7 +231,7 @@ class Surface(nn.Module):
         Args:
             p: parameters.
             ray: at the vertex plane, in the surface's own axes.
-            sense: +1 for light travelling towards +z through the surface, -1 for backward mode.
+            sense: +1 for light that comes towards +z, -1 for light that comes towards -z.
             scale: mm, a length of the size of the aperture; it sets the tolerance near zero.
 
         Returns:
@@ -280,7 +295,7 @@ class Surface(nn.Module):
         ratio: float | Tensor,
         sense: float,
     ) -> Refraction:
-        """Refract rays at points (mm) of the surface; see `snell`."""
+        """Refract or reflect rays at points (mm) of the surface; see `snell`."""
         return snell(direction, cls.normal(p, *point), ratio, sense)
 
 

@@ -51,7 +51,8 @@ def snell(
         direction: cosines of unit vectors.
         normal: unit vectors towards +z.
         ratio: μ, index before over index after, in the order of the light's travel.
-        sense: s, +1 forward and -1 backward: the sign of direction · normal.
+        sense: s, the sign of d'·N behind the surface: +1 for light that leaves towards +z.  With
+            the other sign than d·N, and μ = 1, light is reflected: d' = d - 2(d·N)N.
 
     Returns:
         d' = μ·d + (s·cos t - μ·cos i)·N with cos²t = 1 - μ²(1 - cos²i); `transmitted` is cos²t.

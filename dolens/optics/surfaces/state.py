@@ -1,12 +1,26 @@
 """A surface as the pure functions see it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dolens.optics.surfaces.base import Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture
+from dolens.optics.surfaces.deflection import Deflected, Law, Media, Travel, Vector
+
+
+@dataclass(frozen=True)
+class LawState:
+    """The pure functions see what deflects light at a surface in this form.
+
+    Attributes:
+        law: the `Law` subclass, used as a namespace of pure functions.
+        parameters: name → tensor.
+    """
+
+    law: type[Law]
+    parameters: Parameters
 
 
 @dataclass(frozen=True)
@@ -18,12 +32,28 @@ class SurfaceState:
         parameters: name → tensor.
         aperture: what light passes.
         edge: the semi-diameter as a tensor, where a gradient with respect to it is wanted.
+        deflection: what deflects light in the place of Snell's law, or None.
     """
 
     shape: type[Surface]
     parameters: Parameters
     aperture: ClearAperture
     edge: Tensor | None = None
+    deflection: LawState | None = None
+
+    def deflect(self, point: Vector, direction: Vector, media: Media, travel: Travel) -> Deflected:
+        """Deflect rays at points (mm) of the surface by its law; see `Law.deflect`."""
+        normal = self.shape.normal(self.parameters, *point)
+        law = self.deflection
+        return law.law.deflect(law.parameters, point, direction, normal, media, travel)
+
+    def double(self) -> "SurfaceState":
+        """Return the same surface in double precision; gradients flow back to its own tensors."""
+        law = self.deflection
+        if law is not None:
+            law = replace(law, parameters={n: p.double() for n, p in law.parameters.items()})
+        parameters = {n: p.double() for n, p in self.parameters.items()}
+        return replace(self, parameters=parameters, deflection=law)
 
     def rim_sag(self, like: Tensor) -> Tensor:
         """Return the sag (mm) at the aperture's reach along x, in another tensor's precision."""

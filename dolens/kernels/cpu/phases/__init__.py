@@ -1,0 +1,1 @@
+"""Each module here has the block functions of a phase."""

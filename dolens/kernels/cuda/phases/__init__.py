@@ -1,0 +1,1 @@
+"""Each module here has the Triton functions of a phase."""

@@ -1,0 +1,56 @@
+"""Ideal lenses are told where the object of the axis lies for them: see `IdealLens`."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from dolens.optics.paraxial import vergence
+from dolens.optics.paraxial_recurrence import TwoRays, through_surfaces
+from dolens.optics.paraxial_surfaces import curvatures_of, powers_of
+from dolens.optics.surfaces.ideal_lens import IdealLens
+from dolens.optics.system import OpticalSystem
+
+# Light that meets a lens in its focus has no finite vergence there, 1/mm.
+_LARGEST = 1e9
+
+
+def with_vergences(
+    system: OpticalSystem, wavelength: float, object_distance: float | Tensor | None
+) -> OpticalSystem:
+    """Return the system with the reduced vergence of the axial beam at each of its ideal lenses.
+
+    Vergences are functions of the lens in front, and have its gradients.  Where the axial beam is
+    focused on an ideal lens (a field lens), its vergence is held at 1e9/mm: the lens then changes
+    the beam's path by rounding only.
+
+    Args:
+        system: the lens; itself where it has no ideal lens.
+        wavelength: nm, of the paraxial axial ray.
+        object_distance: mm in front of the first vertex; None or `inf` for infinity.
+    """
+    laws = [s.deflection for s in system.surfaces]
+    lenses = [i for i, law in enumerate(laws) if law is not None and law.law is IdealLens]
+    if not lenses:
+        return system
+    index = system.signed_indices(wavelength)
+    near = index[0] * vergence(object_distance)
+    one = torch.ones_like(system.sensor_distance)
+    ray = TwoRays(one, 0.0 * one, near * one, 0.0 * one)
+    behind = list(
+        through_surfaces(
+            ray, curvatures_of(system), system.thicknesses, index, powers_of(system, wavelength)
+        )
+    )
+    surfaces = list(system.surfaces)
+    for i in lenses:
+        reduced = behind[i - 1].nu if i else ray.nu
+        height = behind[i].y
+        focused = height == 0.0
+        arriving = (reduced / torch.where(focused, one, height)).clamp(-_LARGEST, _LARGEST)
+        arriving = torch.where(focused, torch.full_like(one, _LARGEST), arriving)
+        law = replace(
+            laws[i], parameters={**laws[i].parameters, "vergence": arriving.to(system.dtype)}
+        )
+        surfaces[i] = replace(surfaces[i], deflection=law)
+    return replace(system, surfaces=surfaces)

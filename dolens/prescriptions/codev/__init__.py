@@ -1,0 +1,1 @@
+"""CODE V sequence files (`.seq`) are read and written."""

@@ -1,0 +1,186 @@
+"""The system data of a CODE V `.seq` file are its units, aperture, fields and wavelengths."""
+
+import math
+from fractions import Fraction
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.prescriptions.codev.file import CodeVFile
+from dolens.prescriptions.codev.text import Command, unquoted
+from dolens.prescriptions.decimals import exact, nearest, number_in_text, scaled
+
+_UNITS = {"M": Fraction(1), "C": Fraction(10), "I": Fraction(127, 5)}
+_FIELDS = {
+    "AN": "angles",
+    "OB": "heights",
+    "IM": "image_heights",
+    "RI": "real_image_heights",
+}
+_PUPILS = ("EPD", "FNO", "NA", "NAO")
+# Degrees Celsius and millimetres of mercury that CODE V's glass data are for.
+_USUAL_TEMPERATURES = (20.0, 22.0)
+_ATMOSPHERE = Fraction(760)
+
+
+def factor_to_mm(file: CodeVFile, where: str) -> Fraction:
+    """Return millimetres in the file's unit of length; millimetres where it names none."""
+    command = _last(file, "DIM")
+    unit = command.words[0].upper() if command and command.words else "M"
+    if unit not in ("M", "MM", "C", "CM", "I", "IN"):
+        raise InputError(f"{where}: DIM {unit} is unknown (allowed: M, C, I)")
+    return _UNITS[unit[0]]
+
+
+def read_system(
+    file: CodeVFile, factor: Fraction, finite_object: bool, where: str
+) -> dict[str, Any]:
+    """Read name, wavelengths, fields and pupil as a prescription writes them.
+
+    Args:
+        file: the sorted commands.
+        factor: mm in a unit of the file.
+        finite_object: whether the object is at a finite distance; FNO then is a working F-number.
+        where: name in messages.
+
+    Raises:
+        InputError: two kinds of pupils or fields, or values that do not fit together.
+    """
+    found: dict[str, Any] = {}
+    title = _last(file, "TIT")
+    name = " ".join(map(unquoted, title.words)).strip() if title else ""
+    if name:
+        found["name"] = name
+    found["index_model"] = "dfc"
+    found |= _wavelengths(file, where)
+    found |= _fields(file, factor, where)
+    found |= _pupil(file, factor, finite_object, where)
+    return found | _surroundings(file, where)
+
+
+def _wavelengths(file: CodeVFile, where: str) -> dict[str, Any]:
+    """Read WL in nm, their weights, and REF, the number of the reference; else the middle one."""
+    values = _numbers(file, "WL", Fraction(1), where)
+    if not values:
+        return {}
+    reference = _last(file, "REF")
+    number = (len(values) + 1) // 2
+    if reference is not None and reference.words:
+        number = int(number_in_text(reference.words[0], f"{where}: line {reference.at}: REF"))
+    if not 1 <= number <= len(values):
+        raise InputError(f"{where}: REF {number} is none of the wavelengths 1 to {len(values)}")
+    found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": values[number - 1]}
+    weights = _numbers(file, "WTW", Fraction(1), where)
+    if len(set(weights)) > 1:
+        found["wavelength_weights"] = _as_many(weights, len(values), "WTW", where)
+    return found
+
+
+def _fields(file: CodeVFile, factor: Fraction, where: str) -> dict[str, Any]:
+    """Read fields of one kind, their weights and vignetting."""
+    kinds = [kind for kind in _FIELDS if _last(file, f"X{kind}") or _last(file, f"Y{kind}")]
+    if not kinds:
+        return {}
+    if len(kinds) > 1:
+        names = " and ".join(f"Y{kind}" for kind in kinds)
+        raise InputError(f"{where}: {names} are two kinds of fields; a file may give one")
+    kind = kinds[0]
+    unit = Fraction(1) if kind == "AN" else factor
+    x, y = (_numbers(file, f"{axis}{kind}", unit, where) for axis in "XY")
+    count = max(len(x), len(y))
+    x, y = (values + [0.0] * (count - len(values)) for values in (x, y))
+    fields: dict[str, Any] = {_FIELDS[kind]: [[x[i], y[i]] for i in range(count)]}
+    weights = _numbers(file, "WTF", Fraction(1), where)
+    if len(set(weights)) > 1:
+        fields["weights"] = _as_many(weights, count, "WTF", where)
+    vignetting = _vignetting(file, count, where)
+    if vignetting:
+        fields["vignetting"] = vignetting
+    return {"fields": fields}
+
+
+def _vignetting(file: CodeVFile, count: int, where: str) -> list[dict[str, float]]:
+    """Convert VUX, VLX, VUY and VLY: the parts of the pupil's radius that are cut at its edges.
+
+    A pupil coordinate p from -1 to 1 becomes (VL - VU)/2 + p·(1 - (VU + VL)/2).
+    """
+    cut = {}
+    for key in ("VUX", "VLX", "VUY", "VLY"):
+        command = _last(file, key)
+        words = command.words if command else []
+        place = f"{where}: {key}"
+        cut[key] = [exact(word, place) for word in words[:count]]
+        cut[key] += [Fraction(0)] * (count - len(cut[key]))
+    if not any(any(values) for values in cut.values()):
+        return []
+    rows = []
+    for i in range(count):
+        row = {}
+        for axis in "XY":
+            upper, lower = cut[f"VU{axis}"][i], cut[f"VL{axis}"][i]
+            row[f"decenter_{axis.lower()}"] = nearest((lower - upper) / 2, where)
+            row[f"compression_{axis.lower()}"] = nearest((lower + upper) / 2, where)
+        rows.append(row)
+    return rows
+
+
+def _pupil(file: CodeVFile, factor: Fraction, finite_object: bool, where: str) -> dict[str, Any]:
+    """Read the aperture of the system."""
+    given = [key for key in _PUPILS if _last(file, key)]
+    if len(given) > 1:
+        raise InputError(f"{where}: {' and '.join(given)} both give the aperture; write one")
+    found: dict[str, Any] = {}
+    telecentric = _last(file, "TEL")
+    if telecentric and not (telecentric.words and telecentric.words[0].upper().startswith("N")):
+        found["telecentric_object"] = True
+    apodized = _last(file, "PUI")
+    if apodized and _number(apodized, where) != 1.0:
+        raise InputError(f"{where}: PUI: apodization of the pupil is not held")
+    if not given:
+        return found
+    command = _last(file, given[0])
+    if given[0] == "EPD":
+        return found | {"entrance_pupil_diameter": _number(command, where, factor)}
+    value = _number(command, where)
+    if given[0] == "NAO":
+        return found | {"object_na": value}
+    if given[0] == "NA":
+        if not 0.0 < value < 1.0:
+            raise InputError(f"{where}: NA must be from 0 to 1, not {value!r}")
+        # The F-number is that of the paraxial cone, 1/(2·tan u) with sin u = NA.
+        value = 1.0 / (2.0 * math.tan(math.asin(value)))
+    return found | {"working_f_number" if finite_object else "f_number": value}
+
+
+def _surroundings(file: CodeVFile, where: str) -> dict[str, Any]:
+    """Read temperature (°C) and pressure (mm of mercury) where they are not the usual ones."""
+    found: dict[str, Any] = {}
+    temperature, pressure = _last(file, "TEM"), _last(file, "PRE")
+    if temperature and _number(temperature, where) not in _USUAL_TEMPERATURES:
+        found["temperature"] = _number(temperature, where)
+    if pressure and _number(pressure, where, 1 / _ATMOSPHERE) != 1.0:
+        found["pressure"] = _number(pressure, where, 1 / _ATMOSPHERE)
+    return found
+
+
+def _as_many(values: list[float], count: int, key: str, where: str) -> list[float]:
+    if len(values) < count:
+        raise InputError(f"{where}: {key} gives {len(values)} weights for {count}")
+    return values[:count]
+
+
+def _numbers(file: CodeVFile, key: str, factor: Fraction, where: str) -> list[float]:
+    command = _last(file, key)
+    place = f"{where}: line {command.at}: {key}" if command else where
+    return [scaled(word, factor, place) for word in (command.words if command else [])]
+
+
+def _number(command: Command | None, where: str, factor: Fraction = Fraction(1)) -> float:
+    assert command is not None
+    place = f"{where}: line {command.at}: {command.key}"
+    if not command.words:
+        raise InputError(f"{place} needs a number")
+    return scaled(command.words[0], factor, place)
+
+
+def _last(file: CodeVFile, key: str) -> Command | None:
+    return file.system[key][-1] if key in file.system else None

@@ -1,0 +1,139 @@
+"""Lens files of DeepLens are JSON: a list of surfaces with positions, radii and media.
+
+`roc` is a radius of curvature (0 is a plane), `c` a curvature, `d_next` the gap behind, `mat2` the
+medium behind, `r` the semi-diameter.  `ai` lists the coefficients of r², r⁴, ....  The stop is the
+surface of type Aperture or Stop.
+"""
+
+import math
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.prescriptions.checks import as_number
+from dolens.prescriptions.decimals import radius_of
+from dolens.prescriptions.json_values import difference, mapping, number, rows
+from dolens.prescriptions.read_file import ReadPrescription
+
+_STOPS = ("Aperture", "Stop")
+_NOT_HELD = {
+    "ThinLens": "a paraxial lens",
+    "ParaxialLens": "a paraxial lens",
+    "DOE": "a diffractive element",
+    "Phase": "a diffractive phase",
+    "Fresnel": "a diffractive Fresnel lens",
+    "Binary2": "a diffractive phase",
+    "Grating": "a diffraction grating",
+    "Cubic": "a cubic surface",
+}
+# Positions and gaps are rounded on their own, mm.
+_POSITIONS = 1e-3
+
+
+def read_deeplens(content: dict[str, Any], where: str) -> ReadPrescription:
+    """Convert the content of a DeepLens file to a prescription.
+
+    Raises:
+        InputError: a surface is of a kind that is not held, or positions and gaps disagree.
+    """
+    for key in ("DOE", "doe"):
+        if content.get(key):
+            raise InputError(f"{where}: a diffractive element is not held ('{key}')")
+    found: dict[str, dict[str, Any]] = {}
+    entries = rows(content.get("surfaces"), f"{where}: 'surfaces'")
+    first = mapping(entries[0] if entries else None, f"{where}: surface 1")
+    stops, before, end = [], "air", number(first, "d", where, 0.0)
+    for n, entry in enumerate(entries, 1):
+        place = f"{where}: surface {n}"
+        surface = mapping(entry, place)
+        row = _row(surface, before, place)
+        if surface.get("type") in _STOPS:
+            stops.append(n)
+        before = row["material"]
+        gap = number(surface, "d_next", place)
+        end += gap if n < len(entries) else 0.0
+        found[str(n)] = row | ({"thickness": gap} if n < len(entries) else {})
+    if len(stops) > 1:
+        raise InputError(f"{where}: surfaces {stops[0]} and {stops[1]} are both the stop")
+    if not stops:
+        raise InputError(f"{where}: no surface is the stop (type Aperture)")
+    prescription: dict[str, Any] = {"index_model": "dfc", "stop": stops[0], "surfaces": found}
+    if content.get("info"):
+        prescription = {"name": str(content["info"]), **prescription}
+    prescription["sensor"] = _sensor(content, mapping(entries[-1], where), end, where)
+    passed = [f"{key}, which follows from the lens" for key in ("foclen", "fnum") if key in content]
+    return ReadPrescription(prescription, passed)
+
+
+def _row(surface: dict[str, Any], before: str, place: str) -> dict[str, Any]:
+    kind = str(surface.get("type"))
+    material = str(surface.get("mat2", before if kind in _STOPS else "")).strip()
+    if not material:
+        raise InputError(f"{place}: 'mat2' is missing (the medium behind the surface)")
+    material = "air" if material.lower() in ("air", "vacuum", "occluder") else material
+    row: dict[str, Any] = {}
+    if kind in _STOPS:
+        if number(surface, "c", place, 0.0):
+            raise InputError(f"{place}: a stop with a curvature is not held")
+        row = {"type": "aperture"}
+    elif kind == "Plane":
+        row = {"type": "plane"}
+    elif kind in ("Spheric", "Aspheric"):
+        row = {"type": "sphere", **_curvature(surface, place)}
+        if kind == "Aspheric":
+            row |= {"type": "even_asphere", "conic": number(surface, "k", place, 0.0)}
+            row |= _coefficients(surface, place)
+    else:
+        what = _NOT_HELD.get(kind, f"type '{kind}'")
+        raise InputError(
+            f"{place}: {what} is not held (allowed: Aperture, Plane, Spheric, Aspheric)"
+        )
+    return row | {"material": material} | _aperture(surface, place)
+
+
+def _aperture(surface: dict[str, Any], place: str) -> dict[str, Any]:
+    """Return the clear aperture; a square has the side `l`."""
+    if surface.get("is_square") and surface.get("l") is not None:
+        half = number(surface, "l", place) / 2.0
+        return {"aperture": {"half_width_x": half, "half_width_y": half}}
+    if surface.get("is_square"):
+        raise InputError(f"{place}: a square aperture without its side ('l') is not held")
+    if surface.get("r") is None and surface.get("l") is not None:
+        return {"semi_diameter": number(surface, "l", place) / 2.0}
+    return {"semi_diameter": number(surface, "r", place)}
+
+
+def _curvature(surface: dict[str, Any], place: str) -> dict[str, float]:
+    if surface.get("roc") is not None:
+        radius = as_number(surface["roc"], f"{place}: 'roc'")
+        return {"radius": radius or math.inf}
+    curvature = number(surface, "c", place)
+    radius = radius_of(curvature)
+    return {"curvature": curvature} if radius is None else {"radius": radius}
+
+
+def _coefficients(surface: dict[str, Any], place: str) -> dict[str, float]:
+    """Return a2 (where it is not zero), a4, ... of the list `ai`."""
+    values = rows(surface.get("ai", []), f"{place}: 'ai'")
+    numbers = [as_number(value, f"{place}: 'ai'") for value in values]
+    found = {f"a{2 * i}": value for i, value in enumerate(numbers, 1)}
+    if not found.get("a2"):
+        found.pop("a2", None)
+    return found
+
+
+def _sensor(
+    content: dict[str, Any], last: dict[str, Any], end: float, where: str
+) -> dict[str, Any]:
+    """Return the sensor: its distance, and the diameter of the circle around it."""
+    gap = number(last, "d_next", f"{where}: the last surface")
+    if content.get("d_sensor") is not None:
+        distance = difference(number(content, "d_sensor", where), end, where)
+        if abs(distance - gap) > _POSITIONS:
+            raise InputError(
+                f"{where}: 'd_sensor' puts the sensor {distance:g} mm behind the last surface, and "
+                f"its 'd_next' says {gap:g} mm"
+            )
+    sensor = {"distance": gap}
+    if content.get("r_sensor") is not None:
+        sensor["diameter"] = 2.0 * number(content, "r_sensor", where)
+    return sensor

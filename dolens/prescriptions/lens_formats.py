@@ -1,0 +1,145 @@
+"""The formats of lens files: how each is recognised, read and written."""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.prescriptions.codev.reader import read_codev
+from dolens.prescriptions.codev.writer import codev_of
+from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
+from dolens.prescriptions.json_lenses import json_of, read_json
+from dolens.prescriptions.oslo.reader import read_oslo
+from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.unknown_content import require_text
+from dolens.prescriptions.yaml_text import read_yaml, yaml_of
+from dolens.prescriptions.zemax import decode_zemax, encode_zemax
+from dolens.prescriptions.zemax_reader import read_zemax
+from dolens.prescriptions.zemax_writer import zemax_of
+
+# A lens is text of some kilobytes; more is no lens.
+MOST_BYTES = 64 * 2**20
+_LOOKED_AT = 65536
+
+
+@dataclass(frozen=True)
+class LensFormat:
+    """A `LensFormat` is one way to write a lens down.
+
+    Attributes:
+        name: in messages and tables.
+        suffixes: of its files, in small letters; the first is the usual one.
+        signs: matches text that is surely of this format, whatever the file's name; or None.
+        read: from decoded text and the file's name to its prescription.
+        write: from a prescription and the file's name to bytes; None where it is only read.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    signs: re.Pattern[str] | None
+    read: Callable[[str, str], ReadPrescription]
+    write: Callable[[Mapping[str, Any], str], bytes] | None
+
+
+def _read_diffoptics(text: str, where: str) -> ReadPrescription:
+    return ReadPrescription(prescription_from_diffoptics(text, where), [])
+
+
+# In the order in which content is looked at.
+FORMATS: tuple[LensFormat, ...] = (
+    LensFormat(
+        "dolens YAML",
+        (".yaml", ".yml"),
+        re.compile(r"^surfaces:\s*$", re.MULTILINE),
+        read_yaml,
+        yaml_of,
+    ),
+    LensFormat(
+        "Zemax",
+        (".zmx",),
+        re.compile(r"^SURF 0\s*$", re.MULTILINE),
+        read_zemax,
+        lambda prescription, where: encode_zemax(zemax_of(prescription, where)),
+    ),
+    LensFormat(
+        "OSLO",
+        (".len", ".osl"),
+        re.compile(r"^\s*LEN\s+NEW\b", re.MULTILINE | re.IGNORECASE),
+        read_oslo,
+        None,
+    ),
+    LensFormat(
+        "CODE V",
+        (".seq",),
+        re.compile(r"^\s*SO\s+[-+.\d].*^\s*SI\b", re.MULTILINE | re.IGNORECASE | re.DOTALL),
+        read_codev,
+        lambda prescription, where: codev_of(prescription, where).encode(),
+    ),
+    LensFormat("JSON", (".json", ".roa"), re.compile(r"\A\s*\{"), read_json, json_of),
+    LensFormat(
+        "dO text",
+        (".txt",),
+        None,
+        _read_diffoptics,
+        lambda prescription, where: diffoptics_text_of(prescription, where).encode(),
+    ),
+)
+SUFFIXES = tuple(suffix for each in FORMATS for suffix in each.suffixes)
+WRITTEN_SUFFIXES = tuple(suffix for each in FORMATS if each.write for suffix in each.suffixes)
+
+
+def read_lens(data: bytes, path: str | Path) -> ReadPrescription:
+    """Read the content of a lens file in any format.
+
+    What the text says counts before the file's name: a file of Zemax named `.txt` is one of Zemax.
+
+    Args:
+        data: what the file holds.
+        path: its name, for messages, and for formats that do not say what they are.
+
+    Raises:
+        InputError: the content is of no known format, or not valid; one line that names the file.
+    """
+    where, suffix = str(path), Path(path).suffix.lower()
+    if len(data) > MOST_BYTES:
+        raise InputError(f"{where}: is larger than {MOST_BYTES // 2**20} MB, and no lens")
+    require_text(data, where)
+    named = next((each for each in FORMATS if suffix in each.suffixes), None)
+    if named is not None and named.name == "dolens YAML":
+        # Anything may stand in YAML's texts, and its loader says best what is wrong with it.
+        return named.read(_utf_8(data, where, "YAML"), where)
+    text = decode_zemax(data, where).removeprefix("\ufeff")
+    begin = text[:_LOOKED_AT]
+    by_content = next((each for each in FORMATS if each.signs and each.signs.search(begin)), None)
+    chosen = by_content or named
+    if chosen is None:
+        raise InputError(
+            f"{where}: is no lens file that is known here; lens files end in {', '.join(SUFFIXES)}"
+        )
+    if chosen.name == "dO text":
+        text = _utf_8(data, where, "text")
+    return chosen.read(text, where)
+
+
+def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
+    """Return what a lens file of that name would hold; nothing is written.
+
+    Raises:
+        InputError: the suffix names no format that is written, or the format cannot hold the lens.
+    """
+    suffix = Path(path).suffix.lower()
+    chosen = next((each for each in FORMATS if suffix in each.suffixes), None)
+    if chosen is None or chosen.write is None or suffix == ".roa":
+        why = f"{chosen.name} is read, not written" if chosen else "unknown suffix"
+        allowed = ", ".join(s for s in WRITTEN_SUFFIXES if s != ".roa")
+        raise InputError(f"{path}: {why}; lens files are written as {allowed}")
+    return chosen.write(prescription, str(path))
+
+
+def _utf_8(data: bytes, where: str, kind: str) -> str:
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where}: is not valid {kind} ({error})") from None

@@ -1,0 +1,249 @@
+"""Lens files of Optiland are JSON: surfaces with their shapes, positions and media, and the system.
+
+Positions are those of the axes of each surface in global axes; gaps are their differences.  Glass
+names the file of refractiveindex.info that its data came from, and so its maker.  The first surface
+is the object, the last one the image.
+"""
+
+import math
+import re
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.optics.glass_catalog import find_glass
+from dolens.prescriptions.checks import as_number
+from dolens.prescriptions.json_values import difference, mapping, number, require_unset, rows
+from dolens.prescriptions.read_file import ReadPrescription
+
+_FIELDS = {
+    "angle": "angles",
+    "object_height": "heights",
+    "paraxial_image_height": "image_heights",
+    "real_image_height": "real_image_heights",
+}
+_PUPILS = {"EPD": "entrance_pupil_diameter", "imageFNO": "f_number", "objectNA": "object_na"}
+_MAKER = re.compile(r"[\\/](schott|ohara|hoya|cdgm|sumita|hikari)[\\/]", re.IGNORECASE)
+_NM = {"um": 1e3, "nm": 1.0, "mm": 1e6, "m": 1e9}
+_INFINITE = 1e10
+
+
+def read_optiland(content: dict[str, Any], where: str) -> ReadPrescription:
+    """Convert the content of an Optiland file to a prescription.
+
+    Raises:
+        InputError: a surface is of a shape that is not held, tilted or decentred, or a medium is
+            none that is known here.
+    """
+    group = mapping(content.get("surface_group"), f"{where}: 'surface_group'")
+    surfaces = rows(group.get("surfaces"), f"{where}: 'surfaces'")
+    surfaces = [mapping(s, f"{where}: surface {n}") for n, s in enumerate(surfaces)]
+    if len(surfaces) < 3:
+        raise InputError(f"{where}: needs an object, a surface and an image")
+    require_unset(mapping(content.get("pickups") or {}, where), (), "a pick-up", where)
+    prescription: dict[str, Any] = {"index_model": "dfc"}
+    if content.get("name"):
+        prescription = {"name": str(content["name"]), **prescription}
+    prescription |= _wavelengths(
+        mapping(content.get("wavelengths"), f"{where}: 'wavelengths'"), where
+    )
+    prescription |= _fields(mapping(content.get("fields"), f"{where}: 'fields'"), where)
+    prescription |= _pupil(content, where)
+    positions = [_position(surface, f"{where}: surface {n}") for n, surface in enumerate(surfaces)]
+    prescription["object_material"] = _medium(surfaces[0], f"{where}: surface 0")
+    if math.isfinite(positions[0]) and abs(positions[0]) < _INFINITE:
+        gap = difference(positions[1], positions[0], where)
+        prescription["object_distance"] = gap
+    stops = [n for n, surface in enumerate(surfaces) if surface.get("is_stop")]
+    if len(stops) != 1 or not 1 <= stops[0] <= len(surfaces) - 2:
+        raise InputError(f"{where}: one surface must be the stop ('is_stop'), not {len(stops)}")
+    prescription["stop"] = stops[0]
+    found: dict[str, dict[str, Any]] = {}
+    before = prescription["object_material"]
+    for n, surface in enumerate(surfaces[1:-1], 1):
+        place = f"{where}: surface {n}"
+        row = _row(surface, n == stops[0], before, place)
+        if row["material"] != "mirror":
+            before = row["material"]
+        gap = difference(positions[n + 1], positions[n], place)
+        if n < len(surfaces) - 2:
+            row["thickness"] = gap
+        found[str(n)] = row
+    prescription["surfaces"] = found
+    prescription["sensor"] = {"distance": gap} | _image(surfaces[-1], f"{where}: the image")
+    return ReadPrescription(prescription, [])
+
+
+def _row(surface: dict[str, Any], stop: bool, before: str, place: str) -> dict[str, Any]:
+    """Return type, radius, coefficients, medium and aperture of a surface."""
+    if surface.get("type") not in ("Surface", "StandardSurface"):
+        raise InputError(f"{place}: a surface of type {surface.get('type')!r} is not held")
+    material = "mirror" if surface.get("is_reflective") else _medium(surface, place)
+    row = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
+    if row == {"type": "plane"} and stop and material == before:
+        row = {"type": "aperture"}
+    return row | {"material": material} | _aperture(surface, place)
+
+
+def _shape(geometry: dict[str, Any], place: str) -> dict[str, Any]:
+    kind = geometry.get("type")
+    radius = as_number(geometry.get("radius", math.inf), f"{place}: 'radius'", finite=False)
+    if kind == "Plane":
+        return {"type": "plane"}
+    conic = number(geometry, "conic", place, 0.0)
+    if kind == "StandardGeometry":
+        if math.isinf(radius) and not conic:
+            return {"type": "plane"}
+        return (
+            {"type": "conic", "radius": radius, "conic": conic}
+            if conic
+            else {
+                "type": "sphere",
+                "radius": radius,
+            }
+        )
+    if kind == "EvenAsphere":
+        values = rows(geometry.get("coefficients", []), f"{place}: 'coefficients'")
+        numbers = [as_number(value, f"{place}: 'coefficients'") for value in values]
+        terms = {f"a{2 * i}": value for i, value in enumerate(numbers, 1)}
+        if not terms.get("a2"):
+            terms.pop("a2", None)
+        return {"type": "even_asphere", "radius": radius, "conic": conic, **terms}
+    raise InputError(
+        f"{place}: a surface of shape {kind!r} is not held "
+        "(allowed: Plane, StandardGeometry, EvenAsphere)"
+    )
+
+
+def _medium(surface: dict[str, Any], place: str) -> str:
+    """Return the medium behind a surface as a prescription writes it."""
+    material = mapping(surface.get("material_post"), f"{place}: 'material_post'")
+    kind = material.get("type")
+    require_unset(material, ("absorp",), "absorption", place)
+    if kind == "IdealMaterial":
+        index = as_number(_first(material.get("index")), f"{place}: 'index'")
+        return "air" if index == 1.0 else repr(index)
+    if kind == "AbbeMaterial":
+        nd, vd = (as_number(_first(material.get(k)), f"{place}: {k!r}") for k in ("index", "abbe"))
+        return f"{nd!r}/{vd!r}"
+    if kind != "Material":
+        raise InputError(f"{place}: a medium of type {kind!r} is not held")
+    name = str(material.get("name"))
+    said = f"{material.get('filename') or ''}"
+    maker = _MAKER.search(said)
+    known = maker[1] if maker else str(material.get("reference") or "")
+    try:
+        return find_glass(f"{known}:{name}" if known else name).name
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+
+
+def _first(value: object) -> object:
+    return value[0] if isinstance(value, list) and len(value) == 1 else value
+
+
+def _aperture(surface: dict[str, Any], place: str) -> dict[str, Any]:
+    aperture = surface.get("aperture")
+    if aperture is None:
+        return {"semi_diameter": "auto"}
+    aperture = mapping(aperture, f"{place}: 'aperture'")
+    if aperture.get("type") not in ("RadialAperture", "ConfigurableRadialAperture"):
+        raise InputError(f"{place}: an aperture of type {aperture.get('type')!r} is not held")
+    row: dict[str, Any] = {"semi_diameter": number(aperture, "r_max", place)}
+    if number(aperture, "r_min", place, 0.0):
+        row["obscuration"] = {"semi_diameter": number(aperture, "r_min", place)}
+    return row
+
+
+def _position(surface: dict[str, Any], place: str) -> float:
+    """Return z of a surface's vertex, mm; infinite for a far object."""
+    geometry = mapping(surface.get("geometry"), f"{place}: 'geometry'")
+    axes = mapping(geometry.get("cs"), f"{place}: 'cs'")
+    require_unset(axes, ("x", "y", "rx", "ry", "rz"), "a decentred or tilted surface", place)
+    reference = axes.get("reference_cs")
+    if reference is not None:
+        require_unset(
+            mapping(reference, place),
+            ("x", "y", "z", "rx", "ry", "rz"),
+            "a surface in axes of another",
+            place,
+        )
+    value = axes.get("z")
+    if value == "inf" or value == "-inf" or (isinstance(value, float) and math.isinf(value)):
+        return math.inf
+    return as_number(value, f"{place}: 'z'")
+
+
+def _wavelengths(content: dict[str, Any], where: str) -> dict[str, Any]:
+    values, weights, primary = [], [], None
+    for entry in rows(content.get("wavelengths"), f"{where}: 'wavelengths'"):
+        wave = mapping(entry, f"{where}: 'wavelengths'")
+        unit = str(wave.get("unit", "um"))
+        if unit not in _NM:
+            raise InputError(f"{where}: a wavelength in '{unit}' (allowed: {', '.join(_NM)})")
+        value = round(number(wave, "value", where) * _NM[unit], 9)
+        values.append(value)
+        weights.append(number(wave, "weight", where, 1.0))
+        primary = value if wave.get("is_primary") else primary
+    if not values:
+        return {}
+    found: dict[str, Any] = {"wavelengths": values, "reference_wavelength": primary or values[0]}
+    return found | ({"wavelength_weights": weights} if len(set(weights)) > 1 else {})
+
+
+def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
+    require_unset(
+        content, ("telecentric", "object_space_telecentric"), "a telecentric object", where
+    )
+    entries = [
+        mapping(entry, f"{where}: 'fields'")
+        for entry in rows(content.get("fields"), f"{where}: 'fields'")
+    ]
+    if not entries:
+        return {}
+    definition = content.get("field_definition")
+    named = content.get("field_type") or entries[0].get("field_type")
+    if isinstance(definition, dict):
+        named = named or _DEFINITIONS.get(str(definition.get("field_type")))
+    if named not in _FIELDS:
+        raise InputError(
+            f"{where}: fields of type {named!r} are not held (allowed: {', '.join(_FIELDS)})"
+        )
+    points = [[number(e, "x", where, 0.0), number(e, "y", where, 0.0)] for e in entries]
+    found: dict[str, Any] = {_FIELDS[named]: points}
+    cut = [(number(e, "vx", where, 0.0), number(e, "vy", where, 0.0)) for e in entries]
+    if any(any(pair) for pair in cut):
+        found["vignetting"] = [{"compression_x": x, "compression_y": y} for x, y in cut]
+    weights = [number(e, "weight", where, 1.0) for e in entries]
+    if len(set(weights)) > 1:
+        found["weights"] = weights
+    return {"fields": found}
+
+
+_DEFINITIONS = {
+    "AngleField": "angle",
+    "ObjectHeightField": "object_height",
+    "ParaxialImageHeightField": "paraxial_image_height",
+    "RealImageHeightField": "real_image_height",
+}
+
+
+def _pupil(content: dict[str, Any], where: str) -> dict[str, Any]:
+    aperture = content.get("aperture")
+    if aperture is None:
+        return {}
+    aperture = mapping(aperture, f"{where}: 'aperture'")
+    require_unset(aperture, ("object_space_telecentric",), "a telecentric object", where)
+    kind = str(aperture.get("type"))
+    if kind == "float_by_stop_size":
+        return {}
+    if kind not in _PUPILS:
+        raise InputError(f"{where}: an aperture of type '{kind}' is not held")
+    return {_PUPILS[kind]: number(aperture, "value", where)}
+
+
+def _image(surface: dict[str, Any], place: str) -> dict[str, float]:
+    """Return radius and conic constant of a curved image."""
+    shape = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
+    if shape["type"] not in ("plane", "sphere", "conic"):
+        raise InputError(f"{place}: an image of this shape is not held")
+    return {key: shape[key] for key in ("radius", "conic") if key in shape}

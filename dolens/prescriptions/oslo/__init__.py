@@ -1,0 +1,1 @@
+"""OSLO lens files (`.len`, as text) are read."""

@@ -1,0 +1,231 @@
+"""The text of an OSLO `.len` file is converted to a prescription.
+
+Held: spheres, conics and aspheres to r²⁰, mirrors, glass by name and by code, apertures, one
+field at the edge, and wavelengths.  An aperture that OSLO checks (`AP CHK`) clips; the others are
+drawn.  Angles and places of surfaces (`TLA`, `DCY`, ...) are refused, as are general aspheres.
+The axis and the edge of the field are the fields.
+"""
+
+import math
+from fractions import Fraction
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.prescriptions.codev.glass import glass_by_name_or_code
+from dolens.prescriptions.decimals import exact, nearest, number_in_text, radius_of, scaled
+from dolens.prescriptions.oslo.text import POWERS, Line, OsloFile, parse_oslo
+from dolens.prescriptions.read_file import ReadPrescription
+
+Block = dict[str, Line]
+
+_INFINITE = 1e10
+_MICROMETRE = Fraction(1000)
+_PLACES = ("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC", "BEN", "RCO", "GC", "TOX", "TOY", "TOZ")
+
+
+def read_oslo(text: str, where: str) -> ReadPrescription:
+    """Read a lens from the text of a `.len` file, and list what is passed over.
+
+    Raises:
+        InputError: one line that names `where`, the surface or line, and what is not held.
+    """
+    file = parse_oslo(text, where)
+    if len(file.surfaces) < 3:
+        raise InputError(f"{where}: needs an object, a surface and an image")
+    factor = _factor(file, where)
+    target, *blocks, image = file.surfaces
+    distance = _object_distance(target, factor, where)
+    prescription = _system(file, factor, distance is not None, where)
+    medium = prescription["object_material"] = _medium(target, f"{where}: surface 0")
+    if distance is not None:
+        prescription["object_distance"] = distance
+    stops = [n for n, block in enumerate(blocks, 1) if "AST" in block]
+    if len(stops) > 1:
+        raise InputError(f"{where}: surfaces {stops[0]} and {stops[1]} are both the stop (AST)")
+    stop = prescription["stop"] = stops[0] if stops else 1
+    found: dict[str, dict[str, Any]] = {}
+    gaps = []
+    beam = bool({"entrance_pupil_diameter", "f_number", "object_na"} & prescription.keys())
+    for n, block in enumerate(blocks, 1):
+        place = f"{where}: surface {n}"
+        _refuse_places(block, place)
+        material = _medium(block, place)
+        row = _shape(block, factor, place)
+        if row == {"type": "plane"} and n == stop and material == medium:
+            row = {"type": "aperture"}
+        row["material"] = material
+        if not (n == stop and beam) or _clips(block):
+            row |= _aperture(block, factor, place)
+        gaps.append(_gap(block, factor, place))
+        medium = medium if material == "mirror" else material
+        found[str(n)] = row
+    for row, gap in zip(list(found.values())[:-1], gaps, strict=False):
+        row["thickness"] = nearest(gap, where)
+    prescription["surfaces"] = found
+    place = f"{where}: the image"
+    _refuse_places(image, place)
+    gap = gaps[-1] + (exact(image["TH"].words[0], place) * factor if "TH" in image else 0)
+    prescription["sensor"] = {"distance": nearest(gap, where)} | _curved(image, factor, place)
+    solves = any("SOLVE" in block for block in blocks)
+    return ReadPrescription(prescription, ["solves, whose values are written"] if solves else [])
+
+
+def _system(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    title = file.system["LEN"].words[1:2]
+    if title and title[0].strip('"').strip():
+        found["name"] = title[0].strip('"').strip()
+    notes = "\n".join(note for note in file.notes if note.strip())
+    if notes:
+        found["source"] = notes
+    found["index_model"] = "dfc"
+    waves = file.system.get("WV")
+    if waves:
+        values = [scaled(word, _MICROMETRE, f"{where}: WV") for word in waves.words]
+        found |= {"wavelengths": values, "reference_wavelength": values[0]}
+        weights = [number_in_text(w, f"{where}: WW") for w in _words(file.system, "WW")]
+        if len(set(weights)) > 1 and len(weights) >= len(values):
+            found["wavelength_weights"] = weights[: len(values)]
+    return found | _field(file, factor, finite, where) | _pupil(file, factor, finite, where)
+
+
+def _field(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, Any]:
+    """Return the axis and the edge of the field."""
+    for command, kind, unit in (
+        ("ANG", "angles", Fraction(1)),
+        ("OBH", "heights", factor),
+        ("GIH", "image_heights", factor),
+    ):
+        if command in file.system:
+            words = _words(file.system, command) or ["0"]
+            edge = scaled(words[0], unit, f"{where}: {command}")
+            if edge:
+                return {"fields": {kind: [[0.0, 0.0], [0.0, edge]]}}
+            return {"fields": {kind: [[0.0, 0.0]]}}
+    return {}
+
+
+def _pupil(file: OsloFile, factor: Fraction, finite: bool, where: str) -> dict[str, float]:
+    for command in ("EBR", "NAO", "FNO"):
+        if command not in file.system:
+            continue
+        place = f"{where}: {command}"
+        word = (_words(file.system, command) or [""])[0]
+        if command == "EBR":
+            # The radius of the beam on the first surface: that of the entrance pupil for a far
+            # object alone.
+            if finite:
+                raise InputError(
+                    f"{place}: a beam radius on surface 1 is not held for a near object "
+                    "(allowed: NAO)"
+                )
+            return {"entrance_pupil_diameter": scaled(word, 2 * factor, place)}
+        if command == "NAO":
+            return {"object_na": number_in_text(word, place)}
+        return {"working_f_number" if finite else "f_number": number_in_text(word, place)}
+    return {}
+
+
+def _factor(file: OsloFile, where: str) -> Fraction:
+    """Return millimetres in the file's unit of length."""
+    words = _words(file.system, "UNI")
+    factor = exact(words[0], f"{where}: UNI") if words else Fraction(1)
+    if factor <= 0:
+        raise InputError(f"{where}: UNI must be positive: millimetres in the unit of length")
+    return factor
+
+
+def _object_distance(target: Block, factor: Fraction, where: str) -> float | None:
+    place = f"{where}: surface 0 (the object)"
+    if _shape(target, factor, place) != {"type": "plane"}:
+        raise InputError(f"{place}: a curved object is not held")
+    _refuse_places(target, place)
+    words = _words(target, "TH")
+    if not words or abs(number_in_text(words[0], place)) >= _INFINITE:
+        return None
+    return scaled(words[0], factor, place)
+
+
+def _shape(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
+    """Return type, radius, conic constant and coefficients."""
+    size = _size(block, factor, place)
+    powers = {
+        f"a{power}": scaled(_words(block, key)[0], factor ** (1 - power), f"{place}: {key}")
+        for key, power in POWERS.items()
+        if _words(block, key)
+    }
+    conic = number_in_text((_words(block, "CC") or ["0"])[0], f"{place}: CC")
+    if powers:
+        return {"type": "even_asphere", **(size or {"radius": math.inf}), "conic": conic} | powers
+    if conic:
+        return {"type": "conic", **(size or {"radius": math.inf}), "conic": conic}
+    return {"type": "sphere", **size} if size else {"type": "plane"}
+
+
+def _size(block: Block, factor: Fraction, place: str) -> dict[str, float]:
+    """Return radius or curvature; nothing for a plane."""
+    if "RD" in block:
+        radius = scaled((_words(block, "RD") or ["0"])[0], factor, f"{place}: RD")
+        return {"radius": radius} if radius else {}
+    curvature = scaled((_words(block, "CV") or ["0"])[0], 1 / factor, f"{place}: CV")
+    if not curvature:
+        return {}
+    radius_or_none = radius_of(curvature)
+    return {"curvature": curvature} if radius_or_none is None else {"radius": radius_or_none}
+
+
+def _curved(image: Block, factor: Fraction, place: str) -> dict[str, float]:
+    shape = _shape(image, factor, place)
+    if shape["type"] == "even_asphere":
+        raise InputError(f"{place}: an aspheric image is not held")
+    if "curvature" in shape:
+        shape["radius"] = 1.0 / shape["curvature"]
+    return {key: shape[key] for key in ("radius", "conic") if key in shape}
+
+
+def _medium(block: Block, place: str) -> str:
+    if "RFL" in block or "RFH" in block:
+        return "mirror"
+    words = _words(block, "GLA")
+    if not words:
+        return "air"
+    if len(words) > 1:
+        raise InputError(f"{place}: a glass by its own indices is not held (GLA {words[0]})")
+    return glass_by_name_or_code(words[0].strip('"'), place)
+
+
+def _aperture(block: Block, factor: Fraction, place: str) -> dict[str, Any]:
+    """Return the size; one that OSLO does not check does not clip, and none is as large as must
+    be.
+    """
+    numbers = [word for word in _words(block, "AP") if word.upper() not in ("CHK", "NOP", "STD")]
+    if not numbers or number_in_text(numbers[0], f"{place}: AP") == 0.0:
+        return {"semi_diameter": "auto"}
+    size = {"semi_diameter": scaled(numbers[0], factor, f"{place}: AP")}
+    return size if _clips(block) else size | {"clips": False}
+
+
+def _clips(block: Block) -> bool:
+    return "CHK" in [word.upper() for word in _words(block, "AP")]
+
+
+def _gap(block: Block, factor: Fraction, place: str) -> Fraction:
+    words = _words(block, "TH")
+    gap = exact(words[0], f"{place}: TH") * factor if words else Fraction(0)
+    if not gap and "SOLVE" in block:
+        raise InputError(f"{place}: its gap is left to a solve, and none is written")
+    return gap
+
+
+def _refuse_places(block: Block, place: str) -> None:
+    """Refuse decenters and tilts that are not zero."""
+    for command in _PLACES:
+        if command not in block:
+            continue
+        words = _words(block, command)
+        if not words or any(number_in_text(word, f"{place}: {command}") for word in words[:1]):
+            raise InputError(f"{place}: a decentred or tilted surface is not held ({command})")
+
+
+def _words(lines: dict[str, Line], command: str) -> list[str]:
+    return lines[command].words if command in lines else []

@@ -1,0 +1,354 @@
+"""CODE V's .seq format: what its files mean."""
+
+import math
+
+import pytest
+import torch
+
+from dolens import Rays, Status, load_lens
+from dolens.prescriptions.codev.reader import read_codev
+from tests.prescriptions.codev_samples import SINGLET, TRIPLET, system
+from tests.prescriptions.zemax_samples import triplet as zemax_triplet
+
+
+def prescription(*surfaces, **parts):
+    return read_codev(system(*surfaces, **parts), "lens").prescription
+
+
+def numbers(rows):
+    return torch.tensor([[float(v) for v in row] for row in rows], dtype=torch.float64)
+
+
+def traced(path, rays):
+    return load_lens(path).trace(
+        Rays(
+            numbers(r["o"] for r in rays),
+            numbers(r["d"] for r in rays),
+            torch.tensor([float(r["wavelength"]) for r in rays], dtype=torch.float64),
+        )
+    )
+
+
+def test_the_triplet_traces_as_the_reference(tmp_path, reference):
+    """28-digit rays of the supplement's triplet through the same lens in CODE V's words, and the
+    same lens in Zemax's words gives the same rays.
+    """
+    path, other = tmp_path / "triplet.seq", tmp_path / "triplet.zmx"
+    path.write_text(TRIPLET)
+    other.write_text(zemax_triplet())
+    rays = reference("rays/rays_triplet__dfc.json")["rays"]
+    hit = traced(path, rays)
+    ok = torch.tensor([r["status"] == "ok" for r in rays])
+    assert torch.equal(hit.valid, ok)
+    assert torch.equal(hit.status == Status.OK, ok)
+    expected = numbers(r["sensor"] for r in rays if r["status"] == "ok")
+    assert (hit.position[ok][:, : expected.shape[1]] - expected).abs().max() < 1e-11
+    zemax = traced(other, rays)
+    assert (hit.position[ok] - zemax.position[ok]).abs().max() < 1e-12
+
+
+def test_what_a_file_says_of_its_system():
+    found, passed_over = read_codev(TRIPLET, "lens")
+    assert passed_over == []
+    assert {key: found[key] for key in found if key not in ("surfaces", "sensor")} == {
+        "name": "Cooke triplet",
+        "index_model": "dfc",
+        "wavelengths": [656.2725, 587.5618, 486.1327],
+        "reference_wavelength": 587.5618,
+        "fields": {"angles": [[0.0, 0.0], [0.0, 14.0], [0.0, 20.0]]},
+        "entrance_pupil_diameter": 10.2,
+        "object_material": "air",
+        "stop": 4,
+    }
+    assert found["sensor"] == {"distance": 42.208, "diameter": 36.346}
+    assert found["surfaces"]["3"] == {
+        "type": "sphere", "radius": -22.213, "material": "1.62/36.37", "semi_diameter": 4.0,
+        "thickness": 1.0,
+    }  # fmt: skip
+
+
+def test_commands_are_read_in_any_case_and_length():
+    """A command is its first three letters; `;` ends it, `&` continues it, `!` begins a remark."""
+    text = TRIPLET.lower().replace("title", "titleofthelens").replace("epd   10.2\n", "epd 10.2; ")
+    text = text.replace("s     79.684 2.952", "s &\n 79.684 2.952 & ! a remark; not a command\n")
+    found = read_codev(text, "lens").prescription
+    wanted = read_codev(TRIPLET, "lens").prescription
+    assert found["surfaces"] == wanted["surfaces"]
+    assert found["entrance_pupil_diameter"] == 10.2
+
+
+def test_quotes_hold_marks():
+    found = prescription(*SINGLET, head="RDM\nTITLE 'Questar 3.5\"; with ! and &'\nEPD 8\n")
+    assert found["name"] == 'Questar 3.5"; with ! and &'
+
+
+@pytest.mark.parametrize(("unit", "u"), [("M", 1.0), ("C", 10.0), ("I", 25.4)])
+def test_units(unit, u):
+    """A length u·r in mm; the coefficient of r^2i in mm^(1-2i) is u^(1-2i) of the file's."""
+    found = prescription(
+        "S 50 4 517.642\n STO\n ASP; K -0.5; A 1e-6; B -2e-9\n CIR 5",
+        "S -50 40\n CIR 5",
+        head=f"RDM\nDIM {unit}\nEPD 8\nWL 550\nYOB 0 3\n",
+        target="SO 0 200",
+        image="SI 0 0.5\n CIR 7",
+    )
+    first, second = found["surfaces"].values()
+    assert first["type"] == "even_asphere"
+    assert first["conic"] == -0.5
+    for key, power in (("radius", 1), ("a4", -3), ("a6", -5), ("thickness", 1)):
+        value = {"radius": 50.0, "a4": 1e-6, "a6": -2e-9, "thickness": 4.0}[key]
+        assert first[key] == pytest.approx(value * u**power, rel=1e-15)
+    assert second["semi_diameter"] == pytest.approx(5.0 * u, rel=1e-15)
+    assert found["sensor"] == pytest.approx({"distance": 40.5 * u, "diameter": 14.0 * u}, rel=1e-15)
+    assert found["object_distance"] == pytest.approx(200.0 * u, rel=1e-15)
+    assert found["entrance_pupil_diameter"] == pytest.approx(8.0 * u, rel=1e-15)
+    assert found["fields"]["heights"][1] == [0.0, pytest.approx(3.0 * u, rel=1e-15)]
+
+
+@pytest.mark.parametrize("head", ["RDM N\nEPD 8\n", "EPD 8\n"])
+def test_curvatures(head):
+    """Without RDM CODE V takes curvatures."""
+    found = prescription("S 0.02 4 517.642\n STO", "S 0.0 40", head=head)
+    assert found["surfaces"]["1"]["radius"] == 50.0
+    assert found["surfaces"]["2"]["type"] == "plane"
+
+
+GLASSES = {
+    "NBK7_SCHOTT": "SCHOTT:N-BK7",
+    "N-SK16_Schott": "SCHOTT:N-SK16",
+    "F2_SCHOTT": "SCHOTT:F2",
+    "SLAL8_OHARA": "OHARA:S-LAL8",
+    "STIH53_OHARA": "OHARA:S-TIH53",
+    "'NSF5_SCHOTT'": "SCHOTT:N-SF5",
+    "517642": "1.517/64.2",
+    "517.642": "1.517/64.2",
+    "516800.641700": "1.5168/64.17",
+    "784.25": "1.784/25",
+    "1.5168:64.17": "1.5168/64.17",
+    "AIR": "air",
+    "": "air",
+}
+
+
+@pytest.mark.parametrize("word", GLASSES)
+def test_glass_by_name_and_by_code(word):
+    found = prescription(f"S 50 4 {word}\n STO", "S -50 40")
+    assert found["surfaces"]["1"]["material"] == GLASSES[word]
+
+
+def test_private_glass_by_indices():
+    """A table is a constant where all indices are one, and else nd and Vd that give its indices."""
+    head = (
+        "PRV\n PWL 656.3 587.6 486.1\n 'CONST' 1.5 1.5 1.5\n 'CROWN' 1.51432 1.5168 1.52237\nEND\n"
+    )
+    first = "S 50 4 'CROWN'\n STO"
+    found = prescription(first, "S -50 40 'const'", head=f"RDM;EPD 8;WL 600\n{head}")
+    nd, vd = found["surfaces"]["1"]["material"].split("/")
+    assert float(nd) == 1.5168
+    assert float(vd) == pytest.approx(0.5168 / (1.52237 - 1.51432), rel=1e-12)
+    assert found["surfaces"]["2"]["material"] == "1.5"
+
+
+def test_mirrors_and_their_signs():
+    found = prescription("S -200 -50 REFL\n STO\n CON\n K -1", "S 0 -50")
+    assert found["surfaces"]["1"] == {
+        "type": "conic", "radius": -200.0, "conic": -1.0, "material": "mirror", "thickness": -50.0,
+    }  # fmt: skip
+    assert found["surfaces"]["2"]["material"] == "air"
+    assert found["sensor"]["distance"] == -50.0
+
+
+def test_the_medium_in_front_of_a_mirror_comes_back_behind_it():
+    found = prescription("S -120 1 NBK7_SCHOTT\n STO", "S -100 -1 REFL", "S -120 -50")
+    assert [row["material"] for row in found["surfaces"].values()] == [
+        "SCHOTT:N-BK7",
+        "mirror",
+        "air",
+    ]
+
+
+def test_vignetting():
+    """VUY cuts the upper edge of the pupil: p = 1 becomes 1 - VUY, p = -1 becomes -1 + VLY."""
+    found = prescription(*SINGLET, head="RDM\nEPD 8\nYAN 0 14\nVUY 0 0.4\nVLY 0 0.25\n")
+    axis, edge = found["fields"]["vignetting"]
+    assert set(axis.values()) == {0.0}
+    upper = edge["decenter_y"] + (1.0 - edge["compression_y"])
+    lower = edge["decenter_y"] - (1.0 - edge["compression_y"])
+    assert upper == pytest.approx(1.0 - 0.4, abs=1e-15)
+    assert lower == pytest.approx(-1.0 + 0.25, abs=1e-15)
+
+
+def test_weights():
+    head = "RDM\nEPD 8\nWL 656 588 486\nWTW 1 2 1\nYAN 0 14\nWTF 2 1\n"
+    found = prescription(*SINGLET, head=head)
+    assert found["wavelength_weights"] == [1.0, 2.0, 1.0]
+    assert found["fields"]["weights"] == [2.0, 1.0]
+    assert found["reference_wavelength"] == 588.0
+
+
+def test_pupils():
+    """FNO is that of a far object, or of the cone at the image; NA is the sine of its angle."""
+    near = {"target": "SO 0 100"}
+    assert prescription(*SINGLET, head="RDM;FNO 5\n")["f_number"] == 5.0
+    assert prescription(*SINGLET, head="RDM;FNO 5\n", **near)["working_f_number"] == 5.0
+    assert prescription(*SINGLET, head="RDM;NAO 0.1\n", **near)["object_na"] == 0.1
+    found = prescription(*SINGLET, head="RDM;NA 0.6\n")["f_number"]
+    assert found == pytest.approx(0.8 / (2.0 * 0.6), rel=1e-15)
+
+
+def test_apertures():
+    found = prescription(
+        "S 50 4 517.642\n STO\n CIR 5\n CIR EDG 6\n CIR OBS L'A' 1",
+        "S -50 2\n REX 3; REY 4",
+        "S 0 2\n CIR EDG 6",
+        "S 0 40",
+        "S 0 1\n CIR 3; ADY 20\n ELX OBS 1; ELY OBS 2; ADY OBS 20",
+    )
+    rows = found["surfaces"]
+    assert rows["5"]["aperture"] == {"semi_diameter": 3.0, "decenter_y": 20.0}
+    assert rows["5"]["obscuration"] == {
+        "semi_axis_x": 1.0, "semi_axis_y": 2.0, "decenter_y": 20.0,
+    }  # fmt: skip
+    assert rows["1"]["semi_diameter"] == 5.0
+    assert rows["1"]["obscuration"] == {"semi_diameter": 1.0}
+    assert rows["2"]["aperture"] == {"half_width_x": 3.0, "half_width_y": 4.0}
+    assert (rows["3"]["semi_diameter"], rows["3"]["clips"]) == (6.0, False)
+    assert rows["4"]["semi_diameter"] == "auto"
+
+
+def test_coefficients_that_nobody_uses_are_no_parameters():
+    found = prescription("S 50 4 517.642\n STO\n ASP; K 0; A 0.0; B 1e-9; C 0.0; D 0.0", "S 0 40")
+    row = found["surfaces"]["1"]
+    assert {key: row[key] for key in row if key[0] == "a"} == {"a4": 0.0, "a6": 1e-9}
+
+
+def test_a_stop_in_one_medium_is_an_aperture():
+    assert (
+        prescription("S 0 4\n STO", "S 50 4 517.642", "S -50 40")["surfaces"]["1"]["type"]
+        == "aperture"
+    )
+
+
+def test_the_first_surface_is_the_stop_unless_one_says_so():
+    assert prescription("S 50 4 517.642", "S -50 40")["stop"] == 1
+    assert prescription("S 50 4 517.642", "S -50 40", "STO S2")["stop"] == 2
+
+
+def test_commands_that_name_their_surface():
+    found = prescription("S 50 4 517.642\n STO", "S 0 40", "RDY S2 -70\nTHI S2 60\nK S2 -1")
+    assert found["surfaces"]["2"]["radius"] == -70.0
+    assert found["surfaces"]["2"]["conic"] == -1.0
+    assert found["sensor"]["distance"] == 60.0
+
+
+def test_the_paraxial_image_solve(tmp_path):
+    """PIM puts the image where a thin bundle of the reference wavelength meets the axis."""
+    for written in ("0", "999"):
+        found = prescription(SINGLET[0], f"S -50 {written}\n CIR 5\n PIM", image="SI 0 -0.25")
+        path = tmp_path / "lens.seq"
+        path.write_text(system(SINGLET[0], f"S -50 {written}\n CIR 5\n PIM"))
+        lens = load_lens(path)
+        focus = float(lens.first_order(587.6).bfd)
+        assert float(lens.sensor_distance) == pytest.approx(focus, rel=1e-12)
+        assert found["sensor"]["distance"] == pytest.approx(focus - 0.25, rel=1e-12)
+
+
+def test_the_paraxial_image_of_a_near_object(tmp_path):
+    path = tmp_path / "lens.seq"
+    path.write_text(system(SINGLET[0], "S -50 0\n CIR 5\n PIM", target="SO 0 100"))
+    lens = load_lens(path).requires_grad_(False)
+    y = 1e-4
+    ray = Rays(torch.tensor([0.0, 0.0, -100.0]), torch.tensor([0.0, y / 100.0, 1.0]), 587.6)
+    assert abs(float(lens.trace(ray).position[1])) < 1e-9
+
+
+def test_a_value_that_a_solve_wrote_is_kept():
+    """Its last digits come from CODE V's own glass data."""
+    solved = prescription(SINGLET[0], "S -50 0\n CIR 5\n PIM")["sensor"]["distance"]
+    near = round(solved + 0.003, 6)
+    assert prescription(SINGLET[0], f"S -50 {near}\n PIM")["sensor"]["distance"] == near
+
+
+def test_zoom_positions_are_said():
+    zoom = "ZOO 2\nZOO THI S2 40 50\nZOO EPD 8 9\nZOO THC S2 100 100"
+    found, said = read_codev(system(*SINGLET, "SI 0 0", zoom, image=""), "lens")
+    assert found["sensor"]["distance"] == 40.0
+    assert said == ["position 2 of 2 (ZOO); position 1 is read"]
+
+
+# What follows a surface with YDE 2 and ADE 30, by how it moves the axes.
+MOVED = {"decenter_y": 2.0, "tilt_x": -30.0}
+BACK = {"decenter_y": -2.0, "tilt_x": 30.0, "order": "tilt_first"}
+KINDS = {
+    "": [{"type": "coordinate_break", **MOVED, "thickness": 0.0}, "lens"],
+    "DAR": [{"type": "coordinate_break", **MOVED, "thickness": 0.0}, "lens", BACK],
+    "REV": ["lens", BACK],
+    "BEN": [{"type": "coordinate_break", **MOVED, "thickness": 0.0}, "lens", {"tilt_x": -30.0}],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_decenters_and_tilts_become_breaks(kind):
+    """ADE and BDE are left-handed, CDE is right-handed."""
+    first = f"S -100 -20 REFL\n STO\n YDE 2; ADE 30\n {kind}"
+    rows = list(prescription(first, "S 0 -30\n CIR 5")["surfaces"].values())
+    expected = KINDS[kind]
+    assert len(rows) == len(expected) + 1
+    for row, wanted in zip(rows, expected, strict=False):
+        if wanted == "lens":
+            assert row["material"] == "mirror"
+        else:
+            assert {"type": "coordinate_break", **wanted}.items() <= row.items()
+    gaps = [row["thickness"] for row in rows[:-1]]
+    assert math.fsum(gaps) == -20.0
+    assert gaps[-1] == -20.0
+
+
+def test_a_plane_for_its_tilt_alone_is_a_break():
+    rows = prescription(*SINGLET, "S 0 7\n BDE 10; CDE 5; ZDE 1", "S 0 3\n REV\n XDE 4")["surfaces"]
+    assert rows["2"]["thickness"] == 41.0
+    assert rows["3"] == {
+        "type": "coordinate_break", "tilt_y": -10.0, "tilt_z": 5.0, "thickness": 7.0,
+    }  # fmt: skip
+    assert rows["4"] == {"type": "coordinate_break", "decenter_x": -4.0, "order": "tilt_first"}
+
+
+def test_a_tilted_image():
+    found = prescription(*SINGLET, image="SI 0 1.5\n YDE -3; ADE 8")
+    assert found["surfaces"]["3"] == {
+        "type": "coordinate_break", "decenter_y": -3.0, "tilt_x": -8.0,
+    }  # fmt: skip
+    assert found["surfaces"]["2"]["thickness"] == 40.0
+    assert found["sensor"]["distance"] == 1.5
+
+
+def test_a_polynomial_in_x_and_y():
+    """Coefficient ((m + n)² + m + 3n)/2 + 1 is that of x^m·y^n."""
+    first = "S 0 4 517.642\n STO\n SPS XYP\n SCO C1 0.0; SCO C4 1e-3; SCO C5 0.0; SCO C8 -2e-5"
+    found = prescription(first, "S 0 40", head="RDM;EPD 8;DIM C\n")
+    row = found["surfaces"]["1"]
+    assert row["type"] == "xy_polynomial"
+    assert {key: row[key] for key in row if key[0] in "xy"} == {
+        "x2": 1e-4,
+        "x2y": pytest.approx(-2e-7, rel=1e-15),
+    }
+
+
+def test_a_forbes_asphere():
+    """The numbers of CODE V's listing of a three-mirror anastigmat: NRADIUS, QB4, QB6."""
+    first = "S -449.67012 9 REFL\n STO\n SPS QBF\n SCO C1 189.86; SCC C1 100; SCO C3 0.42605"
+    row = prescription(first + "\n SCO C4 -0.016782", "S 0 40")["surfaces"]["1"]
+    assert row["type"] == "q_bfs"
+    assert row["normalization_radius"] == 189.86
+    assert (row["q0"], row["q1"]) == (0.42605, -0.016782)
+
+
+def test_a_diffractive_lens(tmp_path):
+    """A kinoform's power is -2·m·C1·λ/HWL: the numbers of Edmund Optics' hybrid 65-988."""
+    doe = "DIF DOE\n HOR 1.0\n HWL 587.5618; HCT R\n HCO C1 -0.001807322521767816; HCC C1 100"
+    path = tmp_path / "lens.seq"
+    path.write_text(system(f"S 0 1\n STO\n CIR 6\n {doe}", "S 0 99\n CIR 8"))
+    lens = load_lens(path)
+    for wavelength in (486.1327, 587.5618, 656.2725):
+        power = 2.0 * 0.001807322521767816 * wavelength / 587.5618
+        assert float(lens.first_order(wavelength).efl) == pytest.approx(1.0 / power, rel=1e-12)
