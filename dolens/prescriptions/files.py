@@ -41,6 +41,8 @@ _LENSES = "lens"
 _PUBLISHED = "published"
 # What holds the numbers that a source publishes.
 _WHOLE = (".yaml", ".yml", ".json")
+# What has no place for the source itself; `dolens convert` says that it is lost.
+_WITHOUT_SOURCE = (".seq", ".txt")
 
 
 def lens_names() -> list[str]:
@@ -216,5 +218,7 @@ def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None
     prescription = prescription_of(lens)
     if path.suffix.lower() not in _WHOLE:
         prescription.pop(PUBLISHED_KEY, None)
+    if path.suffix.lower() in _WITHOUT_SOURCE:
+        prescription.pop("source", None)
     with glass_folders(glass_catalogues):
         path.write_bytes(encode_prescription(prescription, path))
