@@ -9,9 +9,11 @@ import math
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.materials import index_model, parse_material
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.decimals import radius_of
 from dolens.prescriptions.json_values import difference, mapping, number, rows
+from dolens.prescriptions.paraxial_image import paraxial_image
 from dolens.prescriptions.read_file import ReadPrescription
 
 _STOPS = ("Aperture", "Stop")
@@ -27,6 +29,9 @@ _NOT_HELD = {
 }
 # Positions and gaps are rounded on their own, mm.
 _POSITIONS = 1e-3
+# Focal lengths that are noted are rounded, and of other wavelengths.
+_FOCAL_LENGTHS = 0.05
+_D_LINE = 587.5618
 
 
 def read_deeplens(content: dict[str, Any], where: str) -> ReadPrescription:
