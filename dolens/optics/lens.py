@@ -25,7 +25,7 @@ from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
 from dolens.optics.thermal_lens import lens_at
-from dolens.optics.vergence import with_vergences
+from dolens.optics.vergence import ideal_lenses, with_vergences
 
 
 class Lens(LensRays, LensViews, nn.Module):
@@ -239,6 +239,8 @@ class Lens(LensRays, LensViews, nn.Module):
             mirrors,
             self.reversals,
         )
+        if not ideal_lenses(system):
+            return system
         return with_vergences(system, self.primary_wavelength, vergence(self.object_distance))
 
     def at(self, temperature: float, pressure: float | None = None) -> "Lens":

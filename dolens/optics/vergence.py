@@ -14,6 +14,12 @@ from dolens.optics.system import OpticalSystem
 _LARGEST = 1e9
 
 
+def ideal_lenses(system: OpticalSystem) -> list[int]:
+    """Return the places of ideal lenses among the surfaces, from 0."""
+    laws = [surface.deflection for surface in system.surfaces]
+    return [i for i, law in enumerate(laws) if law is not None and law.law is IdealLens]
+
+
 def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tensor) -> OpticalSystem:
     """Return the system with the reduced vergence of the axial beam at each of its ideal lenses.
 
@@ -27,10 +33,10 @@ def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tenso
         near: one over the object's distance in front of the first vertex, 1/mm; zero at infinity.
             A tensor of several is for rays that broadcast with it, traced by the reference.
     """
-    laws = [s.deflection for s in system.surfaces]
-    lenses = [i for i, law in enumerate(laws) if law is not None and law.law is IdealLens]
+    lenses = ideal_lenses(system)
     if not lenses:
         return system
+    laws = [surface.deflection for surface in system.surfaces]
     index = system.signed_indices(wavelength)
     near = torch.as_tensor(near, dtype=system.dtype, device=system.device)
     one = torch.ones_like(near)

@@ -164,6 +164,9 @@ def _picked_up(
         if not surfaces and words[0] != _BLANK:
             return [words[0], "0", *words[2:]]
         if number not in range(len(surfaces)):
+            if words[0] != _BLANK:
+                # Zemax writes the name that was picked up.
+                return [words[0], "0", *words[2:]]
             break
         words = surfaces[int(number)]
     raise InputError(f"{place}: GLAS picks up from surface {words[2]}, which has no glass to give")
