@@ -11,8 +11,8 @@ from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet
 
 GOOD = ("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
 BAD = {
-    "toroid": (singlet("TYPE BICONICX", *GOOD),
-               "surface 1: a biconic surface is not held (TYPE BICONICX; allowed: STANDARD, "),
+    "superconic": (singlet("TYPE SUPERCON", *GOOD),
+                   "surface 1: a superconic is not held (TYPE SUPERCON; allowed: STANDARD, "),
     "gradient index": (singlet("TYPE GRINSUR5", *GOOD), "surface 1: a gradient-index medium is"),
     "non-sequential part": (singlet("TYPE NONSEQCO", *GOOD, "NSCS 1 7 _NONE_"),
                             "surface 1: a non-sequential component is not held"),
