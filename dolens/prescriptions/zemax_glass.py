@@ -161,13 +161,11 @@ def _picked_up(
         if len(words) < 3 or words[1] != _PICKUP:
             return words
         number = number_in_text(words[2], f"{place}: GLAS {words[0]}: pick-up")
-        if not surfaces and words[0] != _BLANK:
-            return [words[0], "0", *words[2:]]
         if number not in range(len(surfaces)):
-            if words[0] != _BLANK:
-                # Zemax writes the name that was picked up.
-                return [words[0], "0", *words[2:]]
-            break
+            if words[0] == _BLANK:
+                break
+            # Part of a file: the name is what the pick-up gave.
+            return [words[0], "0", *words[2:]]
         words = surfaces[int(number)]
     raise InputError(f"{place}: GLAS picks up from surface {words[2]}, which has no glass to give")
 

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from dolens import InputError, load_lens, save_lens
+from dolens.optics.glass_catalog import find_glass
 from dolens.optics.materials import abbe_number, index_d, index_model, parse_material
+from dolens.optics.thermal import Environment
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
@@ -130,10 +132,27 @@ def test_pick_ups(surfaces, found):
     assert pickup(*surfaces) == found
 
 
-@pytest.mark.parametrize("surfaces", [["___BLANK 2 9"], ["___BLANK 2 0"], ["", "F2 2 1 0 0"]])
+@pytest.mark.parametrize(
+    "surfaces", [["___BLANK 2 9"], ["___BLANK 2 0"], ["", "F2 2 1 0 0"], ["___BLANK 2 -1"]]
+)
 def test_a_pick_up_from_nowhere(surfaces):
     with pytest.raises(InputError, match="GLAS picks up from surface"):
         pickup(*surfaces)
+
+
+def test_a_file_s_temperature_and_its_pick_ups():
+    """ENVD with 1 as third number: indices are those at 60 °C and 0.5 atm."""
+    head = "GCAT SCHOTT\nFLOA\nENVD 60 0.5 1\n"
+    text = singlet("CURV 0.02", "DIAM 5 1", "GLAS SF6", head=head, last="GLAS ___BLANK 2 1 1.5 40")
+    found = prescription_from_zemax(text, "lens.zmx")
+    assert (found["temperature"], found["pressure"]) == (60.0, 0.5)
+    assert [row["material"] for row in found["surfaces"].values()] == ["SCHOTT:SF6"] * 2
+    lens = lens_from_prescription(found)
+    warm = find_glass("SCHOTT:SF6").at(Environment(60.0, 0.5))
+    assert lens.materials[1] == warm
+    assert abs(warm.index(550.0) - find_glass("SCHOTT:SF6").index(550.0)) > 1e-4
+    written = prescription_from_zemax(zemax_of(prescription_of(lens)), "lens.zmx")
+    assert lens_from_prescription(written).materials == lens.materials
 
 
 def test_a_refusal_says_what_could_be_written_instead():
