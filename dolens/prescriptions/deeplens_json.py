@@ -9,9 +9,11 @@ import math
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.materials import index_model, parse_material
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.decimals import radius_of
 from dolens.prescriptions.json_values import difference, mapping, number, rows
+from dolens.prescriptions.paraxial_image import paraxial_image
 from dolens.prescriptions.read_file import ReadPrescription
 
 _STOPS = ("Aperture", "Stop")
@@ -27,6 +29,9 @@ _NOT_HELD = {
 }
 # Positions and gaps are rounded on their own, mm.
 _POSITIONS = 1e-3
+# Focal lengths that are noted are rounded, and of other wavelengths.
+_FOCAL_LENGTHS = 0.05
+_D_LINE = 587.5618
 
 
 def read_deeplens(content: dict[str, Any], where: str) -> ReadPrescription:
@@ -60,8 +65,37 @@ def read_deeplens(content: dict[str, Any], where: str) -> ReadPrescription:
     if content.get("info"):
         prescription = {"name": str(content["info"]), **prescription}
     prescription["sensor"] = _sensor(content, mapping(entries[-1], where), end, where)
-    passed = [f"{key}, which follows from the lens" for key in ("foclen", "fnum") if key in content]
-    return ReadPrescription(prescription, passed)
+    _require_focal_length(content, found, where)
+    return ReadPrescription(prescription, [])
+
+
+def _require_focal_length(
+    content: dict[str, Any], surfaces: dict[str, dict[str, Any]], where: str
+) -> None:
+    """Refuse a lens whose own focal length is not the one that the file notes.
+
+    Some programs built on DeepLens fold the light between the surfaces of a file; then the surfaces
+    one after the other are another lens.
+    """
+    if content.get("foclen") is None:
+        return
+    said = as_number(content["foclen"], f"{where}: 'foclen'")
+    model = index_model("dfc")
+    curvatures, indices = [], [1.0]
+    for row in surfaces.values():
+        radius = row.get("radius", math.inf)
+        curvatures.append(row.get("curvature", 1.0 / radius) + 2.0 * row.get("a2", 0.0))
+        try:
+            indices.append(float(parse_material(str(row["material"]), model).index(_D_LINE)))
+        except InputError:
+            return  # the lens is refused for this medium, by name, when it is built
+    gaps = [row["thickness"] for row in surfaces.values() if "thickness" in row]
+    own = paraxial_image(curvatures, gaps, indices, None, where).focal_length
+    if abs(own - said) > _FOCAL_LENGTHS * abs(said):
+        raise InputError(
+            f"{where}: 'foclen' says {said:.4g} mm, and the surfaces one after the other give "
+            f"{own:.4g} mm: a folded path, or what else makes the difference, is not held"
+        )
 
 
 def _row(surface: dict[str, Any], before: str, place: str) -> dict[str, Any]:

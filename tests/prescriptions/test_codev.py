@@ -314,12 +314,13 @@ def test_a_plane_for_its_tilt_alone_is_a_break():
 
 
 def test_a_tilted_image():
+    """The defocus of SI lies along the axis in front of the tilt."""
     found = prescription(*SINGLET, image="SI 0 1.5\n YDE -3; ADE 8")
     assert found["surfaces"]["3"] == {
         "type": "coordinate_break", "decenter_y": -3.0, "tilt_x": -8.0,
     }  # fmt: skip
-    assert found["surfaces"]["2"]["thickness"] == 40.0
-    assert found["sensor"]["distance"] == 1.5
+    assert found["surfaces"]["2"]["thickness"] == 41.5
+    assert found["sensor"]["distance"] == 0.0
 
 
 def test_a_polynomial_in_x_and_y():

@@ -120,7 +120,8 @@ def replaced(old, new, text=ASPHERE):
 COLUMNS = "type distance roc diameter material"
 BAD = {
     "no columns": (replaced(COLUMNS + "\n", ""), "line 2 must name the columns"),
-    "empty": ("", "line 2 must name the columns"),
+    "empty": ("", "is empty"),
+    "one line": ("title", "line 2 must name the columns"),
     "unknown letter": (replaced("S 21.0", "T 21.0"),
                        "line 5: row type 'T' cannot be read (allowed: O, S, A, X and I)"),
     "two letters": (replaced("S 21.0", "OS 21.0"), "line 5: row type 'OS' cannot be read"),

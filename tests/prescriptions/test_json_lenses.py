@@ -12,7 +12,7 @@ from tests.prescriptions.samples import SINGLET, require_refused
 # A singlet in the words of each program: N-BK7, R 20 and -50 mm, 5 mm thick, stop in front.
 DEEPLENS = {
     "info": "Singlet",
-    "foclen": 28.0,
+    "foclen": 28.4,
     "fnum": 4.0,
     "r_sensor": 5.0,
     "d_sensor": 37.0,
@@ -173,6 +173,7 @@ REFUSED = [
     (changed(DEEPLENS, ("surfaces", 2, "type"), "ThinLens"), "a paraxial lens is not held"),
     (changed(DEEPLENS, ("surfaces", 2, "d_next"), 29.0), "'d_sensor' puts the sensor 30 mm"),
     (changed(DEEPLENS, ("surfaces", 0, "type"), "Plane"), "no surface is the stop"),
+    (changed(DEEPLENS, ("foclen",), 15.0), "'foclen' says 15 mm, and the surfaces one after"),
     (changed(DEEPLENS, ("DOE",), {"type": "Grating"}), "a diffractive element is not held"),
     (
         changed(OPTILAND, ("surface_group", "surfaces", 2, "geometry", "cs", "rx"), 0.1),

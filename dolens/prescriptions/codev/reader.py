@@ -136,14 +136,14 @@ def _is_idle(block: Block, surface: Surface) -> bool:
 def _with_sensor(
     found: dict[str, Any], rows: _Rows, axes: Axes, image: Block, factor: Fraction, where: str
 ) -> dict[str, Any]:
-    """Put the image where it is: at the last gap, moved by the thickness of SI."""
+    """Put the image where it is: behind the last gap and the thickness of SI, its defocus, and
+    then at its own decenter and tilt.
+    """
     place = f"{where}: surface SI"
     defocus = exact(image.words[1] if len(image.words) > 1 else "0", f"{place}: defocus") * factor
-    rows.gaps[-1] += axes.shift_before
+    rows.gaps[-1] += axes.shift_before + defocus
     if axes.before is not None:
-        rows.append(axes.before, defocus)
-    else:
-        rows.gaps[-1] += defocus
+        rows.append(axes.before, Fraction(0))
     for row, gap in zip(rows.rows[:-1], rows.gaps, strict=False):
         row["thickness"] = nearest(gap, where)
     sensor: dict[str, Any] = {"distance": nearest(rows.gaps[-1], where)}
