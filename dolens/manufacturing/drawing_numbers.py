@@ -28,22 +28,28 @@ EQUATIONS = {
     "implicit": r"$z=\sum_{ij} a_{ij}\,x^i y^j+b\,z^2$",
     "odd_asphere": f"$z={_CONIC}{_POWERS}$",
     "biconic": r"$z=\dfrac{x^2/R_x+y^2/R_y}{1+\sqrt{1-(1+k_x)\,x^2/R_x^2-(1+k_y)\,y^2/R_y^2}}$",
-    "toroid": (
-        r"$f=\dfrac{y^2/R_y}{1+\sqrt{1-(1+k_y)\,y^2/R_y^2}}+\sum_i a_i\,y^i,\quad g=1-f/R_x,\quad "
-        r"z=f+\dfrac{x^2/R_x}{g+\sqrt{g^2-x^2/R_x^2}}$"
-    ),
-    "zernike_standard": f"{_ZERNIKE}, Z in Noll's order",
-    "zernike_fringe": f"{_ZERNIKE}, Z in fringe order",
+    "toroid": r"$z=f(y)+\dfrac{x^2/R_x}{g+\sqrt{g^2-x^2/R_x^2}},\quad g=1-f(y)/R_x$",
+    "zernike_standard": _ZERNIKE,
+    "zernike_fringe": _ZERNIKE,
     "q_con": f"$z={_CONIC}" + r"+u^4\sum_m q_m\,Q_m^{\mathrm{con}}(u^2)$",
-    "q_bfs": (
-        f"$z={_CONIC}"
-        r"+u^2(1-u^2)\,\sqrt{\dfrac{1-k\,r^2/R^2}{1-(1+k)\,r^2/R^2}}"
-        r"\sum_m q_m\,Q_m^{\mathrm{bfs}}(u^2)$"
-    ),
+    "q_bfs": r"$z=z_k(r)+\dfrac{u^2(1-u^2)}{\cos\psi}\sum_m q_m\,Q_m^{\mathrm{bfs}}(u^2)$",
 }
 # Numbers of a surface that are no coefficients, and their symbols on a drawing.
 _SYMBOLS = {"conic": "k", "conic_x": "k_x", "conic_y": "k_y"}
-_LENGTHS = ("normalization_radius", "decenter_x", "decenter_y")
+_LENGTHS = {
+    "normalization_radius": "norm. radius",
+    "decenter_x": "decentre x",
+    "decenter_y": "decentre y",
+}
+# What an equation leaves to words.
+_MEANINGS = {
+    "toroid": ("f(y)", "conic of Ry and k_y, plus Σ a_i·yⁱ"),
+    "zernike_standard": ("Z", "Zernike polynomials, Noll's order and norm"),
+    "zernike_fringe": ("Z", "Zernike polynomials, fringe order"),
+    "q_con": ("Q", "Forbes 2007, u = r/norm. radius"),
+    "q_bfs": ("Q, ψ", "Forbes 2007; ψ: slope of z_k, conic of R, k"),
+    "grid_sag": ("grid", "in the design's YAML file"),
+}
 
 
 def length(value: float, least: int = 3, most: int = 6) -> str:
@@ -131,21 +137,24 @@ def coefficient_rows(face: Face) -> list[tuple[str, str]]:
         if c:
             rows.append((f"{symbol}, signed", f"{length(1.0 / c)} mm ({side})"))
     for name, value in face.parameters.items():
-        if name.startswith("curvature") or value.dim() > 0:
+        if name.startswith(("curvature", "spacing")) or value.dim() > 0:
             continue
         symbol = _SYMBOLS.get(name, name)
         if name in _SYMBOLS:
             rows.append((symbol, length(float(value))))
             continue
         if name in _LENGTHS:
-            rows.append((symbol.replace("_", " "), f"{length(float(value))} mm"))
+            rows.append((_LENGTHS[name], f"{length(float(value))} mm"))
             continue
         power = _power(name)
-        unit = f" mm{str(power).translate(_RAISED)}" if power != 0 else ""
+        raised = "" if power == 1 else str(power).translate(_RAISED)
+        unit = f" mm{raised}" if power != 0 else ""
         rows.append((symbol, coefficient(float(value)) + unit))
     if issubclass(face.shape, BSpline):
         count = "×".join(map(str, face.parameters["coefficients"].shape))
         rows.append(("coefficients", f"{count}, in the design's YAML file"))
+    if face.shape.kind in _MEANINGS:
+        rows.append(_MEANINGS[face.shape.kind])
     return rows
 
 
