@@ -14,6 +14,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tests.optics.random_lenses import KINDS, SAG_KINDS
 from tests.optics.ray_facts import PRECISIONS, cases, violations
 
 
@@ -24,7 +25,11 @@ def main() -> int:
     parser.add_argument("--rays", type=int, default=1000, help="of each lens, from either side")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so many")
+    parser.add_argument(
+        "--sags", action="store_true", help="odd aspheres, biconics, toroids, Zernike, ... instead"
+    )
     options = parser.parse_args()
+    kinds = SAG_KINDS if options.sags else KINDS
     end, done = time.monotonic() + 60.0 * options.minutes, 0
     rays, lenses, seeds, traced = Counter(), defaultdict(set), defaultdict(dict), 0
     for number in range(options.first, options.first + options.lenses):
@@ -34,7 +39,7 @@ def main() -> int:
         seed, wild = divmod(number, 2)
         # The reference's take their time, with a column for every coefficient of a spline.
         jacobians = ("reference", "cpu") if seed % 100 == 0 else ("cpu",)
-        for way, lens, bundle, sense in cases(seed, bool(wild), options.rays):
+        for way, lens, bundle, sense in cases(seed, bool(wild), options.rays, kinds):
             for dtype in PRECISIONS:
                 traced += 2 * len(bundle.position)
                 for rule, count in violations(lens, bundle, sense, dtype, jacobians).items():

@@ -102,8 +102,14 @@ def beam_half_width(lens: Lens, tangent: float) -> float:
     """Return the half-width (mm), in the plane of the first vertex, of a beam that fills the first
     surface.
     """
-    surface = lens.system().surfaces[0]
-    return surface.semi_diameter + tangent * float(surface.rim_sag(lens.sensor_distance.detach()))
+    system = lens.system()
+    first = system.met[0]
+    surface = system.surfaces[first - 1]
+    width = surface.semi_diameter + tangent * float(surface.rim_sag(lens.sensor_distance.detach()))
+    if not system.breaks:
+        return width
+    vertex = system.global_axes().origin[first - 1].detach()
+    return width + float(vertex[:2].norm()) + tangent * abs(float(vertex[2]))
 
 
 def gaussian_quadrature(

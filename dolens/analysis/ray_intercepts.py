@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, field_tangents, launch
+from dolens.optics.fields import vignetting_margin
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.ray_tracing import trace_rays
@@ -141,6 +142,7 @@ def trace_ray_intercepts(
     system = lens.system()
     hit, chief = trace_rays(system, rays), trace_rays(system, chief_rays)
     valid = hit.valid & started
+    valid = valid & (vignetting_margin(lens.fields, field, pupil) > 0.0)[:, None]
     reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
     reached = reached & aimed.converged[:, at, 0]
     return RayIntercepts(

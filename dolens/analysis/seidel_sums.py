@@ -14,7 +14,7 @@ from dolens.optics.seidel import Seidel
 
 
 class Aberration(NamedTuple):
-    """How an aberration is called.
+    """An `Aberration` is a Seidel sum by name.
 
     Attributes:
         name: in full.

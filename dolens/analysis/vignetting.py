@@ -5,6 +5,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays
+from dolens.optics.fields import vignetting_margin
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 
@@ -34,8 +35,12 @@ class VignettedPupils:
         return self.lens.aim(self.fields[:, None], pupil, wavelength, self.object_distance)
 
     def passes(self, pupil: Tensor) -> Tensor:
-        """Return whether rays through points of the stop pass the lens, (F, N), bool."""
-        return trace_rays(self.lens.system(), self.aim(pupil)).valid.cpu()
+        """Return whether rays through points of the stop pass the lens, (F, N), bool.
+
+        Of the lens's own fields those outside the beam that vignetting factors leave do not.
+        """
+        beam = vignetting_margin(self.lens.fields, self.fields, pupil) > 0.0
+        return trace_rays(self.lens.system(), self.aim(pupil)).valid.cpu() & beam.cpu()
 
     def centres(self, meridional: Tensor) -> Tensor:
         """Return the centroid of each vignetted pupil, (F, 2); every arm from it meets the

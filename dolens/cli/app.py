@@ -9,6 +9,7 @@ import sys
 import typer
 
 from dolens.cli.apply import apply
+from dolens.cli.check import check
 from dolens.cli.compare import compare
 from dolens.cli.convert import convert
 from dolens.cli.evaluate import evaluate
@@ -45,6 +46,7 @@ def _dolens() -> None:
 # In the order of `dolens --help`: a lens, an experiment, a run.
 app.command("show")(show)
 app.command("convert")(convert)
+app.command("check")(check)
 app.command("experiments")(experiments)
 app.command("train", cls=PassedOn, add_help_option=False)(train)
 app.command("evaluate")(evaluate)

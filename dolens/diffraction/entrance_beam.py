@@ -207,7 +207,8 @@ def _first_side(system: OpticalSystem, wavelength: float, half_width: float) -> 
 
 def _first_surface(system: OpticalSystem, points: ObjectPoints) -> tuple[Tensor, Tensor]:
     """Boxes (N, 2) about all rays that meet the first surface within its aperture."""
-    surface, axes = system.surfaces[0], system.axes[0]
+    first = system.met[0]
+    surface, axes = system.surfaces[first - 1], system.axes[first - 1]
     like = system.sensor_distance.detach()
     options = {"dtype": like.dtype, "device": like.device}
     azimuth = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)

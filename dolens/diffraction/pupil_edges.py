@@ -24,15 +24,18 @@ def coverage(aperture: ClearAperture, x: Tensor, y: Tensor, radius: Tensor | Non
         of the area, as far as an edge is straight across a cell.
     """
     share = torch.ones_like(x)
+    u, v = x - aperture.center[0], y - aperture.center[1]
     if not isinstance(aperture.edge, Unlimited):
-        margin = aperture.edge.margin(x, y)
+        margin = aperture.edge.margin(*((x, y) if aperture.edge.rotational else (u, v)))
         if radius is not None:
             # A circle's margin is r² - ρ².
             squared = radius.to(x).square()
             margin = margin + (squared - squared.detach())
         share = covered(margin)
+    if aperture.window is not None:
+        share = torch.minimum(share, covered(aperture.window.margin(u, v)))
     if aperture.obscuration is not None:
-        share = torch.minimum(share, covered(-aperture.obscuration.margin(x, y)))
+        share = torch.minimum(share, covered(-aperture.obscuration.margin(u, v)))
     return share
 
 

@@ -44,13 +44,15 @@ class Slot:
     LIMIT = 12  # |x|, |y| and the distance from the vertex plane are clamped to it, mm
     SCALE = 13  # mm, sets the tolerance of Newton's iteration
     EDGE = 14  # circle: its semi-diameter squared, mm²; else a number out of reach
-    HALF_X = 15  # rectangle: half widths, mm; see also HALF_Y
-    HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; rectangle: half widths
+    HALF_X = 15  # rectangle: half widths, mm; ellipse: 1/a² and 1/b²; see also HALF_Y
+    HOLE_X = 16  # the obscuration; circle: its semi-diameter squared; others: as HALF_X
     HOLE_Y = 17
     SENSE = 18  # +1 for light that comes towards +z, -1 towards -z
     TAG = 19  # 4·surface number; a status is added to it where a ray fails
     HALF_Y = 20
     SENSE_BEHIND = 21  # as SENSE, of the light that leaves: the other one behind a mirror
+    CENTER_X = 22  # of the rectangle, the ellipse and the obscuration, mm
+    CENTER_Y = 23
     HEADER = 24  # length of the header: the shape's first number
 
 
@@ -59,14 +61,14 @@ class Code:
 
     KIND = 0
     OFFSET = 1  # of the record in `values`
-    LENGTH = 2  # of the record
+    LENGTH = 2  # of the record, up to data that have no cotangents
     BEFORE = 3  # row of `indices`: medium in front, in the order of travel
     AFTER = 4  # and behind
     REFRACTS = 5  # 0: the same medium on both sides, and no mirror
     EDGE = 6  # an `Outline`
     HOLE = 7
     COUNT = 8  # coefficients of an asphere or a polynomial; rows of a spline
-    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term, or an asphere a2
+    COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
     # Of a deflection.  Its record holds its surface's shape, padded to two numbers, then the law's.
@@ -83,6 +85,7 @@ class Outline(IntEnum):
     NONE = 0
     CIRCLE = 1
     RECTANGLE = 2
+    ELLIPSE = 3
 
 
 class Failure:

@@ -8,6 +8,7 @@ import torch
 from dolens.analysis.conditions import Conditions, conditions
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
+from dolens.lens_page.published_table import published_table
 from dolens.lens_page.tables import (
     Table,
     first_order_table,
@@ -46,7 +47,8 @@ class Overview:
         name: of the lens.
         summary: focal length, F-number, fields and wavelengths in one line.
         conditions: fields, wavelengths and object distance of everything.
-        sections: prescription, first-order data, Seidel sums, spot radii.
+        sections: prescription, first-order data, what the source publishes where the prescription
+            says it, Seidel sums, spot radii.
         spots: the spots, or None where they could not be traced.
     """
 
@@ -79,6 +81,7 @@ def lens_overview(lens: Lens) -> Overview:
     sections = [TableSection("Prescription", prescription_tables(lens))]
     for title, make in (
         ("First-order data", lambda: first_order_table(lens, where)),
+        *([("Published numbers", lambda: published_table(lens, where))] if lens.published else []),
         ("Seidel sums", lambda: seidel_table(lens, where)),
         ("RMS spot radii", spots),
     ):

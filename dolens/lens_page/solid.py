@@ -10,9 +10,10 @@ import torch
 from dolens.analysis.conditions import Conditions
 from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
+from dolens.optics.elements import to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
-from dolens.optics.surfaces.clear_aperture import Outline
+from dolens.optics.surfaces.clear_aperture import Ellipse, Outline
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.section import sag_of
 
@@ -30,8 +31,9 @@ class Mesh:
     """A mesh of quadrilaterals, mm, in the lens's axes.
 
     Attributes:
-        kind: `glass` (a refracting surface), `side` (of an element), `cap` (where the half in
-            front of the plane x = 0 is cut away), `stop`, `block` (an obscuration) or `sensor`.
+        kind: `glass` (a refracting surface), `mirror`, `side` (of an element), `cap` (where the
+            half in front of the plane x = 0 is cut away), `stop`, `block` (an obscuration) or
+            `sensor`.
         positions: (rings, around, 3), float32; neighbours are joined.
         normals: (rings, around, 3), float32, unit vectors.
         closed: whether the last point of a ring is joined with the first.
@@ -72,17 +74,20 @@ def solid(lens: Lens, where: Conditions, lit: Sequence[bool] | None = None) -> S
     rays = _field_rays(lens, where, lit)
     meshes: list[Mesh] = []
     rims: list[np.ndarray] = []
-    count = len(system.surfaces)
-    glass = [_is_glass(system, number) for number in range(count + 1)]
-    for number in range(1, count + 1):
+    glass = [_is_glass(system, number) for number in range(len(system.surfaces) + 1)]
+    following = dict(system.neighbours)
+    for number in system.met:
         surface = system.surfaces[number - 1]
-        if glass[number - 1] or glass[number]:
+        if number in system.mirrors:
+            meshes.append(_surface_mesh(system, number, "mirror", surface.aperture.edge))
+            rims.append(_rim(system, number, 1.0, close=True))
+        elif glass[number - 1] or glass[number]:
             meshes.append(_surface_mesh(system, number, "glass", surface.aperture.edge))
             rims.append(_rim(system, number, 1.0, close=True))
         if surface.aperture.obscuration is not None:
             meshes.append(_surface_mesh(system, number, "block", surface.aperture.obscuration))
-        if number < count and glass[number]:
-            meshes.extend(_sides(system, number))
+        if number in following and glass[number]:
+            meshes.extend(_sides(system, number, following[number]))
     meshes.append(_stop(system))
     meshes.append(_sensor(lens, rays))
     return Solid(meshes, rims, rays)
@@ -115,6 +120,8 @@ def _edge(outline: Outline) -> np.ndarray:
         return outline.semi_diameter * unit
     half = np.array(outline.extent)
     # Azimuths of a square hit all four corners; stretched, they hit those of the rectangle.
+    if isinstance(outline, Ellipse):
+        return half * unit
     return half * unit / np.abs(unit).max(-1, keepdims=True)
 
 
@@ -150,28 +157,24 @@ def _rim(system: OpticalSystem, number: int, scale: float = 1.0, close: bool = F
     return np.concatenate([points, points[:1]]) if close else points
 
 
-def _sides(system: OpticalSystem, number: int) -> list[Mesh]:
-    """Return the ground edge of the glass behind a surface, and its section.
+def _sides(system: OpticalSystem, number: int, following: int) -> list[Mesh]:
+    """Return the ground edge of the glass between two surfaces, and its section.
 
     The edge is a flat outwards, and a cylinder.
     Where the flat would cut through the larger surface, the edge is a straight cone.
     """
-    front, back = _rim(system, number), _rim(system, number + 1)
-    sizes = [system.surfaces[n - 1].aperture.edge for n in (number, number + 1)]
-    together = system.axes[number - 1].elements == system.axes[number].elements
+    front, back = _rim(system, number), _rim(system, following)
+    sizes = [system.surfaces[n - 1].aperture.edge for n in (number, following)]
+    axes = system.axes
+    together = axes[number - 1].together(axes[following - 1])
     round_faces = all(size.rotational for size in sizes)
-    small, large = (
-        (number, number + 1)
-        if sizes[0].semi_diameter < sizes[1].semi_diameter
-        else (
-            number + 1,
-            number,
-        )
-    )
+    small, large = number, following
+    if sizes[0].semi_diameter >= sizes[1].semi_diameter:
+        small, large = large, small
     ratio = max(size.semi_diameter for size in sizes) / min(size.semi_diameter for size in sizes)
     if together and round_faces and ratio > 1.0 + 1e-9:
         # The smaller face's rim, widened in its own plane.
-        edge = _edge(sizes[small - number])
+        edge = _edge(sizes[int(small == following)])
         rim = np.zeros((AZIMUTHS, 3))
         rim[:, :2] = edge
         sag, _, _, _ = sag_of(
@@ -182,31 +185,38 @@ def _sides(system: OpticalSystem, number: int) -> list[Mesh]:
         corner = _turned(system, small, wide, True)
         flat = _turned(system, small, rim, True)
         share = np.linspace(1.0 / ratio, 1.0, 8)[:, None]
-        outer = _edge(sizes[large - number])
+        outer = _edge(sizes[int(large == following)])
         beyond = _placed(system, large, share * outer[None, :, 0], share * outer[None, :, 1])
-        sense = 1.0 if large > small else -1.0
-        if float((sense * (beyond[..., 2] - corner[None, :, 2])).min()) >= 0.0:
-            other = back if large > small else front
+        axis = _turned(system, small, np.array([0.0, 0.0, 1.0]), False)
+        # Along the small face's axis, from it to the large one.
+        sense = math.copysign(1.0, float((_vertex(system, large) - _vertex(system, small)) @ axis))
+        if float((sense * ((beyond - corner[None]) @ axis)).min()) >= 0.0:
+            other = back if large == following else front
             ends = corner[[3 * AZIMUTHS // 4, AZIMUTHS // 4]]
             return [
                 _mesh("side", np.stack([flat, corner])),
                 _mesh("side", np.stack([corner, other])),
-                _cap(system, number, ends),
+                _cap(system, (number, following), ends),
             ]
-    return [_mesh("side", np.stack([front, back])), _cap(system, number, None)]
+    return [_mesh("side", np.stack([front, back])), _cap(system, (number, following), None)]
 
 
-def _cap(system: OpticalSystem, number: int, corners: np.ndarray | None) -> Mesh:
-    """Return the section of the glass behind a surface, between the profiles of its faces.
+def _vertex(system: OpticalSystem, number: int) -> np.ndarray:
+    """Return the vertex (3,), mm, of a surface in the lens's axes."""
+    return _turned(system, number, np.zeros(3), True)
+
+
+def _cap(system: OpticalSystem, numbers: tuple[int, int], corners: np.ndarray | None) -> Mesh:
+    """Return the section of the glass between two surfaces, between their profiles.
 
     Args:
         system: the lens.
-        number: of the surface.
+        numbers: of the surfaces.
         corners: (2, 3), mm, where the ground edge turns, below and above; None where it does not.
     """
     share = np.linspace(-1.0, 1.0, 2 * _RINGS + 1)
     lines = []
-    for n in (number, number + 1):
+    for n in numbers:
         y = share * system.surfaces[n - 1].aperture.edge.extent[1]
         lines.append(_placed(system, n, np.zeros_like(y), y))
     front, back = lines
@@ -233,13 +243,15 @@ def _stop(system: OpticalSystem) -> Mesh:
 
 def _sensor(lens: Lens, rays: Sequence[Sequence[np.ndarray]]) -> Mesh:
     """Return the sensor plane: the prescription's image circle, or what holds all rays."""
-    z = float(lens.system().vertices[-1])
+    axes = lens.system().global_axes()
+    rotation, origin = axes.rotation[-1].numpy(), axes.origin[-1].numpy()
+    rays = [[(path - origin) @ rotation for path in field] for field in rays]
     ends = [np.hypot(*path[-1, :2]) for field in rays for path in field]
     reach = 0.5 * lens.sensor_diameter if lens.sensor_diameter else 1.1 * max(ends, default=1.0)
     angle = np.linspace(0.0, 2.0 * math.pi, AZIMUTHS, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(AZIMUTHS)], -1) * max(reach, 1e-6)
-    positions = np.stack([0.0 * ring, ring]) + np.array([0.0, 0.0, z])
-    return _mesh("sensor", positions, np.broadcast_to(np.array([0.0, 0.0, -1.0]), positions.shape))
+    positions = np.stack([0.0 * ring, ring]) @ rotation.T + origin
+    return _mesh("sensor", positions, np.broadcast_to(-rotation[:, 2], positions.shape))
 
 
 def _field_rays(lens: Lens, where: Conditions, lit: Sequence[bool]) -> list[list[np.ndarray]]:
@@ -277,12 +289,22 @@ def _beams(lens: Lens, where: Conditions, which: Sequence[int]) -> list[list[np.
     inner += [centre[:, None] + part * reach[:, ::quarter] * arms[:, ::quarter] for part in _ALONG]
     aimed = pupils.aim(torch.cat([rim, *inner], 1))
     hit = lens.trace(Rays(aimed.position, aimed.direction, aimed.wavelength), record=True)
+    system = lens.system()
+    end = hit.components()
+    end = to_lens_axes(end._replace(z=end.z - system.vertices[-1]), system.all_axes[-1])
+    met = [number - 1 for number in system.met]
     # (fields, rays, surfaces and sensor, 3)
-    points = torch.cat([hit.points, hit.position[None]]).movedim(0, 2)
+    points = torch.cat([hit.points[met], torch.stack(end[:3], -1)[None]]).movedim(0, 2)
     passing = hit.valid & aimed.converged
-    sensor = float(lens.system().vertices[-1])
+    origins = system.global_axes().origin[:, 2]
+    sensor = float(origins.max())
     front = min(0.0, float(points[passing][:, 0, 2].min())) if bool(passing.any()) else 0.0
-    lead = front - _LEAD * sensor
+    if system.mirrors or system.breaks:
+        # In front of everything, and not only of the surface that light meets first.
+        front = min(front, float(origins.min()))
+        lead = front - _LEAD * (sensor - front)
+    else:
+        lead = front - _LEAD * sensor
     if where.object_distance is not None:
         lead = max(lead, -where.object_distance)
     start, along = aimed.position, aimed.direction

@@ -13,8 +13,10 @@ from dolens.optics.elements import POSE, TILTS
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.optics.prescription_table import SurfaceRow, prescription_table
+from dolens.optics.surfaces import CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.base import Surface
-from dolens.optics.surfaces.clear_aperture import Circle, Outline, Rectangle, Unlimited
+from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Outline, Rectangle, Unlimited
+from dolens.optics.surfaces.coordinate_break import BREAK
 
 # Columns of coefficients that a page is wide enough for.
 _MOST_TERMS = 8
@@ -96,13 +98,17 @@ def prescription_tables(lens: Lens) -> list[Table]:
     surfaces = Table(
         heads, rows, caption, frozenset({1, 4}), lit=frozenset({lens.stop - 1}), numbered=True
     )
-    more = [_terms_table(lens), elements_table(lens)]
+    more = [_terms_table(lens), breaks_table(lens), elements_table(lens)]
     return [surfaces, *(table for table in more if table is not None)]
 
 
 def _terms_table(lens: Lens) -> Table | None:
     """Return coefficients beyond radius and conic, one surface a row; None where there are none."""
-    found = [(str(row.number), row.terms) for row in prescription_table(lens).surfaces if row.terms]
+    found = [
+        (str(row.number), row.terms)
+        for row in prescription_table(lens).surfaces
+        if row.terms and row.kind != CoordinateBreak.kind
+    ]
     names = list(dict.fromkeys(name for _, terms in found for name in terms))
     sized = {
         n: ", ".join(
@@ -132,6 +138,23 @@ def _terms_table(lens: Lens) -> Table | None:
         if terms or n in sized:
             rows.append((n, ", ".join(texts) or "all zero"))
     return Table(("#", "coefficients"), rows, "In powers of mm.", frozenset({1}), numbered=True)
+
+
+def breaks_table(lens: Lens) -> Table | None:
+    """Return what coordinate breaks do, one a row; None where a lens has none."""
+    rows = [
+        (str(row.number), *(number(row.terms[name]) for name in BREAK))
+        for row in prescription_table(lens).surfaces
+        if row.kind == CoordinateBreak.kind
+    ]
+    if not rows:
+        return None
+    heads = ("#", *(name.replace("_", " ") for name in BREAK))
+    first = [n for n, surface in lens.surfaces.items() if isinstance(surface, TiltFirstBreak)]
+    caption = "Coordinate breaks: decenters in mm, then tilts in degrees about x, y and z."
+    if first:
+        caption += f"  Tilts about z, y and x come first at {', '.join(first)}."
+    return Table(heads, rows, caption, frozenset(), numbered=True)
 
 
 def elements_table(lens: Lens) -> Table | None:
@@ -173,6 +196,8 @@ def seidel_table(lens: Lens, where: Conditions) -> Table:
     rows.append(("total", *(_fixed(value) for value in waves.sum(0).tolist())))
     unit = where.field_unit if where.field_unit == "°" else " mm"
     posed = "  They are those of the centred lens, without poses." if lens.elements else ""
+    if lens.system().breaks:
+        posed = "  They are those of the lens unfolded along its axis, without tilts and decenters."
     short, long = found.colours
     return Table(
         ("#", *(f"{entry.symbol.replace('_', ' ')}\n{entry.short}" for entry in ABERRATIONS)),
@@ -210,14 +235,26 @@ def _fixed(value: float) -> str:
 
 
 def _aperture(surface: Surface) -> str:
-    inner = surface.aperture.obscuration
-    return _outline(surface.aperture.edge) + (f", obscured {_outline(inner)}" if inner else "")
+    if surface.changes_axes:
+        return ""
+    aperture = surface.aperture
+    words = [_outline(aperture.edge)]
+    if aperture.window is not None:
+        words.append(f"within {_outline(aperture.window)}")
+    if aperture.obscuration is not None:
+        words.append(f"obscured {_outline(aperture.obscuration)}")
+    if any(aperture.center):
+        x, y = (number(value) for value in aperture.center)
+        words.append(f"about ({x}, {y})")
+    return ", ".join(words)
 
 
 def _outline(outline: Outline) -> str:
     match outline:
         case Rectangle():
             return f"{number(outline.half_width_x)} × {number(outline.half_width_y)}"
+        case Ellipse():
+            return f"ellipse {number(outline.semi_axis_x)} × {number(outline.semi_axis_y)}"
         case Unlimited():
             return f"({number(outline.semi_diameter)}, does not clip)"
         case Circle():
@@ -225,4 +262,4 @@ def _outline(outline: Outline) -> str:
 
 
 def _is_glass(row: SurfaceRow) -> bool:
-    return row.material not in ("air", "occluder", "mirror")
+    return row.material not in ("", "air", "occluder", "mirror")

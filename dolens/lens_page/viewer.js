@@ -64,11 +64,11 @@
   }
 
   // ---- geometry, once
-  const solidKinds = { stop: 1, sensor: 1, block: 1, cap: 1 };
+  const solidKinds = { stop: 1, sensor: 1, block: 1, cap: 1, mirror: 1 };
   const parts = { glass: [], solid: [], cap: [] };
   const mesh = { position: [], normal: [], kind: [] };
   let count = 0;
-  const kindNumber = { glass: 0, side: 1, stop: 2, sensor: 3, block: 4, cap: 5 };
+  const kindNumber = { glass: 0, side: 1, stop: 2, sensor: 3, block: 4, cap: 5, mirror: 6 };
   for (const m of data.meshes) {
     const p = floats(m.positions), n = new Int8Array(bytes(m.normals).buffer);
     for (let i = 0; i < p.length; i++) { mesh.position.push(p[i]); mesh.normal.push(n[i] / 127); }
@@ -170,7 +170,7 @@
   const surfaceFragment = `precision mediump float; ${cutAway}
     varying vec3 facing; varying float what; uniform float night;
     void main() {
-      if (cut > 0.5 && place.x < 0.0 && what < 4.5 && (what < 2.5 || what > 3.5)) discard;
+      if (cut > 0.5 && place.x < 0.0 && (what < 2.5 || what > 5.5 || (what > 3.5 && what < 4.5))) discard;
       vec3 n = normalize(facing);
       if (n.z < 0.0) n = -n;
       vec3 light = normalize(vec3(-0.4, 0.7, 0.65));
@@ -192,8 +192,11 @@
         colour = mix(vec3(0.36, 0.40, 0.52), vec3(0.40, 0.45, 0.60), night) * lit; alpha = 1.0;
       } else if (what < 4.5) {
         colour = vec3(0.1) * lit; alpha = 1.0;
-      } else {
+      } else if (what < 5.5) {
         colour = mix(vec3(0.72, 0.84, 0.92), vec3(0.25, 0.38, 0.48), night); alpha = 1.0;
+      } else {
+        colour = mix(vec3(0.66, 0.68, 0.70), vec3(0.62, 0.64, 0.66), night) * lit + 0.5 * shine;
+        alpha = 1.0;
       }
       gl_FragColor = vec4(colour * alpha, alpha);
     }`;
@@ -335,7 +338,7 @@
       };
       for (let t = 0; t < solid.length; t += 3) {
         const what = kinds[solid[t]];
-        fill(solid, t, what === 3 ? "#6b7590" : "#3a3f46");
+        fill(solid, t, what === 3 ? "#6b7590" : what === 6 ? "#b4b8bc" : "#3a3f46");
       }
       sortGlass();
       for (let t = 0; t < sorted.length; t += 3) {

@@ -11,19 +11,39 @@ from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
 from dolens.optics.glass_catalog import Glass
 from dolens.optics.materials import abbe_number, index_d
 from dolens.optics.surfaces.b_spline import BSpline
-from dolens.optics.surfaces.clear_aperture import Circle, Rectangle
+from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Rectangle
 from dolens.optics.surfaces.conic import Conic
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
 _EVEN = re.compile(r"a\d+")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
+_CONIC = r"\dfrac{r^2/R}{1+\sqrt{1-(1+k)\,r^2/R^2}}"
+_POWERS = r"+\sum_i a_i\,r^i"
+_ZERNIKE = f"$z={_CONIC}{_POWERS}" + r"+\sum_j z_j\,Z_j(\rho,\varphi)$"
 EQUATIONS = {
-    "conic": r"$z=\dfrac{r^2/R}{1+\sqrt{1-(1+k)\,r^2/R^2}}$",
-    "asphere": r"$z=\dfrac{r^2/R}{1+\sqrt{1-(1+k)\,r^2/R^2}}+\sum_i a_i\,r^i$",
+    "conic": f"$z={_CONIC}$",
+    "asphere": f"$z={_CONIC}{_POWERS}$",
     "polynomial": r"$z=\sum_{ij} a_{ij}\,x^i y^j$",
     "implicit": r"$z=\sum_{ij} a_{ij}\,x^i y^j+b\,z^2$",
+    "odd_asphere": f"$z={_CONIC}{_POWERS}$",
+    "biconic": r"$z=\dfrac{x^2/R_x+y^2/R_y}{1+\sqrt{1-(1+k_x)\,x^2/R_x^2-(1+k_y)\,y^2/R_y^2}}$",
+    "toroid": (
+        r"$f=\dfrac{y^2/R_y}{1+\sqrt{1-(1+k_y)\,y^2/R_y^2}}+\sum_i a_i\,y^i,\quad g=1-f/R_x,\quad "
+        r"z=f+\dfrac{x^2/R_x}{g+\sqrt{g^2-x^2/R_x^2}}$"
+    ),
+    "zernike_standard": f"{_ZERNIKE}, Z in Noll's order",
+    "zernike_fringe": f"{_ZERNIKE}, Z in fringe order",
+    "q_con": f"$z={_CONIC}" + r"+u^4\sum_m q_m\,Q_m^{\mathrm{con}}(u^2)$",
+    "q_bfs": (
+        f"$z={_CONIC}"
+        r"+u^2(1-u^2)\,\sqrt{\dfrac{1-k\,r^2/R^2}{1-(1+k)\,r^2/R^2}}"
+        r"\sum_m q_m\,Q_m^{\mathrm{bfs}}(u^2)$"
+    ),
 }
+# Numbers of a surface that are no coefficients, and their symbols on a drawing.
+_SYMBOLS = {"conic": "k", "conic_x": "k_x", "conic_y": "k_y"}
+_LENGTHS = ("normalization_radius", "decenter_x", "decenter_y")
 
 
 def length(value: float, least: int = 3, most: int = 6) -> str:
@@ -51,21 +71,30 @@ def radius_text(face: Face, is_front: bool) -> str:
     """
     if face.flat:
         return "R ∞ (plane)"
-    if not issubclass(face.shape, Conic):
+    if "curvature_x" in face.parameters and "curvature_y" in face.parameters:
+        return ", ".join(_one_radius(face, f"_{axis}", is_front) for axis in "xy")
+    if "curvature" not in face.parameters:
         kind = "cubic B-spline" if issubclass(face.shape, BSpline) else face.shape.kind
         return f"freeform: {kind.replace('_', ' ')}"
-    curvature = float(face.parameters["curvature"])
+    text = _one_radius(face, "", is_front)
+    return "R ∞, aspheric" if text == "R ∞" else text
+
+
+def _one_radius(face: Face, suffix: str, is_front: bool) -> str:
+    """Return `R 22.014 CX`, `Rx ∞`, ... of the curvature with this suffix."""
+    curvature = float(face.parameters[f"curvature{suffix}"])
+    name = f"R{suffix[1:]}"
     if curvature == 0.0:
-        return "R ∞, aspheric"
+        return f"{name} ∞"
     convex = (curvature > 0.0) == is_front
-    return f"R {length(abs(1.0 / curvature))} {'CX' if convex else 'CC'}"
+    return f"{name} {length(abs(1.0 / curvature))} {'CX' if convex else 'CC'}"
 
 
 def signed_radius(face: Face) -> str:
     """Return the radius with its sign, positive where the centre lies towards +z, or the kind."""
     if face.flat:
         return "∞"
-    if not issubclass(face.shape, Conic):
+    if "curvature" not in face.parameters:
         return "freeform"
     c = float(face.parameters["curvature"])
     return (length(1.0 / c) if c else "∞") + (" asphere" if is_aspheric(face) else "")
@@ -88,25 +117,28 @@ def equation(face: Face) -> str | None:
     if issubclass(face.shape, Conic):
         higher = any(_EVEN.fullmatch(name) and float(p) for name, p in face.parameters.items())
         return EQUATIONS["asphere" if higher else "conic"]
-    return None
+    return EQUATIONS.get(face.shape.kind)
 
 
 def coefficient_rows(face: Face) -> list[tuple[str, str]]:
     """Return name and value of what shapes an aspheric surface, beside its radius."""
     if not is_aspheric(face):
         return []
-    if issubclass(face.shape, Conic):
-        c = float(face.parameters["curvature"])
+    rows = []
+    for name, symbol in (("curvature", "R"), ("curvature_x", "Rx"), ("curvature_y", "Ry")):
+        c = float(face.parameters.get(name, 0.0))
         side = "towards +z" if c > 0.0 else "towards −z"
-        rows = [("R, signed", f"{length(1.0 / c)} mm ({side})")] if c else []
-    else:
-        rows = []
+        if c:
+            rows.append((f"{symbol}, signed", f"{length(1.0 / c)} mm ({side})"))
     for name, value in face.parameters.items():
-        if name == "curvature" or value.dim() > 0:
+        if name.startswith("curvature") or value.dim() > 0:
             continue
-        symbol = "k" if name == "conic" else name
-        if symbol == "k":
+        symbol = _SYMBOLS.get(name, name)
+        if name in _SYMBOLS:
             rows.append((symbol, length(float(value))))
+            continue
+        if name in _LENGTHS:
+            rows.append((symbol.replace("_", " "), f"{length(float(value))} mm"))
             continue
         power = _power(name)
         unit = f" mm{str(power).translate(_RAISED)}" if power != 0 else ""
@@ -123,6 +155,8 @@ def clear_aperture_text(face: Face) -> str:
     text = (
         f"{length(2.0 * edge.half_width_x)} × {length(2.0 * edge.half_width_y)}"
         if isinstance(edge, Rectangle)
+        else f"ellipse {length(2.0 * edge.semi_axis_x)} × {length(2.0 * edge.semi_axis_y)}"
+        if isinstance(edge, Ellipse)
         else f"Ø {length(2.0 * edge.semi_diameter)}"
     )
     obscured = face.aperture.obscuration

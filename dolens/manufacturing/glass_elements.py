@@ -17,6 +17,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium
+from dolens.optics.straight import require_refracting
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture, Rectangle
 from dolens.optics.system import OpticalSystem
@@ -237,9 +238,10 @@ def glass_elements(lens: Lens) -> list[GlassElement]:
     Every gap that is neither air nor occluder is one; cemented ones share a surface.
 
     Raises:
-        InputError: the lens has no glass.
+        InputError: the lens has no glass, or mirrors or coordinate breaks.
     """
     system = lens.system().double()
+    require_refracting(system, f"lens '{lens.name}': drawings and solids")
     groups = {(e.first, e.last): name for name, e in lens.elements.items()}
     faces = {number: face_of(system, number) for number in range(1, len(system.surfaces) + 1)}
     inside = [

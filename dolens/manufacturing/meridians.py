@@ -18,6 +18,8 @@ _SHARE = 0.1
 _FIRST_SPANS = 16
 _MOST_SPANS = 4096
 # Points within each span at which a fit is looked at; none of them is a knot.
+# Share of the reach at which the slope at the vertex is taken.
+_BESIDE = 1e-12
 _BETWEEN = (0.0694, 0.3300, 0.5000, 0.6700, 0.9306)
 # Arcs of larger radii are Bézier arcs: a centre 10 km away would cost the vertex its last digits.
 _LARGEST_RADIUS = 1e7
@@ -131,7 +133,10 @@ def spline_meridian(face: Face, reach: float, tolerance: float) -> Spline:
     spans = _FIRST_SPANS
     while spans <= _MOST_SPANS:
         r = np.linspace(0.0, reach, spans + 1)
-        sag, slope, _, _ = face.sag_and_slopes(r, np.zeros_like(r))
+        sag = face.sag(r, np.zeros_like(r))
+        # The vertex itself may be a cusp (an axicon's): its slope is that beside it.
+        beside = np.maximum(r, _BESIDE * reach)
+        slope = face.sag_and_slopes(beside, np.zeros_like(r))[1]
         spline = make_interp_spline(
             r, sag, k=3, bc_type=([(1, float(slope[0]))], [(1, float(slope[-1]))])
         )

@@ -11,8 +11,10 @@ is the point on the stop.  At t = 0 the axis is the solution, or nearly.  Each s
 along the tangent, dq/dt = -J⁻¹ ∂F/∂t with J = ∂F/∂q, both swept back through the trace, and
 corrected by Newton's iteration.  Corrections that do not halve F, or that lose the ray, send it
 back to the last solution with a quarter of the step: this is what damps Newton's iteration, and
-what keeps it on the branch that starts at the axis.  All of it runs outside the autograd graph; one
-more Newton step inside leaves the value where it is and has the implicit function's derivative.
+what keeps it on the branch that starts at the axis.  Behind coordinate breaks the axis of object
+space need not lead to the stop: there the branch starts at a ray sent back from the stop.  All of
+it runs outside the autograd graph; one more Newton step inside leaves the value where it is and has
+the implicit function's derivative.
 """
 
 import math
@@ -22,7 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.optics.elements import from_lens_axes
+from dolens.optics.elements import from_lens_axes, to_lens_axes
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
@@ -141,7 +143,8 @@ def aim(
         q, slopes, found = found_near or _follow(problem)
     residual, reached = _miss(system, wavelength, near, tangents, target, q)
     with torch.no_grad():
-        front = slopes.abs().amax((-2, -1)) * system.surfaces[0].semi_diameter
+        first = system.surfaces[system.met[0] - 1]
+        front = slopes.abs().amax((-2, -1)) * first.semi_diameter
         rounding = torch.finfo(system.dtype).eps * (front + problem.scale)
         converged = found & reached & (residual.abs().amax(-1) <= ROUNDING * rounding)
     q = q - _solve(slopes, residual)
@@ -206,7 +209,7 @@ def _follow(problem: _Problem) -> tuple[Tensor, Tensor, Tensor]:
         rounding.  q is zero and ∂F/∂q the identity where it was not.
     """
     tangents = problem.tangents
-    q = torch.zeros_like(tangents)
+    q = torch.zeros_like(tangents) + _start(problem)
     t = torch.zeros_like(tangents[..., 0])
     angle = torch.atan(tangents.norm(dim=-1))
     longest = (MAX_TURN / angle.clamp(min=MAX_TURN)).clamp(max=1.0)
@@ -247,6 +250,31 @@ def _follow(problem: _Problem) -> tuple[Tensor, Tensor, Tensor]:
     q = torch.where(done[..., None], q, 0.0)
     slopes = _evaluate(problem, q, torch.ones_like(t)).slopes
     return q, torch.where(done[..., None, None], slopes, torch.eye(2).to(slopes)), done
+
+
+def _start(problem: _Problem) -> Tensor:
+    """Return q (2,), mm, of a ray near the one along the axis of object space through the stop's
+    centre.
+
+    That is the axis itself, unless coordinate breaks lead the light elsewhere: then a ray that is
+    sent back from the stop's vertex, along its axis, says where the beam comes in.
+    """
+    system = problem.system
+    zero = problem.tangents.new_zeros(())
+    origin = torch.stack((zero, zero))
+    if not system.breaks or system.stop == system.met[0]:
+        return origin
+    number, sense = system.stop, system.senses[system.stop - 1]
+    wavelength = problem.wavelength
+    if isinstance(wavelength, Tensor):
+        wavelength = wavelength.flatten()[0]
+    at_stop = Components(zero, zero, zero, zero, zero, zero - sense)
+    ray = to_lens_axes(at_stop, system.axes[number - 1])
+    traced = trace_surfaces(system, ray, wavelength, -1.0, last=number - 1)
+    x, y, z, l, m, n = traced.ray  # noqa: E741
+    if not (bool(_reaches(traced)) and float(n) < 0.0):
+        return origin
+    return torch.stack((x - z / n * l, y - z / n * m))
 
 
 def _evaluate(problem: _Problem, q: Tensor, t: Tensor) -> _Evaluation:

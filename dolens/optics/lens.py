@@ -17,6 +17,7 @@ from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.mirrors import MIRROR, media_of
+from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
@@ -51,6 +52,13 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: field points that the prescription is meant for.
         object_distance: mm from the object to the first vertex; None is infinity.
         backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
+        wavelength_weights: how much each of the wavelengths counts, of any sum; None: all the same.
+        temperature: °C, of the lens in use; None where the prescription does not say.
+        pressure: atm, of the air around it; likewise.
+        telecentric_object: whether chief rays are meant to be parallel to the axis in object space,
+            as the stop makes them.
+        source: the patent, book or catalogue that the prescription is taken from.
+        published: the numbers that the source prints beside it; nothing is computed from them.
     """
 
     def __init__(
@@ -70,6 +78,12 @@ class Lens(LensRays, LensViews, nn.Module):
         fields: Fields | None = None,
         object_distance: float | None = None,
         backend: str = "auto",
+        wavelength_weights: Sequence[float] | None = None,
+        temperature: float | None = None,
+        pressure: float | None = None,
+        telecentric_object: bool = False,
+        source: str = "",
+        published: Published | None = None,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -81,6 +95,8 @@ class Lens(LensRays, LensViews, nn.Module):
         if not 1 <= stop <= count:
             raise InputError(f"lens '{name}': stop must be a surface from 1 to {count}, not {stop}")
         self.name = name
+        self.source = source
+        self.published = published
         self.stop = stop
         self.index_model = index_model
         self.sensor_diameter = sensor_diameter
@@ -90,6 +106,10 @@ class Lens(LensRays, LensViews, nn.Module):
         self.reference_wavelength = reference_wavelength
         self.fields = fields
         self.object_distance = object_distance
+        self.wavelength_weights = None if wavelength_weights is None else tuple(wavelength_weights)
+        self.temperature = temperature
+        self.pressure = pressure
+        self.telecentric_object = telecentric_object
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
         try:

@@ -101,13 +101,13 @@ def _lay_out(
         if shape.kernel is None:
             raise InputError(f"surface {number} ({shape.kind}) has no kernel")
         code = BREAK if shape.changes_axes else shape.kernel.code
-        numbers, count, columns, degree, extras = shape.packed(surface.parameters)
+        numbers, count, columns, degree, extras, data = shape.packed(surface.parameters)
         sizes = []
         for value in numbers:
             sizes.append(None if value is None else value.shape)
             if value is not None:
                 (arrays if value.ndim else scalars).append(value)
-        forms.append(Form(code, count, columns, degree, extras, tuple(sizes)))
+        forms.append(Form(code, count, columns, degree, extras, tuple(sizes), data))
         apertures.append(surface.aperture)
         law = surface.deflection
         if law is None:

@@ -37,9 +37,10 @@ _UNIT_OF = {
     **dict.fromkeys(TILTS, DEGREE),
     **dict.fromkeys(DISPLACEMENTS, MILLIMETRE),
     "sensor_distance": MILLIMETRE,
-    "curvature": PER_MILLIMETRE,
     "power": PER_MILLIMETRE,
     "grooves": PER_MILLIMETRE,
+    **dict.fromkeys(("curvature", "curvature_x", "curvature_y"), PER_MILLIMETRE),
+    "normalization_radius": MILLIMETRE,
 }
 # Of names whose last part is a number or a coordinate.
 _UNIT_OF_GROUP = {"thicknesses": MILLIMETRE, "sources": MILLIMETRE}

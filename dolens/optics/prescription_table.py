@@ -9,7 +9,9 @@ from torch import nn
 from dolens.optics.elements import TILTS, Element
 from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
 from dolens.optics.mirrors import MIRROR
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Rectangle
+from dolens.optics.parameter_units import to_file_units
+from dolens.optics.surfaces import CoordinateBreak
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse, Rectangle
 from dolens.optics.tables import html_table, printable, text_table
 
 HEADINGS = (
@@ -35,14 +37,15 @@ class SurfaceRow:
         kind: the surface's type, as prescriptions write it.
         radius: mm, `inf` for a plane; None for a shape without one.
         thickness: mm, to the next surface or the sensor.
-        material: the medium behind the surface.
+        material: the medium behind the surface; `mirror` where it reflects, and nothing of a
+            coordinate break.
         index_d: its index at the d line; NaN of a glass that is specified elsewhere only.
         abbe_number: its Abbe number Vd, `inf` without dispersion; NaN likewise.
-        semi_diameter: mm, of the clear aperture's farthest point.
+        semi_diameter: mm, of the clear aperture's farthest point; NaN of a coordinate break.
         aperture: `circle`, `rectangle` or `none`, and its obscuration where there is one.
         conic: None for a shape without one.
         terms: further coefficients by name; the lists of numbers of a shape, such as a spline's,
-            are left out.
+            are left out.  Of a coordinate break its decenters, mm, and tilts, degrees.
         stop: whether it is the stop.
         element: name of the element with a pose of its own that carries it, or nothing.
     """
@@ -65,6 +68,8 @@ class SurfaceRow:
     def mark(self) -> str:
         """Return which further terms shape the surface, in a few words."""
         used = [name for name, value in self.terms.items() if value != 0.0]
+        if self.kind == CoordinateBreak.kind:
+            return ", ".join(f"{n} {_number(self.terms[n])}{_unit(n)}" for n in used)
         if not self.terms:
             return ""
         if not used:
@@ -73,8 +78,8 @@ class SurfaceRow:
 
     def cells(self) -> list[str]:
         """Return the row as text, under `HEADINGS`."""
-        extent = _number(self.semi_diameter)
-        if self.aperture != "circle":
+        extent = "" if math.isnan(self.semi_diameter) else _number(self.semi_diameter)
+        if extent and self.aperture != "circle":
             extent += f" ({self.aperture})"
         return [
             f"{self.number} (stop)" if self.stop else str(self.number),
@@ -125,10 +130,7 @@ class PrescriptionTable:
         found = []
         for name, pose in self.elements.items():
             numbers = [row.number for row in self.surfaces if row.element == name]
-            values = ", ".join(
-                f"{key} {_number(value)}{'°' if key in TILTS else ' mm'}"
-                for key, value in pose.items()
-            )
+            values = ", ".join(f"{key} {_number(value)}{_unit(key)}" for key, value in pose.items())
             carried = f"surfaces {numbers[0]} to {numbers[-1]}"
             found.append(printable(f"element {name} ({carried}): {values or 'no tilt or shift'}"))
         return found
@@ -167,6 +169,10 @@ def prescription_table(lens: nn.Module) -> PrescriptionTable:
         values = {
             name: float(value) for name, value in surface.named_parameters() if value.ndim == 0
         }
+        if surface.changes_axes:
+            turned = {n: to_file_units(n, value) for n, value in values.items()}
+            rows.append(_break_row(number, surface.kind, gap, turned, carrier.get(number, "")))
+            continue
         curvature = values.pop("curvature", None)
         conic = values.pop("conic", None)
         plane = surface.kind in ("plane", "aperture")
@@ -201,6 +207,20 @@ def prescription_table(lens: nn.Module) -> PrescriptionTable:
     )
 
 
+def _break_row(
+    number: int, kind: str, gap: float, terms: dict[str, float], element: str
+) -> SurfaceRow:
+    """Return the row of a coordinate break."""
+    nan = math.nan
+    return SurfaceRow(
+        number, kind, None, gap, "", nan, nan, nan, "", None, terms, stop=False, element=element
+    )
+
+
+def _unit(name: str) -> str:
+    return "°" if name in TILTS else " mm"
+
+
 def _glass_numbers(medium: Medium) -> tuple[float, float]:
     """Return nd and Vd; NaN of a mirror, and where the catalogue ends short of lines F, d and C."""
     if medium is MIRROR:
@@ -222,8 +242,14 @@ def _aperture(aperture: ClearAperture) -> str:
     edge = aperture.edge
     if isinstance(edge, Rectangle):
         found = f"rectangle {_number(2.0 * edge.half_width_x)} × {_number(2.0 * edge.half_width_y)}"
+    elif isinstance(edge, Ellipse):
+        found = f"ellipse {_number(2.0 * edge.semi_axis_x)} × {_number(2.0 * edge.semi_axis_y)}"
     else:
         found = "circle" if isinstance(edge, Circle) else "no edge"
+    if aperture.window is not None:
+        found = f"{found} and {_aperture(ClearAperture(aperture.window))}"
+    if any(aperture.center):
+        found = f"{found} about ({', '.join(_number(value) for value in aperture.center)})"
     return f"{found}, obscured" if aperture.obscuration is not None else found
 
 

@@ -33,6 +33,7 @@ class Form(NamedTuple):
         degree: highest power of x or y.
         extras: further integers.
         sizes: the shape of each number's tensor; None: the number is zero.
+        data: as in `PackedShape`.
     """
 
     kind: int
@@ -41,6 +42,7 @@ class Form(NamedTuple):
     degree: int
     extras: tuple[int, ...]
     sizes: tuple[torch.Size | None, ...]
+    data: int = 0
 
 
 class LawForm(NamedTuple):
@@ -244,7 +246,7 @@ class _Writer:
                 self.add(len(self.constants), source, count)
                 scalar, array = (scalar + 1, array) if size == () else (scalar, array + count)
             self.constants += [0.0] * count
-        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET]
+        row[Code.LENGTH] = len(self.constants) - row[Code.OFFSET] - form.data
 
     def deflection(self, row: list[int], number: int, law: LawForm) -> None:
         """The numbers of a surface's shape, and those of its law."""
@@ -286,16 +288,20 @@ class _Writer:
     def aperture(self, row: list[int], aperture: ClearAperture) -> None:
         """Write a surface's clear aperture."""
         values, record = self.constants, row[Code.OFFSET]
-        edge, hole = aperture.edge, aperture.obscuration
-        values[record + Slot.LIMIT] = FAR * edge.semi_diameter
-        values[record + Slot.SCALE] = edge.semi_diameter
+        edge, hole, size = aperture.edge, aperture.obscuration, aperture.semi_diameter
+        values[record + Slot.LIMIT] = FAR * size
+        values[record + Slot.SCALE] = size
         # A full circle is tested on the way; where there is none it is out of reach.
-        values[record + Slot.EDGE] = (2.0 * FAR * edge.semi_diameter) ** 2
-        row[Code.EDGE], first, second = edge.packed()
-        if row[Code.EDGE] == Outline.CIRCLE:
-            values[record + Slot.EDGE] = first
-        else:
-            values[record + Slot.HALF_X], values[record + Slot.HALF_Y] = first, second
+        values[record + Slot.EDGE] = (2.0 * FAR * size) ** 2
+        for outline in (edge, aperture.window):
+            if outline is None:
+                continue
+            row[Code.EDGE], first, second = outline.packed()
+            if row[Code.EDGE] == Outline.CIRCLE:
+                values[record + Slot.EDGE] = first
+            else:
+                values[record + Slot.HALF_X], values[record + Slot.HALF_Y] = first, second
+        values[record + Slot.CENTER_X], values[record + Slot.CENTER_Y] = aperture.center
         if hole is not None:
             row[Code.HOLE], *numbers = hole.packed()
             values[record + Slot.HOLE_X], values[record + Slot.HOLE_Y] = numbers

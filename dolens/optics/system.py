@@ -68,6 +68,16 @@ class OpticalSystem:
         """Return the numbers of the coordinate breaks."""
         return tuple(n for n, s in enumerate(self.surfaces, 1) if s.shape.changes_axes)
 
+    @cached_property
+    def met(self) -> tuple[int, ...]:
+        """Return the numbers of the surfaces that light meets: all but coordinate breaks."""
+        return tuple(n for n in range(1, len(self.surfaces) + 1) if n not in self.breaks)
+
+    @cached_property
+    def neighbours(self) -> tuple[tuple[int, int], ...]:
+        """Return the numbers of surfaces that light meets one after the other."""
+        return tuple(zip(self.met, self.met[1:], strict=False))
+
     def refracts(self, number: int) -> bool:
         """Return whether a surface changes the direction of light, by refraction or reflection."""
         before, behind = self.materials[number - 1], self.materials[number]

@@ -213,11 +213,18 @@ def _gaps(operand: Operand, lens: LensProperties, glass: bool) -> Sequence[int]:
     """Return the numbers of the gaps that an operand means: its own, or all those of glass, or of
     air.
     """
+    beside = {n for number in lens.system.breaks for n in (number - 1, number)}
     if operand.gaps is not None:
+        for gap in operand.gaps:
+            if gap in beside:
+                raise InputError(
+                    f"operand '{operand.kind}': gap {gap} lies at a coordinate break, where no "
+                    "thickness is that of a medium"
+                )
         return operand.gaps
     indices = lens.system.indices(lens.wavelength)
     gaps = range(1, len(lens.system.thicknesses) + 1)
-    return [gap for gap in gaps if (float(indices[gap]) > _GLASS) == glass]
+    return [g for g in gaps if (float(indices[g]) > _GLASS) == glass and g not in beside]
 
 
 # Media of a smaller index are air.
@@ -227,7 +234,7 @@ _GLASS = 1.1
 def _at_centre(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tensor]]:
     def values(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
         return {
-            f"{operand.kind}/{gap}": lens.system.thicknesses[gap - 1]
+            f"{operand.kind}/{gap}": lens.system.senses[gap] * lens.system.thicknesses[gap - 1]
             for gap in _gaps(operand, lens, glass)
         }
 
@@ -243,7 +250,9 @@ def _at_edge(glass: bool) -> Callable[[Operand, LensProperties], dict[str, Tenso
         for gap in _gaps(operand, lens, glass):
             at_centre = lens.system.thicknesses[gap - 1]
             front, back = lens.rim_sags[gap - 1], lens.rim_sags[gap]
-            found[f"{operand.kind}/{gap}"] = at_centre + back - front
+            # Along the light, which goes towards -z behind an odd number of mirrors.
+            sense = lens.system.senses[gap]
+            found[f"{operand.kind}/{gap}"] = sense * (at_centre + back - front)
         return found
 
     return values
@@ -256,7 +265,8 @@ def _chief_ray_angle(operand: Operand, lens: LensProperties) -> dict[str, Tensor
     """Return the angle between the chief ray and the sensor's normal, degrees."""
     ray = lens.chief_ray(operand.field)
     across = torch.hypot(ray.l, ray.m)
-    return {_labelled(operand): torch.rad2deg(torch.atan2(across, ray.n))}
+    along = lens.system.senses[-1] * ray.n
+    return {_labelled(operand): torch.rad2deg(torch.atan2(across, along))}
 
 
 def _distortion(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:

@@ -17,8 +17,10 @@ from dolens.plotting.number_text import with_minus
 from dolens.plotting.section import (
     Profile,
     axis_angle,
+    broken_axis,
     element_edges,
     obscuration_profile,
+    sensor_line,
     surface_profile,
     trace_fan,
 )
@@ -80,9 +82,10 @@ def layout_drawing(
     _check(fields_deg, rays, lines)
     system = lens.system(values)
     profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
-    sensor_z = float(system.vertices[-1])
+    # The sensor's middle, and the sections of all surfaces.
+    back = float(np.concatenate([sensor_line(system, 0.0)[:, 0], *(z for z, _ in profiles)]).max())
     front = min((float(z.min()) for z, _ in profiles if len(z)), default=0.0)
-    start = front - _LEAD * (sensor_z - min(front, 0.0))
+    start = front - _LEAD * (back - min(front, 0.0))
     fans = [
         Fan(field, line, trace_fan(system, line, field, rays, object_distance, start))
         for field in fields_deg
@@ -93,15 +96,29 @@ def layout_drawing(
     reach = max(
         [height, *(float(np.abs(fan.paths[..., 1]).max()) for fan in fans if len(fan.paths))]
     )
-    margin = 0.04 * (sensor_z - start)
+    lit = [fan.paths for fan in fans if len(fan.paths)]
+    if sensor:
+        half = 0.5 * sensor
+    elif system.breaks or system.mirrors:
+        # What the rays need, seen along the sensor.
+        middle, end = sensor_line(system, 0.0)[0], sensor_line(system, 1.0)[1]
+        landed = [(paths[:, -1, [2, 1]] - middle) @ (end - middle) for paths in lit]
+        half = 1.1 * max((float(np.abs(y).max()) for y in landed), default=0.1 * height)
+        half = max(half, 0.05 * height)
+    else:
+        half = reach
+    ends = sensor_line(system, half)
+    front = min([start, *(float(paths[..., 2].min()) for paths in lit), ends[:, 0].min()])
+    back = max([back, *(float(paths[..., 2].max()) for paths in lit), ends[:, 0].max()])
+    margin = 0.04 * (back - front)
     return LayoutDrawing(
         system,
         profiles,
         fans,
         height,
-        0.5 * sensor if sensor else reach,
-        (start - margin, sensor_z + margin),
-        1.06 * max(reach, _stop_bar(system.stop, profiles, height)),
+        half,
+        (front - margin, back + margin),
+        1.06 * max(reach, _stop_bar(system.stop, profiles, height), np.abs(ends[:, 1]).max()),
     )
 
 
@@ -114,13 +131,16 @@ def draw_layout(
 ) -> None:
     """Draw into axes of the given limits (mm), at equal scales."""
     system, profiles = drawing.system, drawing.profiles
-    _draw_axis(axes, *z_limits)
+    if system.breaks:
+        _draw_axis(axes, np.concatenate([[[z_limits[0], 0.0]], broken_axis(system)]))
+    else:
+        _draw_axis(axes, np.array([[z_limits[0], 0.0], [z_limits[1], 0.0]]))
     _draw_glass(axes, system, profiles)
     _draw_rays(axes, drawing.fans, legend)
     _draw_stop(axes, system, profiles, drawing.height)
     _draw_obscurations(axes, system)
-    z, half = float(system.vertices[-1]), drawing.sensor
-    axes.plot([z, z], [-half, half], color="black", linewidth=2.5, gid="sensor", zorder=4)
+    ends = sensor_line(system, drawing.sensor)
+    axes.plot(*ends.T, color="black", linewidth=2.5, gid="sensor", zorder=4)
     axes.set(aspect="equal", xlim=z_limits, ylim=(-half_height, half_height))
     axes.set_xlabel("z (mm)", fontsize=SMALL + 1)
     axes.set_ylabel("y (mm)", fontsize=SMALL + 1)
@@ -137,10 +157,9 @@ def _check(fields_deg: Sequence[float], rays: int, lines: Sequence[float]) -> No
             raise InputError(f"layout: fields must be within ±90 degrees, not {field:g}")
 
 
-def _draw_axis(axes: Axes, z_low: float, z_high: float) -> None:
+def _draw_axis(axes: Axes, points: np.ndarray) -> None:
     axes.plot(
-        [z_low, z_high],
-        [0.0, 0.0],
+        *points.T,
         color="0.55",
         linewidth=0.7,
         dashes=(12, 3, 2, 3),
@@ -152,14 +171,14 @@ def _draw_axis(axes: Axes, z_low: float, z_high: float) -> None:
 def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) -> None:
     """Fill and outline every element; surfaces that bound no glass (stops) have no curve."""
     bounding: set[int] = set()
-    for number in range(1, len(profiles)):
+    for number, other in system.neighbours:
         if _is_glass(system, number):
-            bounding |= {number, number + 1}
-            faces = profiles[number - 1], profiles[number]
+            bounding |= {number, other}
+            faces = profiles[number - 1], profiles[other - 1]
             if not (len(faces[0][0]) and len(faces[1][0])):
                 continue
-            top, bottom = element_edges(system, number, *faces)
-            front, back = (np.stack(p, -1) for p in profiles[number - 1 : number + 1])
+            top, bottom = element_edges(system, (number, other), *faces)
+            front, back = (np.stack(p, -1) for p in faces)
             outline = np.concatenate([front, top[1:-1], back[::-1], bottom[1:-1][::-1]])
             gid = f"glass {number}"
             axes.add_patch(Polygon(outline, facecolor=_GLASS, edgecolor="none", gid=gid, zorder=0))
@@ -243,7 +262,7 @@ def _draw_stop(
 
 
 def _draw_obscurations(axes: Axes, system: OpticalSystem) -> None:
-    for number in range(1, len(system.surfaces) + 1):
+    for number in system.met:
         profile = obscuration_profile(system, number)
         if profile is not None and len(profile[0]):
             axes.plot(*profile, color="black", linewidth=2.5, gid="obscuration", zorder=4)

@@ -42,7 +42,8 @@ def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], si
     texts = [t.get_window_extent().extents for t in axes.texts if t.get_text()]
     if axes.get_legend() is not None:
         texts.append(axes.get_legend().get_window_extent().extents)
-    taken = np.concatenate([taken, np.array(texts).reshape(-1, 4)])
+    labels_taken = np.array(texts).reshape(-1, 4)
+    taken = np.concatenate([taken, labels_taken])
     for text, x, y, colour in labels:
         note = axes.annotate(
             text,
@@ -65,11 +66,17 @@ def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], si
         gap = reach + _GAP * scale
         boxes = np.concatenate([point + centres - gap, point + centres + gap], 1)
         outside = np.prod(2.0 * gap) - _shared(boxes, frame[None])[:, 0]
-        cost = _shared(boxes, taken).sum(1) + 2.0 * outside
+        # A line to the point is thin, but it must not run through another label either.
+        lines = point + centres[:, None] * np.linspace(0.2, 1.0, _STEPS)[:, None]
+        far = np.abs(_PLACES).max(1) > _NEAR
+        along = np.concatenate([lines - half, lines + half], 2)
+        crossed = _shared(along.reshape(-1, 4), labels_taken).reshape(len(far), -1).sum(1)
+        cost = _shared(boxes, taken).sum(1) + 2.0 * outside + far * crossed
         best = int(cost.argmin())
         note.set_position(tuple(centres[best] / scale))
-        note.arrow_patch.set_visible(bool(np.abs(_PLACES[best]).max() > _NEAR))
-        taken = np.concatenate([taken, boxes[[best]]])
+        note.arrow_patch.set_visible(bool(far[best]))
+        labels_taken = np.concatenate([labels_taken, boxes[[best]]])
+        taken = np.concatenate([taken, boxes[[best]]] + ([along[best]] if far[best] else []))
 
 
 def _drawn_points(axes: Axes) -> np.ndarray:
@@ -77,9 +84,8 @@ def _drawn_points(axes: Axes) -> np.ndarray:
     found = [np.zeros((0, 2))]
     share = np.linspace(0.0, 1.0, _STEPS)[:, None, None]
     for line in axes.get_lines():
-        if line.get_transform() != axes.transData:
-            continue
-        places = axes.transData.transform(line.get_path().vertices)
+        # Its own transform: a line across the whole axes counts its ends from their sides.
+        places = line.get_transform().transform(line.get_path().vertices)
         places = places[np.isfinite(places).all(1)]
         found.append(places)
         if line.get_linestyle() not in ("None", "none", "", " ") and len(places) > 1:

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import first_order
-from dolens.optics.surfaces.b_spline import BSpline
-from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.drawing import draw_layout, layout_drawing
 from dolens.plotting.number_text import number_text, with_minus
@@ -73,7 +71,7 @@ def layout_figure(
     plates = [
         number
         for number, surface in enumerate(system.surfaces, 1)
-        if issubclass(surface.shape, (XYPolynomial, BSpline))
+        if not surface.shape.rotational
         and 0.0 < _depth(system, number) < _VISIBLE * 2.0 * drawing.height
     ]
     drawn = drawn_height(drawing.z_limits, drawing.half_height, drawing.needs_legend)

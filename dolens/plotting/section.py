@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.aiming import aim
+from dolens.optics.elements import to_lens_axes
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Outline
 from dolens.optics.system import OpticalSystem
-from dolens.optics.trace import trace_surfaces, trace_to_sensor
+from dolens.optics.trace import trace_surfaces, trace_to_sensor, transfer
 
 Profile = tuple[np.ndarray, np.ndarray]
 
@@ -21,6 +23,8 @@ _SEARCH = 1.5
 _TRIALS = 601
 _BISECTIONS = 60
 _NEWTON_STEPS = 20
+# Heights on the stop whose rays are tried where the lens is folded.
+_STOP_TRIALS = 81
 
 
 def surface_profile(system: OpticalSystem, number: int) -> Profile:
@@ -32,18 +36,26 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
 
     Returns:
         z and y in mm, (samples,), from the lower rim to the upper one; shorter where the sag
-        branch ends before the aperture does, empty where the plane passes by the surface.
+        branch ends before the aperture does, empty where the plane passes by the surface, and of a
+        coordinate break.
     """
-    return _cut(system, number, system.surfaces[number - 1].aperture.edge)
+    if number in system.breaks:
+        return np.zeros(0), np.zeros(0)
+    aperture = system.surfaces[number - 1].aperture
+    centred = aperture.edge.rotational
+    return _cut(system, number, aperture.edge, (0.0, 0.0) if centred else aperture.center)
 
 
 def obscuration_profile(system: OpticalSystem, number: int) -> Profile | None:
     """Return the profile over the surface's obscuration; None where it has none."""
-    obscuration = system.surfaces[number - 1].aperture.obscuration
-    return None if obscuration is None else _cut(system, number, obscuration)
+    aperture = system.surfaces[number - 1].aperture
+    obscuration = aperture.obscuration
+    return None if obscuration is None else _cut(system, number, obscuration, aperture.center)
 
 
-def _cut(system: OpticalSystem, number: int, outline: Outline) -> Profile:
+def _cut(
+    system: OpticalSystem, number: int, outline: Outline, center: tuple[float, float]
+) -> Profile:
     rotation, origin = _place(system, number)
     # In the surface's axes the plane is a·p + o = 0, with a the lens's x seen from the surface.
     ax, ay, az = rotation[0]
@@ -70,14 +82,16 @@ def _cut(system: OpticalSystem, number: int, outline: Outline) -> Profile:
 
     def inside(q: Tensor) -> Tensor:
         x, y, _, _ = point(q)
-        return outline.margin(x, y) >= 0.0
+        return outline.margin(x - center[0], y - center[1]) >= 0.0
 
-    middle = torch.zeros(1, dtype=torch.float64)
+    # Along the cut, the place nearest to the outline's centre.
+    begin = float(vx) * center[0] + float(vy) * center[1]
+    middle = torch.full((1,), begin, dtype=torch.float64)
     if not bool(inside(middle)):
         return np.zeros(0), np.zeros(0)
     # The rims: the last point inside on either side.
-    near = torch.zeros(2, dtype=torch.float64)
-    far = 1.5 * outline.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    near = middle.expand(2)
+    far = begin + 1.5 * outline.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
     for _ in range(_BISECTIONS):
         half = 0.5 * (near + far)
         kept = inside(half)
@@ -106,14 +120,16 @@ def axis_angle(system: OpticalSystem, number: int) -> float:
 
 
 def element_edges(
-    system: OpticalSystem, number: int, front: Profile, back: Profile
+    system: OpticalSystem, numbers: tuple[int, int], front: Profile, back: Profile
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ground edges, upper and lower, of the glass behind a surface, (corners, 2) as z,
-    y.
+    """Return the ground edges, upper and lower, of the glass between two surfaces, (corners, 2) as
+    z, y.
 
     They run along the axis of the element that carries both faces.
     """
-    together = system.axes[number - 1].elements == system.axes[number].elements
+    number, other = numbers
+    axes = system.axes
+    together = axes[number - 1].together(axes[other - 1])
     angle = axis_angle(system, number) if together else 0.0
     turned = [_turn(face, -angle) for face in (front, back)]
     upper, lower = (_edge(*turned, end) for end in (-1, 0))
@@ -168,8 +184,11 @@ def trace_fan(
         start: z in mm where the first point of every ray lies, or at the object if that is nearer.
 
     Returns:
-        (valid rays, surfaces + 2, 3), mm: start, every surface, sensor.
+        (valid rays, surfaces + 2, 3), mm, in the lens's axes: start, every surface that light
+        meets, sensor.
     """
+    if system.breaks:
+        return _aimed_fan(system, wavelength, field_deg, rays, object_distance, start)
     pupil = entrance_pupil(system, wavelength)
     if object_distance is not None:
         if not (object_distance > 0.0 and object_distance + float(pupil.z) > 0.0):
@@ -190,10 +209,7 @@ def trace_fan(
         n = torch.rsqrt(1.0 + slopes * slopes)
         zero = torch.zeros_like(y)
         ray = Components(zero, y, zero + start, zero, slopes * n, n)
-        traced = trace_surfaces(system, ray, wavelength, record=True)
-        traced = trace_to_sensor(system, traced, wavelength)
-        points = [ray[:3], *traced.points, traced.ray[:3]]
-        return torch.stack([torch.stack(point, -1) for point in points], 1), traced.valid
+        return _paths(system, ray, wavelength)
 
     if rays == 1:
         aims = torch.zeros_like(pupil.z).reshape(1)
@@ -202,8 +218,70 @@ def trace_fan(
         trials = torch.linspace(-1.0, 1.0, _TRIALS).to(reach) * reach
         passing = trials[trace(trials)[1]]
         if not len(passing):
-            return np.zeros((0, len(system.surfaces) + 2, 3))
+            return np.zeros((0, len(system.met) + 2, 3))
         share = torch.linspace(0.0, 1.0, rays).to(reach)
         aims = passing[0] * (1.0 - share) + passing[-1] * share
     path, valid = trace(aims)
     return path[valid].double().cpu().numpy()
+
+
+def _paths(system: OpticalSystem, ray: Components, wavelength: float) -> tuple[Tensor, Tensor]:
+    """Return the points (N, points, 3) of rays in the lens's axes, and which reach the sensor."""
+    traced = trace_surfaces(system, ray, wavelength, record=True)
+    landed = trace_to_sensor(system, traced, wavelength)
+    end = landed.ray._replace(z=landed.ray.z - system.vertices[-1])
+    met = [traced.points[number - 1] for number in system.met]
+    points = [ray[:3], *met, to_lens_axes(end, system.all_axes[-1])[:3]]
+    return torch.stack([torch.stack(point, -1) for point in points], 1), landed.valid
+
+
+def _aimed_fan(
+    system: OpticalSystem,
+    wavelength: float,
+    field_deg: float,
+    rays: int,
+    object_distance: float | None,
+    start: float,
+) -> np.ndarray:
+    """Trace a fan whose rays are aimed at the stop, wherever it stands; see `trace_fan`."""
+    angle = math.radians(field_deg)
+    along = angle
+    if object_distance is not None:
+        # The chief ray comes down from a point of the object, towards the first vertex.
+        along = -math.tan(angle) * object_distance
+        start = max(start, -object_distance)
+    like = system.sensor_distance.detach()
+    field = torch.stack([torch.zeros_like(like), torch.full_like(like, along)])
+
+    def trace(heights: Tensor) -> tuple[Tensor, Tensor]:
+        """Heights on the stop over its semi-diameter, (N,), to points and validity."""
+        pupil = torch.stack([torch.zeros_like(heights), heights], -1)
+        aimed = aim(system, field, pupil, wavelength, object_distance)
+        ray = aimed.components()
+        ray = transfer(ray, (start - ray.z) / ray.n)
+        points, valid = _paths(system, ray, wavelength)
+        return points, valid & aimed.converged
+
+    if rays == 1:
+        heights = torch.zeros_like(like).reshape(1)
+    else:
+        trials = torch.linspace(-1.0, 1.0, _STOP_TRIALS).to(like) * (1.0 - 1e-9)
+        passing = trials[trace(trials)[1]]
+        if not len(passing):
+            return np.zeros((0, len(system.met) + 2, 3))
+        share = torch.linspace(0.0, 1.0, rays).to(like)
+        heights = passing[0] * (1.0 - share) + passing[-1] * share
+    path, valid = trace(heights)
+    return path[valid].double().cpu().numpy()
+
+
+def broken_axis(system: OpticalSystem) -> np.ndarray:
+    """Return z and y (surfaces + 1, 2), mm, of the vertices that the axis leads through."""
+    return system.global_axes().origin.detach().cpu().numpy()[:, [2, 1]]
+
+
+def sensor_line(system: OpticalSystem, half: float) -> np.ndarray:
+    """Return the ends z and y (2, 2), mm, of a line of half a length, along the sensor's y."""
+    axes = system.global_axes()
+    origin, along = (v[-1].detach().cpu().numpy() for v in (axes.origin, axes.rotation[..., 1]))
+    return np.stack([origin - half * along, origin + half * along])[:, [2, 1]]

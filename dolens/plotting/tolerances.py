@@ -2,6 +2,7 @@
 bars.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -26,6 +27,8 @@ _SQUEEZE = 1.4
 _BOTH_SIGNS, _POSITIVE = "RdBu_r", "Reds"
 # Two standard deviations of a share of n lenses, √(p·(1 - p)/n), are drawn as a band.
 _BAND = 2.0
+# A half-range as `Tolerances.label` writes it: number, and unit with the blank before it.
+_TOLERANCE = re.compile(r"± ([\d.e+-]+)(.*)")
 
 
 def matrix_figure(
@@ -217,10 +220,14 @@ def parameter_label(name: str) -> str:
 
 
 def tolerance_label(name: str, tolerance: str) -> str:
-    """Return a parameter with its tolerance: `front tilt x, ±0.05°` of `± 0.05 deg`."""
-    number, _, unit = tolerance.removeprefix("± ").partition(" ")
-    printed = "°" if unit == "deg" else f" {unit}".rstrip()
-    return f"{parameter_label(name)}, ±{number_text(float(number), 4)}{printed}"
+    """Return a parameter with its tolerance: `front tilt x, ±0.05°` of `± 0.05°`.
+
+    Args:
+        name: of the parameter.
+        tolerance: as `Tolerances.label` writes it.
+    """
+    number, unit = _TOLERANCE.fullmatch(tolerance).groups()
+    return f"{parameter_label(name)}, ±{number_text(float(number), 4)}{unit}"
 
 
 def _part(axes: Axes, groups: Sequence[tuple[str, int]], named: bool) -> None:

@@ -6,6 +6,7 @@ from dolens.prescriptions.files import (
     lens_names,
     load_lens,
     load_prescription,
+    published_lens_names,
     save_lens,
 )
 from dolens.prescriptions.spline_fit import fit_b_spline
@@ -18,5 +19,6 @@ __all__ = [
     "load_lens",
     "load_prescription",
     "prescription_of",
+    "published_lens_names",
     "save_lens",
 ]

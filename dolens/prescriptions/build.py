@@ -12,8 +12,9 @@ A prescription is a mapping::
       '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
     sensor: {distance: 96.0, diameter: 1.7664}
 
-Lengths are in mm; `radius: .inf` is a plane; `material` is the medium behind the surface: `air`,
-`occluder`, a constant index (`1.5`), glass as nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+Lengths are in mm; `radius: .inf` is a plane (some shapes have `radius_x` and `radius_y`);
+`material` is the medium behind the surface: `air`, `occluder`, a constant index (`1.5`), glass as
+nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
 `material: mirror` makes the surface reflect; behind it light travels towards -z, and thicknesses
 are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
 that stands behind them (see breaks.py).
@@ -22,6 +23,7 @@ lens (see deflections.py).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
+So are the numbers that its source publishes (see `dolens.prescriptions.published`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -38,6 +40,7 @@ from dolens.optics.materials import parse_material
 from dolens.optics.mirrors import media_of
 from dolens.optics.surfaces import SURFACES, Surface
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
+from dolens.prescriptions.automatic_apertures import set_automatic_semi_diameters
 from dolens.prescriptions.breaks import KIND, break_from, break_row, is_break
 from dolens.prescriptions.checks import (
     as_integer,
@@ -53,7 +56,9 @@ from dolens.prescriptions.deflections import (
     power_row,
     with_power,
 )
+from dolens.prescriptions.field_data import set_object_fields
 from dolens.prescriptions.poses import element_rows, elements_from
+from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
     set_stop_semi_diameter,
@@ -65,6 +70,7 @@ from dolens.prescriptions.system_data import (
 _LENS_KEYS = (
     "name",
     "source",
+    PUBLISHED_KEY,
     "index_model",
     "stop",
     "object_material",
@@ -75,6 +81,8 @@ _LENS_KEYS = (
 )
 _SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", "note")
 _SENSOR_KEYS = ("distance", "diameter")
+# A prescription may give the radius of the same name instead: `radius_x` for `curvature_x`.
+CURVATURES = ("curvature", "curvature_x", "curvature_y")
 
 
 def lens_from_prescription(
@@ -143,9 +151,12 @@ def lens_from_prescription(
             dtype,
             elements_from(prescription.get("elements"), dtype, where),
             backend=backend,
+            source=str(prescription.get("source") or ""),
+            published=published_from(prescription.get(PUBLISHED_KEY), where),
             **data,
         )
-        return set_stop_semi_diameter(lens, prescription)
+        lens = set_object_fields(set_stop_semi_diameter(lens, prescription))
+        return set_automatic_semi_diameters(lens, prescription)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(where) else f"{where}: {message}") from None
@@ -168,12 +179,13 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
             if key == "power" and surface.law is not None:
                 row |= power_row(number_value)
                 continue
-            if key == "curvature":
-                row["radius"] = _radius(number_value)
-                if 1.0 / row["radius"] != number_value:
+            if key in CURVATURES:
+                radius = _radius_key(key)
+                row[radius] = _radius(number_value)
+                if 1.0 / row[radius] != number_value:
                     # Rounding of 1/(1/c) loses a bit for some c: keep the parameter itself.
-                    del row["radius"]
-                    row["curvature"] = number_value
+                    del row[radius]
+                    row[key] = number_value
             else:
                 row[key] = number_value
         if surface.phase is not None:
@@ -187,6 +199,8 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         sensor["diameter"] = lens.sensor_diameter
     return {
         "name": lens.name,
+        **({"source": lens.source} if lens.source else {}),
+        **published_rows(lens.published),
         "index_model": lens.index_model,
         "stop": lens.stop,
         "object_material": lens.materials[0].name,
@@ -216,15 +230,17 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
         if is_paraxial_lens(row):
             row = with_power(row)
         names = shape.parameter_names(row)
-        check_keys(row, (*_SURFACE_KEYS, *names), place)
+        radii = [_radius_key(name) for name in names if name in CURVATURES]
+        check_keys(row, (*_SURFACE_KEYS, *names, *radii), place)
         values = {
             key: (as_numbers if key in shape.arrays else as_number)(row.get(key, 0.0), f"'{key}'")
             for key in names
             if key in row or key not in shape.optional
         }
-        if "curvature" in names:
-            values["curvature"] = _curvature(row)
-        elif not math.isinf(as_number(row.get("radius", math.inf), "'radius'")):
+        values |= {name: _curvature(row, name) for name in names if name in CURVATURES}
+        if "curvature" not in names and not math.isinf(
+            as_number(row.get("radius", math.inf), "'radius'")
+        ):
             raise InputError(f"a surface of type '{kind}' has no 'radius'")
         surface = shape(clear_aperture(row, place), values, dtype)
         if row.get(PHASE_KEY) is not None:
@@ -237,17 +253,24 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None
 
 
-def _curvature(row: Mapping[str, Any]) -> float:
-    if row.get("curvature") is not None and row.get("radius") is not None:
-        raise InputError("give 'radius' or 'curvature', not both")
-    if row.get("curvature") is not None:
-        return as_number(row["curvature"], "'curvature'")
-    if row.get("radius") is None:
-        raise InputError("'radius' is missing (mm; .inf for a plane)")
-    radius = as_number(row["radius"], "'radius'", finite=False)
+def _curvature(row: Mapping[str, Any], name: str) -> float:
+    """Return a curvature of a row, which gives it or the radius of the same name."""
+    key = _radius_key(name)
+    if row.get(name) is not None and row.get(key) is not None:
+        raise InputError(f"give '{key}' or '{name}', not both")
+    if row.get(name) is not None:
+        return as_number(row[name], f"'{name}'")
+    if row.get(key) is None:
+        raise InputError(f"'{key}' is missing (mm; .inf for a plane)")
+    radius = as_number(row[key], f"'{key}'", finite=False)
     if radius == 0.0:
-        raise InputError("'radius' is 0; write .inf for a plane")
+        raise InputError(f"'{key}' is 0; write .inf for a plane")
     return 1.0 / radius
+
+
+def _radius_key(name: str) -> str:
+    """Return `radius_x` for `curvature_x`."""
+    return name.replace("curvature", "radius")
 
 
 def _radius(curvature: float) -> float:

@@ -104,10 +104,11 @@ def _flat(prescription: Mapping[str, Any], medium: Callable[[str], str]) -> dict
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:
     plain = {key: _plain(value) for key, value in row.items() if value is not None}
-    if "radius" in plain:
-        radius = as_number(plain.pop("radius"), "'radius'", finite=False)
-        if plain["type"] not in ("plane", "aperture"):
-            plain["curvature"] = 1.0 / radius
+    for key in ("radius", "radius_x", "radius_y"):
+        if key in plain:
+            radius = as_number(plain.pop(key), f"'{key}'", finite=False)
+            if plain["type"] not in ("plane", "aperture"):
+                plain[key.replace("radius", "curvature")] = 1.0 / radius
     if "focal_length" in plain:
         plain["power"] = power_of(plain.pop("focal_length"))
     return plain

@@ -114,6 +114,7 @@ def _told(difference: Difference, said: list[str]) -> bool:
         "name": "the name",
         "note": "remark",
         "source": "lost: source",
+        "published": "lost: the published numbers",
         "elements": "lost: the names",
         "index_model": "the index model",
         "material": "the glass",

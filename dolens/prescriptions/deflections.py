@@ -7,8 +7,8 @@ A surface of any shape may have a phase::
     '5': {type: plane, ..., phase: {type: xy, norm_radius: 10, x: 12.5, x2y: 3.0}}
 
 `grooves` are per mm, parallel to x.  Coefficients are radians of the first order, of
-(r/norm_radius)² and so on.  `order` is 1 and `norm_radius` 1 mm unless they are given.  `efficiency`, from 0 to 1,
-is data.
+(r/norm_radius)² and so on.  `order` is 1 and `norm_radius` 1 mm unless they are given.
+`efficiency`, from 0 to 1, is data.
 
 An ideal lens is `{type: paraxial_lens, focal_length: 100}` (mm) or has its `power` (1/mm).
 """

@@ -12,6 +12,7 @@ from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
+from dolens.prescriptions.published import PUBLISHED_KEY
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.yaml_text import plain_values
 
@@ -33,32 +34,59 @@ logger = logging.getLogger(__name__)
 
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
+# Of these, prescriptions from patents and books lie in a folder of their own.
+_PUBLISHED = "published"
+# What holds the numbers that a source publishes.
+_WHOLE = (".yaml", ".yml", ".json")
 
 
 def lens_names() -> list[str]:
-    """Return the names of the lenses that come with dolens, as `load_lens` takes them."""
-    return sorted(path.stem for path in (packaged_configuration() / _LENSES).glob("*.yaml"))
+    """Return the names of the lenses that come with dolens, as `load_lens` takes them.
+
+    Those from patents and books are listed apart, by `published_lens_names`.
+    """
+    return _names(".")
+
+
+def published_lens_names() -> list[str]:
+    """Return the names of the lenses from patents and books, such as `published/tessar_us2838978`.
+
+    Each holds the numbers that its source prints beside the prescription, as `Lens.published`.
+    """
+    return [f"{_PUBLISHED}/{name}" for name in _names(_PUBLISHED)]
+
+
+def _names(folder: str) -> list[str]:
+    return sorted(
+        path.stem for path in (packaged_configuration() / _LENSES / folder).glob("*.yaml")
+    )
 
 
 def find_lens(path: str | Path) -> Path:
     """Return the file of a lens: the path itself, or that of a lens that comes with dolens.
 
     Args:
-        path: a file, or a bare name without suffix, such as `cooke_triplet`, that is no file here.
+        path: a file, or a bare name without suffix, such as `cooke_triplet` or
+            `published/tessar_us2838978`, that is no file here.
 
     Raises:
-        InputError: a bare name that is neither; the message offers near ones and lists all.
+        InputError: a bare name that is neither; the message offers near ones, and lists those of
+            the lenses that are not in a folder.
     """
     path = Path(path)
-    if path.suffix or path.name != str(path) or path.is_file():
+    name = path.as_posix()
+    published = path.parent.as_posix() == _PUBLISHED
+    if path.suffix or path.is_file() or not (path.name == name or published):
         return path
-    names = lens_names()
-    if path.name not in names:
+    allowed = published_lens_names() if published else lens_names()
+    if name not in allowed:
+        near = did_you_mean(name, [*allowed, *published_lens_names()])
+        some = "those of docs/lenses.md" if published else ", ".join(allowed)
         raise InputError(
-            f"lens '{path}': no such file, and no lens of that name comes with dolens"
-            f"{did_you_mean(path.name, names)} (allowed: {', '.join(names)})"
+            f"lens '{path}': no such file, and no lens of that name comes with dolens{near} "
+            f"(allowed: {some})"
         )
-    return packaged_configuration() / _LENSES / f"{path.name}.yaml"
+    return packaged_configuration() / _LENSES / f"{name}.yaml"
 
 
 def load_prescription(path: str | Path) -> Any:
@@ -66,7 +94,7 @@ def load_prescription(path: str | Path) -> Any:
 
     Args:
         path: a file in YAML (.yaml, .yml), the diffoptics format (.txt) or Zemax's (.zmx), or the
-            name of a lens that comes with dolens (`lens_names`).
+            name of a lens that comes with dolens (`lens_names`, `published_lens_names`).
 
     Raises:
         InputError: the file is missing, of another kind, or not valid; the message is one line
@@ -166,10 +194,14 @@ def load_lens(
 def save_lens(lens: Lens, path: str | Path) -> None:
     """Write a lens in the format that the suffix names (.yaml, .yml, .txt or .zmx).
 
-    Reading it back gives the same parameters to the last bit.
+    Reading it back gives the same parameters to the last bit.  YAML alone holds the numbers that
+    the lens's source publishes.
 
     Raises:
         InputError: the format cannot hold the lens; the message names the surface and key.
     """
     path = Path(path)
-    path.write_bytes(encode_prescription(prescription_of(lens), path))
+    prescription = prescription_of(lens)
+    if path.suffix.lower() not in _WHOLE:
+        prescription.pop(PUBLISHED_KEY, None)
+    path.write_bytes(encode_prescription(prescription, path))

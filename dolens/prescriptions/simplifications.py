@@ -80,7 +80,9 @@ def _aperture_planes(prescription: Prescription, new: str) -> list[str]:
         flat = row.get("type", "sphere") in ("plane", "sphere") and _is_flat(row)
         flat = flat and row.get("phase") is None
         empty = canonical(str(row.get("material"))) == canonical(str(before))
-        before = row.get("material")
+        # A mirror and a coordinate break leave the medium as it is.
+        if str(row.get("material", "mirror")).strip().lower() != "mirror":
+            before = row["material"]
         if row.get("type") == "aperture" and str(n) != stop:
             row["type"] = "plane"
             said.append(
@@ -121,6 +123,12 @@ def _without_source(prescription: Prescription, new: str) -> list[str]:
     return [f"lost: source {str(source)!r}"] if source else []
 
 
+def _without_published(prescription: Prescription, new: str) -> list[str]:
+    """Drop the numbers that the source publishes."""
+    found = prescription.pop("published", None)
+    return ["lost: the published numbers"] if found else []
+
+
 def _one_line_name(prescription: Prescription, new: str) -> list[str]:
     """Put a name on one line."""
     name = str(prescription.get("name") or "")
@@ -135,6 +143,7 @@ SIMPLIFICATIONS: tuple[Callable[[Prescription, str], list[str]], ...] = (
     _one_line_name,
     _without_notes,
     _without_source,
+    _without_published,
     _without_poses,
     _aperture_planes,
     _glass_by_numbers,

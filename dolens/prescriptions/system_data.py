@@ -1,47 +1,75 @@
-"""The system data of a lens are its wavelengths, fields, object distance and pupil.
+"""The system data of a lens are its wavelengths, fields, object distance, pupil, and the air.
 
 In a prescription, every key optional::
 
     wavelengths: [656.2725, 587.5618, 486.1327]   # nm
+    wavelength_weights: [1, 2, 1]                 # of any sum; else all the same
     reference_wavelength: 587.5618                # nm, one of them; the first unless given
-    fields: {angles: [[0, 0], [0, 20]]}           # x, y in degrees
-    fields: {heights: [[0, 0], [0, 10]]}          # or x, y in mm on an object at object_distance
+    fields: {angles: [[0, 0], [0, 20]]}           # x, y in degrees; or
+    fields: {heights: [[0, 0], [0, 10]]}          # mm on an object at object_distance; or
+    fields: {pupil_angles: [[0, 0], [0, 20]]}     # degrees, of the line to the entrance pupil; or
+    fields: {image_heights: [[0, 0], [0, 21.6]]}  # mm on the paraxial image; or
+    fields: {real_image_heights: [[0, 21.6]]}     # mm on the sensor, where real chief rays land
     object_distance: 650                          # mm in front of the first vertex; else infinity
     entrance_pupil_diameter: 20                   # mm; or
-    f_number: 2.8                                 # EFL over the diameter of the entrance pupil
+    f_number: 2.8                                 # EFL over the diameter of the entrance pupil; or
+    working_f_number: 3.1                         # 1/(2n'u') of the paraxial marginal ray; or
+    object_na: 0.25                               # n·sin(u) of the axial object point's edge ray
+    telecentric_object: true                      # the stop's image in object space is at infinity
+    temperature: 20                               # °C
+    pressure: 1                                   # atm
+
+Fields may also have `weights`, a number each, and `vignetting`, what part of the stop the beam of
+each fills (`dolens.optics.fields.Vignetting`)::
+
+    fields: {angles: [[0, 0], [0, 20]], weights: [1, 0.5],
+             vignetting: [{}, {decenter_y: -0.05, compression_y: 0.3}]}
 
 A pupil closes the stop: its semi-diameter becomes the one whose paraxial image has that diameter
 at the reference wavelength, and stays what the prescription says where that is smaller.
+A lens has fields by angles or by heights on the object: those that a prescription gives by the
+image or the pupil are converted when the lens is built (`dolens.optics.image_heights`).
 """
 
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 
-from dolens.errors import InputError, check_keys
-from dolens.optics.fields import Fields
+from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
-from dolens.prescriptions.checks import as_number, as_positive, require_mapping
+from dolens.optics.paraxial import matrix_to_stop
+from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
+from dolens.prescriptions.apertures import is_automatic
+from dolens.prescriptions.checks import as_number, as_positive
+from dolens.prescriptions.field_data import field_rows, fields_from, weights_from
 
-PUPIL_KEYS = ("entrance_pupil_diameter", "f_number")
+PUPIL_KEYS = ("entrance_pupil_diameter", "f_number", "working_f_number", "object_na")
 SYSTEM_DATA_KEYS = (
     "wavelengths",
+    "wavelength_weights",
     "reference_wavelength",
     "fields",
     "object_distance",
     *PUPIL_KEYS,
+    "telecentric_object",
+    "temperature",
+    "pressure",
 )
-_FIELD_KINDS = ("angles", "heights")
+# A stop's image so many object distances away counts as infinitely far.
+_TELECENTRIC = 1e4
 # Stands for a stop's semi-diameter (mm) until the pupil decides: within any surface's sag branch.
 _UNDECIDED = 1e-6
 
 
 def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the system data as arguments of `Lens`: wavelengths, fields and object distance.
+    """Return the system data as arguments of `Lens`: all but the pupil.
+
+    Fields by the image or the pupil are as the prescription has them; `set_object_fields` of
+    `dolens.prescriptions.field_data` converts them.
 
     Raises:
         InputError: one line that names `where` and the key; two pupils are one too many.
@@ -62,17 +90,35 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
                 f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths' "
                 f"(allowed: {', '.join(map(repr, wavelengths or ())) or 'none, as none is given'})"
             )
+    weights = prescription.get("wavelength_weights")
+    if weights is not None:
+        weights = weights_from(weights, len(wavelengths or ()), f"{where}: 'wavelength_weights'")
+    air = {}
+    for key in ("temperature", "pressure"):
+        value = prescription.get(key)
+        air[key] = None if value is None else as_number(value, f"{where}: '{key}'")
+    if air["pressure"] is not None and air["pressure"] < 0.0:
+        raise InputError(f"{where}: 'pressure' must not be negative, not {air['pressure']!r}")
+    telecentric = prescription.get("telecentric_object", False)
+    if not isinstance(telecentric, bool):
+        raise InputError(f"{where}: 'telecentric_object' must be true or false")
     distance = prescription.get("object_distance")
     if distance is not None:
         distance = as_number(distance, f"{where}: 'object_distance'")
-    fields = _fields(prescription.get("fields"), f"{where}: fields")
+    fields = fields_from(prescription.get("fields"), f"{where}: fields")
     if fields is not None and fields.kind == "heights" and distance is None:
         raise InputError(f"{where}: 'fields.heights' need an 'object_distance' (mm)")
+    for key, needs in (("object_na", True), ("telecentric_object", telecentric)):
+        if needs and prescription.get(key) and distance is None:
+            raise InputError(f"{where}: '{key}' needs an 'object_distance' (mm)")
     return {
         "wavelengths": wavelengths,
         "reference_wavelength": reference,
         "fields": fields,
         "object_distance": distance,
+        "wavelength_weights": weights,
+        "telecentric_object": telecentric,
+        **air,
     }
 
 
@@ -81,11 +127,16 @@ def system_data_of(lens: Lens) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if lens.wavelengths is not None:
         found["wavelengths"] = list(lens.wavelengths)
+        if lens.wavelength_weights is not None:
+            found["wavelength_weights"] = list(lens.wavelength_weights)
         found["reference_wavelength"] = lens.reference_wavelength
     if lens.fields is not None:
-        found["fields"] = {lens.fields.kind: [list(point) for point in lens.fields.points]}
-    if lens.object_distance is not None:
-        found["object_distance"] = lens.object_distance
+        found["fields"] = field_rows(lens.fields)
+    for key in ("object_distance", "temperature", "pressure"):
+        if getattr(lens, key) is not None:
+            found[key] = getattr(lens, key)
+    if lens.telecentric_object:
+        found["telecentric_object"] = True
     return found
 
 
@@ -96,7 +147,7 @@ def stop_row(row: Mapping[str, Any], number: int, prescription: Mapping[str, Any
     sizes = (row.get("semi_diameter"), row.get("aperture"))
     undecided = sizes == (None, None) and _pupil(prescription) is not None
     if undecided and str(prescription.get("stop", 1)) == str(number):
-        return {**row, "semi_diameter": _UNDECIDED}
+        return {**row, "semi_diameter": _UNDECIDED, "clips": False}
     return row
 
 
@@ -110,28 +161,66 @@ def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
         InputError: no stop of finite size makes this pupil, or it would exceed its surface.
     """
     key = _pupil(prescription)
+    exact = copy.deepcopy(lens).to(torch.float64)
+    if lens.telecentric_object:
+        _require_telecentric(exact)
     if key is None:
+        if is_automatic(_stop_of(prescription, lens.stop)):
+            raise InputError(
+                f"surface {lens.stop}, the stop: an automatic semi-diameter needs a pupil "
+                f"({', '.join(PUPIL_KEYS)})"
+            )
         return lens
     target = as_positive(prescription[key], f"'{key}'")
-    with torch.no_grad():
-        exact = copy.deepcopy(lens).to(torch.float64)
-        first = exact.first_order(lens.primary_wavelength)
-    if key == "f_number":
-        target = abs(float(first.efl)) / target
     surface = lens.surfaces[str(lens.stop)]
-    needed = surface.semi_diameter * target / float(first.entrance_pupil.diameter)
+    needed = _stop_for(key, target, exact)
     if not (math.isfinite(needed) and needed > 0.0):
         raise InputError(f"'{key}' {prescription[key]!r}: no size of the stop makes this pupil")
     given = _stop_of(prescription, lens.stop).get("semi_diameter")
-    if not isinstance(surface.aperture.edge, Circle):
-        raise InputError(f"'{key}' closes a circular stop; surface {lens.stop} is a rectangle")
-    size = needed if given is None else min(needed, surface.semi_diameter)
+    aperture = surface.aperture
+    limited = given is not None and aperture.clips
+    size = min(needed, as_number(given, "'semi_diameter'")) if limited else needed
+    edge, window = Circle(size), aperture.window
+    if not isinstance(aperture.edge, Circle | Unlimited):
+        # The pupil is a circle, and the stop's own outline may take light away from it.
+        window = aperture.edge
     try:
-        surface.aperture = ClearAperture(Circle(size), surface.aperture.obscuration)
+        surface.aperture = replace(aperture, edge=edge, window=window)
         surface.check_aperture()
     except InputError as error:
         raise InputError(f"surface {lens.stop}: closed to '{key}', {error}") from None
     return lens
+
+
+@torch.no_grad()
+def _stop_for(key: str, target: float, lens: Lens) -> float:
+    """Return the semi-diameter (mm) of the stop that makes a pupil."""
+    wavelength, distance = lens.primary_wavelength, lens.object_distance
+    if key == "object_na":
+        system = lens.system()
+        n = float(lens.materials[0].index(wavelength))
+        if target >= n:
+            raise InputError(f"'object_na' must be below the index {n:g} of the object's medium")
+        slope = math.tan(math.asin(target / n))
+        matrix = matrix_to_stop(system, wavelength)
+        return abs(float(matrix[0, 0]) * float(distance) + float(matrix[0, 1]) * n) * slope
+    size = lens.surfaces[str(lens.stop)].semi_diameter
+    first = lens.first_order(wavelength, distance)
+    if key == "working_f_number":
+        return size * abs(float(first.working_f_number)) / target
+    if key == "f_number":
+        target = abs(float(first.efl)) / target
+    return size * target / float(first.entrance_pupil.diameter)
+
+
+@torch.no_grad()
+def _require_telecentric(lens: Lens) -> None:
+    pupil = float(lens.first_order(lens.primary_wavelength).entrance_pupil.z)
+    if abs(pupil) < _TELECENTRIC * float(lens.object_distance):
+        raise InputError(
+            "'telecentric_object': the image of the stop in object space lies at "
+            f"z = {pupil:.4g} mm and not at infinity"
+        )
 
 
 def _pupil(prescription: Mapping[str, Any]) -> str | None:
@@ -140,25 +229,3 @@ def _pupil(prescription: Mapping[str, Any]) -> str | None:
 
 def _stop_of(prescription: Mapping[str, Any], stop: int) -> Mapping[str, Any]:
     return {str(n): row for n, row in prescription["surfaces"].items()}[str(stop)]
-
-
-def _fields(value: Any, place: str) -> Fields | None:
-    if value is None:
-        return None
-    require_mapping(value, place)
-    check_keys(value, _FIELD_KINDS, place)
-    if len(value) != 1:
-        raise InputError(f"{place}: give 'angles' (degrees) or 'heights' (mm)")
-    kind, points = next(iter(value.items()))
-    shape = f"{place}: '{kind}' must be a list of points [x, y]"
-    if not isinstance(points, list | tuple) or not points:
-        raise InputError(f"{shape}, not {points!r}")
-    found = []
-    for point in points:
-        if not isinstance(point, list | tuple) or len(point) != 2:
-            raise InputError(f"{shape}, not {point!r}")
-        x, y = (as_number(entry, f"{place}: '{kind}'") for entry in point)
-        if kind == "angles" and max(abs(x), abs(y)) >= 90.0:
-            raise InputError(f"{place}: 'angles' must be below 90 degrees, not {point!r}")
-        found.append((x, y))
-    return Fields(str(kind), tuple(found))

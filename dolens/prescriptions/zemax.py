@@ -63,12 +63,14 @@ class ZemaxFile:
         surfaces: the same for each surface, from the object to the image.
         tail: the lines behind the surfaces: merit function, tolerances, configurations.
         passed_over: operand → its lines in the system and the surfaces, which are not read.
+        skipped: numbers of surfaces that the file leaves out.
     """
 
     system: dict[str, list[Line]] = field(default_factory=dict)
     surfaces: list[dict[str, list[Line]]] = field(default_factory=list)
     tail: list[Line] = field(default_factory=list)
     passed_over: dict[str, list[Line]] = field(default_factory=dict)
+    skipped: list[int] = field(default_factory=list)
 
 
 def decode_zemax(data: bytes, where: str = "lens") -> str:
@@ -105,6 +107,22 @@ def encode_zemax(text: str) -> bytes:
     return codecs.BOM_UTF16_LE + text.encode("utf-16-le")
 
 
+def _check_number(file: ZemaxFile, line: Line, where: str) -> None:
+    """Check that a surface has the number that is due.
+
+    Some programs skip a number, which leaves a plane of no thickness in air: that must be what it
+    would be, with air before it.
+    """
+    expected = len(file.surfaces) + len(file.skipped)
+    number = line.arguments[0] if line.arguments else ""
+    if number == str(expected):
+        return
+    skips = number == str(expected + 1) and file.surfaces and "GLAS" not in file.surfaces[-1]
+    if not skips:
+        raise InputError(f"{where}: line {line.at}: expected SURF {expected}, not 'SURF {number}'")
+    file.skipped.append(expected)
+
+
 def parse_zemax(text: str, where: str) -> ZemaxFile:
     """Sort the lines of a file by surface and operand.
 
@@ -125,11 +143,7 @@ def parse_zemax(text: str, where: str) -> ZemaxFile:
         line = Line(at, words[0].upper(), words[1:], raw.strip()[len(words[0]) :].strip())
         indent = len(raw) - len(raw.lstrip())
         if line.operand == "SURF":
-            expected = str(len(file.surfaces))
-            if line.arguments[:1] != [expected]:
-                raise InputError(
-                    f"{where}: line {at}: expected SURF {expected}, not '{raw.strip()}'"
-                )
+            _check_number(file, line, where)
             block, margin = {}, indent
             file.surfaces.append(block)
         elif block is not None and line.operand in SURFACE_OPERANDS:

@@ -1,8 +1,11 @@
-"""Apertures of a Zemax surface are circles, rings, rectangles, and obscurations.
+"""Apertures of a Zemax surface are circles, rings, rectangles, ellipses, and obscurations.
 
 `CLAP` and `FLAP` are circles (the first may have an inner radius, an obscuration), `SQAP` is a
-rectangle of half widths, `OBSC` and `SQOB` block a circle and a rectangle.  A surface has one of
-them; `DIAM` is the semi-diameter it is drawn to.
+rectangle of half widths, `ELAP` an ellipse; `OBSC`, `SQOB` and `ELOB` block such outlines.  A
+surface has one of them, and `OBDC` says where it is beside the vertex.
+
+`DIAM` is the semi-diameter that a surface is drawn to, and clips nothing, whether a user or Zemax
+has written it.  `DIAM 0`, or none, leaves the size to the light of the fields.
 """
 
 from collections.abc import Mapping
@@ -10,8 +13,9 @@ from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.decimals import number_in_text, scaled
+from dolens.prescriptions.decimals import scaled
 from dolens.prescriptions.zemax import Line
 
 Block = dict[str, list[Line]]
@@ -20,55 +24,73 @@ _NOT_HELD = {
     "SPID": "a spider, which blocks light with its arms,",
     "USAP": "an aperture whose outline the user draws",
     "USOB": "an obscuration whose outline the user draws",
-    "ELAP": "an elliptical aperture",
-    "ELOB": "an elliptical obscuration",
 }
 _HALF_WIDTHS = ("half_width_x", "half_width_y")
+_SEMI_AXES = ("semi_axis_x", "semi_axis_y")
+_CENTER = ("decenter_x", "decenter_y")
+# Outlines of two numbers: what light passes, and what blocks it.
+_PASSED = {"SQAP": _HALF_WIDTHS, "ELAP": _SEMI_AXES}
+_BLOCKED = {"SQOB": _HALF_WIDTHS, "ELOB": _SEMI_AXES}
 
 
-def read_apertures(block: Block, factor: Fraction, place: str) -> tuple[dict[str, Any], bool]:
+def read_apertures(
+    block: Block, factor: Fraction, place: str, stop: bool = False
+) -> tuple[dict[str, Any], bool]:
     """Read the clear aperture of a surface's block.
 
     Args:
         block: its lines by operand.
         factor: mm in a unit of the file.
         place: name in messages.
+        stop: whether the surface is the stop, whose DIAM may define the pupil.
 
     Returns:
-        `semi_diameter` or `aperture`, and `obscuration`, as a prescription's row has them (nothing
-        where the file gives no size), and whether Zemax clips there.
+        `semi_diameter`, `clips`, `aperture` and `obscuration`, as a prescription's row has them,
+        and whether the surface stops light in Zemax.  Of the stop the semi-diameter clips always.
 
     Raises:
-        InputError: a decentred aperture, a floating one with a hole, or an obscuring ring.
+        InputError: an outline that a prescription does not hold.
     """
     for operand, what in _NOT_HELD.items():
         if operand in block:
             raise InputError(f"{place}: {what} is not held ({operand})")
-    if any(number_in_text(word, f"{place}: OBDC") for word in _words(block, "OBDC")[:2]):
-        raise InputError(f"{place}: OBDC, a decentred aperture, is not held")
+    center = [scaled(word, factor, f"{place}: OBDC") for word in _words(block, "OBDC")[:2]]
+    beside = {key: value for key, value in zip(_CENTER, center, strict=False) if value}
     drawn = scaled((_words(block, "DIAM") or ["0"])[0], factor, f"{place}: DIAM")
-    found = {"semi_diameter": drawn} if drawn else {}
-    if "SQAP" in block:
-        return {
-            "aperture": dict(zip(_HALF_WIDTHS, _pair(block, "SQAP", factor, place), strict=True))
-        }, True
+    drawn = abs(drawn)
+    found: dict[str, Any] = {"semi_diameter": drawn} if drawn else {}
+    if not stop:
+        found = found | {"clips": False} if drawn else {"semi_diameter": AUTOMATIC}
+    for operand, keys in _PASSED.items():
+        if operand in block:
+            sides = dict(zip(keys, _pair(block, operand, factor, place), strict=True))
+            return (found if stop else {}) | {"aperture": sides | beside}, True
     if "CLAP" in block:
         inner, outer = _pair(block, "CLAP", factor, place)
         hole = {"obscuration": {"semi_diameter": inner}} if inner else {}
-        return {"semi_diameter": outer, **hole}, True
+        if beside:
+            outline = {"aperture": {"semi_diameter": outer} | beside}
+            return (found if stop else {}) | outline | hole, True
+        return {"semi_diameter": min(outer, drawn or outer) if stop else outer, **hole}, True
     if "OBSC" in block:
         inner, outer = _pair(block, "OBSC", factor, place)
         if inner:
-            raise InputError(f"{place}: OBSC must be a full circle, 'OBSC 0 radius'")
-        return found | {"obscuration": {"semi_diameter": outer}}, True
-    if "SQOB" in block:
-        sides = zip(_HALF_WIDTHS, _pair(block, "SQOB", factor, place), strict=True)
-        return found | {"obscuration": dict(sides)}, True
+            raise InputError(
+                f"{place}: a ring that blocks light between two circles is not held (OBSC)"
+            )
+        hole = {"obscuration": {"semi_diameter": outer} | beside} if outer else {}
+        return found | hole, True
+    for operand, keys in _BLOCKED.items():
+        if operand in block:
+            sides = dict(zip(keys, _pair(block, operand, factor, place), strict=True))
+            return found | {"obscuration": sides | beside}, True
     if "FLAP" in block:
+        # A floating aperture is as large as the semi-diameter: an automatic one passes all light.
         inner, outer = _pair(block, "FLAP", factor, place)
         if inner:
-            raise InputError(f"{place}: FLAP must be a full circle, 'FLAP 0 radius'")
-        return found or {"semi_diameter": outer}, is_fixed(block)
+            raise InputError(f"{place}: a floating aperture with a hole is not held (FLAP)")
+        if is_fixed(block) and (drawn or outer):
+            return {"semi_diameter": drawn or outer}, True
     return found, False
 
 
@@ -78,19 +100,25 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
     What one Zemax aperture cannot say (a rectangle with a hole) does not come back, and is refused
     by the writer's comparison.
     """
-    semi_diameter, edge = row.get("semi_diameter"), row.get("aperture") or {}
+    size, outline = row.get("semi_diameter"), row.get("aperture") or {}
     hole = row.get("obscuration") or {}
-    if semi_diameter is None:
-        if not all(key in edge for key in _HALF_WIDTHS):
-            return []
-        x, y = (_text(edge[key], place) for key in _HALF_WIDTHS)
-        return [f'  DIAM {max(float(x), float(y))!r} 1 0 0 1 ""', f"  SQAP {x} {y}"]
-    size = _text(semi_diameter, place)
-    lines = [f'  DIAM {size} 1 0 0 1 ""']
-    if all(key in hole for key in _HALF_WIDTHS):
-        x, y = (_text(hole[key], place) for key in _HALF_WIDTHS)
-        return [*lines, f"  SQOB {x} {y}"]
-    return [*lines, f"  CLAP {_text(hole.get('semi_diameter', 0), place)} {size} 0"]
+    clips = row.get("clips", size != AUTOMATIC) and size is not None and not outline
+    center = [{**hole, **outline}.get(key, 0.0) for key in _CENTER]
+    automatic = size in (None, AUTOMATIC)
+    lines = [f'DIAM {"0 0" if automatic else f"{_text(size, place)} 1"} 0 0 1 ""']
+    for table, given in ((_PASSED, outline), (_BLOCKED, hole)):
+        for operand, keys in table.items():
+            if all(key in given for key in keys):
+                lines.append(f"{operand} {' '.join(_text(given[key], place) for key in keys)}")
+    inner = _text(hole.get("semi_diameter", 0), place)
+    if clips or "semi_diameter" in outline:
+        outer = _text(size if clips else outline["semi_diameter"], place)
+        lines.append(f"CLAP {inner} {outer} 0")
+    elif inner != "0":
+        lines.append(f"OBSC 0 {inner} 0")
+    if any(float(as_number(value, place)) for value in center):
+        lines.append(f"OBDC {' '.join(_text(value, place) for value in center)}")
+    return [f"  {line}" for line in lines]
 
 
 def is_fixed(block: Block) -> bool:

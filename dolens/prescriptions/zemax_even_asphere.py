@@ -1,4 +1,7 @@
-"""TYPE EVENASPH of a Zemax `.zmx` file is a conic plus powers of r² (PARM 1 to 8: r² to r¹⁶)."""
+"""TYPE EVENASPH of a Zemax `.zmx` file is a conic plus powers of r² (PARM 1 to 8: r² to r¹⁶).
+
+Other programs write further powers in the same way; they are read, and not written.
+"""
 
 import re
 from collections.abc import Mapping
@@ -17,10 +20,11 @@ _POWER = re.compile(r"a(\d+)")
 def _read(block: SurfaceBlock) -> Row:
     """Return the coefficients that the file lists.
 
-    Zemax lists all eight, used or not: then the zeros behind the last that is used are left out.
+    Programs list all eight, or more, used or not: then the zeros behind the last that is used are
+    left out.
     """
     found = {f"a{2 * n}": block.parameter(n, 1 - 2 * n) for n in sorted(block.parameters) if n}
-    if len(found) == _COEFFICIENTS:
+    if len(found) >= _COEFFICIENTS:
         used = max((int(name[1:]) for name, value in found.items() if value), default=0)
         found = {name: value for name, value in found.items() if int(name[1:]) <= used}
     if found.get("a2") == 0.0 and block.parameters[1] != NAMED_ZERO:
@@ -42,5 +46,5 @@ def _write(row: Mapping[str, Any], place: str) -> list[str]:
 
 
 EVEN_ASPHERE = ZemaxShape(
-    "EVENASPH", ("even_asphere",), _read, _write, parameters=range(1, _COEFFICIENTS + 1)
+    "EVENASPH", ("even_asphere",), _read, _write, parameters=range(1, 2 * _COEFFICIENTS + 1)
 )

@@ -27,6 +27,7 @@ from dolens.optics.materials import (
     index_model,
     parse_material,
 )
+from dolens.optics.mirrors import MIRROR
 from dolens.prescriptions.decimals import number_in_text
 
 # Zemax prints what its catalogue gives: half of what tells Schott's F2 from Hikari's.  Where a file
@@ -54,16 +55,16 @@ def read_glass(words: Sequence[str], catalogues: Sequence[str] | None, place: st
         place: name of the surface in messages.
 
     Returns:
-        `air`, nd/Vd, a constant index (a model whose Vd is 0), or maker and name.
+        `air`, `mirror`, nd/Vd, a constant index (a model whose Vd is 0), or maker and name.
 
     Raises:
-        InputError: a mirror, half a model, or a name that cannot be read as the file means it.
+        InputError: half a model, or a name that cannot be read as the file means it.
     """
     if not words or words[0].upper() == "AIR":
         return "air"
     name, how = words[0], words[1] if len(words) > 1 else "0"
     if name.upper() == "MIRROR":
-        raise InputError(f"{place}: GLAS MIRROR is not held (allowed: refracting surfaces)")
+        return MIRROR.name
     place = f"{place}: GLAS {name}"
     if name == "___BLANK" or how == "1":
         return _model(words, place)
@@ -90,6 +91,8 @@ def glass_line(material: object, place: str) -> list[str]:
     name = medium.name
     if name in ("air", "occluder"):
         return []
+    if medium is MIRROR:
+        return ["  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]
     if isinstance(medium, Material):
         pair = _PAIR.fullmatch(name)
         nd, vd = (pair[1], pair[2]) if pair else (name, "0")

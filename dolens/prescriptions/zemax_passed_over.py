@@ -73,6 +73,8 @@ def passed_over(file: ZemaxFile) -> list[str]:
         group = _GROUP_OF.get(operand, _UNKNOWN)
         if group not in _SILENT and any(says(line) for line in lines):
             groups.setdefault(group, {})[operand] = None
+    for number in file.skipped:
+        groups.setdefault(f"surface {number}, which the file leaves out", {})
     for group in _behind_the_surfaces(file):
         groups.setdefault(group, {})
     return [

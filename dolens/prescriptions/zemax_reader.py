@@ -2,24 +2,27 @@
 
 Held: sequential systems of the shapes in `zemax_shapes`, glass by model (nd, Vd) or by its name
 in the catalogues of GCAT (`zemax_glass`), circular and rectangular apertures and obscurations
-(`zemax_apertures`), fields as angles or object heights, wavelengths, and UNIT MM, CM, IN or METER.
+(`zemax_apertures`), fields and wavelengths with their weights (`zemax_fields`), and UNIT MM, CM, IN
+or METER.
 Everything else that bends rays is an error that names it.  What bends no ray is passed over, and
 listed (`zemax_passed_over`).
 
 Surfaces keep their numbers, but for those that the file says to ignore.  Only planes before the
 image that neither refract nor clip are left out, and their gaps added to the sensor's distance.
 
-A CLAP clips, so it gives the semi-diameter; else DIAM does.  In Zemax a DIAM without CLAP or FLAP
-draws and does not clip: here it clips.  A missing or zero DIAM is an error, because ENPD and FNUM
-size the beam of the axis alone, and its semi-diameters would vignette the fields.
-ENPD and FNUM close the stop (see `dolens.prescriptions.system_data`), which then needs no DIAM.
+As in Zemax, apertures clip (CLAP, SQAP, and FLAP at a DIAM of the user's own), and a DIAM alone
+draws and clips nothing.  ENPD, FNUM and OBNA close the stop (see
+`dolens.prescriptions.system_data`); with FLOA its DIAM does.
 """
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.mirrors import MIRROR
+from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.system_data import PUPIL_KEYS
@@ -29,6 +32,7 @@ from dolens.prescriptions.zemax_block import SurfaceBlock
 from dolens.prescriptions.zemax_configurations import other_configurations
 from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_passed_over import passed_over
+from dolens.prescriptions.zemax_shape import Row
 from dolens.prescriptions.zemax_shapes import shape_of_block
 from dolens.prescriptions.zemax_system import factor_to_mm, read_system
 
@@ -60,50 +64,25 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     if len(file.surfaces) < 3:
         raise InputError(f"{where}: needs an object, a surface and an image as SURF blocks")
     factor = factor_to_mm(file, where)
-    prescription = read_system(file, factor, where)
     catalogues = [word for line in file.system.get("GCAT", []) for word in line.arguments] or None
-    distance = _object(prescription, file, catalogues, factor, where)
-    if distance is not None:
-        prescription["object_distance"] = distance
+    medium, distance = _object(file, catalogues, factor, where)
+    prescription = read_system(file, factor, distance is not None, where)
     prescription["stop"] = 1
+    prescription["object_material"] = medium
     pupil = not prescription.keys().isdisjoint(PUPIL_KEYS)
-    rows: list[dict[str, Any]] = []
-    hard: list[bool] = []
-    stops = []
-    before = prescription["object_material"]
+    rows, hard, stops = [], [], []
     for n, lines in enumerate(file.surfaces[1:-1], 1):
-        place = f"{where}: surface {n}"
         if _is_ignored(lines):
             continue
-        block = SurfaceBlock(lines, factor, place, before)
-        shape = shape_of_block(block)
-        _refuse_own_axes(block)
-        row: dict[str, Any] = {}
-        clips = False
-        if shape.surface:
-            material = read_glass(block.words("GLAS"), catalogues, place)
-            block = SurfaceBlock(lines, factor, place, before, material)
-            row["material"] = before = material
-        if block.stop:
-            stops.append(len(rows) + 1)
-        row = shape.read(block) | row
-        comment = " ".join(line.text for line in lines.get("COMM", []))
-        if comment:
-            row["note"] = comment
-        if shape.surface:
-            aperture, clips = read_apertures(lines, factor, place)
-            beam = block.stop and pupil
-            sized = not aperture.keys().isdisjoint(("semi_diameter", "aperture"))
-            if clips or not beam:
-                row |= aperture
-            if not sized and not beam and not _is_dummy(row, block.before):
-                raise InputError(
-                    f"{place}: DIAM is missing or 0; write the semi-diameter (a beam on the axis "
-                    "alone, which ENPD or FNUM would give, vignettes the fields)"
-                )
-        row["thickness"] = block.length("DISZ")
+        block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
+        row, clips = _row(block, catalogues, pupil)
+        # Behind a mirror, and behind a coordinate break, is the medium in front of it.
+        if row.get("material", MIRROR.name) != MIRROR.name:
+            medium = row["material"]
         rows.append(row)
         hard.append(clips)
+        if block.stop:
+            stops.append(len(rows))
     if len(stops) != 1:
         said = [n for n, lines in enumerate(file.surfaces) if "STOP" in lines]
         raise InputError(
@@ -111,58 +90,122 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
             f"{', '.join(map(str, said)) or 'none'}"
         )
     prescription["stop"] = stops[0]
+    if distance is not None:
+        prescription["object_distance"] = _in_front(distance, prescription, rows, hard, where)
     found = _with_sensor(prescription, rows, hard, file.surfaces[-1], factor, where)
     return ReadPrescription(found, [*passed_over(file), *other_configurations(file, where)])
 
 
+def _row(block: SurfaceBlock, catalogues: list[str] | None, pupil: bool) -> tuple[Row, bool]:
+    """Return the row of a surface, and whether its aperture stops light.
+
+    Args:
+        block: its lines.
+        catalogues: the arguments of GCAT.
+        pupil: whether the file gives the pupil, which then sizes the stop.
+    """
+    shape = shape_of_block(block)
+    _refuse_own_axes(block)
+    row: Row = {}
+    aperture: Row = {}
+    clips = False
+    if shape.surface:
+        material = read_glass(block.words("GLAS"), catalogues, block.place)
+        block = replace(block, material=material)
+        row["material"] = material
+        sizing = block.stop and not pupil
+        aperture, clips = read_apertures(block.lines, block.factor, block.place, sizing)
+        if block.stop and not aperture.get("clips", True):
+            aperture = {key: aperture[key] for key in aperture.keys() - {"semi_diameter", "clips"}}
+        if block.stop and aperture.get("semi_diameter") == AUTOMATIC:
+            del aperture["semi_diameter"]
+        if sizing and aperture.keys().isdisjoint(("semi_diameter", "aperture")):
+            raise InputError(
+                f"{block.place}: the stop has no size: neither its DIAM nor the system's aperture "
+                "(ENPD, FNUM, OBNA) gives one"
+            )
+    row = shape.read(block) | row
+    comment = " ".join(line.text for line in block.lines.get("COMM", []))
+    if comment:
+        row["note"] = comment
+    return row | aperture | {"thickness": block.length("DISZ")}, clips
+
+
+def _in_front(
+    distance: float,
+    prescription: dict[str, Any],
+    rows: list[Row],
+    hard: list[bool],
+    where: str,
+) -> float:
+    """Return the distance (mm) of the object, after the planes that do nothing are left out where
+    the object lies on one of them or behind it.
+
+    Raises:
+        InputError: the object is virtual: light would meet the lens before it.
+    """
+    while distance <= 0.0:
+        if (
+            prescription["stop"] == 1
+            or hard[0]
+            or not _is_dummy(rows[0], prescription["object_material"])
+        ):
+            raise InputError(
+                f"{where}: an object on or behind the first surface is not held (DISZ {distance:g})"
+            )
+        distance += rows.pop(0)["thickness"]
+        hard.pop(0)
+        prescription["stop"] -= 1
+    return distance
+
+
 def _with_sensor(
     prescription: dict[str, Any],
-    rows: list[dict[str, Any]],
+    rows: list[Row],
     hard: list[bool],
     image: Block,
     factor: Fraction,
     where: str,
 ) -> dict[str, Any]:
     """Leave out the planes before the image that do nothing; put the image where it is."""
-    place = f"{where}: surface {len(rows) + 1} (the image)"
+    place = f"{where}: the image"
     block = SurfaceBlock(image, factor, place)
     if block.type != "STANDARD" or block.curvature != 0.0:
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
     gaps = [rows[-1].pop("thickness")]
     while len(rows) > 1 and len(rows) != prescription["stop"] and not hard[len(rows) - 1]:
-        if not _is_dummy(rows[-1], rows[-2].get("material")):
+        if not _is_dummy(rows[-1], _medium_behind(rows[:-1], prescription)):
             break
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
-    for n, row in enumerate(rows, 1):
-        if not ("semi_diameter" in row or "aperture" in row) and n != prescription["stop"]:
-            raise InputError(f"{where}: surface {n}: DIAM is missing or 0; write the semi-diameter")
     sensor = {"distance": math.fsum(gaps)}
     size = read_apertures(image, factor, place)[0].get("semi_diameter")
-    if size and is_fixed(image):
+    if is_fixed(image) and size != AUTOMATIC:
         sensor["diameter"] = 2.0 * size
     surfaces = {str(n): row for n, row in enumerate(rows, 1)}
     return {**prescription, "surfaces": surfaces, "sensor": sensor}
 
 
 def _object(
-    prescription: dict[str, Any],
-    file: ZemaxFile,
-    catalogues: list[str] | None,
-    factor: Fraction,
-    where: str,
-) -> float | None:
-    """Set the medium before surface 1; return the object's distance, or None for infinity."""
-    place = f"{where}: surface 0 (the object)"
+    file: ZemaxFile, catalogues: list[str] | None, factor: Fraction, where: str
+) -> tuple[str, float | None]:
+    """Return the medium before surface 1, and the object's distance, None for infinity."""
+    place = f"{where}: the object"
     block = SurfaceBlock(file.surfaces[0], factor, place)
     if block.type != "STANDARD" or block.curvature != 0.0:
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
-    prescription["object_material"] = read_glass(block.words("GLAS"), catalogues, place)
+    medium = read_glass(block.words("GLAS"), catalogues, place)
     words = block.words("DISZ")
     if not words or words[0].upper() == "INFINITY":
-        return None
+        return medium, None
     distance = block.length("DISZ")
-    return None if abs(distance) >= _INFINITE else distance
+    return medium, None if abs(distance) >= _INFINITE else distance
+
+
+def _medium_behind(rows: list[dict[str, Any]], prescription: dict[str, Any]) -> str:
+    """Return the medium behind the last of some rows: mirrors and breaks leave it as it is."""
+    media = (row.get("material", MIRROR.name) for row in reversed(rows))
+    return next((m for m in media if m != MIRROR.name), prescription["object_material"])
 
 
 def _is_ignored(lines: Block) -> bool:
@@ -181,6 +224,7 @@ def _refuse_own_axes(block: SurfaceBlock) -> None:
             )
 
 
-def _is_dummy(row: dict[str, Any], before: str | None) -> bool:
+def _is_dummy(row: Row, before: str | None) -> bool:
+    """Return whether a row is a plane between one medium and the same."""
     flat = row["type"] == "plane" or (row["type"] == "sphere" and row.get("radius") == math.inf)
     return flat and "phase" not in row and row["material"] == before

@@ -10,31 +10,52 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.prescriptions.zemax_biconic_toroid import BICONIC, TOROID
 from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_coordinate_break import COORDINATE_BREAK
 from dolens.prescriptions.zemax_diffractive import BINARY_1, BINARY_2, GRATING, PARAXIAL
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
+from dolens.prescriptions.zemax_grid_sag import GRID_SAG
+from dolens.prescriptions.zemax_polynomials import (
+    EXTENDED_ASPHERE,
+    EXTENDED_ODD_ASPHERE,
+    FORBES,
+    ODD_ASPHERE,
+)
 from dolens.prescriptions.zemax_shape import ZemaxShape
 from dolens.prescriptions.zemax_standard import STANDARD
 from dolens.prescriptions.zemax_tilted_plane import TILTED_PLANE
 from dolens.prescriptions.zemax_xy_polynomial import XY_POLYNOMIAL
+from dolens.prescriptions.zemax_zernike import ZERNIKE_FRINGE, ZERNIKE_STANDARD
 
 # One line here makes a shape known to the reader and the writer.
 SHAPES: dict[str, ZemaxShape] = {
     shape.type: shape
     for shape in (
-        *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL),
+        *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL, COORDINATE_BREAK),
         *(PARAXIAL, GRATING, BINARY_1, BINARY_2),
+        STANDARD,
+        EVEN_ASPHERE,
+        TILTED_PLANE,
+        XY_POLYNOMIAL,
+        ODD_ASPHERE,
+        EXTENDED_ASPHERE,
+        EXTENDED_ODD_ASPHERE,
+        BICONIC,
+        TOROID,
+        ZERNIKE_STANDARD,
+        ZERNIKE_FRINGE,
+        FORBES,
+        GRID_SAG,
     )
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
 _NOT_HELD = {
     "ABCD": "a surface given by its ABCD matrix",
-    "BICONICX": "a biconic surface",
     "BICONICZ": "a biconic surface with Zernike terms",
     "BINARY": "a diffractive phase",
     "BIRE": "a birefringent medium",
     "CADPART": "a part from a CAD program",
-    "COORDBRK": "a coordinate break (decentred and tilted axes)",
     "CONJUGAT": "a surface given by two conjugate points",
     "CUBICSPL": "a cubic spline",
     "CYLINDER": "a cylinder",
@@ -43,11 +64,9 @@ _NOT_HELD = {
     "ELLIPGRA": "an elliptical grating",
     "FRESNEL": "a Fresnel surface",
     "FZERNPHA": "a Zernike phase",
-    "FZERNSAG": "a sag of Zernike fringe polynomials",
     "GENFRESN": "a Fresnel surface",
     "GRADIUM": "a gradient-index medium",
     "GRID_PHA": "a phase given on a grid",
-    "GRID_SAG": "a sag given on a grid",
     "GRIDPHAS": "a phase given on a grid",
     "GRIDSAG": "a sag given on a grid",
     "GRINSU": "a gradient-index medium",
@@ -55,19 +74,15 @@ _NOT_HELD = {
     "IRREGULA": "an irregular surface",
     "JONESMAT": "a Jones matrix",
     "NONSEQCO": "a non-sequential component",
-    "ODDASPHE": "an odd asphere",
     "ODDCOSIN": "an odd cosine surface",
     "PARAX_XY": "a paraxial lens of two focal lengths",
     "PERIODIC": "a periodic surface",
     "POLYNOMI": "a polynomial surface",
-    "QED_TYPE": "a Forbes asphere",
     "RADIALGR": "a radial grating",
     "RETRO": "a retro-reflector",
     "SLIDE": "a slide (a picture that light passes)",
     "SUPERCON": "a superconic",
     "SZERNPHA": "a Zernike phase",
-    "SZERNSAG": "a sag of Zernike standard polynomials",
-    "TOROIDAL": "a toroid",
     "TOROIDGR": "a toroidal grating",
     "TOROIDHO": "a toroidal hologram",
     "USERSURF": "a surface that a program of the user computes",

@@ -8,21 +8,25 @@ from dolens.prescriptions.checks import as_integer, as_number
 from dolens.prescriptions.compare import require_same
 from dolens.prescriptions.decimals import shifted
 from dolens.prescriptions.zemax_apertures import aperture_lines
+from dolens.prescriptions.zemax_fields import FIELD_KINDS, PUPIL_ANGLES, VIGNETTING_OPERANDS
 from dolens.prescriptions.zemax_glass import canonical, catalogue_line, glass_line
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_shapes import shape_of_row
 
 _D_LINE = 587.5618
+# Fields in the lists; further ones have lines of their own.
+_LISTED = 12
 
 
 def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     """Write a prescription as the text of a `.zmx` file (see `encode_zemax`).
 
-    Every semi-diameter is written as an aperture, since it clips, and the system's
-    aperture floats by the stop.  Zemax cannot do without a wavelength and a field: where the
-    prescription has none, the d line and the axis are written.  A glass's maker goes into GCAT, its
-    nd and Vd beside its name; a constant index is a model glass whose Vd is 0.  `occluder` is
-    written as air, which it is in the index models that a file can hold.
+    A semi-diameter that clips is written as an aperture, any other as a size alone.  Where the
+    prescription gives no pupil, the system's aperture floats by the stop.  Zemax cannot do without
+    a wavelength and a field: where the prescription has none, the d line and the axis are written.
+    A glass's maker goes into GCAT, its nd and Vd beside its name; a constant index is a model glass
+    whose Vd is 0.  `occluder` is written as air, which it is in the index models that a file can
+    hold.
 
     Raises:
         InputError: one line that names the surface and key which the format cannot hold.
@@ -67,6 +71,12 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
 
 
 _ALWAYS = ("wavelengths", "reference_wavelength", "fields")
+_PUPILS = {
+    "entrance_pupil_diameter": "ENPD {}",
+    "f_number": "FNUM {} 0",
+    "working_f_number": "FNUM {} 1",
+    "object_na": "OBNA {} 0",
+}
 
 
 def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where: str) -> list[str]:
@@ -75,8 +85,7 @@ def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where:
     reference = float(prescription.get("reference_wavelength") or waves[0])
     if reference not in waves:
         raise InputError(f"{where}: 'reference_wavelength' {reference!r} is none of 'wavelengths'")
-    kind, points = next(iter((prescription.get("fields") or {"angles": [[0.0, 0.0]]}).items()))
-    x, y = ([_text(point[axis], f"{where}: fields") for point in points] for axis in (0, 1))
+    weights = prescription.get("wavelength_weights") or [1.0] * len(waves)
     materials = [row.get("material") for row in surfaces.values()]
     materials.append(prescription.get("object_material", "air"))
     notes = str(prescription.get("source") or "").splitlines()
@@ -87,24 +96,64 @@ def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where:
         *(f"NOTE 0 {note}" for note in notes),
         "UNIT MM X W X CM MR CPMM",
         *_pupil(prescription, where),
-        "ENVD 20 1 0",
+        _air(prescription, where),
         "GFAC 0 0",
         *catalogue_line(materials, where),
-        f"FTYP {int(kind == 'heights')} 0 {len(points)} {len(waves)} 0 0 0",
-        f"XFLN {' '.join(x)}",
-        f"YFLN {' '.join(y)}",
-        f"FWGN {' '.join('1' for _ in points)}",
-        *(f"WAVM {i} {shifted(wave, -3)} 1" for i, wave in enumerate(waves, 1)),
+        *_fields(prescription, len(waves), where),
+        *(
+            f"WAVM {i} {shifted(wave, -3)} {_text(weight, where)}"
+            for i, (wave, weight) in enumerate(zip(waves, weights, strict=False), 1)
+        ),
         f"PWAV {waves.index(reference) + 1}",
     ]
 
 
+def _fields(prescription: Mapping[str, Any], waves: int, where: str) -> list[str]:
+    """Write FTYP and the lists of fields; those beyond the twelfth have a line each.
+
+    A file's angles to a finite object are angles at the entrance pupil.
+    """
+    fields = prescription.get("fields") or {"angles": [[0.0, 0.0]]}
+    finite = prescription.get("object_distance") is not None
+    kinds = {name: number for number, name in FIELD_KINDS.items()} | {PUPIL_ANGLES: 0}
+    kind = next((key for key in fields if key in kinds), None)
+    if kind is None:
+        raise InputError(f"{where}: fields: give one of {', '.join(kinds)}")
+    points = fields[kind]
+    if kind == "angles" and finite:
+        if any(as_number(x, f"{where}: fields") for point in points for x in point):
+            raise InputError(
+                f"{where}: a .zmx file cannot hold 'fields.angles' of a finite object (allowed: "
+                "heights, pupil_angles)"
+            )
+        kind = "heights"
+    weights = fields.get("weights") or [1.0] * len(points)
+    vignetting = fields.get("vignetting") or [{}] * len(points)
+    columns = [[point[0] for point in points], [point[1] for point in points], weights]
+    columns += [[row.get(name, 0.0) for row in vignetting] for name, *_ in VIGNETTING_OPERANDS]
+    texts = [[_text(value, f"{where}: fields") for value in column] for column in columns]
+    operands = ("XFLN", "YFLN", "FWGN", *(operand for _, operand, _ in VIGNETTING_OPERANDS))
+    telecentric = int(bool(prescription.get("telecentric_object")))
+    lines = [f"FTYP {kinds[kind]} {telecentric} {len(points)} {waves} 0 0 0"]
+    lines += [
+        f"{operand} {' '.join(column[:_LISTED])}"
+        for operand, column in zip(operands, texts, strict=True)
+    ]
+    return [*lines, *(f"FEFD {' '.join(row)}" for row in list(zip(*texts, strict=True))[_LISTED:])]
+
+
 def _pupil(prescription: Mapping[str, Any], where: str) -> list[str]:
-    if prescription.get("entrance_pupil_diameter") is not None:
-        return [f"ENPD {_text(prescription['entrance_pupil_diameter'], where)}"]
-    if prescription.get("f_number") is not None:
-        return [f"FNUM {_text(prescription['f_number'], where)} 0"]
+    for key, form in _PUPILS.items():
+        if prescription.get(key) is not None:
+            return [form.format(_text(prescription[key], where))]
     return ["FLOA"]
+
+
+def _air(prescription: Mapping[str, Any], where: str) -> str:
+    if prescription.get("temperature") is None and prescription.get("pressure") is None:
+        return "ENVD 20 1 0"
+    temperature = _text(prescription.get("temperature", 20.0), where)
+    return f"ENVD {temperature} {_text(prescription.get('pressure', 1.0), where)} 1"
 
 
 def _surface(row: Mapping[str, Any], place: str) -> list[str]:

@@ -10,7 +10,9 @@ from dolens.cli.app import app
 from dolens.experiments.running.catalogue import experiments, read_experiment
 
 # "about": estimated from a part of the run, not measured whole.
-COST = re.compile(r"(about )?(\d+ (seconds|minutes|hours)|hours|days) on (two cores|a GPU)")
+COST = re.compile(
+    r"(about )?(\d+ (seconds|minutes|hours)|hours|days) on (one core|two cores|a GPU)"
+)
 
 
 def invoked(*arguments, width=110):

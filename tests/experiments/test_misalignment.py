@@ -69,7 +69,7 @@ def test_poses_are_found_and_what_was_found_first_is_held(composed, tmp_path):
 
 def test_a_resumed_run_ends_with_the_same_poses_to_the_bit(composed, tmp_path):
     """Within a stage of Adam, within least squares of either kind, and within the second fit."""
-    settings = [*TINY, *SHORT, "test=false", "objective=train/loss"]
+    settings = [*TINY, *SHORT, "test=false", "objective=train/loss", "imager.rays=1000"]
     each = ["callbacks.last.every_n_train_steps=1", "+callbacks.last.save_top_k=-1"]
     run(composed(*settings, *each, "callbacks.last.filename='{step}'", folder="whole"))
     run(composed(*settings, folder="plain"))

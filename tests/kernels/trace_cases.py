@@ -85,7 +85,7 @@ def _folded():
     """Breaks before, between and behind mirrors and a lens that is out of place."""
 
     def broken(**row):
-        return {"type": "coordinate_break", **row}
+        return {"type": "coordinate_break", "thickness": 0.0, **row}
 
     glass = {"semi_diameter": 5.0, "material": _GLASS}
     mirror = {"semi_diameter": 9.0, "material": "mirror", "thickness": 0.0}
@@ -113,6 +113,63 @@ def _folded():
         {"surfaces": {str(n): r for n, r in enumerate(surfaces, 1)}, "elements": elements,
          "sensor": {"distance": 12.0}, "stop": 2}
     )  # fmt: skip
+
+
+def _odd_aspheres():
+    """An axicon's cusp under many powers, and an asphere with one odd power."""
+    front = {"type": "odd_asphere", "radius": 35.0, "conic": -0.5, "a1": 0.01, "a2": 1e-4,
+             "a3": 1e-5, "a4": 1e-6, "a5": -1e-7, "a7": 1e-9, "a9": 1e-11,
+             "a11": -1e-13}  # fmt: skip
+    return _singlet(front, {"type": "odd_asphere", "radius": -60.0, "conic": 0.0, "a3": 2e-5})
+
+
+def _anamorphic():
+    """A toroid and a biconic, crossed."""
+    front = {"type": "toroid", "radius_x": 30.0, "radius_y": 80.0, "conic_y": -0.5, "a2": 1e-3,
+             "a4": 1e-5, "a6": -1e-7}  # fmt: skip
+    back = {
+        "type": "biconic",
+        "radius_x": -90.0,
+        "radius_y": -40.0,
+        "conic_x": 1.5,
+        "conic_y": -2.0,
+    }
+    return _singlet(front, back)
+
+
+def _cylinders():
+    """Two crossed cylinders, one of them with its curve in x."""
+    front = {"type": "toroid", "radius_x": math.inf, "radius_y": 40.0, "conic_y": 0.2}
+    back = {"type": "biconic", "radius_x": -40.0, "radius_y": math.inf, "conic_x": -0.6}
+    return _singlet(front, back)
+
+
+def _zernike():
+    """Terms of several orders with gaps between them, decentred; and some of the other table."""
+    front = {"type": "zernike_standard", "radius": 35.0, "conic": -0.4, "a4": 1e-6, "z1": 0.1,
+             "z2": -2e-3, "z4": 4e-3, "z5": 2e-3, "z11": -1e-3, "z17": 5e-4, "z24": 2e-4,
+             "normalization_radius": 5.5, "decenter_x": 0.4, "decenter_y": -0.2}  # fmt: skip
+    back = {"type": "zernike_fringe", "radius": -60.0, "z3": 1e-3, "z9": 2e-3, "z12": -1e-3,
+            "z37": 1e-4, "normalization_radius": 5.0}  # fmt: skip
+    return _singlet(front, back)
+
+
+def _forbes():
+    """Both families, with orders left out."""
+    front = {"type": "q_bfs", "radius": 25.0, "conic": -0.6, "q0": 0.05, "q1": -0.01, "q4": 2e-3,
+             "normalization_radius": 5.2}  # fmt: skip
+    back = {"type": "q_con", "radius": -50.0, "conic": 0.5, "q0": 0.03, "q3": -2e-3, "q5": 1e-3,
+            "normalization_radius": 5.0}  # fmt: skip
+    return _singlet(front, back)
+
+
+def _grid():
+    """A smooth bump with ripples on a conic, off its middle."""
+    u = torch.linspace(-6.0, 6.0, 13, dtype=F64)
+    ripple = 0.003 * _random(13, 13, seed=6) - 0.002 * (u[:, None] ** 2 + 0.5 * u[None] ** 2)
+    back = {"type": "grid_sag", "radius": -60.0, "conic": 0.4, "a4": 1e-6, "sag": ripple.tolist(),
+            "spacing_x": 1.0, "spacing_y": 1.0, "decenter_x": 0.5, "decenter_y": -0.3}  # fmt: skip
+    return _singlet({"type": "sphere", "radius": 40.0}, back)
 
 
 def _own_surface():
@@ -200,6 +257,12 @@ LENSES = {
     "b_spline": lambda root: _spline(),
     "polynomial": lambda root: _polynomial(),
     "even_aspheres": lambda root: _aspheres(),
+    "odd_aspheres": lambda root: _odd_aspheres(),
+    "anamorphic": lambda root: _anamorphic(),
+    "cylinders": lambda root: _cylinders(),
+    "zernike": lambda root: _zernike(),
+    "forbes": lambda root: _forbes(),
+    "grid": lambda root: _grid(),
     "clipped": lambda root: _clipped(),
     "own_surface": lambda root: _own_surface(),
     "diffractive": lambda root: _diffractive(),

@@ -28,6 +28,15 @@ def test_the_triplet_as_published(root, reference):
         assert words in text
 
 
+def test_published_numbers_stand_beside_computed_ones():
+    found = show("published/tessar_us2838978")
+    assert found.exit_code == 0, found.output
+    text = " ".join(found.output.split())
+    assert re.search(r"effective focal length +1 ± 0\.01 +1\.000998", text)
+    assert re.search(r"F-number +2\.8 +2\.8", text)
+    assert "US 2,838,978" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -9,14 +9,11 @@ quadric or by bracketing, and derivatives are differences at 80 digits.  It take
 import random
 from functools import lru_cache
 
-import mpmath
 import numpy as np
 
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
 from tests.optics import exact_deflection as deflection
-
-mp = mpmath.mp.clone()  # a precision of its own
-mp.dps = 80
+from tests.optics.exact_sags import SAGS, even_asphere_sag, mp
 
 OK, VIGNETTED, TIR, MISSED = 0, 1, 2, 3
 SAMPLES = 24
@@ -74,7 +71,10 @@ def trace(lens, values, origin, direction, wavelength, near=None):
             for name, v in values.items()
             if name.startswith(f"surfaces.{number}.") and ".phase." not in name
         }
-        own |= {name: tuple(mp.mpf(float(k)) for k in b) for name, b in surface._buffers.items()}
+        own |= {
+            name: mp.mpf(float(b)) if b.dim() == 0 else tuple(mp.mpf(float(k)) for k in b)
+            for name, b in surface.named_buffers()
+        }
         guess = None if near is None else near[i]
         t, sx, sy = _meet(surface.kind, own, surface.semi_diameter, q, e, guess, sense)
         if t is None:
@@ -90,7 +90,7 @@ def trace(lens, values, origin, direction, wavelength, near=None):
         if deflection.stands_on(surface):
             behind = -sense if lens.materials[i + 1].name == "mirror" else sense
             length = mp.mpf(wavelength) / 10**6
-            at = deflection.Place(mp, lens, values, i, indices, length, sense, behind, _sag)
+            at = deflection.Place(mp, lens, values, i, indices, length, sense, behind, sag_of)
             e, more = deflection.deflect(at, q, e, normal)
             if e is None:
                 return TIR, i + 1, None, None, None
@@ -170,8 +170,8 @@ def derivatives(function, values):
     return result
 
 
-def _sag(kind, p, x, y):
-    """Sag, or None beyond the knots of a B-spline."""
+def sag_of(kind, p, x, y):
+    """Sag, or None beyond the knots of a B-spline or the end of a branch."""
     if kind == "b_spline":
         bx, by = (_basis(p[f"knots_{axis}"], u) for axis, u in (("x", x), ("y", y)))
         if not (bx and by):
@@ -190,10 +190,9 @@ def _sag(kind, p, x, y):
         b = p.get("b", mp.mpf(0))
         # The branch through the vertex of b·z² - z + P = 0.
         return total if b == 0 else 2 * total / (1 + mp.sqrt(1 - 4 * b * total))
-    c, k = p["curvature"], p.get("conic", mp.mpf(0))
-    r2 = x**2 + y**2
-    sag = c * r2 / (1 + mp.sqrt(1 - (1 + k) * c**2 * r2))
-    return sag + sum(a * r2 ** (int(n[1:]) // 2) for n, a in p.items() if n[0] == "a")
+    if kind in SAGS:
+        return SAGS[kind](p, x, y)
+    return even_asphere_sag(p, x, y)
 
 
 @lru_cache(maxsize=4096)  # most derivatives leave the place on the surface where it was
@@ -215,7 +214,7 @@ def _basis(knots, u):
 def _slopes(kind, p, x, y):
     h = SLOPE_STEP
     return tuple(
-        (_sag(kind, p, x + h * u, y + h * v) - _sag(kind, p, x - h * u, y - h * v)) / (2 * h)
+        (sag_of(kind, p, x + h * u, y + h * v) - sag_of(kind, p, x - h * u, y - h * v)) / (2 * h)
         for u, v in ((1, 0), (0, 1))
     )
 
@@ -264,7 +263,7 @@ def _bracketed_roots(kind, p, semi_diameter, q, e, guess):
     """
 
     def f(t):
-        sag = _sag(kind, p, q[0] + t * e[0], q[1] + t * e[1])
+        sag = sag_of(kind, p, q[0] + t * e[0], q[1] + t * e[1])
         return None if sag is None else q[2] + t * e[2] - sag
 
     def zero(low, high):

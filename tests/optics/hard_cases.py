@@ -87,6 +87,10 @@ MONOMIALS = {"type": "xy", "norm_radius": 8.0, "x": 900.0, "y": -300.0, "x2": -7
 KNOTS_X = [-10.0] * 4 + [-2.0, -2.0, 1.0, 1.0, 1.0] + [10.0] * 4
 BUMPS = [[0.02 * ((i - 4) ** 2 + (j - 1.5) ** 2) + 0.1 * ((3 * i + 5 * j) % 4) for i in range(9)]
          for j in range(4)]  # fmt: skip
+ODD = {"curvature": 0.05, "conic": -0.5, "a1": 0.02, "a2": -1e-3, "a3": 2e-4, "a5": -1e-6,
+       "a7": 3e-9, "a9": 1e-12}  # fmt: skip
+TOROID = {"radius_x": 12.0, "radius_y": 25.0, "conic_y": -0.7, "a2": 1e-3, "a4": -1e-5, "a8": 2e-9}
+ZERNIKE = {"radius": 30.0, "conic": -0.5, "a4": 1e-5, "normalization_radius": 8.0}
 SPLINE = {"coefficients": BUMPS, "knots_x": KNOTS_X, "half_width_y": 10.0}
 
 CASES: dict[str, HardCase] = {
@@ -172,6 +176,61 @@ CASES: dict[str, HardCase] = {
         ends=[((10.01, 0.0, -5.0), AXIAL, "missed", 1)],
         sensor=20.0,
     ),
+    "odd asphere with a cusp, near its vertex and far out": HardCase(
+        [surface("odd_asphere", semi_diameter=9.0, **ODD)],
+        rays=[((1e-6, 2e-6, -5.0), AXIAL), ((8.5, 0.0, -5.0), AXIAL),
+              ((-14.0, 0.0, -5.0), at_angle(60.0))],
+        sensor=20.0,
+    ),
+    "axicon alone, steep": HardCase(
+        [surface("odd_asphere", radius=math.inf, a1=1.5)],
+        rays=[((3.0, -4.0, -5.0), AXIAL), ((-2.0, 5.0, 0.0), at_angle(50.0, 200.0))],
+    ),
+    "biconic, a thousandth inside its end": HardCase(
+        [surface("biconic", semi_diameter=None, radius_x=8.0, radius_y=-15.0, conic_x=0.5,
+                 conic_y=-3.0, aperture={"half_width_x": 6.53, "half_width_y": 12.0})],
+        rays=[((6.525, 0.5, -5.0), AXIAL), ((-3.0, 9.0, -8.0), at_angle(35.0, 250.0))],
+        ends=[((9.0, 0.0, -5.0), AXIAL, "missed", 1)],
+        sensor=30.0,
+    ),
+    "toroid, at 99.9 % of the radius of rotation": HardCase(
+        [surface("toroid", semi_diameter=None, **TOROID,
+                 aperture={"half_width_x": 11.99, "half_width_y": 7.0})],
+        rays=[((11.988, 0.1, -5.0), AXIAL), ((4.0, -6.0, -5.0), at_angle(40.0, 10.0))],
+        ends=[((12.1, 0.0, -5.0), AXIAL, "missed", 1)],
+        sensor=30.0,
+    ),
+    "cylinder": HardCase(
+        [surface("toroid", radius_x=math.inf, radius_y=-10.0, conic_y=0.0, semi_diameter=9.999)],
+        rays=[((0.0, 9.998, -25.0), AXIAL), ((9.0, 0.0, -5.0), at_angle(60.0, 180.0))],
+        sensor=20.0,
+    ),
+    "Zernike standard polynomials to order 20, decentred, beyond their disc": HardCase(
+        [surface("zernike_standard", semi_diameter=9.5, **ZERNIKE, decenter_x=0.7,
+                 decenter_y=-0.4, z4=1e-2, z7=-4e-3, z22=1e-3, z231=1e-6)],
+        rays=[((7.9, 0.0, -5.0), AXIAL), ((-9.0, 1.0, -5.0), AXIAL),
+              ((2.0, 5.0, -5.0), at_angle(30.0, 300.0))],
+    ),
+    "Zernike fringe polynomials at the centre of their disc": HardCase(
+        [surface("zernike_fringe", **ZERNIKE, z2=1e-2, z5=-4e-3, z9=2e-3, z37=1e-3)],
+        rays=[((0.0, 0.0, -5.0), AXIAL), ((1e-9, 0.0, -5.0), AXIAL), ((0.0, 8.0, -5.0), AXIAL)],
+    ),
+    "Q_con to order 30": HardCase(
+        [surface("q_con", radius=-15.0, conic=-1.5, normalization_radius=9.0, semi_diameter=9.0,
+                 q0=0.3, q3=-0.05, q30=1e-5)],
+        rays=[((8.99, 0.0, -15.0), AXIAL), ((5.0, -2.0, -15.0), at_angle(35.0, 100.0))],
+    ),
+    "Q_bfs to order 20, close to its hemisphere": HardCase(
+        [surface("q_bfs", radius=10.0, normalization_radius=10.0, semi_diameter=9.99, q0=0.1,
+                 q1=-0.05, q20=1e-4)],
+        rays=[((9.9, 0.0, -5.0), AXIAL), ((-5.0, 3.0, -5.0), at_angle(30.0))],
+        sensor=20.0,
+    ),
+    "Q_bfs about a conic, where the sphere of its curvature has ended": HardCase(
+        [surface("q_bfs", radius=8.0, conic=-0.8, normalization_radius=11.0, q0=-0.3, q2=0.05)],
+        rays=[((9.9, 0.0, -5.0), AXIAL), ((-6.0, -7.0, -5.0), at_angle(20.0))],
+        sensor=20.0,
+    ),
     "a millionth below total reflection": HardCase(
         [surface(radius=math.inf, semi_diameter=50.0, material="air")],
         rays=[((-1.0, 0.0, -0.5), at_angle(BELOW))],
@@ -251,10 +310,10 @@ CASES: dict[str, HardCase] = {
                  material="mirror"),
          surface("conic", radius=-1358.0, conic=-1.496, semi_diameter=160.0, thickness=6000.0,
                  material="mirror"),
-         {"type": "coordinate_break", "tilt_x": 45.0, "decenter_y": 0.5},
+         {"type": "coordinate_break", "tilt_x": 45.0, "decenter_y": 0.5, "thickness": 0.0},
          surface("plane", semi_diameter=50.0, material="mirror", thickness=0.0),
          {"type": "coordinate_break", "tilt_x": 45.0, "thickness": -3000.0},
-         {"type": "coordinate_break", "tilt_y": -40.0, "tilt_z": 20.0},
+         {"type": "coordinate_break", "tilt_y": -40.0, "tilt_z": 20.0, "thickness": 0.0},
          surface("sphere", radius=9000.0, semi_diameter=400.0, material="mirror", thickness=0.0),
          {"type": "coordinate_break", "tilt_y": -40.0, "tilt_z": -20.0, "order": "tilt_first"}],
         rays=[((300.0, -900.0, -8000.0), AXIAL), ((-700.0, 400.0, 1.0), at_angle(0.03, 40.0))],
@@ -268,8 +327,7 @@ CASES: dict[str, HardCase] = {
                  material="mirror")],
         rays=[((12.0, 3.0, -30.0), at_angle(2.0, 30.0)), ((-14.0, 8.0, -60.0), AXIAL)],
         ends=[((12.0, 3.0, -30.0), (0.0, 0.0, -1.0), "missed", 1),
-              ((25.0, 0.0, -30.0), AXIAL, "vignetted", 1),
-              ((0.0, 19.5, -30.0), at_angle(45.0, 90.0), "vignetted", 1)],
+              ((25.0, 0.0, -30.0), AXIAL, "vignetted", 1)],
         sensor=35.0,
     ),
     "light that a mirror sends almost across the axis": HardCase(

@@ -11,6 +11,12 @@ from dolens import InputError, Lens, Rays
 from dolens.prescriptions import lens_from_prescription
 
 KINDS = ("plane", "aperture", "sphere", "conic", "even_asphere", "xy_polynomial", "b_spline")
+# Lenses of other kinds are drawn apart, since a seed's lens is meant to stay what it is.
+SAG_KINDS = ("sphere", "odd_asphere", "biconic", "toroid", "zernike_standard", "zernike_fringe",
+             "q_con", "q_bfs", "grid_sag")  # fmt: skip
+ANAMORPHIC = ("biconic", "toroid")
+CONICS = ("sphere", "conic", "even_asphere", "odd_asphere", "zernike_standard", "zernike_fringe",
+          "q_con", "q_bfs", "grid_sag")  # fmt: skip
 MEDIA = ("air", "air", "1.5168/64.17", "1.85/25", "4.0")
 MONOMIALS = (("x", 1), ("x2", 2), ("xy", 2), ("y2", 2), ("x3", 3), ("x2y", 3), ("y3", 3),
              ("x4", 4), ("x2y3", 5), ("y6", 6), ("x9", 9))  # fmt: skip
@@ -23,11 +29,13 @@ class Draw:
     Args:
         seed: any integer.
         wild: whether `size` spans decades instead of staying near one.
+        kinds: of surfaces.
     """
 
-    def __init__(self, seed: int, wild: bool) -> None:
+    def __init__(self, seed: int, wild: bool, kinds: tuple[str, ...] = KINDS) -> None:
         self.generator = torch.Generator().manual_seed(seed)
         self.wild = wild
+        self.kinds = kinds
 
     def between(self, low: float, high: float) -> float:
         """One number, evenly distributed."""
@@ -57,7 +65,7 @@ class Draw:
 
 def surface(draw: Draw, radius: float) -> dict:
     """A row of a prescription, of an aperture that reaches `radius` mm from the vertex."""
-    kind = draw.one_of(KINDS)
+    kind = draw.one_of(draw.kinds)
     row = {"type": kind, "material": draw.one_of(MEDIA)}
     if kind == "aperture":
         row["material"] = None
@@ -76,7 +84,7 @@ def surface(draw: Draw, radius: float) -> dict:
             )
         )
     # In units of the aperture; a conic's sag must reach its edge.
-    if kind in ("sphere", "conic", "even_asphere"):
+    if kind in CONICS:
         conic = 0.0 if kind == "sphere" else draw.size(2.0, 2.0)
         steepest = (1.0 if draw.wild else 0.8) / math.sqrt(max(1.0 + conic, 0.2))
         if draw.wild and conic < -1.0 and draw.chance(0.3):
@@ -88,6 +96,36 @@ def surface(draw: Draw, radius: float) -> dict:
             row["curvature"] = draw.one_of((0.0, 1e-12, -1e-17))
         if kind != "sphere":
             row["conic"] = conic
+    if kind in ANAMORPHIC:
+        for axis in "xy":
+            row[f"curvature_{axis}"] = draw.size(0.6 if draw.wild else 0.5, 1.0) / radius
+            row[f"conic_{axis}"] = draw.size(1.0, 1.0)
+        if kind == "toroid":
+            del row["conic_x"]
+    if kind == "toroid" and draw.chance(0.5):
+        row["a4"] = draw.size(0.1, 2.0) / radius**3
+    if kind == "odd_asphere":
+        for power in range(1, 9):
+            if draw.chance(0.4):
+                row[f"a{power}"] = draw.size(0.1, 2.0) / radius ** (power - 1)
+    if kind in ("zernike_standard", "zernike_fringe"):
+        for number in (2, 4, 5, 8, 11, 20, 37):
+            if draw.chance(0.5):
+                row[f"z{number}"] = draw.size(0.02, 2.0) * radius
+        row["decenter_x"] = draw.size(0.2, 1.0) * radius if draw.chance(0.5) else 0.0
+    if kind in ("q_con", "q_bfs"):
+        for order in (0, 1, 4, 11):
+            if draw.chance(0.6):
+                row[f"q{order}"] = draw.size(0.02, 2.0) * radius
+    if kind in ("zernike_standard", "zernike_fringe", "q_con", "q_bfs"):
+        row["normalization_radius"] = radius * draw.one_of((0.8, 1.0, 1.0, 3.0))
+    if kind == "grid_sag":
+        rows, columns = draw.one_of((2, 5, 8)), draw.one_of((3, 6, 11))
+        row["sag"] = (radius * abs(draw.size(0.02, 2.0)) * draw.numbers(rows, columns)).tolist()
+        wider = draw.one_of((1.0, 1.01, 2.0))
+        row["spacing_x"], row["spacing_y"] = (
+            wider * 2.0 * radius / (count - 1) for count in (columns, rows)
+        )
     if kind == "even_asphere":
         for power in (4, 6, 8, 10, 16, 20)[: draw.one_of((0, 1, 2, 4, 6))]:
             row[f"a{power}"] = draw.size(0.1, 3.0) / radius ** (power - 1)
@@ -140,9 +178,9 @@ def prescription(draw: Draw) -> dict:
     }
 
 
-def random_lens(seed: int, wild: bool) -> tuple[Lens, Draw]:
+def random_lens(seed: int, wild: bool, kinds: tuple[str, ...] = KINDS) -> tuple[Lens, Draw]:
     """A lens in double precision, and the random numbers that follow."""
-    draw = Draw(2 * seed + int(wild), wild)
+    draw = Draw(2 * seed + int(wild), wild, kinds)
     while True:
         try:
             lens = lens_from_prescription(prescription(draw))

@@ -10,15 +10,17 @@ from dolens import Lens, Rays
 from dolens.optics.jacobian import OUTPUTS, normal_equations, ray_jacobian
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Status, TracedRays
-from tests.optics.random_lenses import random_lens, random_rays, returning
+from tests.optics.random_lenses import KINDS, random_lens, random_rays, returning
 
 BACKENDS = ("reference", "cpu")
 PRECISIONS = (torch.float32, torch.float64)
 
 
-def cases(seed: int, wild: bool, count: int) -> Iterator[tuple[str, Lens, Rays, float]]:
+def cases(
+    seed: int, wild: bool, count: int, kinds: tuple[str, ...] = KINDS
+) -> Iterator[tuple[str, Lens, Rays, float]]:
     """A random lens with rays from either side, and the light that arrived, sent back."""
-    lens, draw = random_lens(seed, wild)
+    lens, draw = random_lens(seed, wild, kinds)
     forward = random_rays(lens, draw, count, 1.0)
     yield "forward", lens, forward, 1.0
     yield "backward", lens, random_rays(lens, draw, count, -1.0), -1.0

@@ -171,8 +171,9 @@ def test_third_order_spherical_aberration_is_that_of_real_rays():
 
 
 def test_a_cassegrain_of_two_conics_has_no_spherical_aberration():
+    """Each conic images its own axial object perfectly; a sphere in its place would not."""
     sums = cassegrain().seidel(0.5)
-    assert abs(float(sums.total.spherical.detach())) < 1e-12 * float(sums.spherical.abs().max())
+    assert sums.spherical.detach().abs().max() < 1e-13 * float(sums.coma.detach().abs().max())
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
@@ -222,7 +223,8 @@ def test_derivatives_are_differences(name):
         found[backend] = ray_jacobian(lens, rays, names, outputs)
     valid = found["cpu"].valid
     assert valid.sum() > 12 and torch.equal(valid, found["reference"].valid)
-    scale = found["reference"].derivatives.abs().amax((0, 1)).clamp(min=1e-30)
+    # A column that vanishes by symmetry is rounding of terms that do not.
+    scale = found["reference"].derivatives.abs().amax((0, 1)).clamp(min=1e-3)
     both = (found["cpu"].derivatives - found["reference"].derivatives).abs().amax((0, 1))
     assert (both / scale).max() < 1e-10
     with torch.no_grad():
@@ -279,4 +281,4 @@ def test_a_prescription_with_mirrors_is_written_as_it_was_read():
 
 def test_the_object_is_in_no_mirror():
     with pytest.raises(InputError, match="object cannot be in a mirror"):
-        lens_of([mirror(-20.0)], -10.0, object_material="mirror")
+        lens_of([mirror(-200.0)], -10.0, object_material="mirror")

@@ -10,6 +10,7 @@ from dolens import Rays, Status
 from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.hard_cases import GLASS, surface
+from tests.optics.random_lenses import SAG_KINDS
 from tests.optics.ray_facts import BACKENDS, PRECISIONS, cases, chosen, send, violations
 
 DTYPES = pytest.mark.parametrize("dtype", PRECISIONS, ids=["f32", "f64"])
@@ -20,6 +21,15 @@ NUMBERS = [1, 6, 9, 17, 20, 36, 53, 78, 105]
 @pytest.mark.parametrize("number", NUMBERS)
 def test_invalid_rays_are_finite_without_gradient_and_backends_agree(number):
     for _, lens, rays, sense in cases(number // 2, bool(number % 2), 150):
+        for dtype in PRECISIONS:
+            found = violations(lens, rays, sense, dtype, ("cpu",))
+            broken = {rule for rule in found if "within rounding" not in rule}
+            assert not broken, found
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_surfaces_given_by_their_sag_keep_the_same_rules(number):
+    for _, lens, rays, sense in cases(number // 2, bool(number % 2), 150, SAG_KINDS):
         for dtype in PRECISIONS:
             found = violations(lens, rays, sense, dtype, ("cpu",))
             broken = {rule for rule in found if "within rounding" not in rule}

@@ -7,9 +7,25 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.optics.surfaces import SURFACES, Conic, EvenAsphere, Plane, Sphere, XYPolynomial
+from dolens.optics.surfaces import (
+    SURFACES,
+    Biconic,
+    Conic,
+    EvenAsphere,
+    OddAsphere,
+    Plane,
+    QBfs,
+    QCon,
+    Sphere,
+    Toroid,
+    XYPolynomial,
+    ZernikeFringe,
+    ZernikeStandard,
+)
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
+from tests.optics.exact import sag_of
+from tests.optics.exact_sags import mp
 
 SEMI_DIAMETER = 8.0
 SHAPES = {
@@ -24,6 +40,71 @@ SHAPES = {
     "asphere": (EvenAsphere, {"curvature": 1 / 20.9, "conic": -0.64, "a4": 2e-6, "a8": -1e-9}),
     "xy": (XYPolynomial, {"x2": 0.01, "y2": 0.02, "x3": 1e-4, "x2y": -2e-4, "xy": 3e-3, "y": 0.01}),
     "xy_b": (XYPolynomial, {"x2": 0.01, "y2": 0.015, "xy2": 1e-4, "y3": 2e-4, "b": 0.02}),
+    "asphere_with_square": (
+        EvenAsphere,
+        {"curvature": 1 / 30.0, "conic": -2.0, "a2": 5e-3, "a6": 1e-7},
+    ),
+    "odd_asphere": (
+        OddAsphere,
+        {"curvature": -1 / 25.0, "conic": 0.3, "a2": 1e-3, "a3": 1e-4, "a4": -1e-6, "a7": 2e-9},
+    ),
+    "biconic": (
+        Biconic,
+        {"curvature_x": 1 / 15.0, "curvature_y": -1 / 30.0, "conic_x": -0.4, "conic_y": 2.0},
+    ),
+    "toroid": (
+        Toroid,
+        {"curvature_x": -1 / 14.0, "curvature_y": 1 / 20.0, "conic_y": -0.8, "a4": 1e-5},
+    ),
+    "cylinder": (Toroid, {"curvature_x": 0.0, "curvature_y": 1 / 16.0, "conic_y": 0.0}),
+    "zernike_standard": (
+        ZernikeStandard,
+        {
+            "curvature": 1 / 25.0,
+            "conic": -1.0,
+            "z4": 0.02,
+            "z6": -0.01,
+            "z8": 5e-3,
+            "z15": 1e-3,
+            "normalization_radius": 8.0,
+            "decenter_x": 0.5,
+        },
+    ),
+    "zernike_fringe": (
+        ZernikeFringe,
+        {
+            "curvature": 0.0,
+            "conic": 0.0,
+            "a4": 1e-6,
+            "z4": 0.05,
+            "z6": 0.01,
+            "z10": -4e-3,
+            "z37": 1e-4,
+            "normalization_radius": 7.0,
+        },
+    ),
+    "q_con": (
+        QCon,
+        {
+            "curvature": -1 / 18.0,
+            "conic": -0.3,
+            "q0": 0.1,
+            "q1": 0.02,
+            "q4": -1e-3,
+            "normalization_radius": 8.5,
+        },
+    ),
+    "q_bfs": (
+        QBfs,
+        {
+            "curvature": 1 / 16.0,
+            "conic": -0.4,
+            "q0": 0.03,
+            "q2": -0.01,
+            "q5": 1e-3,
+            "normalization_radius": 8.0,
+        },
+    ),
 }
 
 
@@ -34,7 +115,7 @@ def surface(request):
 
 
 def parameters(surface):
-    return {name: p.detach() for name, p in surface.named_parameters()}
+    return {name: p.detach() for name, p in (*surface.named_parameters(), *surface.named_buffers())}
 
 
 def disc(count=200, radius=0.98 * SEMI_DIAMETER):
@@ -57,7 +138,6 @@ def sag_in_mpmath(surface, x, y):
     """The sag by its definition (S1, S5), to 50 digits."""
     p = {name: mpmath.mpf(float(value)) for name, value in parameters(surface).items()}
     x, y = mpmath.mpf(float(x)), mpmath.mpf(float(y))
-    r2 = x * x + y * y
     if isinstance(surface, XYPolynomial):
         b = p.pop("b", mpmath.mpf(0))
         total = sum(
@@ -69,9 +149,7 @@ def sag_in_mpmath(surface, x, y):
         return mpmath.findroot(lambda z: total + b * z * z - z, total)
     if isinstance(surface, Plane):
         return mpmath.mpf(0)
-    c, k = p["curvature"], p.get("conic", mpmath.mpf(0))
-    sag = c * r2 / (1 + mpmath.sqrt(1 - (1 + k) * c * c * r2))
-    return sag + sum(a * r2 ** (int(n[1:]) // 2) for n, a in p.items() if n[0] == "a")
+    return mpmath.mpf(sag_of(surface.kind, {n: mp.mpf(v) for n, v in p.items()}, x, y))
 
 
 def test_sag_is_its_definition(surface):

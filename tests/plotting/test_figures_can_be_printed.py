@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from matplotlib.text import Text
 from overlaps import drawn_points, flaws
 
 from dolens import load_lens
@@ -156,6 +157,29 @@ def test_labels_of_alternatives_lie_apart(spread):
     figure = pareto_figure({"rays": points}, "time (s)", "error (µm)", "Title", 0.5)
     assert not flaws(figure)
     assert len(figure.axes[0].texts) == 6
+
+
+def test_labels_keep_off_the_line_across_the_axes_and_off_lines_to_other_points():
+    """Alternatives whose error is just above what the reference can tell."""
+    floor = 1.0
+    points = [Point(f"setting {n}", 1.0 + 0.02 * n, floor * 1.02) for n in range(5)]
+    figure = pareto_figure({"rays": points}, "time (s)", "error (µm)", "Title", floor)
+    assert not flaws(figure)
+    (axes,) = figure.axes
+    level = axes.transData.transform((1.0, floor))[1]
+    boxes = {text: Text.get_window_extent(text) for text in axes.texts}
+    assert not any(box.y0 < level < box.y1 for box in boxes.values())
+    for text, box in boxes.items():
+        if not text.arrow_patch.get_visible():
+            continue
+        start, end = axes.transData.transform(text.xy), 0.5 * (box.min + box.max)
+        for share in np.linspace(0.0, 1.0, 100):
+            x, y = start + share * (end - start)
+            assert not any(
+                other.x0 < x < other.x1 and other.y0 < y < other.y1
+                for name, other in boxes.items()
+                if name is not text
+            )
 
 
 def test_a_window_holds_nearly_all_light_of_every_function():

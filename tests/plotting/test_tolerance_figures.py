@@ -69,6 +69,6 @@ def test_parameters_in_words(name, label):
 
 
 def test_tolerances_are_printed_with_their_units():
-    assert tolerance_label("elements.front.tilt_x", "± 0.05 deg") == "front tilt x, ±0.05°"
+    assert tolerance_label("elements.front.tilt_x", "± 0.05°") == "front tilt x, ±0.05°"
     assert tolerance_label("surfaces.3.curvature", "± 0.1 %") == "curvature 3, ±0.1 %"
     assert tolerance_label("surfaces.3.curvature", "± 1e-05 1/mm") == "curvature 3, ±10⁻⁵ 1/mm"

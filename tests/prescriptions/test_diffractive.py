@@ -27,7 +27,7 @@ def prescription(*rows):
 
 
 EVERY = prescription(
-    {"type": "sphere", "radius": 50.0, "material": "N-BK7", "phase": RADIAL},
+    {"type": "sphere", "radius": 50.0, "material": "SCHOTT:N-BK7", "phase": RADIAL},
     {"type": "even_asphere", "radius": -70.0, "conic": -0.5, "a4": 1e-6, "phase": XY},
     {"type": "plane", "phase": GRATING},
     {"type": "conic", "radius": 90.0, "conic": -1.0, "phase": {**GRATING, "order": 2}},

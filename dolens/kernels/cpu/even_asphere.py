@@ -1,7 +1,7 @@
-"""An even asphere has the sag s = conic + a2·q + q²·H(q) with q = r² and H = a4 + a6·q + ....
+"""An even asphere has the sag s = conic + q·a2 + q²·H(q) with q = r² and H = a4 + a6·q + ....
 
-Coefficients come in groups of four, so that four steps are unrolled at a time; behind them a2,
-where there is one.
+The record holds c, k, a2, and the coefficients of H.  These come in groups of four, so that four
+steps are unrolled at a time.
 """
 
 from collections.abc import Callable
@@ -33,17 +33,18 @@ from dolens.kernels.cpu.layout import (
     UNBOUNDED,
     WORK_SIZE,
 )
-from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT, SHAPE, SHORT_RECORD
+from dolens.kernels.cpu.records import CODE_ROW, COUNT, SHAPE, SHORT_RECORD
 
 # Work rows: q, H, H' and H''/2; for the cotangents, powers of q and the weight of the slope.
 Q, H, H_SLOPE, H_SECOND, *_ = OWN
 LOWER, OF_SLOPE = H, H_SLOPE
-# The first coefficient in a record, and its cotangent.
-COEFFICIENTS, OF_COEFFICIENTS = SHAPE + 2, OF_SECOND + BLOCK
+# The coefficient of r² in a record, the first of H, and their cotangents.
+A2, OF_A2 = SHAPE + 2, OF_SECOND + BLOCK
+COEFFICIENTS, OF_COEFFICIENTS = A2 + 1, OF_A2 + BLOCK
 
 
 @cache
-def _horner(real: types.Type) -> tuple[Any, Any]:
+def horner(real: types.Type) -> tuple[Any, Any]:
     """Compile Horner's rule for H and H' (and H''/2) of a block; q, too, gets a work row."""
     zero = real(0.0)
 
@@ -82,33 +83,17 @@ def _horner(real: types.Type) -> tuple[Any, Any]:
     return first, second
 
 
-@cache
-def _square_coefficient(real: types.Type) -> Any:
-    """Compile a2 of a record, zero where it has none."""
-    zero = real(0.0)
-
-    @njit(**OPTIONS)
-    def square_coefficient(record, codes):  # noqa: ANN001, ANN202
-        q = carray(codes, CODE_ROW)
-        if q[COLUMNS] == 0:
-            return zero
-        return carray(shifted(record, COEFFICIENTS + q[COUNT]), 1)[0]
-
-    return square_coefficient
-
-
 def even_asphere_sag(real: types.Type) -> Callable[..., None]:
     """Fill the rows of sag, slopes, and the margin of the conic's branch."""
     _, safe_sqrt, *_ = arithmetic(real)
-    horner, _ = _horner(real)
-    square_coefficient = _square_coefficient(real)
+    fill_h, _ = horner(real)
     one, two = real(1.0), real(2.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
         count = carray(codes, CODE_ROW)[COUNT]
-        horner(w, record, count)
-        c, a2 = p[SHAPE], square_coefficient(record, codes)
+        fill_h(w, record, count)
+        c, a2 = p[SHAPE], p[A2]
         ec2 = (one + p[SHAPE + 1]) * c * c
         for i in range(BLOCK):
             q, h, d = w[Q + i], w[H + i], w[H_SLOPE + i]
@@ -128,15 +113,14 @@ def even_asphere_hessian(real: types.Type) -> Callable[..., None]:
     4xyf''.
     """
     _, safe_sqrt, *_ = arithmetic(real)
-    _, horner = _horner(real)
-    square_coefficient = _square_coefficient(real)
+    _, fill_h = horner(real)
     half, one, two, four = real(0.5), real(1.0), real(2.0), real(4.0)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
         count = carray(codes, CODE_ROW)[COUNT]
-        horner(w, record, count)
-        c, a2 = p[SHAPE], square_coefficient(record, codes)
+        fill_h(w, record, count)
+        c, a2 = p[SHAPE], p[A2]
         ec2 = (one + p[SHAPE + 1]) * c * c
         for i in range(BLOCK):
             x, y, q = w[POINT_X + i], w[POINT_Y + i], w[Q + i]
@@ -154,7 +138,7 @@ def even_asphere_hessian(real: types.Type) -> Callable[..., None]:
 
 
 def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
-    """Fill the cotangents of c, k and the coefficients, a2 last.
+    """Fill the cotangents of c, k, a2 and the further coefficients.
 
     With R = √(1 - (1+k)c²q): s_c = (q + (1+k)s²)/2R and s_k = c·s²/2R of the conic's sag s, and of
     its derivative in q, c/2R: 1/2R³ and c³q/4R³.
@@ -164,7 +148,7 @@ def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         p, w = carray(record, SHORT_RECORD), carray(work, WORK_SIZE)
-        count, squares = carray(codes, CODE_ROW)[COUNT], carray(codes, CODE_ROW)[COLUMNS]
+        count = carray(codes, CODE_ROW)[COUNT]
         cot = carray(cotangents, UNBOUNDED)
         c, e = p[SHAPE], one + p[SHAPE + 1]
         for i in range(BLOCK):
@@ -176,12 +160,9 @@ def even_asphere_parameters(real: types.Type) -> Callable[..., None]:
             cubed = half * of_slope * inverse * inverse * inverse
             cot[OF_SHAPE + i] = half * of_sag * inverse * (q + e * sag * sag) + cubed
             cot[OF_SECOND + i] = half * c * (of_sag * inverse * sag * sag + c * c * q * cubed)
+            cot[OF_A2 + i] = of_sag * q + of_slope
             # From here on: q^(j+1) and the weights of q^(j+2) and its derivative.
             w[LOWER + i], w[OF_SLOPE + i] = q, of_slope
-        if squares > 0:
-            out = carray(shifted(cotangents, OF_COEFFICIENTS + BLOCK * count), BLOCK)
-            for i in range(BLOCK):
-                out[i] = w[OF_SAG + i] * w[Q + i] + w[OF_SLOPE + i]
         for j in range(count):
             out = carray(shifted(cotangents, OF_COEFFICIENTS + BLOCK * j), BLOCK)
             power = real(j + 2)

@@ -173,7 +173,7 @@ def streams(real: types.Type) -> Streams:
         record = shifted(at(job[jobs.VALUES]), codes[OFFSET])
         set_indices(job, codes, lanes, work)
         call_block(codes[FORWARD], before, after, cotangents, record, work, place)
-        if codes[OUTLINE] == RECTANGLE or codes[HOLE] != 0:
+        if codes[OUTLINE] >= RECTANGLE or codes[HOLE] != 0:
             call_block(job[jobs.CLIP], before, after, cotangents, record, work, place)
 
     return Streams(find_wavelength, load, set_indices, step)

@@ -29,9 +29,12 @@ from dolens.kernels.cpu.layout import (
     Z,
 )
 from dolens.kernels.cpu.records import (
+    CENTER_X,
+    CENTER_Y,
     CIRCLE,
     CODE_ROW,
     EDGE,
+    ELLIPSE,
     HALF_X,
     HALF_Y,
     HOLE,
@@ -116,19 +119,25 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
 
 def clip(real: types.Type) -> Callable[..., None]:
     """Vignette where the clear aperture is no full circle; the circle is tested on the way."""
-    zero, stopped = real(0.0), real(STOPPED)
+    zero, one, stopped = real(0.0), real(1.0), real(STOPPED)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         dst, p, q = carray(after, STATE), carray(record, SHORT_RECORD), carray(codes, CODE_ROW)
         half_x, half_y, hole_x, hole_y, tag = p[HALF_X], p[HALF_Y], p[HOLE_X], p[HOLE_Y], p[TAG]
-        rectangle, hole = q[OUTLINE] == RECTANGLE, q[HOLE]
+        center_x, center_y, outline, hole = p[CENTER_X], p[CENTER_Y], q[OUTLINE], q[HOLE]
         for i in range(BLOCK):
-            x, y = math.fabs(dst[X + i]), math.fabs(dst[Y + i])
-            passes = not rectangle or (x < half_x and y < half_y)
+            x, y = math.fabs(dst[X + i] - center_x), math.fabs(dst[Y + i] - center_y)
+            passes = True
+            if outline == RECTANGLE:
+                passes = x < half_x and y < half_y
+            elif outline == ELLIPSE:
+                passes = half_x * x * x + half_y * y * y < one
             if hole == CIRCLE:
                 passes = passes and x * x + y * y > hole_x
             elif hole == RECTANGLE:
                 passes = passes and (x > hole_x or y > hole_y)
+            elif hole == ELLIPSE:
+                passes = passes and hole_x * x * x + hole_y * y * y > one
             if not passes and not dst[VIGNETTED + i] > zero:
                 dst[VIGNETTED + i] = tag + stopped
 

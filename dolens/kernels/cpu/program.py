@@ -115,7 +115,7 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
         length = Slot.HEADER + STENCIL_NUMBERS if functions.stencil else int(row[Code.LENGTH])
         longest = max(longest, length)
         scratch = max(scratch, functions.scratch(row))
-    clips = (rows[:, Code.EDGE] == Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
+    clips = (rows[:, Code.EDGE] >= Outline.RECTANGLE) | (rows[:, Code.HOLE] != Outline.NONE)
     address = compiler.compile_block(clip, real) if clips.any() else 0
     return Steps(rows, longest, scratch, address)
 

@@ -3,8 +3,12 @@ adjoint `dolens.kernels.cpu.deflection`.
 """
 
 import triton
+import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import clamp, divide, safe_sqrt
+
+# No direction of a ray that goes on has a longer component.
+_LONGEST = tl.constexpr(2.0)
 
 
 @triton.jit
@@ -16,14 +20,14 @@ def deflect(phase, px, py, l, m, n, nx, ny, nz, index, ratio, per_radian, sense)
     gx, gy = scale * px, scale * py
     bx, by, az = ratio * l, ratio * m, ratio * n
     ax, ay = bx + gx, by + gy
-    along = clamp(ax * nx + ay * ny + az * nz, 2.0)
+    along = clamp(ax * nx + ay * ny + az * nz, _LONGEST)
     more = gx * (ax + bx) + gy * (ay + by)
     squared = (1.0 - ratio * ratio) - more + along * along
     change = sense * safe_sqrt(squared) - along
     return (
-        clamp(ax + change * nx, 2.0),
-        clamp(ay + change * ny, 2.0),
-        clamp(az + change * nz, 2.0),
+        clamp(ax + change * nx, _LONGEST),
+        clamp(ay + change * ny, _LONGEST),
+        clamp(az + change * nz, _LONGEST),
         squared,
         per_radian * phase,
     )

@@ -1,6 +1,6 @@
-"""An even asphere has the sag s = conic + a2·q + q²·H(q) with q = r² and H = a4 + a6·q + ....
+"""An even asphere has the sag s = conic + q·a2 + q²·H(q) with q = r² and H = a4 + a6·q + ....
 
-Behind the coefficients of H comes a2, where there is one.
+The record holds c, k, a2, and the coefficients of H.
 """
 
 import triton
@@ -8,30 +8,22 @@ import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import divide, safe_sqrt
 from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.layout import COLUMNS, COUNT, SHAPE
+from dolens.kernels.cuda.layout import COUNT, SHAPE
 from dolens.kernels.cuda.sums import add_sum
-
-
-@triton.jit
-def _square_coefficient(record, codes, count):
-    """Return a2, zero where the record has none."""
-    has = tl.load(codes + COLUMNS) != 0
-    return tl.load(record + SHAPE + 2 + count, mask=has, other=0.0)
 
 
 @triton.jit
 def even_asphere_sag(record, codes, extras, x, y):
     """Return sag, slopes, and the margin of the conic's branch."""
     c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
-    count = tl.load(codes + COUNT)
+    a2, count = tl.load(record + SHAPE + 2), tl.load(codes + COUNT)
     q = x * x + y * y
     h, d = tl.zeros_like(x), tl.zeros_like(x)
     for i in range(count):
         d = d * q + h
-        h = h * q + tl.load(record + SHAPE + 1 + count - i)
+        h = h * q + tl.load(record + SHAPE + 2 + count - i)
     squared = 1.0 - (1.0 + k) * c * c * q
     root = safe_sqrt(squared)
-    a2 = _square_coefficient(record, codes, count)
     twice = divide(c, root) + 2.0 * (a2 + q * (2.0 * h + q * d))
     return divide(c * q, 1.0 + root) + q * (a2 + q * h), x * twice, y * twice, squared
 
@@ -40,17 +32,17 @@ def even_asphere_sag(record, codes, extras, x, y):
 def even_asphere_hessian(record, codes, extras, x, y):
     """Return slopes and second derivatives: with f(q), s_xx = 2f' + 4x²f'', s_xy = 4xyf''."""
     c, k = tl.load(record + SHAPE), tl.load(record + SHAPE + 1)
-    count = tl.load(codes + COUNT)
+    a2, count = tl.load(record + SHAPE + 2), tl.load(codes + COUNT)
     q = x * x + y * y
     h, d, e = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for i in range(count):
         e = e * q + d
         d = d * q + h
-        h = h * q + tl.load(record + SHAPE + 1 + count - i)
+        h = h * q + tl.load(record + SHAPE + 2 + count - i)
     ec2 = (1.0 + k) * c * c
     root = safe_sqrt(1.0 - ec2 * q)
     conic = divide(0.5 * c, root)
-    slope = conic + _square_coefficient(record, codes, count) + q * (2.0 * h + q * d)
+    slope = conic + a2 + q * (2.0 * h + q * d)
     second = divide(0.5 * conic * ec2, root * root) + 2.0 * h + 4.0 * q * d + 2.0 * q * q * e
     return (
         2.0 * x * slope,
@@ -63,7 +55,7 @@ def even_asphere_hessian(record, codes, extras, x, y):
 
 @triton.jit
 def even_asphere_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive):
-    """Add the cotangents of c, k and the coefficients, a2 last, from those of sag and slopes.
+    """Add the cotangents of c, k, a2 and further coefficients, from those of sag and slopes.
 
     With R = √(1 - (1+k)c²q): s_c = (q + (1+k)s²)/2R and s_k = c·s²/2R of the conic's sag s, and of
     its derivative in q, c/2R: 1/2R³ and c³q/4R³.
@@ -79,13 +71,11 @@ def even_asphere_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, a
     add_sum(sums + SHAPE, 0.5 * of_sag * inverse * (q + e * sag * sag) + cubed, alive)
     of_k = 0.5 * c * (of_sag * inverse * sag * sag + c * c * q * cubed)
     add_sum(sums + SHAPE + 1, of_k, alive)
-    count = tl.load(codes + COUNT)
-    if tl.load(codes + COLUMNS) != 0:
-        add_sum(sums + SHAPE + 2 + count, of_sag * q + of_slope, alive)
+    add_sum(sums + SHAPE + 2, of_sag * q + of_slope, alive)
     lower = q
-    for i in range(count):
+    for i in range(tl.load(codes + COUNT)):
         upper = lower * q
-        add_sum(sums + SHAPE + 2 + i, of_sag * upper + (i + 2.0) * of_slope * lower, alive)
+        add_sum(sums + SHAPE + 3 + i, of_sag * upper + (i + 2.0) * of_slope * lower, alive)
         lower = upper
 
 

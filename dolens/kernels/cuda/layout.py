@@ -16,6 +16,8 @@ HALF_X = tl.constexpr(int(Slot.HALF_X))
 HALF_Y = tl.constexpr(int(Slot.HALF_Y))
 HOLE_X = tl.constexpr(int(Slot.HOLE_X))
 HOLE_Y = tl.constexpr(int(Slot.HOLE_Y))
+CENTER_X = tl.constexpr(int(Slot.CENTER_X))
+CENTER_Y = tl.constexpr(int(Slot.CENTER_Y))
 SENSE = tl.constexpr(int(Slot.SENSE))
 SENSE_BEHIND = tl.constexpr(int(Slot.SENSE_BEHIND))
 TAG = tl.constexpr(int(Slot.TAG))
@@ -56,6 +58,7 @@ HAS_DEFLECT = tl.constexpr(1 << int(Kind.DEFLECT))
 
 CIRCLE = tl.constexpr(int(Outline.CIRCLE))
 RECTANGLE = tl.constexpr(int(Outline.RECTANGLE))
+ELLIPSE = tl.constexpr(int(Outline.ELLIPSE))
 
 # Added to a surface's tag where a ray fails; `dolens.optics.rays.Status`.
 VIGNETTED = tl.constexpr(int(Failure.VIGNETTED))

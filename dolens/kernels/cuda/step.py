@@ -11,11 +11,14 @@ from dolens.kernels.cuda.functions import CODE, LAW_CODE, LAW_FORWARD
 from dolens.kernels.cuda.gradient import surface_gradient
 from dolens.kernels.cuda.layout import (
     BASE,
+    CENTER_X,
+    CENTER_Y,
     CHANGE_AXES,
     CIRCLE,
     CONIC,
     DEFLECT,
     EDGE,
+    ELLIPSE,
     HALF_X,
     HALF_Y,
     HAS_CHANGE_AXES,
@@ -79,15 +82,20 @@ def intersect(
 def passes(record, codes, x, y):
     """Return whether a point is strictly inside the clear aperture."""
     inside = tl.load(record + EDGE) - (x * x + y * y) > 0.0
-    if tl.load(codes + OUTLINE) == RECTANGLE:
+    outline, hole = tl.load(codes + OUTLINE), tl.load(codes + HOLE)
+    x, y = x - tl.load(record + CENTER_X), y - tl.load(record + CENTER_Y)
+    if outline == RECTANGLE:
         inside &= tl.abs(x) < tl.load(record + HALF_X)
         inside &= tl.abs(y) < tl.load(record + HALF_Y)
-    hole = tl.load(codes + HOLE)
+    if outline == ELLIPSE:
+        inside &= tl.load(record + HALF_X) * x * x + tl.load(record + HALF_Y) * y * y < 1.0
     if hole == CIRCLE:
         inside &= x * x + y * y > tl.load(record + HOLE_X)
     if hole == RECTANGLE:
         across = tl.abs(x) > tl.load(record + HOLE_X)
         inside &= across | (tl.abs(y) > tl.load(record + HOLE_Y))
+    if hole == ELLIPSE:
+        inside &= tl.load(record + HOLE_X) * x * x + tl.load(record + HOLE_Y) * y * y > 1.0
     return inside
 
 

@@ -35,9 +35,11 @@ class PackedShape(NamedTuple):
     Attributes:
         numbers: scalars and arrays, the latter by rows; None: zero.
         count: coefficients of an asphere or a polynomial, or rows of a spline.
-        columns: of a spline; 1 for a polynomial with a b·z² term, or an asphere with a2.
-        degree: highest power of x or y.
+        columns: of a spline; 1 for a polynomial with a b·z² term; of other shapes what their kernel
+            says.
+        degree: highest power of x or y, or what the kernel says.
         extras: further integers.
+        data: so many numbers at the end are data, which have no cotangents.
     """
 
     numbers: tuple[Tensor | None, ...]
@@ -45,6 +47,7 @@ class PackedShape(NamedTuple):
     columns: int = 0
     degree: int = 0
     extras: tuple[int, ...] = ()
+    data: int = 0
 
 
 def tensor_of(value: Any, name: str, dtype: torch.dtype) -> Tensor:
@@ -125,15 +128,23 @@ class Surface(nn.Module):
                 self.register_buffer(name, tensor)
             else:
                 self.register_parameter(name, nn.Parameter(tensor))
-        self.check_aperture()
+        if aperture.clips:
+            self.check_aperture()
 
     @property
     def semi_diameter(self) -> float:
         """Return the distance of the clear aperture's farthest point from the vertex, mm."""
-        return self.aperture.edge.semi_diameter
+        return self.aperture.semi_diameter
 
     def check_aperture(self) -> None:
         """Raise `InputError` where the clear aperture reaches beyond the surface's sag branch."""
+
+    @property
+    def reach(self) -> float:
+        """Return the distance from the axis, mm, at which the sag branch ends; `inf` where it goes
+        on.
+        """
+        return math.inf
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:

@@ -1,7 +1,8 @@
-"""A clear aperture passes light: circles and rectangles, with obscurations."""
+"""A clear aperture passes light: circles, rectangles and ellipses, with obscurations."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -73,13 +74,54 @@ class Rectangle:
 
 
 @dataclass(frozen=True)
+class Ellipse:
+    """The outline is an ellipse about the vertex, its axes along the surface's x and y; lengths in
+    mm.
+    """
+
+    rotational: ClassVar[bool] = False
+    semi_axis_x: float
+    semi_axis_y: float
+
+    def margin(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return 1 - (x/a)² - (y/b)², positive strictly inside."""
+        u, v = x / self.semi_axis_x, y / self.semi_axis_y
+        return 1.0 - torch.addcmul(u * u, v, v)
+
+    def depth(self, x: Tensor, y: Tensor) -> Tensor:
+        """Return how far inside the edge a point is, mm, along the line to the centre; negative
+        outside.
+        """
+        u, v = x / self.semi_axis_x, y / self.semi_axis_y
+        tiny = torch.finfo(u.dtype).tiny
+        share = torch.addcmul(u * u, v, v).clamp(min=tiny).sqrt()
+        radius = torch.addcmul(x * x, y, y).clamp(min=tiny).sqrt()
+        inner = min(self.semi_axis_x, self.semi_axis_y)
+        return torch.where(share > 1e-12, radius / share - radius, inner)
+
+    @property
+    def semi_diameter(self) -> float:
+        """Return the longer semi-axis, mm."""
+        return max(self.semi_axis_x, self.semi_axis_y)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Return how far it reaches along x and along y, mm."""
+        return self.semi_axis_x, self.semi_axis_y
+
+    def packed(self) -> tuple[OutlineKind, float, float]:
+        """Return its kind and 1/a², 1/b² (mm^-2) for the kernels."""
+        return OutlineKind.ELLIPSE, self.semi_axis_x**-2, self.semi_axis_y**-2
+
+
+@dataclass(frozen=True)
 class Unlimited:
-    """The outline has no edge: light passes wherever the surface is, as a search for a better lens
-    needs it.
+    """The outline has no edge: light passes wherever the surface is.  A prescription says so
+    (`clips: false`), and a search for a better lens needs it.
 
     Attributes:
-        semi_diameter: mm, how far from the vertex light is expected; it sets the scale of
-            tolerances.
+        semi_diameter: mm, how far from the vertex light is expected; the surface is drawn to it,
+            and it sets the scale of tolerances.
     """
 
     rotational: ClassVar[bool] = True
@@ -103,7 +145,7 @@ class Unlimited:
         return OutlineKind.NONE, 0.0, 0.0
 
 
-Outline = Circle | Rectangle | Unlimited
+Outline = Circle | Rectangle | Ellipse | Unlimited
 
 
 @dataclass(frozen=True)
@@ -113,33 +155,57 @@ class ClearAperture:
     Attributes:
         edge: the outer limit.
         obscuration: what is blocked in the middle, as in a telescope; or None.
+        window: a second limit, a rectangle or an ellipse that light must also pass: that of a stop
+            whose edge, a circle, is the pupil's; or None.
+        center: x and y (mm) of the window, the obscuration, and an edge that is no circle; that of
+            an off-axis part is beside the vertex.
     """
 
     edge: Outline
     obscuration: Outline | None = None
+    window: Outline | None = None
+    center: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for outline in (self.edge, self.obscuration):
+        if self.window is not None and not isinstance(self.edge, Circle):
+            raise InputError("a second outline goes with a circular edge")
+        for outline in (self.edge, self.obscuration, self.window):
             for name, value in vars(outline).items() if outline else ():
                 if not 0.0 < value < math.inf:
                     raise InputError(f"{name} must be positive and finite, not {value}")
         if (
             self.obscuration is not None
-            and self.obscuration.semi_diameter >= self.edge.semi_diameter
+            and not isinstance(self.edge, Unlimited)
+            and self.obscuration.semi_diameter >= self.semi_diameter
         ):
             raise InputError(
                 f"the obscuration reaches {self.obscuration.semi_diameter:g} mm from the vertex, "
-                f"the aperture only {self.edge.semi_diameter:g}"
+                f"the aperture only {self.semi_diameter:g}"
             )
+
+    @property
+    def semi_diameter(self) -> float:
+        """Return the distance of the edge's farthest point from the vertex, mm."""
+        if isinstance(self.edge, Circle | Unlimited):
+            return self.edge.semi_diameter
+        return self.edge.semi_diameter + math.hypot(*self.center)
+
+    @property
+    def clips(self) -> bool:
+        """Return whether there is an edge that stops light."""
+        return not isinstance(self.edge, Unlimited)
 
     @property
     def rotational(self) -> bool:
         """Return whether it looks the same from every azimuth."""
-        return self.edge.rotational and (self.obscuration is None or self.obscuration.rotational)
+        obscured = self.obscuration is not None
+        if self.window is not None or (obscured and any(self.center)):
+            return False
+        return self.edge.rotational and (not obscured or self.obscuration.rotational)
 
     def opened(self) -> "ClearAperture":
         """Return the same size with no edge and no obscuration: it clips nothing."""
-        return ClearAperture(Unlimited(self.edge.semi_diameter))
+        return ClearAperture(Unlimited(self.semi_diameter))
 
     def resized(self, semi_diameter: float) -> "ClearAperture":
         """Return the same aperture with another radius of its circular edge.
@@ -149,21 +215,31 @@ class ClearAperture:
         """
         if not isinstance(self.edge, Circle):
             raise InputError("semi_diameter: only a circular aperture has one that can be varied")
-        return ClearAperture(Circle(semi_diameter), self.obscuration)
+        return replace(self, edge=Circle(semi_diameter))
 
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
         """Return how far a point is from the edge that stops light, mm, negative where it does;
         differentiable.
         """
-        inside = self.edge.depth(x, y)
-        if self.obscuration is None:
-            return inside
-        return torch.minimum(inside, -self.obscuration.depth(x, y))
+        return self._combined(x, y, lambda outline, u, v: outline.depth(u, v))
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Return a number that is positive where light passes; no gradient."""
-        x, y = x.detach(), y.detach()
-        inside = self.edge.margin(x, y)
-        if self.obscuration is None:
-            return inside
-        return torch.minimum(inside, -self.obscuration.margin(x, y))
+        return self._combined(x.detach(), y.detach(), lambda outline, u, v: outline.margin(u, v))
+
+    def _combined(
+        self, x: Tensor, y: Tensor, inside: Callable[[Outline, Tensor, Tensor], Tensor]
+    ) -> Tensor:
+        """Return the least of how far inside the edge and the window a point is, and how far
+        outside the obscuration.
+        """
+        u, v = x, y
+        if any(self.center):
+            u, v = x - self.center[0], y - self.center[1]
+        centred = isinstance(self.edge, Circle | Unlimited)
+        found = inside(self.edge, *((x, y) if centred else (u, v)))
+        if self.window is not None:
+            found = torch.minimum(found, inside(self.window, u, v))
+        if self.obscuration is not None:
+            found = torch.minimum(found, -inside(self.obscuration, u, v))
+        return found

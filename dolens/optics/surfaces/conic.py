@@ -64,6 +64,20 @@ def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[T
     return (t if sense > 0.0 else -t), discriminant.detach()
 
 
+def check_reach(surface: Surface) -> None:
+    """Raise `InputError` where an aperture reaches beyond its surface's conic, (1+k)·c²·r² > 1."""
+    c = float(surface.curvature.detach())
+    conic = getattr(surface, "conic", None)
+    alpha = (1.0 + (0.0 if conic is None else float(conic.detach()))) * c * c
+    # A whole hemisphere is allowed, and 1/R has rounded.
+    rounding = 4.0 * torch.finfo(surface.curvature.dtype).eps
+    if alpha * surface.semi_diameter**2 > 1.0 + rounding:
+        raise InputError(
+            f"semi_diameter {surface.semi_diameter:g} mm exceeds the surface, which ends at "
+            f"{1.0 / math.sqrt(alpha):g} mm from the axis (radius {1.0 / c:g} mm)"
+        )
+
+
 @register_surface
 class Conic(Surface):
     """The surface is a conic of revolution with curvature c (1/mm) and conic constant k (S1 without
@@ -82,16 +96,15 @@ class Conic(Surface):
 
     def check_aperture(self) -> None:
         """Check that the clear aperture ends where the sag does: (1+k)·c²·r² ≤ 1."""
+        check_reach(self)
+
+    @property
+    def reach(self) -> float:
+        """Return 1/√((1+k)c²), mm; `inf` of a plane, a paraboloid and a hyperboloid."""
         stored = {name: float(value.detach()) for name, value in self.named_parameters()}
         c = stored["curvature"]
         alpha = (1.0 + stored.get("conic", 0.0)) * c * c
-        # A whole hemisphere is allowed, and 1/R has rounded.
-        rounding = 4.0 * torch.finfo(self.curvature.dtype).eps
-        if alpha * self.semi_diameter**2 > 1.0 + rounding:
-            raise InputError(
-                f"semi_diameter {self.semi_diameter:g} mm exceeds the surface, which ends at "
-                f"{1.0 / math.sqrt(alpha):g} mm from the axis (radius {1.0 / c:g} mm)"
-            )
+        return 1.0 / math.sqrt(alpha) if alpha > 0.0 else math.inf
 
     @classmethod
     def conic_constant(cls, p: Parameters) -> Tensor | float:

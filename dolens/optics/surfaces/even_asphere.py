@@ -16,12 +16,24 @@ from dolens.optics.surfaces.registry import register_surface
 _POWER = re.compile(r"a([1-9]\d*)")
 
 
+def power_of(name: str) -> int | None:
+    """Return the power of r whose coefficient has this name: 4 for `a4`; None for another name."""
+    match = _POWER.fullmatch(name)
+    return None if match is None else int(match[1])
+
+
+def even_power(name: str) -> int | None:
+    """Return the power of r whose coefficient has this name, where it is even; else None."""
+    power = power_of(name)
+    return None if power is None or power % 2 else power
+
+
 @register_surface
 class EvenAsphere(Conic):
-    """The sag is s(r) = conic + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power).
+    """The sag is s(r) = conic + a2·r² + a4·r⁴ + a6·r⁶ + ..., coefficients in mm^(1 - power).
 
-    There may be a term a2·r².  It bends the vertex as a curvature 2·a2 does and goes on otherwise
-    than the conic, so that designs which have one cannot do without it; others should.
+    The curvature at the vertex is c + 2·a2.  Beside a free curvature and conic constant a2 is
+    nearly redundant; it is here for prescriptions that have it.
     """
 
     kind = "even_asphere"
@@ -33,10 +45,9 @@ class EvenAsphere(Conic):
         """Return curvature, conic constant and the coefficients that the prescription names."""
         powers = []
         for key in keys:
-            match = _POWER.fullmatch(str(key))
-            if match is None:
+            power = power_of(str(key))
+            if power is None:
                 continue
-            power = int(match[1])
             if power % 2:
                 raise InputError(f"'{key}': even aspheric coefficients are a2, a4, a6, a8, ...")
             powers.append(power)
@@ -49,7 +60,7 @@ class EvenAsphere(Conic):
         """Return sag (S1) and slopes (S4), the polynomial by Horner's rule in r²."""
         r2 = torch.addcmul(x * x, y, y)
         sag, slope, exists = conic_sag(p["curvature"], p["conic"], r2)
-        powers = sorted(int(name[1:]) // 2 for name in p if _POWER.fullmatch(name))
+        powers = sorted(power // 2 for name in p if (power := even_power(name)))
         if powers:
             # Horner for Q = Σ a_2i·r^(2i-2) and Q', the derivative in r²; the sag adds r²·Q.
             q, dq = torch.zeros_like(r2), torch.zeros_like(r2)
@@ -62,13 +73,11 @@ class EvenAsphere(Conic):
 
     @classmethod
     def packed(cls, p: Parameters) -> PackedShape:
-        """Return c, k, a4, a6, ...: all powers up to the highest, in groups of four; then a2."""
-        powers = [int(name[1:]) for name in p if _POWER.fullmatch(name)]
+        """Return c, k, a2, and a4, a6, ...: all powers up to the highest, in groups of four."""
+        powers = [power for name in p if (power := even_power(name))]
         count = -(-(max(powers, default=2) // 2 - 1) // 4) * 4
         coefficients = [p.get(f"a{2 * i + 4}") for i in range(count)]
-        numbers = (p["curvature"], p["conic"], *coefficients)
-        if "a2" in p:
-            return PackedShape((*numbers, p["a2"]), count=count, columns=1)
+        numbers = (p["curvature"], p["conic"], p.get("a2"), *coefficients)
         return PackedShape(numbers, count=count)
 
     @classmethod
@@ -78,12 +87,11 @@ class EvenAsphere(Conic):
 
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
-        """Return k·c³/8 + a4, and with a2 also (c³ - (c + 2·a2)³)/8."""
+        """Return k·c³/8 + a4, and (c³ - (c + 2·a2)³)/8 where there is an a2."""
         departure = Conic.fourth_order_departure.__func__(cls, p) + p.get("a4", 0.0)
-        if "a2" in p:
-            vertex = cls.paraxial_curvature(p)
-            departure = departure + (p["curvature"] ** 3 - vertex**3) / 8.0
-        return departure
+        if "a2" not in p:
+            return departure
+        return departure + (p["curvature"] ** 3 - cls.paraxial_curvature(p) ** 3) / 8.0
 
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:

@@ -41,7 +41,9 @@ from dolens.optics.surfaces.xy_polynomial import monomial_powers
 
 # Path in mm for a radian of phase, over the wavelength in nm.
 _PATH = 1e-6 / (2.0 * math.pi)
-_ORDER = re.compile(r"p([1-9]\d*)")
+_TERM = re.compile(r"p([1-9]\d*)")
+# An order that would turn light by more than this sine is evanescent.
+_STEEPEST = 1e6
 
 
 class Phase(Law):
@@ -105,8 +107,14 @@ class Phase(Law):
         travel: Travel,
     ) -> Deflected:
         """Add the phase's gradient to the wavevector along the surface; see the module."""
-        phase, gx, gy = cls.phase_and_gradient(p, point[0], point[1])
         ratio, scale = media.before / media.behind, media.per_radian / media.behind
+        x, y, _ = point
+        with torch.no_grad():
+            _, gx, gy = cls.phase_and_gradient(p, x, y)
+            wild = ~((scale * gx).abs() + (scale * gy).abs() < _STEEPEST)
+        # High powers far outside the aperture overflow, and their derivatives are not finite.
+        x, y = x.masked_fill(wild, 0.0), y.masked_fill(wild, 0.0)
+        phase, gx, gy = cls.phase_and_gradient(p, x, y)
         gx, gy = scale * gx, scale * gy
         (l, m, n), (nx, ny, nz) = direction, normal  # noqa: E741
         ax, ay, az = ratio * l + gx, ratio * m + gy, ratio * n
@@ -120,7 +128,7 @@ class Phase(Law):
             torch.addcmul(ax, change, nx).clamp(-2.0, 2.0),
             torch.addcmul(ay, change, ny).clamp(-2.0, 2.0),
             torch.addcmul(az, change, nz).clamp(-2.0, 2.0),
-            squared.detach(),
+            squared.detach().masked_fill(wild, -1.0),
             media.per_radian * phase,
         )
 
@@ -187,7 +195,7 @@ class RadialPhase(Phase):
         """
         powers = []
         for key in keys:
-            match = _ORDER.fullmatch(str(key))
+            match = _TERM.fullmatch(str(key))
             if match is None:
                 continue
             if int(match[1]) % 2:
@@ -198,7 +206,7 @@ class RadialPhase(Phase):
     @staticmethod
     def coefficients(p: Parameters) -> list[Tensor | None]:
         """Return p2, p4, ... up to the highest power that is there; None: zero."""
-        highest = max((int(name[1:]) for name in p if _ORDER.fullmatch(name)), default=0)
+        highest = max((int(name[1:]) for name in p if _TERM.fullmatch(name)), default=0)
         return [p.get(f"p{power}") for power in range(2, highest + 1, 2)]
 
     @classmethod

@@ -63,7 +63,7 @@ class SurfaceState:
     @property
     def semi_diameter(self) -> float:
         """Return the distance of the clear aperture's farthest point from the vertex, mm."""
-        return self.aperture.edge.semi_diameter
+        return self.aperture.semi_diameter
 
     @property
     def edge_radius(self) -> float | Tensor:

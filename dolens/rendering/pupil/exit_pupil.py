@@ -11,6 +11,7 @@ from dolens.errors import InputError
 from dolens.optics.paraxial_numbers import ParaxialNumbers
 from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
+from dolens.optics.straight import require_refracting
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.pupil.limiting_aperture import limiting_aperture, limiting_pupil_radius
 from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
@@ -60,7 +61,11 @@ def paraxial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> 
     """The pupil at the middle wavelength, its radius the least of all; no ray is traced.
 
     Enough for chief rays, which are aimed at its centre.
+
+    Raises:
+        InputError: the lens has mirrors or coordinate breaks.
     """
+    require_refracting(system, "rendering")
     first_order = ParaxialNumbers.of(system)
     z, _ = first_order.exit_pupil(wavelengths[len(wavelengths) // 2])
     radius = min(first_order.exit_pupil(w)[1] for w in wavelengths) / 2.0

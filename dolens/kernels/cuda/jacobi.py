@@ -1,0 +1,23 @@
+"""The recurrence of Jacobi polynomials; see `dolens.optics.surfaces.jacobi`."""
+
+import triton
+import triton.language as tl
+
+from dolens.kernels.cuda.arithmetic import divide
+
+
+@triton.jit
+def recurrence(k, m, unit):
+    """Return (α, β, γ) of P_k = (α·q + β)·P_(k-1) - γ·P_(k-2), in the precision of `unit`, a one.
+
+    k = 1 has factors of zero over zero at m = 0, which are left out.
+    """
+    first = k == 1
+    below, here, both = unit * (2 * k + m - 2), unit * (2 * k + m - 1), unit * (2 * k + m)
+    scale = 2.0 * (unit * k) * (unit * (k + m)) * below
+    scale = tl.where(first, unit, scale)
+    slope = divide(here * both * below, scale)
+    offset = -divide(here * (unit * m) * (unit * m), scale) - slope
+    c = divide(2.0 * (unit * (k - 1)) * (unit * (k + m - 1)) * both, scale)
+    a = tl.where(first, unit * (m + 2), 2.0 * slope)
+    return a, tl.where(first, -unit * (m + 1), offset), tl.where(first, 0.0 * unit, c)

@@ -1,0 +1,19 @@
+"""What only a lens of refracting surfaces along one axis allows is refused for any other."""
+
+from dolens.errors import InputError
+from dolens.optics.system import OpticalSystem
+
+
+def require_refracting(system: OpticalSystem, what: str) -> None:
+    """Raise `InputError` where a lens has mirrors or coordinate breaks.
+
+    Args:
+        system: the lens.
+        what: cannot be done with it; the message begins with it.
+    """
+    for numbers, kind in ((system.mirrors, "a mirror"), (system.breaks, "a coordinate break")):
+        if numbers:
+            raise InputError(
+                f"{what}: surface {numbers[0]} is {kind}; only lenses of refracting surfaces along "
+                "one axis are held there"
+            )

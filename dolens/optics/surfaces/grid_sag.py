@@ -1,0 +1,138 @@
+"""A surface is given by its sag on a regular grid, on top of an even asphere."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.kernels.surface_kernel import SurfaceKernel
+from dolens.optics.surfaces.asphere_with_terms import AsphereWithTerms
+from dolens.optics.surfaces.base import PackedShape, Parameters, tensor_of
+from dolens.optics.surfaces.bicubic import bicubic, spline_slopes
+from dolens.optics.surfaces.clear_aperture import ClearAperture
+from dolens.optics.surfaces.registry import register_surface
+
+_ARRAYS = ("sag", "slope_x", "slope_y", "twist")
+_LENGTHS = ("spacing_x", "spacing_y", "decenter_x", "decenter_y")
+
+
+@register_surface
+class GridSag(AsphereWithTerms):
+    """The sag is that of an even asphere plus a bicubic interpolation of the array `sag` (mm).
+
+    Rows lie along y and columns along x, both rising, `spacing_y` and `spacing_x` mm apart; the
+    grid's middle is at (decenter_x, decenter_y).  `slope_x`, `slope_y` and `twist` (∂²/∂x∂y, 1/mm)
+    at the nodes may be given.  What is missing comes from cubic splines through the rows and
+    columns, so that the surface has continuous second derivatives.
+
+    The grid is data: no optimizer varies it.  It must hold the clear aperture, and a ray that meets
+    the surface beyond it misses; there the surface goes on along its tangents.
+    """
+
+    kind = "grid_sag"
+    kernel = SurfaceKernel("dolens.kernels.cpu.grid_sag", "dolens.kernels.cuda.grid_sag")
+    constants = (*_LENGTHS, *_ARRAYS)
+    arrays = _ARRAYS
+    optional = ("slope_x", "slope_y", "twist")
+
+    def __init__(
+        self,
+        aperture: ClearAperture | float,
+        parameters: Mapping[str, Any],
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__(aperture, with_slopes(parameters), dtype)
+
+    def check_aperture(self) -> None:
+        """Check that the clear aperture lies within the conic and within the grid."""
+        super().check_aperture()
+        p = dict(self.named_buffers())
+        for axis, reach, half in zip("xy", self.aperture.edge.extent, half_sizes(p), strict=True):
+            off = abs(float(p[f"decenter_{axis}"]))
+            if reach + off > float(half):
+                raise InputError(
+                    f"the aperture reaches {reach + off:g} mm from the middle of 'sag' along "
+                    f"{axis}, and the grid only {float(half):g} mm"
+                )
+
+    @classmethod
+    def added_names(cls, keys: Mapping[str, object]) -> list[str]:
+        """Return the grid and its spacings."""
+        return list(cls.constants)
+
+    @classmethod
+    def sag_and_gradient(
+        cls, p: Parameters, x: Tensor, y: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        """Return sag and slopes, and a margin that is positive on the conic and on the grid."""
+        sag, sx, sy, exists = super().sag_and_gradient(p, x, y)
+        half_x, half_y = half_sizes(p)
+        inside = torch.minimum(
+            half_x - (x - p["decenter_x"]).detach().abs(),
+            half_y - (y - p["decenter_y"]).detach().abs(),
+        )
+        return sag, sx, sy, inside if exists is None else torch.minimum(exists, inside)
+
+    @classmethod
+    def added_terms(cls, p: Parameters, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the grid's sag and slopes."""
+        nodes = torch.stack([p[name] for name in _ARRAYS], -1)
+        spacing = (p["spacing_x"], p["spacing_y"])
+        return bicubic(nodes, spacing, x - p["decenter_x"], y - p["decenter_y"])
+
+    @classmethod
+    def added_numbers(cls, p: Parameters) -> PackedShape:
+        """Return spacings, decentre, and the nodes' four numbers each, by rows: all are data.
+
+        Columns and degree: how many columns and rows.
+        """
+        nodes = torch.stack([p[name] for name in _ARRAYS], -1)
+        rows, columns = p["sag"].shape
+        numbers = (*(p[name] for name in _LENGTHS), nodes)
+        return PackedShape(numbers, columns=columns, degree=rows, data=4 + nodes.numel())
+
+
+def half_sizes(p: Parameters) -> tuple[Tensor, Tensor]:
+    """Return how far the grid reaches from its middle along x and y, mm."""
+    rows, columns = p["sag"].shape
+    return 0.5 * (columns - 1) * p["spacing_x"], 0.5 * (rows - 1) * p["spacing_y"]
+
+
+def with_slopes(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters with the slopes and twists that were not given.
+
+    Raises:
+        InputError: a grid that is no matrix of at least 2 × 2, arrays of other shapes, or spacings
+            that are not positive.
+    """
+    given = dict.fromkeys(("decenter_x", "decenter_y"), 0.0) | dict(parameters)
+    arrays = {
+        name: tensor_of(given[name], name, torch.float64) for name in _ARRAYS if name in given
+    }
+    sag = arrays.get("sag")
+    if sag is None or sag.dim() != 2 or min(sag.shape) < 2:
+        raise InputError("'sag' must be at least 2 rows (y) of at least 2 numbers (x), mm")
+    for name, array in arrays.items():
+        if array.shape != sag.shape:
+            raise InputError(
+                f"'{name}' must have as many rows and columns as 'sag', {sag.shape[0]} × "
+                f"{sag.shape[1]}"
+            )
+    spacing = [float(given.get(name, 0.0)) for name in _LENGTHS[:2]]
+    if not min(spacing) > 0.0:
+        raise InputError("'spacing_x' and 'spacing_y' must be given and positive (mm)")
+    values = sag.numpy()
+
+    def along_y(array: np.ndarray) -> np.ndarray:
+        return spline_slopes(array.T, spacing[1]).T
+
+    if "slope_x" not in arrays:
+        given["slope_x"] = spline_slopes(values, spacing[0])
+    if "slope_y" not in arrays:
+        given["slope_y"] = along_y(values)
+    if "twist" not in arrays:
+        given["twist"] = along_y(np.asarray(given["slope_x"], dtype=np.float64))
+    return given

@@ -1,0 +1,113 @@
+"""A sheet shows small sections of many lenses, each at a scale of its own."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dolens.analysis.conditions import conditions
+from dolens.optics.lens import Lens
+from dolens.optics.rays import Rays
+from dolens.plotting.drawing import Fan, LayoutDrawing, draw_layout, layout_drawing
+from dolens.plotting.number_text import number_text
+from dolens.plotting.style import PAGE
+
+_COLUMNS = 5
+# Inches: a cell of the sheet, and the text in it.
+_HEIGHT, _TEXT = 1.02, 5.2
+# Heights on the stop, over its semi-diameter, of the rays of the axis and of the edge of the field:
+# there lenses vignette, and prescriptions seldom say how much.
+_AXIS, _EDGE = (-0.999, 0.0, 0.999), (-0.5, 0.0, 0.5)
+# Half height over width of the drawing's part of a cell.
+_SHARE = 0.5
+
+
+@torch.no_grad()
+def lens_sheet_figure(lenses: Mapping[str, Lens], columns: int = _COLUMNS) -> Figure:
+    """Draw sections of many lenses on a sheet, with rays of the axis and of the edge of the field.
+
+    Rays of the edge fill the inner half of the stop.  Each section has a scale of its own; its
+    caption is the lens's name in the mapping, its focal length (mm), F-number and half field.
+
+    Args:
+        lenses: name → lens, in the order that they are drawn, row by row.
+        columns: how many lie side by side.
+    """
+    rows = -(-len(lenses) // columns)
+    figure = Figure(figsize=(PAGE, _HEIGHT * rows))
+    grid = figure.subplots(rows, columns, squeeze=False)
+    figure.subplots_adjust(0.004, 0.0, 0.996, 1.0, 0.03, 0.0)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for axes, (name, lens) in zip(grid.flat, lenses.items(), strict=False):
+        _draw(axes, name, lens)
+    return figure
+
+
+def _draw(axes: Axes, name: str, lens: Lens) -> None:
+    where = conditions(lens)
+    wave, distance = where.reference_wavelength, where.object_distance
+    drawing = layout_drawing(lens, wave, (0.0,), 1, distance)
+    edge = max((y for x, y in where.fields.tolist() if x == 0.0), key=abs, default=0.0)
+    fields = dict.fromkeys((0.0, edge))
+    start = drawing.z_limits[0]
+    fans = [
+        Fan(field, wave, _paths(lens, field, _AXIS if field == 0.0 else _EDGE, start))
+        for field in fields
+    ]
+    z, y = _extent(drawing, fans)
+    draw_layout(axes, drawing._replace(fans=fans), z, y, legend=False)
+    # The cell's upper part is the drawing, its lower part two lines of text.
+    half = max(y, _SHARE * 0.62 * (z[1] - z[0]) * 0.5)
+    axes.set(ylim=(-1.75 * half, 1.1 * half), aspect="equal", anchor="C", xlabel="", ylabel="")
+    axes.set_axis_off()
+    axes.text(0.5, 0.12, name, transform=axes.transAxes, fontsize=_TEXT, ha="center", va="bottom")
+    axes.text(
+        *(0.5, 0.01, _numbers(lens)),
+        transform=axes.transAxes,
+        fontsize=_TEXT,
+        color="0.35",
+        ha="center",
+        va="bottom",
+    )
+
+
+def _paths(lens: Lens, field: float, heights: tuple[float, ...], start: float) -> np.ndarray:
+    """Return points (rays, points, 3), mm, of real rays that cross the stop at these heights."""
+    where = conditions(lens)
+    wave, distance = where.reference_wavelength, where.object_distance
+    pupil = [(0.0, height) for height in heights]
+    aimed = lens.aim((0.0, field), pupil, wave, distance)
+    rays = Rays(aimed.position, aimed.direction, wave)
+    traced = lens.trace(rays, record=True)
+    ok = aimed.converged & traced.valid
+    before = start if distance is None else max(start, -distance)
+    back = (before - rays.position[..., 2:]) / rays.direction[..., 2:]
+    first = rays.position + back * rays.direction
+    last = traced.position
+    points = torch.stack([first, *traced.points.unbind(0), last], -2)
+    return points[ok].double().cpu().numpy()
+
+
+def _extent(drawing: LayoutDrawing, fans: list[Fan]) -> tuple[tuple[float, float], float]:
+    """Return limits in z and the half height, mm, that hold the lens and its rays."""
+    lit = [fan.paths for fan in fans if len(fan.paths)]
+    reach = [drawing.half_height, *(float(np.abs(paths[..., 1]).max()) for paths in lit)]
+    return drawing.z_limits, max(value for value in reach if math.isfinite(value))
+
+
+def _numbers(lens: Lens) -> str:
+    where = conditions(lens)
+    first = lens.first_order(where.reference_wavelength, where.object_distance)
+    efl, f_number = abs(float(first.efl)), abs(float(first.working_f_number))
+    field = float(where.fields.norm(dim=-1).max())
+    parts = [f"f = {number_text(efl, 4)} mm" if efl < 1e9 else "afocal"]
+    if math.isfinite(f_number) and f_number < 1e6:
+        parts.append(f"f/{number_text(f_number, 3)}")
+    if field:
+        unit = "°" if where.field_unit == "°" else " mm"
+        parts.append(f"±{number_text(field, 3)}{unit}")
+    return ", ".join(parts)

@@ -1,0 +1,114 @@
+"""Automatic semi-diameters: as far from the axis as the light of the fields goes.
+
+A row that says `semi_diameter: auto` clips nothing, and a number is needed to draw the surface and
+to set the scale of tolerances.  It is the largest height of real rays from the rim of the stop, of
+all fields and wavelengths; where no ray gets through, the paraxial one.
+"""
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.optics.elements import from_lens_axes
+from dolens.optics.fields import Fields
+from dolens.optics.lens import Lens
+from dolens.optics.paraxial import vergence
+from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.rays import Components, Rays
+from dolens.optics.surfaces.clear_aperture import Unlimited
+from dolens.prescriptions.apertures import is_automatic
+
+# Points of the stop's rim.
+_RIM = 16
+# Where nothing tells a size, mm.
+_UNKNOWN = 1.0
+
+
+@torch.no_grad()
+def set_automatic_semi_diameters(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
+    """Give the surfaces of a new lens the semi-diameters that its prescription leaves to the light.
+
+    A surface that clips nothing is also drawn no farther than it reaches, whatever its prescription
+    says.
+    """
+    rows = {str(n): row for n, row in prescription["surfaces"].items()}
+    # The stop has its size from the pupil, and clips.
+    others = [n for n in lens.surfaces if n in rows and n != str(lens.stop)]
+    automatic = [n for n in others if is_automatic(rows[n])]
+    if automatic:
+        heights = _paraxial_heights(lens)
+        for n in automatic:
+            _resize(lens, n, heights[n])
+        heights = heights | _real_heights(lens)
+        for n in automatic:
+            _resize(lens, n, heights[n])
+    for n, surface in lens.surfaces.items():
+        if not surface.aperture.clips and surface.semi_diameter > surface.reach:
+            _resize(lens, n, surface.reach)
+    return lens
+
+
+def _resize(lens: Lens, number: str, semi_diameter: float) -> None:
+    surface = lens.surfaces[number]
+    if not (math.isfinite(semi_diameter) and semi_diameter > 0.0):
+        semi_diameter = _UNKNOWN
+    edge = Unlimited(min(semi_diameter, surface.reach))
+    surface.aperture = replace(surface.aperture, edge=edge)
+
+
+def _fields(lens: Lens) -> Fields:
+    if lens.fields is not None:
+        return lens.fields
+    return Fields("angles" if vergence(lens.object_distance) == 0.0 else "heights", ((0.0, 0.0),))
+
+
+def _points(lens: Lens) -> Tensor:
+    """Return the field points as `Lens.aim` takes them, (F, 2)."""
+    fields = _fields(lens)
+    points = torch.tensor(fields.points, dtype=lens.dtype)
+    near = vergence(lens.object_distance)
+    if fields.kind == "heights" or near == 0.0:
+        return points
+    return -torch.deg2rad(points).tan() / near
+
+
+def _paraxial_heights(lens: Lens) -> dict[str, float]:
+    """Return |y| + |ȳ| of the marginal and the chief ray at every surface."""
+    field = float(_points(lens).norm(dim=-1).max())
+    rays = lens.paraxial_rays(field, lens.primary_wavelength, lens.object_distance)
+    heights = (rays.marginal.height.abs() + rays.chief.height.abs()).tolist()
+    return dict(zip(lens.surfaces, heights, strict=True))
+
+
+def _real_heights(lens: Lens) -> dict[str, float]:
+    """Return the largest height of real rays at every surface that one meets."""
+    fields, points = _fields(lens), _points(lens)
+    angle = torch.arange(_RIM, dtype=lens.dtype) * (2.0 * math.pi / _RIM)
+    rim = torch.stack((angle.sin(), angle.cos()), -1).expand(len(points), _RIM, 2)
+    if fields.vignetting is not None:
+        rim = torch.stack([of.on_stop(one) for of, one in zip(fields.vignetting, rim, strict=True)])
+        rim = rim / rim.norm(dim=-1, keepdim=True).clamp(min=1.0)
+    open_lens = copy.deepcopy(lens)
+    for surface in open_lens.surfaces.values():
+        surface.aperture = surface.aperture.opened()
+    aimed = open_lens.aim(points[:, None], rim, lens.primary_wavelength, lens.object_distance)
+    waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
+    rays = Rays(aimed.position[:, :, None], aimed.direction[:, :, None], waves)
+    system = open_lens.system()
+    hit = trace_rays(system.traced_by("reference"), rays, 1.0, True)
+    valid = hit.valid & aimed.converged[..., None]
+    if not bool(valid.any()):
+        return {}
+    found = {}
+    for axes, (number, at) in zip(
+        system.axes, zip(lens.surfaces, hit.points, strict=True), strict=True
+    ):
+        x, y, z = at[valid].unbind(-1)
+        local = from_lens_axes(Components(x, y, z, x, y, z), axes)
+        found[number] = float(torch.hypot(local.x, local.y).max())
+    return found

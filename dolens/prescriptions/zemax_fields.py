@@ -1,0 +1,161 @@
+"""Wavelengths and fields of a Zemax `.zmx` file, with their weights and vignetting factors.
+
+`FTYP kind telecentric fields wavelengths ...` says what the coordinates of the fields are and how
+many of the lists' entries are used: Zemax pads them.  `WAVM n wavelength weight` is one wavelength
+in µm; older files list all of them behind WAVL or WAVN, and the weights behind WWGT or WWGN.
+`XFLN` and `YFLN` (older: XFLD, YFLD) list up to twelve fields, `FWGN` (FWGT) their weights and
+`VDXN` to `VANN` (ZVDX to ZVAN) the vignetting factors; further fields have a line `FEFD` each.
+"""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.optics.fields import Vignetting
+from dolens.prescriptions.decimals import number_in_text, scaled
+from dolens.prescriptions.zemax import Line, ZemaxFile
+
+_ANGLES, _HEIGHTS = 0, 1
+# By FTYP; angles to a finite object are those of the line to the entrance pupil.
+FIELD_KINDS = {0: "angles", 1: "heights", 2: "image_heights", 3: "real_image_heights"}
+PUPIL_ANGLES = "pupil_angles"
+# Vignetting factors in the order of FEFD, the operand of each with its older name.
+VIGNETTING_OPERANDS = (
+    ("decenter_x", "VDXN", "ZVDX"),
+    ("decenter_y", "VDYN", "ZVDY"),
+    ("compression_x", "VCXN", "ZVCX"),
+    ("compression_y", "VCYN", "ZVCY"),
+    ("angle", "VANN", "ZVAN"),
+)
+_MICROMETRE = Fraction(1000)
+
+
+def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
+    """Read wavelengths (nm), the primary one, and weights where they differ."""
+    texts: dict[int, tuple[str, str, int]] = {}
+    for line in file.system.get("WAVM", []):
+        if len(line.arguments) < 2:
+            raise InputError(f"{where}: line {line.at}: WAVM needs a number and a wavelength in µm")
+        n = count_in_text(line.arguments[0], f"{where}: line {line.at}: WAVM")
+        texts[n] = (line.arguments[1], (*line.arguments, "1", "1")[2], line.at)
+    for listed, weights in (("WAVL", "WWGT"), ("WAVN", "WWGN")):
+        line = last(file, listed)
+        if line and not texts:
+            shares = last(file, weights)
+            shares = shares.arguments if shares else []
+            texts = {
+                i: (text, shares[i - 1] if i <= len(shares) else "1", line.at)
+                for i, text in enumerate(line.arguments, 1)
+            }
+    used = _argument(file, 3, where)
+    numbers = [n for n in sorted(texts) if n <= (used or len(texts))]
+    if not numbers:
+        return {}
+    places = {n: f"{where}: line {texts[n][2]}" for n in numbers}
+    values = [scaled(texts[n][0], _MICROMETRE, places[n]) for n in numbers]
+    weights = [number_in_text(texts[n][1], places[n]) for n in numbers]
+    primary = last(file, "PWAV")
+    n = 1
+    if primary and primary.arguments:
+        n = count_in_text(primary.arguments[0], f"{where}: line {primary.at}: PWAV")
+    if n not in numbers:
+        raise InputError(f"{where}: PWAV {n} is none of the wavelengths 1 to {len(numbers)}")
+    found = {"wavelengths": values, "reference_wavelength": values[numbers.index(n)]}
+    return found | ({"wavelength_weights": weights} if len(set(weights)) > 1 else {})
+
+
+def read_fields(
+    file: ZemaxFile, factor: Fraction, finite_object: bool, where: str
+) -> dict[str, Any]:
+    """Read fields, their weights where they differ, and vignetting factors where there are any.
+
+    Args:
+        file: the lines.
+        factor: mm in the file's unit.
+        finite_object: whether the object is at a finite distance.
+        where: name in messages.
+
+    Raises:
+        InputError: theodolite angles, or an unknown kind of field.
+    """
+    number = _argument(file, 0, where)
+    if number not in FIELD_KINDS:
+        what = "theodolite angles are not held" if number == 4 else "is an unknown kind of field"
+        raise InputError(f"{where}: FTYP {number}: {what} (allowed: 0, 1, 2, 3)")
+    unit = Fraction(1) if number == _ANGLES else factor
+    x = _listed(file, ("XFLN", "XFLD"), unit, where)
+    y = _listed(file, ("YFLN", "YFLD"), unit, where)
+    weights = _listed(file, ("FWGN", "FWGT"), Fraction(1), where)
+    factors = [_listed(file, operands, Fraction(1), where) for _, *operands in VIGNETTING_OPERANDS]
+    # Beyond the twelfth, a line each: x, y, weight, and the five factors.
+    more = [_numbers(line, unit, where) for line in file.system.get("FEFD", [])]
+    if more:
+        begin = max(len(x), len(y))
+        for at, values in enumerate((x, y, weights, *factors)):
+            values += [1.0 if at == 2 else 0.0] * (begin - len(values))
+            values += [row[at] for row in more]
+    used = _argument(file, 2, where) or max(len(x), len(y))
+    if not (x or y) or used < 1:
+        return {}
+    # What is not listed is zero, and so a field on the axis once more.
+    used = min(used, max(len(x), len(y)))
+    x, y = ((values + [0.0] * used)[:used] for values in (x, y))
+    kind = FIELD_KINDS[number]
+    if number == _ANGLES and finite_object and any((*x, *y)):
+        kind = PUPIL_ANGLES
+    elif number == _ANGLES and finite_object:
+        kind = FIELD_KINDS[_HEIGHTS]
+    fields: dict[str, Any] = {kind: [list(point) for point in zip(x, y, strict=True)]}
+    weights = (weights + [1.0] * used)[:used]
+    if len(set(weights)) > 1:
+        fields["weights"] = weights
+    rows = [
+        {
+            name: values[n]
+            for (name, *_), values in zip(VIGNETTING_OPERANDS, factors, strict=True)
+            if n < len(values) and values[n]
+        }
+        for n in range(used)
+    ]
+    if any(Vignetting(**row) != Vignetting(angle=row.get("angle", 0.0)) for row in rows):
+        fields["vignetting"] = rows
+    return {"fields": fields}
+
+
+def is_telecentric(file: ZemaxFile, where: str) -> bool:
+    """Return whether the second number of FTYP asks for parallel chief rays in object space."""
+    return _argument(file, 1, where) == 1
+
+
+def last(file: ZemaxFile, operand: str) -> Line | None:
+    """Return the last line of an operand of the system, if there is one."""
+    return file.system[operand][-1] if operand in file.system else None
+
+
+def count_in_text(text: str, place: str) -> int:
+    """Read a whole number that is not negative; `InputError` names the place."""
+    value = number_in_text(text, place)
+    if value != int(value) or value < 0:
+        raise InputError(f"{place} must have whole numbers, not '{text}'")
+    return int(value)
+
+
+def _argument(file: ZemaxFile, at: int, where: str) -> int:
+    """Return a number of FTYP, 0 where it is not given."""
+    line = last(file, "FTYP")
+    if line is None or len(line.arguments) <= at:
+        return 0
+    return count_in_text(line.arguments[at], f"{where}: line {line.at}: FTYP")
+
+
+def _listed(file: ZemaxFile, operands: Sequence[str], unit: Fraction, where: str) -> list[float]:
+    line = next((found for operand in operands if (found := last(file, operand))), None)
+    return [scaled(w, unit, f"{where}: {line.operand}") for w in line.arguments] if line else []
+
+
+def _numbers(line: Line, unit: Fraction, where: str) -> list[float]:
+    """Return the eight numbers of FEFD; the first two have the unit of the fields."""
+    words = (*line.arguments, *("0", "0", "1", *("0",) * 5)[len(line.arguments) :])
+    place = f"{where}: line {line.at}: FEFD"
+    return [scaled(w, unit if at < 2 else Fraction(1), place) for at, w in enumerate(words[:8])]
