@@ -83,6 +83,8 @@ def glass_word(material: str, place: str) -> str:
     if name in ("air", "occluder"):
         return ""
     nd, slash, vd = name.partition("/")
+    if "/" in vd:
+        raise InputError(f"{place}: a .seq file cannot hold material '{material}' (nd/Vd alone)")
     if slash:
         return _code(nd.strip(), vd.strip(), f"{place}: material '{material}'")
     maker, _, word = name.rpartition(":")
@@ -104,9 +106,8 @@ def canonical(material: str) -> str:
         name = parse_material(material, index_model("dfc")).name
     except InputError:
         return material
-    nd, slash, vd = name.partition("/")
-    if slash:
-        return f"{float(nd)!r}/{float(vd)!r}"
+    if "/" in name:
+        return "/".join(repr(float(part)) for part in name.split("/"))
     return "air" if name == "occluder" else name
 
 

@@ -121,7 +121,7 @@ def _entrance_pupil(prescription: Mapping[str, Any], where: str) -> str:
     """Return the diameter of the entrance pupil, mm: the stop's own, or the next above it that has
     a short text, so that the stop's size is what clips.
     """
-    lens = lens_from_prescription(prescription, where=where)
+    lens = lens_from_prescription(prescription, where=where).requires_grad_(False)
     diameter = float(lens.first_order(lens.primary_wavelength).entrance_pupil.diameter)
     if not math.isfinite(diameter) or diameter <= 0.0:
         raise InputError(
