@@ -392,3 +392,8 @@ def test_the_listing_of_code_v_itself(tmp_path):
     assert float(first.entrance_pupil.z) == pytest.approx(57.9120, abs=6e-5)
     rays = Rays(torch.tensor([25.0 - 1e-9, 0.0, -1.0]), torch.tensor([0.0, 0.0, 1.0]), 587.6)
     assert float(lens.trace(rays).position[0]) == pytest.approx(0.014138, abs=2e-5)
+
+
+def test_opening_remarks_are_the_source():
+    found = prescription(*SINGLET, head="! US 1,987,878\n! example 2\nRDM\nEPD 8 ! not this\n")
+    assert found["source"] == "US 1,987,878\nexample 2"

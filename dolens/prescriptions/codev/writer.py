@@ -60,7 +60,8 @@ def codev_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
                 f"{where}: surface {n}: a .seq file cannot hold type '{row.get('type')}' "
                 f"(allowed: {', '.join(_TYPES)})"
             )
-    lines = ["RDM;LEN", *_system(prescription, where), *_private(prescription, surfaces)]
+    remarks = [f"! {line}" for line in str(prescription.get("source") or "").splitlines()]
+    lines = [*remarks, "RDM;LEN", *_system(prescription, where), *_private(prescription, surfaces)]
     distance = prescription.get("object_distance")
     far = _INFINITY if distance is None else _text(distance, where)
     medium = prescription.get("object_material", "air")
