@@ -42,7 +42,17 @@ def test_help_lists_every_command_without_importing_pytorch():
     done = run("-c", code)
     assert done.returncode == 0, done.stderr
     for name in (
-        *("show", "convert", "export", "experiments", "train", "evaluate", "apply", "compare"),
+        *(
+            "show",
+            "convert",
+            "check",
+            "export",
+            "experiments",
+            "train",
+            "evaluate",
+            "apply",
+            "compare",
+        ),
         "report",
     ):
         assert f"│ {name} " in done.stdout

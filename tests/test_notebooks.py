@@ -13,6 +13,8 @@ NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 # Fewer steps and rays than a reader takes: every line runs, in a tenth of the time.
 SHORTER = {
     "camera_in_pytorch": {"range(80)": "range(4)"},
+    "damped_least_squares": {"len(history) < 60": "len(history) < 8"},
+    "derivatives_of_an_image": {"pupil_samples=20": "pupil_samples=6"},
     "pose_from_a_point": {"rays=50_000": "rays=10_000", "rays=400_000": "rays=20_000"},
 }
 

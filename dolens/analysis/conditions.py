@@ -90,7 +90,8 @@ def conditions(
         wavelengths: nm.
         object_distance: mm in front of the first vertex, `inf` for infinity; None for the lens's
             own.
-        wavelength_weights: (W,), of any sum; None for equal ones.
+        wavelength_weights: (W,), of any sum; None for the lens's own, where the wavelengths are its
+            own too, else for equal ones.
 
     Raises:
         InputError: a value of another shape, or not finite, or a wavelength that is not positive.
@@ -98,6 +99,8 @@ def conditions(
     distance = own_distance(lens, object_distance)
     points = own_fields(lens, distance) if fields is None else field_points(fields)
     if wavelengths is None:
+        if wavelength_weights is None:
+            wavelength_weights = lens.wavelength_weights
         waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
     else:
         waves = torch.as_tensor(wavelengths, dtype=torch.float64).detach().cpu().reshape(-1)

@@ -17,6 +17,7 @@ from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
+from dolens.optics.vergence import with_vergences
 
 MM_PER_NM = 1e-6
 # Rays around the box, for differences of fourth order.
@@ -144,6 +145,9 @@ def pupil_wavefront(
     options = {"dtype": torch.float64, "device": system.device}
     points = points.to(**options)
     waves = _one_each("wavelengths", wavelength, len(points), options)
+    near = points.vergence
+    alike = bool((near == near[0]).all())
+    system = with_vergences(system, float(waves[0]), near[0] if alike else near[:, None, None])
     if beam is None:
         beam = find_beam(system, points, waves)
     if centres is None:

@@ -71,7 +71,8 @@ class Code:
     COLUMNS = 9  # of a spline; 1 where a polynomial has its b·z² term
     EXTRAS = 10  # offset in `extras`
     DEGREE = 11  # highest power of x or y
-    # Of a deflection.  Its record holds its surface's shape, padded to two numbers, then the law's.
+    # Of a deflection.  Its record holds its surface's shape, of three numbers at least, then the
+    # law's.
     LAW = 12  # the code of its `LawKernel`
     BASE = 13  # the kind of the surface that it stands on
     WAVE = 14  # row of `indices` that holds λ/2π, mm

@@ -3,8 +3,8 @@
 All take the wavelength in µm, the unit that catalogues print coefficients for, as a number or as a
 tensor of any shape, a constant term, and the rest of the coefficients in pairs; a number gives a
 number in double precision, a tensor a tensor of its shape and precision, differentiable in the
-wavelength.  Wavelengths are those in air, as of the spectral lines that makers measure.  They are
-formulas 1, 2, 3 and 5 in the numbering of refractiveindex.info.
+wavelength.  Wavelengths are those in air, as of the spectral lines that makers measure.
+`dolens.optics.agf_formulas` says which of them the formulas 1 to 13 of `.agf` catalogues are.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,9 @@ from torch import Tensor
 Wavelength = TypeVar("Wavelength", float, Tensor)
 Terms = tuple[tuple[float, float], ...]
 Formula = Callable[[float | Tensor, float, Terms], float | Tensor]
+
+# µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
+_HERZBERGER = 0.028
 
 
 def sellmeier(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
@@ -33,6 +36,41 @@ def sellmeier_squared(wavelength: Wavelength, constant: float, terms: Terms) -> 
     return (1.0 + constant + sum(b * square / (square - c) for b, c in terms)) ** 0.5
 
 
+def sellmeier_with_offset(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
+    """n² = constant + Σ B λ² / (λ² - C), with (B, C) in `terms`, C in µm²: Zemax's Sellmeier 4."""
+    square = wavelength * wavelength
+    return (constant + sum(b * square / (square - c) for b, c in terms)) ** 0.5
+
+
+def sellmeier_with_pole(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
+    """n² = 1 + constant + B λ² / (λ² - C²) + D / (λ² - E²), with (B, C), (D, E) in `terms`, C and E
+    in µm: Zemax's Sellmeier 2.
+    """
+    square = wavelength * wavelength
+    (b, c), (d, e) = terms
+    return (1.0 + constant + b * square / (square - c * c) + d / (square - e * e)) ** 0.5
+
+
+def pole_and_powers(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
+    """n² = constant + B / (λ² - C) + Σ a λᵉ, with (B, C) first in `terms` and then (a, e).
+
+    With one power, -D λ², it is the first formula of the Handbook of Optics.
+    """
+    square = wavelength * wavelength
+    (b, c), *powers = terms
+    return (constant + b / (square - c) + sum(a * wavelength**e for a, e in powers)) ** 0.5
+
+
+def resonance_and_powers(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
+    """n² = constant + B λ² / (λ² - C) + Σ a λᵉ, with (B, C) first in `terms` and then (a, e).
+
+    With one power, -D λ², it is the second formula of the Handbook of Optics.
+    """
+    square = wavelength * wavelength
+    (b, c), *powers = terms
+    return (constant + b * square / (square - c) + sum(a * wavelength**e for a, e in powers)) ** 0.5
+
+
 def polynomial(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
     """n² = constant + Σ a λᵉ, with (a, e) in `terms`.
 
@@ -43,5 +81,18 @@ def polynomial(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelen
 
 
 def cauchy(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
-    """n = constant + Σ a λᵉ, with (a, e) in `terms`; exponents are usually -2 and -4."""
+    """n = constant + Σ a λᵉ, with (a, e) in `terms`; exponents are usually -2 and -4.
+
+    Exponents -1 and -3.5 make it Conrady's formula.
+    """
     return constant + sum(a * wavelength**e for a, e in terms)
+
+
+def herzberger(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
+    """n = constant + B L + C L² + Σ a λᵉ with L = 1/(λ² - 0.028 µm²).
+
+    The first two of `terms` are (B, 1) and (C, 2), powers of L; the others are (a, e), powers of λ.
+    """
+    pole = 1.0 / (wavelength * wavelength - _HERZBERGER)
+    of_pole = sum(a * pole**e for a, e in terms[:2])
+    return constant + of_pole + sum(a * wavelength**e for a, e in terms[2:])

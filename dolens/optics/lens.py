@@ -17,13 +17,15 @@ from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.mirrors import MIRROR, media_of
+from dolens.optics.paraxial import vergence
 from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
-from dolens.optics.vergence import with_vergences
+from dolens.optics.thermal_lens import lens_at
+from dolens.optics.vergence import ideal_lenses, with_vergences
 
 
 class Lens(LensRays, LensViews, nn.Module):
@@ -51,6 +53,8 @@ class Lens(LensRays, LensViews, nn.Module):
         reference_wavelength: nm, one of them; the first unless it is given.
         fields: field points that the prescription is meant for.
         object_distance: mm from the object to the first vertex; None is infinity.
+        thermal_expansions: 1e-6/K, of the mount of the air gap behind each surface, or of glass
+            there whose catalogue does not say; None where nothing is known.
         backend: what traces: `auto`, `reference`, `cpu` or `cuda`; see `choose_backend`.
         wavelength_weights: how much each of the wavelengths counts, of any sum; None: all the same.
         temperature: °C, of the lens in use; None where the prescription does not say.
@@ -77,6 +81,7 @@ class Lens(LensRays, LensViews, nn.Module):
         reference_wavelength: float | None = None,
         fields: Fields | None = None,
         object_distance: float | None = None,
+        thermal_expansions: Sequence[float | None] | None = None,
         backend: str = "auto",
         wavelength_weights: Sequence[float] | None = None,
         temperature: float | None = None,
@@ -106,6 +111,7 @@ class Lens(LensRays, LensViews, nn.Module):
         self.reference_wavelength = reference_wavelength
         self.fields = fields
         self.object_distance = object_distance
+        self.thermal_expansions = tuple(thermal_expansions or (None,) * count)
         self.wavelength_weights = None if wavelength_weights is None else tuple(wavelength_weights)
         self.temperature = temperature
         self.pressure = pressure
@@ -233,7 +239,13 @@ class Lens(LensRays, LensViews, nn.Module):
             mirrors,
             self.reversals,
         )
-        return with_vergences(system, self.primary_wavelength, self.object_distance)
+        if not ideal_lenses(system):
+            return system
+        return with_vergences(system, self.primary_wavelength, vergence(self.object_distance))
+
+    def at(self, temperature: float, pressure: float | None = None) -> "Lens":
+        """Return this lens at another temperature (°C) and pressure (atm); see `lens_at`."""
+        return lens_at(self, temperature, pressure)
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""

@@ -1,4 +1,7 @@
-"""Media as a prescription names them: air, a constant index, nd and Vd, or a catalogue glass."""
+"""Media as a prescription names them: air, a constant index, nd and Vd, or a catalogue glass.
+
+`docs/glass.md` explains the names and the formulas behind them.
+"""
 
 import math
 import re
@@ -7,8 +10,11 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.glass_catalog import Glass, find_glass
+from dolens.optics.glass import Glass
+from dolens.optics.glass_catalog import find_glass
 from dolens.optics.mirrors import MIRROR, Mirror
+from dolens.optics.model_glass import ModelGlass, model_glass
+from dolens.optics.thermal import Environment
 
 
 @dataclass(frozen=True)
@@ -37,10 +43,15 @@ INDEX_MODELS = {
 # Wavelengths of the Fraunhofer lines that nd and Vd are defined on, nm.
 LINE_C, LINE_D, LINE_F = INDEX_MODELS["dfc"].lines
 
-_GLASS = re.compile(r"\s*(\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s*")
+_DECIMAL = r"\s*(\d+(?:\.\d+)?)\s*"
+_SIGNED = r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*"
+_GLASS = re.compile(f"{_DECIMAL}/{_DECIMAL}(?:/{_SIGNED})?", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
-# No optical medium is denser; the bound also catches a wavelength or a glass code.
-_HIGHEST_INDEX = 10.0
+# No optical medium is denser; the bound also catches a wavelength or a glass code.  Vacuum has
+# 0.9997 relative to air, and some crystals in the infrared have less than 1.
+_LOWEST_INDEX, _HIGHEST_INDEX = 0.1, 10.0
+# Of ΔPgF: catalogue glasses deviate from the normal line by less than 0.1.
+LARGEST_DEVIATION = 1.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +75,7 @@ class Material:
 
 # What light may travel through: hashable, equal when it is the same medium, and with a name that a
 # prescription reads back as the same.
-Medium = Material | Glass | Mirror
+Medium = Material | ModelGlass | Glass | Mirror
 
 
 def index_model(name: str) -> IndexModel:
@@ -74,22 +85,25 @@ def index_model(name: str) -> IndexModel:
     return INDEX_MODELS[name]
 
 
-def parse_material(text: str, model: IndexModel) -> Medium:
+def parse_material(text: str, model: IndexModel, environment: Environment | None = None) -> Medium:
     """Read a material as a prescription writes it.
 
     Args:
         text: `air`; `occluder`; `mirror`, where a surface reflects; a number, the same index at
-            every wavelength; glass as nd/Vd, for example `1.5168/64.17`; or a catalogue glass, for
-            example `N-BK7` or `SCHOTT:N-BK7` (see `find_glass`).  Case is ignored.
-        model: which lines nd and Vd stand for, and the index of air.  A constant index and nd/Vd
-            are taken as written; a catalogue glass is relative to air (see `Glass`).
+            every wavelength; glass as nd/Vd, for example `1.5168/64.17`, or as nd/Vd/ΔPgF (see
+            `model_glass`); or a catalogue glass, for example `N-BK7` or `SCHOTT:N-BK7` (see
+            `find_glass`).  Case is ignored.
+        model: which lines nd and Vd stand for, and the index of air.  A constant index, nd/Vd and
+            nd/Vd/ΔPgF are taken as written; a catalogue glass is relative to air (see `Glass`).
+        environment: temperature and pressure of a catalogue glass; None: those of its catalogue.
+            Other media are relative to the air around the lens, and stay as they are written.
 
     Returns:
         The medium; of nd/Vd the one with B = (nd - 1)/Vd / (1/λF² - 1/λC²) and A = nd - B/λd².
 
     Raises:
         InputError: the text is none of these, or a name that several makers gave (see
-            `find_glass`), or the number is not from 1 to 10, or nd < 1, or Vd is not positive.
+            `find_glass`), or the number is not from 0.1 to 10, or nd is not, or Vd is not positive.
     """
     name = str(text).strip()
     if name.lower() == "air":
@@ -102,10 +116,12 @@ def parse_material(text: str, model: IndexModel) -> Medium:
         return MIRROR
     match = _GLASS.fullmatch(name)
     if match is None:
-        return find_glass(name, model.air)
+        return find_glass(name, model.air, environment)
     nd, vd = float(match[1]), float(match[2])
-    if nd < 1.0 or vd <= 0.0 or not math.isfinite(nd * vd):
-        raise InputError(f"material '{name}': nd must be at least 1 and Vd positive")
+    if not _LOWEST_INDEX <= nd <= _HIGHEST_INDEX or vd <= 0.0 or not math.isfinite(vd):
+        raise InputError(f"material '{name}': nd must be from 0.1 to 10 and Vd positive")
+    if match[3] is not None:
+        return _with_partial_dispersion(name, nd, vd, float(match[3]), model)
     line_c, line_d, line_f = model.lines
     b = (nd - 1.0) / vd / (1.0 / line_f**2 - 1.0 / line_c**2)
     return Material(name, nd - b / line_d**2, b)
@@ -122,9 +138,17 @@ def abbe_number(medium: Medium) -> float:
     return math.inf if dispersion == 0.0 else (index_d(medium) - 1.0) / dispersion
 
 
+def _with_partial_dispersion(
+    name: str, nd: float, vd: float, deviation: float, model: IndexModel
+) -> ModelGlass:
+    if not abs(deviation) <= LARGEST_DEVIATION:
+        raise InputError(f"material '{name}': ΔPgF must be from -1 to 1 (glasses have about ±0.05)")
+    return model_glass(name, nd, vd, deviation, model.lines)
+
+
 def _constant(text: str) -> Material:
     index = float(text)
-    if not 1.0 <= index <= _HIGHEST_INDEX:
-        raise InputError(f"material '{text}': a constant index must be from 1 to 10")
+    if not _LOWEST_INDEX <= index <= _HIGHEST_INDEX:
+        raise InputError(f"material '{text}': a constant index must be from 0.1 to 10")
     # Written one way, so that 1.5 and 1.50 are the same medium.
     return Material(repr(index), index)

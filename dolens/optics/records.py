@@ -253,7 +253,8 @@ class _Writer:
         self.waves = True
         form = self.structure.forms[number - 1]
         self.shape(row, number)
-        self.constants += [0.0] * (2 - len(form.sizes))
+        # Planes, spheres and conics are there as aspheres: c, k, a2.
+        self.constants += [0.0] * (3 - len(form.sizes))
         row[Code.LAW], row[Code.BASE] = law.code, form.kind
         row[Code.NUMBERS] = len(self.constants) - row[Code.OFFSET]
         source = self.of_law[number - 1]

@@ -5,7 +5,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dolens.optics.paraxial import vergence
 from dolens.optics.paraxial_recurrence import TwoRays, through_surfaces
 from dolens.optics.paraxial_surfaces import curvatures_of, powers_of
 from dolens.optics.surfaces.ideal_lens import IdealLens
@@ -15,9 +14,13 @@ from dolens.optics.system import OpticalSystem
 _LARGEST = 1e9
 
 
-def with_vergences(
-    system: OpticalSystem, wavelength: float, object_distance: float | Tensor | None
-) -> OpticalSystem:
+def ideal_lenses(system: OpticalSystem) -> list[int]:
+    """Return the places of ideal lenses among the surfaces, from 0."""
+    laws = [surface.deflection for surface in system.surfaces]
+    return [i for i, law in enumerate(laws) if law is not None and law.law is IdealLens]
+
+
+def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tensor) -> OpticalSystem:
     """Return the system with the reduced vergence of the axial beam at each of its ideal lenses.
 
     Vergences are functions of the lens in front, and have its gradients.  Where the axial beam is
@@ -27,16 +30,17 @@ def with_vergences(
     Args:
         system: the lens; itself where it has no ideal lens.
         wavelength: nm, of the paraxial axial ray.
-        object_distance: mm in front of the first vertex; None or `inf` for infinity.
+        near: one over the object's distance in front of the first vertex, 1/mm; zero at infinity.
+            A tensor of several is for rays that broadcast with it, traced by the reference.
     """
-    laws = [s.deflection for s in system.surfaces]
-    lenses = [i for i, law in enumerate(laws) if law is not None and law.law is IdealLens]
+    lenses = ideal_lenses(system)
     if not lenses:
         return system
+    laws = [surface.deflection for surface in system.surfaces]
     index = system.signed_indices(wavelength)
-    near = index[0] * vergence(object_distance)
-    one = torch.ones_like(system.sensor_distance)
-    ray = TwoRays(one, 0.0 * one, near * one, 0.0 * one)
+    near = torch.as_tensor(near, dtype=system.dtype, device=system.device)
+    one = torch.ones_like(near)
+    ray = TwoRays(one, 0.0 * one, index[0] * near, 0.0 * one)
     behind = list(
         through_surfaces(
             ray, curvatures_of(system), system.thicknesses, index, powers_of(system, wavelength)
@@ -53,4 +57,5 @@ def with_vergences(
             laws[i], parameters={**laws[i].parameters, "vergence": arriving.to(system.dtype)}
         )
         surfaces[i] = replace(surfaces[i], deflection=law)
-    return replace(system, surfaces=surfaces)
+    found = replace(system, surfaces=surfaces)
+    return found.traced_by("reference") if near.numel() > 1 else found

@@ -1,7 +1,9 @@
 """A sheet shows small sections of many lenses, each at a scale of its own."""
 
+import copy
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,6 +13,7 @@ from matplotlib.figure import Figure
 from dolens.analysis.conditions import conditions
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
+from dolens.optics.surfaces.clear_aperture import Unlimited
 from dolens.plotting.drawing import Fan, LayoutDrawing, draw_layout, layout_drawing
 from dolens.plotting.number_text import number_text
 from dolens.plotting.style import PAGE
@@ -21,16 +24,21 @@ _HEIGHT, _TEXT = 1.02, 5.2
 # Heights on the stop, over its semi-diameter, of the rays of the axis and of the edge of the field:
 # there lenses vignette, and prescriptions seldom say how much.
 _AXIS, _EDGE = (-0.999, 0.0, 0.999), (-0.5, 0.0, 0.5)
-# Half height over width of the drawing's part of a cell.
-_SHARE = 0.5
+# Half height over half width of the drawing's part of a cell.
+_SHARE = 0.32
+# Of the line widths of a large drawing.
+_LINES = 0.5
+# Surfaces without an edge of their own are drawn so much farther than the rays go.
+_MARGIN = 1.06
 
 
 @torch.no_grad()
 def lens_sheet_figure(lenses: Mapping[str, Lens], columns: int = _COLUMNS) -> Figure:
     """Draw sections of many lenses on a sheet, with rays of the axis and of the edge of the field.
 
-    Rays of the edge fill the inner half of the stop.  Each section has a scale of its own; its
-    caption is the lens's name in the mapping, its focal length (mm), F-number and half field.
+    Rays of the edge fill the inner half of the stop, and surfaces that clip nothing are drawn as
+    far as these rays go.  Each section has a scale of its own; its caption is the lens's name in
+    the mapping, its focal length (mm), F-number and half field.
 
     Args:
         lenses: name → lens, in the order that they are drawn, row by row.
@@ -50,33 +58,37 @@ def lens_sheet_figure(lenses: Mapping[str, Lens], columns: int = _COLUMNS) -> Fi
 def _draw(axes: Axes, name: str, lens: Lens) -> None:
     where = conditions(lens)
     wave, distance = where.reference_wavelength, where.object_distance
-    drawing = layout_drawing(lens, wave, (0.0,), 1, distance)
     edge = max((y for x, y in where.fields.tolist() if x == 0.0), key=abs, default=0.0)
-    fields = dict.fromkeys((0.0, edge))
+    beams = {0.0: _AXIS} | ({edge: _EDGE} if edge else {})
+    paths = {field: _paths(lens, field, heights) for field, heights in beams.items()}
+    drawing = layout_drawing(_fitted(lens, list(paths.values())), wave, (0.0,), 1, distance)
     start = drawing.z_limits[0]
-    fans = [
-        Fan(field, wave, _paths(lens, field, _AXIS if field == 0.0 else _EDGE, start))
-        for field in fields
-    ]
+    fans = [Fan(field, wave, _led(rays, start, drawing.height)) for field, rays in paths.items()]
     z, y = _extent(drawing, fans)
     draw_layout(axes, drawing._replace(fans=fans), z, y, legend=False)
+    for line in axes.lines:
+        line.set_linewidth(_LINES * line.get_linewidth())
     # The cell's upper part is the drawing, its lower part two lines of text.
-    half = max(y, _SHARE * 0.62 * (z[1] - z[0]) * 0.5)
-    axes.set(ylim=(-1.75 * half, 1.1 * half), aspect="equal", anchor="C", xlabel="", ylabel="")
+    half = max(y, 0.5 * _SHARE * (z[1] - z[0]))
+    axes.set(ylim=(-1.75 * half, 1.05 * half), xlabel="", ylabel="")
+    axes.set_aspect("equal", adjustable="datalim")
     axes.set_axis_off()
-    axes.text(0.5, 0.12, name, transform=axes.transAxes, fontsize=_TEXT, ha="center", va="bottom")
-    axes.text(
-        *(0.5, 0.01, _numbers(lens)),
-        transform=axes.transAxes,
-        fontsize=_TEXT,
-        color="0.35",
-        ha="center",
-        va="bottom",
-    )
+    for height, text, grey in ((0.13, name, "0.0"), (0.02, _numbers(lens), "0.35")):
+        axes.text(
+            *(0.5, height, text),
+            transform=axes.transAxes,
+            fontsize=_TEXT,
+            color=grey,
+            ha="center",
+            va="bottom",
+        )
 
 
-def _paths(lens: Lens, field: float, heights: tuple[float, ...], start: float) -> np.ndarray:
-    """Return points (rays, points, 3), mm, of real rays that cross the stop at these heights."""
+def _paths(lens: Lens, field: float, heights: tuple[float, ...]) -> np.ndarray:
+    """Return points (rays, points, 3), mm, of real rays that cross the stop at these heights.
+
+    The first point lies on the first surface's side of the object, 1 mm in front of it.
+    """
     where = conditions(lens)
     wave, distance = where.reference_wavelength, where.object_distance
     pupil = [(0.0, height) for height in heights]
@@ -84,12 +96,37 @@ def _paths(lens: Lens, field: float, heights: tuple[float, ...], start: float) -
     rays = Rays(aimed.position, aimed.direction, wave)
     traced = lens.trace(rays, record=True)
     ok = aimed.converged & traced.valid
-    before = start if distance is None else max(start, -distance)
-    back = (before - rays.position[..., 2:]) / rays.direction[..., 2:]
-    first = rays.position + back * rays.direction
-    last = traced.position
-    points = torch.stack([first, *traced.points.unbind(0), last], -2)
+    surfaces = traced.points.unbind(0)
+    points = torch.stack([surfaces[0] - rays.direction, *surfaces, traced.position], -2)
     return points[ok].double().cpu().numpy()
+
+
+def _led(paths: np.ndarray, start: float, longest: float) -> np.ndarray:
+    """Return paths whose first point is where the drawing starts, or so far in front of the lens:
+    rays of wide fields would leave the drawing.
+    """
+    paths = paths.copy()
+    first, towards = paths[:, 1], paths[:, 1] - paths[:, 0]
+    length = np.minimum((first[:, 2:] - start) / towards[:, 2:], longest)
+    paths[:, 0] = first - length * towards
+    return paths
+
+
+def _fitted(lens: Lens, paths: list[np.ndarray]) -> Lens:
+    """Return the lens with surfaces that clip nothing drawn as far as these rays go.
+
+    Their own sizes hold whole beams of the edge of the field, which a real lens vignettes.
+    """
+    lit = [rays for rays in paths if len(rays)]
+    if not lit or not lens.system().rotationally_symmetric:
+        return lens
+    fitted = copy.deepcopy(lens)
+    heights = np.max([np.abs(rays[:, 1:-1, 1]).max(0) for rays in lit], 0)
+    for height, surface in zip(heights, fitted.surfaces.values(), strict=True):
+        if not surface.aperture.clips and height > 0.0:
+            size = min(_MARGIN * float(height), surface.semi_diameter)
+            surface.aperture = replace(surface.aperture, edge=Unlimited(size))
+    return fitted
 
 
 def _extent(drawing: LayoutDrawing, fans: list[Fan]) -> tuple[tuple[float, float], float]:

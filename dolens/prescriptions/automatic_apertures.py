@@ -1,11 +1,10 @@
 """Automatic semi-diameters: as far from the axis as the light of the fields goes.
 
 A row that says `semi_diameter: auto` clips nothing, and a number is needed to draw the surface and
-to set the scale of tolerances.  It is the largest height of real rays from the rim of the stop, of
-all fields and wavelengths; where no ray gets through, the paraxial one.
+to set the scale of tolerances.  It is the largest height of real rays through the rim of the
+entrance pupil, of all fields and wavelengths; where no ray gets through, the paraxial one.
 """
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,7 +22,7 @@ from dolens.optics.rays import Components, Rays
 from dolens.optics.surfaces.clear_aperture import Unlimited
 from dolens.prescriptions.apertures import is_automatic
 
-# Points of the stop's rim.
+# Points of the pupil's rim.
 _RIM = 16
 # Where nothing tells a size, mm.
 _UNKNOWN = 1.0
@@ -86,29 +85,37 @@ def _paraxial_heights(lens: Lens) -> dict[str, float]:
 
 
 def _real_heights(lens: Lens) -> dict[str, float]:
-    """Return the largest height of real rays at every surface that one meets."""
-    fields, points = _fields(lens), _points(lens)
+    """Return the largest height of real rays at every surface: from every field to the rim of the
+    paraxial entrance pupil, or of what vignetting factors leave of it.
+    """
+    points, fields = _points(lens), _fields(lens)
+    pupil = lens.first_order(lens.primary_wavelength).entrance_pupil
+    if not math.isfinite(float(pupil.z)):
+        return {}
     angle = torch.arange(_RIM, dtype=lens.dtype) * (2.0 * math.pi / _RIM)
     rim = torch.stack((angle.sin(), angle.cos()), -1).expand(len(points), _RIM, 2)
     if fields.vignetting is not None:
         rim = torch.stack([of.on_stop(one) for of, one in zip(fields.vignetting, rim, strict=True)])
         rim = rim / rim.norm(dim=-1, keepdim=True).clamp(min=1.0)
-    open_lens = copy.deepcopy(lens)
-    for surface in open_lens.surfaces.values():
-        surface.aperture = surface.aperture.opened()
-    aimed = open_lens.aim(points[:, None], rim, lens.primary_wavelength, lens.object_distance)
+    # An inverted pupil has the rim of an upright one.
+    at = torch.cat([0.5 * pupil.diameter * rim, pupil.z.expand(*rim.shape[:-1], 1)], -1)
+    if vergence(lens.object_distance) == 0.0:
+        towards = torch.cat([torch.deg2rad(points).tan(), torch.ones_like(points[:, :1])], -1)
+        towards = towards[:, None].expand_as(at)
+    else:
+        start = torch.full_like(points[:, :1], -float(lens.object_distance))
+        towards = at - torch.cat([points, start], -1)[:, None]
+        towards = torch.where(towards[..., 2:] < 0.0, -towards, towards)
+    towards = towards / towards.norm(dim=-1, keepdim=True)
     waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
-    rays = Rays(aimed.position[:, :, None], aimed.direction[:, :, None], waves)
-    system = open_lens.system()
-    hit = trace_rays(system.traced_by("reference"), rays, 1.0, True)
-    valid = hit.valid & aimed.converged[..., None]
-    if not bool(valid.any()):
+    rays = Rays(at[:, :, None], towards[:, :, None], waves)
+    system = lens.system().opened().traced_by("reference")
+    hit = trace_rays(system, rays, 1.0, True)
+    if not bool(hit.valid.any()):
         return {}
     found = {}
-    for axes, (number, at) in zip(
-        system.axes, zip(lens.surfaces, hit.points, strict=True), strict=True
-    ):
-        x, y, z = at[valid].unbind(-1)
+    for number, axes, point in zip(lens.surfaces, system.axes, hit.points, strict=True):
+        x, y, z = point[hit.valid].unbind(-1)
         local = from_lens_axes(Components(x, y, z, x, y, z), axes)
         found[number] = float(torch.hypot(local.x, local.y).max())
     return found

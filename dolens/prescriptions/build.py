@@ -14,12 +14,13 @@ A prescription is a mapping::
 
 Lengths are in mm; `radius: .inf` is a plane (some shapes have `radius_x` and `radius_y`);
 `material` is the medium behind the surface: `air`, `occluder`, a constant index (`1.5`), glass as
-nd/Vd, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
+nd/Vd or nd/Vd/ΔPgF, or by catalogue (`N-BK7`, `OHARA:S-BSL7`).
 `material: mirror` makes the surface reflect; behind it light travels towards -z, and thicknesses
 are negative until the next mirror.  Rows of type `coordinate_break` move and turn the axes of all
 that stands behind them (see breaks.py).
 A surface may have a `phase`, a grating or a diffractive lens, and a `paraxial_lens` is an ideal
 lens (see deflections.py).
+`thermal_expansion` (1e-6/K) is that of the mount of an air gap (see `dolens.optics.thermal_lens`).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
@@ -36,7 +37,6 @@ import torch
 from dolens.errors import InputError, check_keys, did_you_mean
 from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
-from dolens.optics.materials import parse_material
 from dolens.optics.mirrors import media_of
 from dolens.optics.surfaces import SURFACES, Surface
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
@@ -57,6 +57,7 @@ from dolens.prescriptions.deflections import (
     with_power,
 )
 from dolens.prescriptions.field_data import set_object_fields
+from dolens.prescriptions.media import EXPANSION_KEY, environment_of, expansion_of, medium_of
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
 from dolens.prescriptions.system_data import (
@@ -79,7 +80,9 @@ _LENS_KEYS = (
     "sensor",
     *SYSTEM_DATA_KEYS,
 )
-_SURFACE_KEYS = ("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", "note")
+_SURFACE_KEYS = (
+    *("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", EXPANSION_KEY, "note"),
+)
 _SENSOR_KEYS = ("distance", "diameter")
 # A prescription may give the radius of the same name instead: `radius_x` for `curvature_x`.
 CURVATURES = ("curvature", "curvature_x", "curvature_y")
@@ -119,8 +122,10 @@ def lens_from_prescription(
         raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
     check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
     data = system_data(prescription, where)
-    surfaces, thicknesses = [], []
-    materials = [_material(prescription.get("object_material", "air"), model, f"{where}: object")]
+    air = environment_of(prescription, where)
+    surfaces, thicknesses, expansions = [], [], []
+    first = prescription.get("object_material", "air")
+    materials = [medium_of(first, model, f"{where}: object", air)]
     for number, row in enumerate(rows, 1):
         place = f"{where}: surface {number}"
         if is_break(row):
@@ -128,7 +133,8 @@ def lens_from_prescription(
             materials.append(media_of(materials).materials[-1])
         else:
             surfaces.append(_surface(stop_row(row, number, prescription), place, dtype))
-            materials.append(_material(row.get("material"), model, place))
+            materials.append(medium_of(row.get("material"), model, place, air))
+        expansions.append(expansion_of(row, place))
         if number < len(rows):
             if row.get("thickness") is None:
                 raise InputError(f"{place}: 'thickness' is missing (mm to surface {number + 1})")
@@ -150,6 +156,7 @@ def lens_from_prescription(
             None if diameter is None else as_number(diameter, f"{where}: 'sensor.diameter'"),
             dtype,
             elements_from(prescription.get("elements"), dtype, where),
+            thermal_expansions=expansions,
             backend=backend,
             source=str(prescription.get("source") or ""),
             published=published_from(prescription.get(PUBLISHED_KEY), where),
@@ -193,6 +200,8 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         row |= aperture_rows(surface.aperture)
         row |= _gap(lens, number)
         row["material"] = material.name
+        if lens.thermal_expansions[int(number) - 1] is not None:
+            row[EXPANSION_KEY] = lens.thermal_expansions[int(number) - 1]
         rows[number] = row
     sensor: dict[str, Any] = {"distance": float(lens.sensor_distance.detach())}
     if lens.sensor_diameter is not None:
@@ -290,12 +299,3 @@ def _rows(prescription: Mapping[str, Any], where: str) -> list[Mapping[str, Any]
             )
         require_mapping(rows[str(number)], f"{where}: surface {number}")
     return [rows[str(number)] for number in range(1, len(rows) + 1)]
-
-
-def _material(value: object, model: Any, place: str) -> Any:
-    if value is None:
-        raise InputError(f"{place}: 'material' is missing (the medium behind the surface)")
-    try:
-        return parse_material(str(value), model)
-    except InputError as error:
-        raise InputError(f"{place}: {error}") from None

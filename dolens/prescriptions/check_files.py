@@ -113,4 +113,4 @@ def as_data(checks: Sequence[FileCheck]) -> dict[str, list[dict[str, object]]]:
 
 
 def _without_name(message: str, path: Path) -> str:
-    return message.removeprefix(f"{path}: ")
+    return message.removeprefix(f"{one_line(path)}: ")

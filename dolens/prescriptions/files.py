@@ -1,13 +1,14 @@
 """Lens files are read and written."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from dolens.errors import InputError, did_you_mean
+from dolens.optics.glass_folders import glass_folders
 from dolens.optics.lens import Lens
 from dolens.packaged import packaged_configuration
 from dolens.prescriptions.build import lens_from_prescription, prescription_of
@@ -32,12 +33,16 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
+GlassPlaces = Sequence[str | Path] | str | Path | None
+
 # Lenses that come with dolens lie in this folder of its configuration.
 _LENSES = "lens"
 # Of these, prescriptions from patents and books lie in a folder of their own.
 _PUBLISHED = "published"
 # What holds the numbers that a source publishes.
 _WHOLE = (".yaml", ".yml", ".json")
+# What has no place for the source itself; `dolens convert` says that it is lost.
+_WITHOUT_SOURCE = (".seq", ".txt")
 
 
 def lens_names() -> list[str]:
@@ -168,6 +173,7 @@ def load_lens(
     dtype: torch.dtype = torch.float64,
     index_model: str | None = None,
     backend: str = "auto",
+    glass_catalogues: GlassPlaces = None,
 ) -> Lens:
     """Read a lens from a prescription in YAML, diffoptics's `.txt` or Zemax's `.zmx`.
 
@@ -179,23 +185,31 @@ def load_lens(
 
     Rarely needed:
         backend: auto, reference, cpu or cuda.
+        glass_catalogues: folders of `.agf` files, or such files, besides those that the environment
+            variable `DOLENS_GLASS` names (see `dolens.optics.glass_folders`).
 
     Raises:
         InputError: the file is missing, not valid, or no prescription; the message is one line
             that names the file, and the surface and key where there is one.
     """
     path = find_lens(path)
-    prescription, passed_over = read_lens_file(path)
-    if passed_over:
-        logger.info("%s: passed over: %s", path, "; ".join(passed_over))
-    return lens_from_prescription(prescription, dtype, index_model, str(path), backend)
+    with glass_folders(glass_catalogues):
+        prescription, passed_over = read_lens_file(path)
+        if passed_over:
+            logger.info("%s: passed over: %s", path, "; ".join(passed_over))
+        return lens_from_prescription(prescription, dtype, index_model, str(path), backend)
 
 
-def save_lens(lens: Lens, path: str | Path) -> None:
+def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None) -> None:
     """Write a lens in the format that the suffix names (.yaml, .yml, .txt or .zmx).
 
     Reading it back gives the same parameters to the last bit.  YAML alone holds the numbers that
     the lens's source publishes.
+
+    Args:
+        lens: as it is now.
+        path: the file.
+        glass_catalogues: as for `load_lens`; another program's file needs them to name their glass.
 
     Raises:
         InputError: the format cannot hold the lens; the message names the surface and key.
@@ -204,4 +218,7 @@ def save_lens(lens: Lens, path: str | Path) -> None:
     prescription = prescription_of(lens)
     if path.suffix.lower() not in _WHOLE:
         prescription.pop(PUBLISHED_KEY, None)
-    path.write_bytes(encode_prescription(prescription, path))
+    if path.suffix.lower() in _WITHOUT_SOURCE:
+        prescription.pop("source", None)
+    with glass_folders(glass_catalogues):
+        path.write_bytes(encode_prescription(prescription, path))

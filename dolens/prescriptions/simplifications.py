@@ -61,7 +61,8 @@ def _needs_numbers(name: str, new: str) -> bool:
     if name.lower() in _KNOWN_MEDIA or (name[:1].isdigit() and "/" not in name):
         return False
     if _suffix(new) == ".txt":
-        return not name[:1].isdigit()
+        # nd/Vd/ΔPgF has a number too many.
+        return not name[:1].isdigit() or name.count("/") > 1
     try:
         glass_word(name, new)
     except InputError:

@@ -31,7 +31,6 @@ A lens has fields by angles or by heights on the object: those that a prescripti
 image or the pupil are converted when the lens is built (`dolens.optics.image_heights`).
 """
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -40,6 +39,7 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.optics.image_heights import in_double_precision
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import matrix_to_stop
 from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
@@ -161,7 +161,7 @@ def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
         InputError: no stop of finite size makes this pupil, or it would exceed its surface.
     """
     key = _pupil(prescription)
-    exact = copy.deepcopy(lens).to(torch.float64)
+    exact = in_double_precision(lens)
     if lens.telecentric_object:
         _require_telecentric(exact)
     if key is None:

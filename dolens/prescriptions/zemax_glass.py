@@ -1,83 +1,95 @@
-"""The glass of a Zemax surface is a model (nd and Vd), or a name in the catalogues of the file.
+"""The glass of a Zemax surface is a model (nd, Vd, ΔPgF), a code, or a name in a catalogue.
 
 `GCAT` lists the catalogues that a file uses, and Zemax takes a name from the first that has it.
-Here a name is read from that catalogue too, or refused: the same name at another maker is another
-glass.  `GLAS name 0 0 nd Vd` repeats nd and Vd, which Zemax fills in or leaves at 1.5 and 40; where
-they are filled in they must be those of the glass found.
+`GLAS name 0 0 nd Vd` repeats nd and Vd, which Zemax fills in, leaves at 1.5 and 40, or leaves as
+they were for an earlier glass.  So the name decides here, too; where nd and Vd say something quite
+different, the log says so in one line.
 
-A catalogue here is a maker's (SCHOTT_2000 and CDGM-ZEMAX are editions of the makers' own) or MISC,
-whose plastics are read as the measurements of the same plastics here.  Others are not known: where
-one may hold a name too and stands before the maker that has it, nd and Vd must agree.  A file
-without GCAT gives a name that one maker alone uses, or the only glass of that name whose nd and Vd
-agree.
+A catalogue here is one of `dolens.optics.glass_catalog.catalogues`: SCHOTT_2000 and CDGM-ZEMAX are
+editions of the makers' own.  Where a catalogue that is not known here stands before the one that
+has the name, and may have it too, nd and Vd must agree with the glass found: Schott once had
+glasses that its table here lacks.  A file without GCAT gives a name that one maker alone uses, or
+the only glass of that name whose nd and Vd agree.
 """
 
-import itertools
+import logging
 import re
 from collections.abc import Sequence
-from decimal import Decimal
 
 from dolens.errors import InputError
-from dolens.optics.glass_catalog import find_glass, is_old_name, makers_of
-from dolens.optics.materials import (
-    Material,
-    Medium,
-    abbe_number,
-    index_d,
-    index_model,
-    parse_material,
-)
+from dolens.optics.glass_catalog import find_glass, makers_of
+from dolens.optics.materials import LARGEST_DEVIATION, Medium, index_model, parse_material
 from dolens.optics.mirrors import MIRROR
+from dolens.optics.model_glass import deviation_of_two_terms
 from dolens.prescriptions.decimals import number_in_text
+from dolens.prescriptions.glass_order import catalogue_order
+from dolens.prescriptions.zemax_catalogues import (
+    Pair,
+    index_and_abbe_number,
+    known_catalogue,
+    may_have,
+    named_glass,
+)
 
-# Zemax prints what its catalogue gives: half of what tells Schott's F2 from Hikari's.  Where a file
-# prints fewer decimals, half a unit of the last.
-_ND, _VD = 5e-5, 0.02
+logger = logging.getLogger(__name__)
+
+# By how much nd or Vd of a line must miss the glass that it names to be worth a line in the log.
+_FAR_ND, _FAR_VD = 1e-3, 0.5
 # Zemax leaves nd at 1.5, other programs at 0 or 1, where a name says it all.
 _NOT_GIVEN = (0.0, 1.0, 1.5)
-_MISC = "MISC"
-# What Zemax calls the plastics of its catalogue MISC.
-_PLASTICS = {"POLYCARBONATE": "POLYCARB", "POLYSTYRENE": "POLYSTYR", "ZEONEX-E48R": "E48R"}
-_MAKERS = ("SCHOTT", "OHARA", "HOYA", "CDGM", "SUMITA", "HIKARI", "NIKON-HIKARI")
-# Their glasses have names of their own schemes alone.
-_OWN_NAMES = ("OHARA", "SUMITA")
-_PAIR = re.compile(r"\s*([\d.]+)\s*/\s*([\d.]+)\s*")
+_MODEL, _PICKUP, _OFFSET = "1", "2", "4"
+_BLANK = "___BLANK"
+# Catalogue, series and name, as one supplier of lenses writes them: SCHOTT-BK|N-BK7.
+_QUALIFIED = re.compile(r"([A-Za-z]+)(?:-\w+)?\|(.+)")
+# nd - 1 and Vd in three digits each.
+_CODE = re.compile(r"(\d{3})(\d{2})(\d)")
+_PAIR = re.compile(r"([\d.]+)\s*/\s*([\d.]+)(?:\s*/\s*(\S+))?")
+# ΔPgF that was written for a glass given by nd and Vd alone; what a file may round it to.
+_SAME_DEVIATION = 1e-9
 
-Pair = tuple[str, str]
 
-
-def read_glass(words: Sequence[str], catalogues: Sequence[str] | None, place: str) -> str:
+def read_glass(
+    words: Sequence[str],
+    catalogues: Sequence[str] | None,
+    place: str,
+    surfaces: Sequence[Sequence[str]] = (),
+) -> str:
     """Return the medium that the arguments of GLAS name, as a prescription writes it.
 
     Args:
-        words: name, kind of solve (1 is a model), pick-up, nd, Vd, ...; none is air.
+        words: name, kind of solve (1 is a model, 2 a pick-up), surface of the pick-up, nd, Vd,
+            ΔPgF, ...; none is air.
         catalogues: the arguments of GCAT; None where the file has none.
         place: name of the surface in messages.
+        surfaces: the arguments of GLAS of all surfaces from 0, for pick-ups.
 
     Returns:
-        `air`, `mirror`, nd/Vd, a constant index (a model whose Vd is 0), or maker and name.
+        `air`, `mirror`, nd/Vd/ΔPgF, nd/Vd, a constant index (a model whose Vd is 0), or catalogue
+        and name.
 
     Raises:
         InputError: half a model, or a name that cannot be read as the file means it.
     """
+    words = _picked_up(words, place, surfaces)
     if not words or words[0].upper() == "AIR":
         return "air"
     name, how = words[0], words[1] if len(words) > 1 else "0"
     if name.upper() == "MIRROR":
         return MIRROR.name
     place = f"{place}: GLAS {name}"
-    if name == "___BLANK" or how == "1":
+    if name == _BLANK or how == _MODEL:
         return _model(words, place)
-    if how == "4" and any(number_in_text(w, place) for w in words[9:11]):
+    if how == _OFFSET and any(number_in_text(w, place) for w in words[9:11]):
         raise InputError(f"{place} with offsets of nd or Vd is not held")
     pair = _printed(words, place)
-    found = _named(name, catalogues, pair, place)
-    if pair and _agrees(found, pair) is False:
-        glass = find_glass(found)
-        raise InputError(
-            f"{place}: nd {pair[0]} and Vd {pair[1]} of its line are not those of {found}, "
-            f"{index_d(glass):.5f} and {abbe_number(glass):.2f}; {_instead(pair)}"
-        )
+    code = _CODE.fullmatch(name)
+    if code and not makers_of(name):
+        return _with_vd(f"1.{code[1]}", f"{int(code[2])}.{code[3]}", "0")
+    qualified = _QUALIFIED.fullmatch(name)
+    if qualified and known_catalogue(qualified[1]):
+        name, catalogues = qualified[2], [qualified[1]]
+    found = named_glass(name, catalogues, pair, place)
+    _compare(found, pair, place)
     return found
 
 
@@ -93,14 +105,16 @@ def glass_line(material: object, place: str) -> list[str]:
         return []
     if medium is MIRROR:
         return ["  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]
-    if isinstance(medium, Material):
-        pair = _PAIR.fullmatch(name)
-        nd, vd = (pair[1], pair[2]) if pair else (name, "0")
-        return [f"  GLAS ___BLANK 1 0 {nd} {vd} 0 0 0 0 0 0"]
-    maker, _, word = name.rpartition(":")
-    word = _PLASTICS.get(word, word) if maker == "PLASTIC" else word
-    nd, vd = _index_and_abbe_number(medium) or (1.5, 40.0)
-    return [f"  GLAS {word} 0 0 {nd:.8f} {vd:.6f} 0 0 0 0 0 0"]
+    _, colon, word = name.partition(":")
+    if colon:
+        nd, vd = index_and_abbe_number(medium) or (1.5, 40.0)
+        vd = vd if abs(vd) < 1e4 else 0.0
+        return [f"  GLAS {word} 0 0 {nd:.8f} {vd:.6f} 0 0 0 0 0 0"]
+    pair = _PAIR.fullmatch(name)
+    nd, vd, deviation = (pair[1], pair[2], pair[3]) if pair else (name, "0", "0")
+    if deviation is None:
+        deviation = f"{_deviation_of_two_terms(vd):.12f}"
+    return [f"  GLAS {_BLANK} 1 0 {nd} {vd} {deviation} 0 0 0 0 0"]
 
 
 def canonical(material: str) -> str:
@@ -119,32 +133,61 @@ def catalogue_line(materials: Sequence[object], where: str) -> list[str]:
     glass.
 
     Raises:
-        InputError: there is no such order, because two makers' glasses share their names.
+        InputError: there is no such order, because two catalogues' glasses share their names.
     """
     names = sorted({canonical(str(material)) for material in materials})
-    glasses = {name: name.partition(":") for name in names if ":" in name}
-    used = sorted({_MISC if maker == "PLASTIC" else maker for maker, _, _ in glasses.values()})
-    if not used:
+    glasses = [(name.partition(":")[0], name.partition(":")[2]) for name in names if ":" in name]
+    if not glasses:
         return []
-    for order in itertools.permutations(used):
-        try:
-            if all(_named(word, order, None, where) == n for n, (_, _, word) in glasses.items()):
-                return [f"GCAT {' '.join(order)}"]
-        except InputError:
-            continue
-    raise InputError(
-        f"{where}: a .zmx file cannot hold {', '.join(glasses)} together: its GCAT names "
-        "catalogues, and whichever comes first has, or may have, another glass of the same name"
-    )
+
+    def must_precede(catalogue: str, word: str, other: str) -> bool:
+        return other in makers_of(word) or may_have(other, word)
+
+    order = catalogue_order(glasses, must_precede)
+    if order is None:
+        raise InputError(
+            f"{where}: a .zmx file cannot hold {', '.join(f'{c}:{w}' for c, w in glasses)} "
+            "together: its GCAT names catalogues, and whichever comes first has, or may have, "
+            "another glass of the same name"
+        )
+    return [f"GCAT {' '.join(order)}"]
+
+
+def _picked_up(
+    words: Sequence[str], place: str, surfaces: Sequence[Sequence[str]]
+) -> Sequence[str]:
+    """Return the words of the surface that a glass is picked up from; the same without pick-up."""
+    for _ in range(len(surfaces) + 1):
+        if len(words) < 3 or words[1] != _PICKUP:
+            return words
+        number = number_in_text(words[2], f"{place}: GLAS {words[0]}: pick-up")
+        if number not in range(len(surfaces)):
+            if words[0] == _BLANK:
+                break
+            # Part of a file: the name is what the pick-up gave.
+            return [words[0], "0", *words[2:]]
+        words = surfaces[int(number)]
+    raise InputError(f"{place}: GLAS picks up from surface {words[2]}, which has no glass to give")
 
 
 def _model(words: Sequence[str], place: str) -> str:
     if len(words) < 5:
-        raise InputError(f"{place} needs nd and Vd: '___BLANK 1 0 nd Vd'")
-    if len(words) > 5 and number_in_text(words[5], place):
-        raise InputError(f"{place}: the deviation of its dispersion (ΔPgF) must be 0")
+        raise InputError(f"{place} needs nd and Vd: '{_BLANK} 1 0 nd Vd'")
     nd, vd = (_plain(word, place) for word in words[3:5])
-    return nd if float(vd) == 0.0 else f"{nd}/{vd}"
+    deviation = _plain(words[5], place) if len(words) > 5 else "0"
+    if not abs(float(deviation)) <= LARGEST_DEVIATION:
+        raise InputError(f"{place}: ΔPgF must be from -1 to 1, not {deviation}")
+    if float(vd) != 0.0 and abs(float(deviation) - _deviation_of_two_terms(vd)) < _SAME_DEVIATION:
+        return f"{nd}/{vd}"
+    return _with_vd(nd, vd, deviation)
+
+
+def _with_vd(nd: str, vd: str, deviation: str) -> str:
+    return nd if float(vd) == 0.0 else f"{nd}/{vd}/{deviation}"
+
+
+def _deviation_of_two_terms(vd: str) -> float:
+    return deviation_of_two_terms(float(vd), index_model("dfc").lines)
 
 
 def _printed(words: Sequence[str], place: str) -> Pair | None:
@@ -155,94 +198,17 @@ def _printed(words: Sequence[str], place: str) -> Pair | None:
     return None if nd in _NOT_GIVEN or vd <= 0.0 else (words[3], words[4])
 
 
-def _named(name: str, catalogues: Sequence[str] | None, pair: Pair | None, place: str) -> str:
-    """Return maker and name of the glass that a file means."""
-    makers = makers_of(name)
-    if catalogues is None:
-        agreeing = [m for m in makers if pair and _agrees(_of(m, name), pair)]
-        if len(agreeing) == 1:
-            return _of(agreeing[0], name)
-        try:
-            return find_glass(name).name
-        except InputError as error:
-            if not makers:
-                raise InputError(f"{place}: {error}; {_instead(pair)}") from None
-            raise InputError(
-                f"{place}: the file has no GCAT, and several makers gave that name "
-                f"(here: {', '.join(makers)}); add GCAT with the maker meant; {_instead(pair)}"
-            ) from None
-    doubtful = []
-    for catalogue in catalogues:
-        maker = _maker(catalogue)
-        if maker in makers:
-            found = _of(maker, name)
-            if doubtful and not (pair and _agrees(found, pair)):
-                raise InputError(
-                    f"{place}: {' and '.join(doubtful)}, which GCAT names before {catalogue}, may "
-                    f"have another glass of that name that is not known here; {_instead(pair)}"
-                )
-            return found
-        if _may_have(catalogue, maker, name):
-            doubtful.append(catalogue)
-    elsewhere = f"; {' and '.join(makers)} has another of that name" if makers else ""
-    raise InputError(
-        f"{place} is in none of the file's catalogues as they are known here (GCAT "
-        f"{' '.join(catalogues)}){elsewhere}; {_instead(pair)}"
-    )
-
-
-def _maker(catalogue: str) -> str | None:
-    """Return the maker whose glasses a catalogue of Zemax holds; editions have a suffix."""
-    word = catalogue.upper()
-    if word == _MISC:
-        return "PLASTIC"
-    known = next((m for m in _MAKERS if re.fullmatch(rf"{m}([-_].*)?", word)), None)
-    return known.rpartition("-")[2] if known else None
-
-
-def _may_have(catalogue: str, maker: str | None, name: str) -> bool:
-    """Return whether a catalogue may have a glass of that name, which is not known here.
-
-    Makers' modern names have a hyphen and are theirs alone.  MISC has no such names, and some that
-    are glasses elsewhere (LAF3 is lanthanum fluoride there).
-    """
-    if maker is None:
-        return True
-    if maker == "PLASTIC":
-        return "-" not in name
-    return is_old_name(name) and maker not in _OWN_NAMES
-
-
-def _agrees(found: str, pair: Pair) -> bool | None:
-    """Return whether a glass has that nd and Vd; None where it has none, for example in the
-    infrared.
-    """
-    own = _index_and_abbe_number(find_glass(found))
-    if own is None:
-        return None
-    printed = zip(own, pair, (_ND, _VD), strict=True)
-    return all(abs(x - float(text)) <= max(least, _half_unit(text)) for x, text, least in printed)
-
-
-def _half_unit(text: str) -> float:
-    """Return half a unit of the last decimal that is written."""
-    return 0.5 * 10.0 ** int(Decimal(text).as_tuple().exponent)
-
-
-def _index_and_abbe_number(medium: Medium) -> tuple[float, float] | None:
-    try:
-        return index_d(medium), abbe_number(medium)
-    except InputError:
-        return None
-
-
-def _of(maker: str, name: str) -> str:
-    return find_glass(f"{maker}:{name}").name
-
-
-def _instead(pair: Pair | None) -> str:
-    nd, vd = pair or ("nd", "Vd")
-    return f"for a glass by its nd and Vd write GLAS ___BLANK 1 0 {nd} {vd}"
+def _compare(found: str, pair: Pair | None, place: str) -> None:
+    """Log that nd and Vd of a line are not those of the glass that it names, if they are far."""
+    own = index_and_abbe_number(find_glass(found)) if pair else None
+    if pair is None or own is None:
+        return
+    nd, vd = (float(text) for text in pair)
+    if abs(nd - own[0]) > _FAR_ND or abs(vd - own[1]) > _FAR_VD:
+        logger.warning(
+            "%s: nd %s and Vd %s of its line are not those of %s, %.5f and %.2f, which is used",
+            *(place, *pair, found, *own),
+        )
 
 
 def _medium(material: object, place: str) -> Medium:

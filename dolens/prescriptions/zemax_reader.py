@@ -16,8 +16,10 @@ draws and clips nothing.  ENPD, FNUM and OBNA close the stop (see
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 from dolens.errors import InputError
@@ -38,6 +40,8 @@ from dolens.prescriptions.zemax_system import factor_to_mm, read_system
 
 # Zemax writes INFINITY, and takes any distance from here on for it.
 _INFINITE = 1e10
+
+GlassReader = Callable[..., str]
 
 Block = dict[str, list[Line]]
 
@@ -64,8 +68,8 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     if len(file.surfaces) < 3:
         raise InputError(f"{where}: needs an object, a surface and an image as SURF blocks")
     factor = factor_to_mm(file, where)
-    catalogues = [word for line in file.system.get("GCAT", []) for word in line.arguments] or None
-    medium, distance = _object(file, catalogues, factor, where)
+    glass = _glass_reader(file)
+    medium, distance = _object(file, glass, factor, where)
     prescription = read_system(file, factor, distance is not None, where)
     prescription["stop"] = 1
     prescription["object_material"] = medium
@@ -75,7 +79,7 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
         if _is_ignored(lines):
             continue
         block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
-        row, clips = _row(block, catalogues, pupil)
+        row, clips = _row(block, glass, pupil)
         # Behind a mirror, and behind a coordinate break, is the medium in front of it.
         if row.get("material", MIRROR.name) != MIRROR.name:
             medium = row["material"]
@@ -91,17 +95,24 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
         )
     prescription["stop"] = stops[0]
     if distance is not None:
-        prescription["object_distance"] = _in_front(distance, prescription, rows, hard, where)
+        prescription["object_distance"] = _in_front(distance, prescription, rows, hard)
     found = _with_sensor(prescription, rows, hard, file.surfaces[-1], factor, where)
     return ReadPrescription(found, [*passed_over(file), *other_configurations(file, where)])
 
 
-def _row(block: SurfaceBlock, catalogues: list[str] | None, pupil: bool) -> tuple[Row, bool]:
+def _glass_reader(file: ZemaxFile) -> GlassReader:
+    """Return what reads a surface's glass, given the words of its GLAS and its name in messages."""
+    catalogues = [word for line in file.system.get("GCAT", []) for word in line.arguments]
+    words = [lines["GLAS"][-1].arguments if "GLAS" in lines else [] for lines in file.surfaces]
+    return partial(read_glass, catalogues=catalogues or None, surfaces=words)
+
+
+def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, bool]:
     """Return the row of a surface, and whether its aperture stops light.
 
     Args:
         block: its lines.
-        catalogues: the arguments of GCAT.
+        glass: reads the words of GLAS.
         pupil: whether the file gives the pupil, which then sizes the stop.
     """
     shape = shape_of_block(block)
@@ -110,7 +121,7 @@ def _row(block: SurfaceBlock, catalogues: list[str] | None, pupil: bool) -> tupl
     aperture: Row = {}
     clips = False
     if shape.surface:
-        material = read_glass(block.words("GLAS"), catalogues, block.place)
+        material = glass(block.words("GLAS"), place=block.place)
         block = replace(block, material=material)
         row["material"] = material
         sizing = block.stop and not pupil
@@ -132,27 +143,14 @@ def _row(block: SurfaceBlock, catalogues: list[str] | None, pupil: bool) -> tupl
 
 
 def _in_front(
-    distance: float,
-    prescription: dict[str, Any],
-    rows: list[Row],
-    hard: list[bool],
-    where: str,
+    distance: float, prescription: dict[str, Any], rows: list[Row], hard: list[bool]
 ) -> float:
     """Return the distance (mm) of the object, after the planes that do nothing are left out where
     the object lies on one of them or behind it.
-
-    Raises:
-        InputError: the object is virtual: light would meet the lens before it.
     """
-    while distance <= 0.0:
-        if (
-            prescription["stop"] == 1
-            or hard[0]
-            or not _is_dummy(rows[0], prescription["object_material"])
-        ):
-            raise InputError(
-                f"{where}: an object on or behind the first surface is not held (DISZ {distance:g})"
-            )
+    while distance <= 0.0 and prescription["stop"] > 1 and not hard[0]:
+        if not _is_dummy(rows[0], prescription["object_material"]):
+            break
         distance += rows.pop(0)["thickness"]
         hard.pop(0)
         prescription["stop"] -= 1
@@ -187,14 +185,14 @@ def _with_sensor(
 
 
 def _object(
-    file: ZemaxFile, catalogues: list[str] | None, factor: Fraction, where: str
+    file: ZemaxFile, glass: GlassReader, factor: Fraction, where: str
 ) -> tuple[str, float | None]:
     """Return the medium before surface 1, and the object's distance, None for infinity."""
     place = f"{where}: the object"
     block = SurfaceBlock(file.surfaces[0], factor, place)
     if block.type != "STANDARD" or block.curvature != 0.0:
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
-    medium = read_glass(block.words("GLAS"), catalogues, place)
+    medium = glass(block.words("GLAS"), place=place)
     words = block.words("DISZ")
     if not words or words[0].upper() == "INFINITY":
         return medium, None

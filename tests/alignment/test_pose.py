@@ -334,7 +334,7 @@ def test_a_held_number_that_is_off_moves_the_fit_by_what_was_foretold(singlet):
     measured = seen(singlet, 400_000, **truth)
     right, wrong = pose(singlet, **truth), pose(singlet, **truth)
     wrong.lens.sensor_distance.add_(0.05)
-    moved = [weighted_fit(one, fine, measured, 5) for one in (right, wrong)]
+    moved = [weighted_fit(one, fine, measured, 3) for one in (right, wrong)]
     names = {n: {"initial": v} for n, v in moved[0].items()}
     both = Pose(right.lens, SOURCE, {**names, "sensor_distance": None})
     variance = torch.tensor([[0.05**2]], dtype=torch.float64)

@@ -11,15 +11,15 @@ from dolens.experiments.running.training import run
 
 TINY = [
     "experiment=pose_accuracy",
-    "sensor.height=48",
-    "sensor.width=48",
-    "sensor.pixel_pitch=0.1472",
+    "sensor.height=32",
+    "sensor.width=32",
+    "sensor.pixel_pitch=0.2208",
     "photons=100000",
-    "imagers.narrow.rays=50000",
-    "imagers.wide.rays=50000",
+    "imagers.narrow.rays=20000",
+    "imagers.wide.rays=20000",
     "photon_levels=[20000,80000]",
     "measurements=8",
-    "ray_counts=[1000,50000]",
+    "ray_counts=[500,20000]",
     "patterns=2",
     "reference_photons=5e6",
     "objective=pose_error/over_bound/photons_80000/noise_weighted",
@@ -56,7 +56,7 @@ def test_errors_fall_with_light_and_rays_and_near_starts_converge(composed, tmp_
         assert found < metrics[f"pose_error/over_bound/photons_{level}/s21"]
     few, many = (
         metrics[f"pose_error/over_bound/rays/narrow_{count}/noise_weighted"]
-        for count in (1000, 50000)
+        for count in (500, 20000)
     )
     assert many < 0.3 * few
     basin = rows_of(folder / "basin.csv")

@@ -14,7 +14,7 @@ TINY = [
     "sensor.width=32",
     "sensor.pixel_pitch=0.2208",
     "photons=100000",
-    "imager.rays=20000",
+    "imager.rays=8000",
     "imager.rim=0.01",
     "+trainer.enable_progress_bar=false",
 ]

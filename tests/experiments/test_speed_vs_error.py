@@ -16,9 +16,9 @@ from dolens.plotting import Point, pareto_front
 
 SMALL = [
     "experiment=speed_vs_error",
-    "pixels=48",
+    "pixels=32",
     "pupil_samples=[1,4,7]",
-    "fields=[1,2]",
+    "fields=[1]",
     "tolerances=[4.0]",
     "reference_samples=12",
     "rays=400",

@@ -11,7 +11,7 @@ import torch
 from dolens import InputError, Rays, load_lens
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Kind
-from dolens.optics.surfaces import EvenAsphere, XYPolynomial
+from dolens.optics.surfaces import EvenAsphere, XYPolynomial, ZernikeStandard
 from tests.kernels.own_surface.paraboloid import Paraboloid
 
 pytest.importorskip("triton")
@@ -102,6 +102,7 @@ LENSES = {
     "aspheres": (SPHERES, (EvenAsphere,)),
     "posed plates": (SPHERES | 1 << Kind.CHANGE_AXES | 1 << Kind.LENS_AXES, (XYPolynomial,)),
     "a surface of a user's own": (SPHERES, (Paraboloid,)),
+    "polynomials by recurrence": (SPHERES, (ZernikeStandard,)),
 }
 
 
@@ -114,6 +115,7 @@ LENSES = {
         ("posed plates", torch.float32),
         ("aspheres", torch.float64),
         ("a surface of a user's own", torch.float32),
+        ("polynomials by recurrence", torch.float64),
     ],
 )
 def test_the_kernels_compile_and_keep_their_precision(name, real):

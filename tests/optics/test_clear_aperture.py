@@ -54,7 +54,12 @@ def test_apertures_survive_writing_and_reading():
     "aperture, message",
     [
         ({}, "surface 1: 'semi_diameter' is missing"),
-        ({"semi_diameter": 1.0, "aperture": {"half_width_x": 1}}, "not both"),
+        ({"semi_diameter": 1.0, "aperture": {"half_width_x": 1}}, "'half_width_y' is missing"),
+        ({"semi_diameter": 1.0, "clips": 0}, "'clips' must be true or false, not 0"),
+        ({"semi_diameter": "auto", "clips": True}, "an automatic semi-diameter clips nothing"),
+        ({"clips": False, "aperture": {"semi_diameter": 1}}, "'aperture' clips"),
+        ({"aperture": {"semi_diameter": 1, "semi_axis_x": 1}}, "give one of semi_diameter, half"),
+        ({"aperture": {"semi_axis_x": 1.0}}, "'semi_axis_y' is missing"),
         ({"aperture": {"half_width_x": 1.0}}, "'half_width_y' is missing"),
         (
             {"aperture": {"half_width_x": 1.0, "half_width_y": -1.0}},

@@ -38,9 +38,12 @@ def built(name):
     in a tenth of the time."""
     prescription = load_prescription(name)
     rows = {str(n): dict(row) for n, row in prescription["surfaces"].items()}
+    # A length of the size of the lens, which sets the scale of tolerances.
+    gaps = [abs(row.get("thickness", 0.0)) for row in rows.values()]
+    size = 0.05 * (sum(gaps) + abs(prescription["sensor"]["distance"]))
     for n, row in rows.items():
         if row.get("semi_diameter") == "auto" and n != str(prescription["stop"]):
-            row |= {"semi_diameter": 1.0, "clips": False}
+            row |= {"semi_diameter": size, "clips": False}
     return lens_from_prescription(prescription | {"surfaces": rows}, where=name)
 
 

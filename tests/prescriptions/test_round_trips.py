@@ -148,6 +148,8 @@ relaxed = settings(
 @relaxed
 @given(prescriptions([*ROTATIONAL, "aperture", "xy_polynomial"], ["dfc", "do", "paper"]))
 def test_any_lens_through_the_source_s_format(data):
+    for row in data["surfaces"].values():
+        row.pop("a2", None)  # which this format does not have
     require_equal(
         lens_from_prescription(FORMATS[".txt"](data)), lens_from_prescription(copy.deepcopy(data))
     )
@@ -227,8 +229,8 @@ CANNOT = {
                         "surface 1: a .txt file cannot hold material 'N-BK7'"),
     "unknown glass": ((".txt",), with_row(material="SCHOTT:X"),
                       "surface 1: a .txt file cannot hold material 'SCHOTT:X'"),
-    "glass in two words": ((".zmx",), with_row(material="BK 7"),
-                           "surface 1: a .zmx file cannot hold material 'BK 7'"),
+    "glass in two words": ((".zmx",), with_row(material="flint glass"),
+                           "surface 1: a .zmx file cannot hold material 'flint glass'"),
     "index model": ((".zmx",), {**SINGLET, "index_model": "do"},
                     "a .zmx file cannot hold index_model 'do' (allowed: dfc"),
     "high power": ((".zmx",), with_row(a18=1e-20),

@@ -102,7 +102,7 @@ BAD = {
     ),
     "both fields": (
         {"fields": {"angles": [[0, 0]], "heights": [[0, 0]]}},
-        "fields: give 'angles' (degrees) or 'heights' (mm)",
+        "fields: give one of 'angles', 'pupil_angles' (degrees), 'heights'",
     ),
     "fields as a list": ({"fields": [0, 10]}, "fields: expected a mapping"),
     "a field of one number": (

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dolens import Rays, Status, load_lens
+from dolens.optics.fields import Fields
 from dolens.prescriptions.zemax_reader import prescription_from_zemax, read_zemax
 from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet, surface, triplet
 
@@ -42,7 +43,7 @@ def test_the_triplet_traces_as_the_reference(tmp_path, reference):
     assert lens.stop == 4
     assert lens.wavelengths == (486.1327, 587.5618, 656.2725)
     assert lens.reference_wavelength == 587.5618
-    assert lens.fields == ("angles", ((0.0, 0.0), (0.0, 14.0), (0.0, 20.0)))
+    assert lens.fields == Fields("angles", ((0.0, 0.0), (0.0, 14.0), (0.0, 20.0)))
     assert lens.sensor_diameter == 36.346
     rays = reference("rays/rays_triplet__dfc.json")["rays"]
     hit = lens.trace(
@@ -156,9 +157,10 @@ def test_a_plane_before_the_image_that_clips_or_refracts_is_a_surface(line):
         ("GLAS AIR", "air"),
         ("GLAS N-BK7 0 0 1.5168 64.17 0 0 0 0 0 0", "SCHOTT:N-BK7"),
         ("GLAS S-BSL7 0 0 1.5 40 0 0 0 0 0 0", "OHARA:S-BSL7"),
-        ("GLAS ___BLANK 1 0 1.51680 64.170 0 0 0 0 0 0", "1.51680/64.170"),
-        ("GLAS ___BLANK 1 0 1.5168E+000 6.417E+1 0 0 0 0 0 0", "1.5168/64.17"),
-        ("GLAS RESIN 1 0 1.53 56 0 0 0 0 0 0", "1.53/56"),
+        ("GLAS ___BLANK 1 0 1.51680 64.170 0 0 0 0 0 0", "1.51680/64.170/0"),
+        ("GLAS ___BLANK 1 0 1.51680 64.170 0.005098803673", "1.51680/64.170"),
+        ("GLAS ___BLANK 1 0 1.5168E+000 6.417E+1 0 0 0 0 0 0", "1.5168/64.17/0"),
+        ("GLAS RESIN 1 0 1.53 56 0 0 0 0 0 0", "1.53/56/0"),
         ("GLAS ___BLANK 1 0 1.5 0 0 0 0 0 0 0", "1.5"),
     ],
 )

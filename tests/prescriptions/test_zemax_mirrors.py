@@ -116,9 +116,9 @@ def test_behind_a_mirror_is_the_medium_in_front_of_it():
         + image(6)
     )  # fmt: skip
     lens = lens_of(text)
-    assert [m.name for m in lens.materials] == ["air", "1.5168/64.17", "mirror", "air", "mirror"]
+    assert [m.name for m in lens.materials] == ["air", "1.5168/64.17/0", "mirror", "air", "mirror"]
     assert [m.name for m in lens.system().materials] == [
-        "air", "1.5168/64.17", "1.5168/64.17", "air", "air",
+        "air", "1.5168/64.17/0", "1.5168/64.17/0", "air", "air",
     ]  # fmt: skip
     assert float(lens.sensor_distance.detach()) == 30.0
 

@@ -18,8 +18,6 @@ from dolens.kernels.cpu.layout import (
     OF_BEHIND,
     OF_FRONT,
     OF_RECORD,
-    OF_SECOND,
-    OF_SHAPE,
     OF_SHIFT,
     PATH,
     RATIO,
@@ -35,7 +33,7 @@ from dolens.kernels.cpu.layout import (
     Y,
     Z,
 )
-from dolens.kernels.cpu.records import CODE_ROW, NUMBERS, SENSE, SHORT_RECORD
+from dolens.kernels.cpu.records import CODE_ROW, NUMBERS, SENSE, SHAPE, SHORT_RECORD
 
 
 def ideal_lens_forward(real: types.Type) -> Callable[..., None]:
@@ -137,7 +135,10 @@ def ideal_lens_adjoint(real: types.Type) -> Callable[..., None]:
             cot[N + i] = -of_q * q * q * sense
             cot[OF_FRONT + i], cot[OF_BEHIND + i] = of_front, of_behind
             cot[OF_SHIFT + i] = zero
-            cot[OF_SHAPE + i], cot[OF_SECOND + i] = zero, zero
+        for j in range(SHAPE, q_[NUMBERS]):
+            of_shape = carray(shifted(cotangents, OF_RECORD + BLOCK * j), BLOCK)
+            for i in range(BLOCK):
+                of_shape[i] = zero
 
     return kernel
 

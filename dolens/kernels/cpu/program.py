@@ -125,7 +125,7 @@ def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
     law: LawFunctions = law_kernels_of(int(row[Code.LAW]), "cpu")
     base = functions_of(int(row[Code.BASE]))
     if base.sag is None:
-        # Planes, spheres and conics are aspheres without coefficients: their two numbers are c, k.
+        # Planes, spheres and conics are aspheres without coefficients: c, k and a2 = 0.
         base = even_asphere.KERNELS
     always = [(FORWARD, law.forward), (PHASE_AND_SLOPES, law.phase)]
     for_adjoint = [

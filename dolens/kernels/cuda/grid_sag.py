@@ -23,7 +23,9 @@ NODES = tl.constexpr(4)
 @triton.jit
 def _place(u, spacing, count):
     """Return the lower node of each point's cell, and the place within the cell, in cells."""
-    place = divide(u, spacing + tl.zeros_like(u)) + 0.5 * (count - 1)
+    # An integer times a literal would be in single precision.
+    middle = 0.5 * ((count - 1) + tl.zeros_like(u))
+    place = divide(u, spacing + tl.zeros_like(u)) + middle
     place = tl.where(tl.abs(place) < 1e9, place, 0.0)
     first = tl.floor(place).to(tl.int32)
     first = tl.where(first < 0, 0, first)
@@ -69,7 +71,7 @@ def _grid(record, codes, x, y):
     u, v = x - tl.load(own + 2), y - tl.load(own + 3)
     column, across = _place(u, width, columns)
     row, along = _place(v, height, rows)
-    edge_x, edge_y = 0.5 * (columns - 1) * width, 0.5 * (rows - 1) * height
+    edge_x, edge_y = width * (columns - 1) * 0.5, height * (rows - 1) * 0.5
     edge = tl.minimum(edge_x - tl.abs(u), edge_y - tl.abs(v))
     node = own + NODES + 4 * (row * columns + column)
     return node, 4 * columns, across, along, width, height, edge

@@ -88,7 +88,7 @@ def odd_asphere_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, al
     lower = r
     for i in range(tl.load(codes + COLUMNS)):
         upper = lower * q
-        add_sum(own + 1 + i, of_sag * upper + (2.0 * i + 3.0) * of_slope * r * lower, alive)
+        add_sum(own + 1 + i, of_sag * upper + (2 * i + 3.0) * of_slope * r * lower, alive)
         lower = upper
 
 

@@ -10,7 +10,7 @@ from decimal import Decimal
 from itertools import combinations, pairwise
 
 from dolens.errors import InputError
-from dolens.optics.glass_catalog import find_glass, makers_of
+from dolens.optics.glass_catalog import find_glass, likely_makers, makers_of
 from dolens.optics.materials import abbe_number, index_model, parse_material
 from dolens.prescriptions.codev.file import CodeVFile
 from dolens.prescriptions.codev.text import unquoted
@@ -84,7 +84,7 @@ def glass_word(material: str, place: str) -> str:
         return ""
     nd, slash, vd = name.partition("/")
     if "/" in vd:
-        raise InputError(f"{place}: a .seq file cannot hold material '{material}' (nd/Vd alone)")
+        raise InputError(f"{place}: a .seq file cannot hold ΔPgF of material '{material}'")
     if slash:
         return _code(nd.strip(), vd.strip(), f"{place}: material '{material}'")
     maker, _, word = name.rpartition(":")
@@ -142,7 +142,7 @@ def _named(name: str, place: str) -> str:
     spelt = word or name.upper()
     found: dict[str, None] = {}
     for candidate in _spellings(spelt):
-        for maker in makers_of(candidate):
+        for maker in likely_makers(candidate) if makers is None else makers_of(candidate):
             if makers is None or maker in makers:
                 found[find_glass(f"{maker}:{candidate}").name] = None
     if not found:

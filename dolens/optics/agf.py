@@ -1,0 +1,253 @@
+"""Glass catalogues in Zemax's text format (`.agf`) are read.
+
+A catalogue lists glasses one after another.  Each begins with the line NM and goes on with others,
+a keyword of two letters and its numbers:
+
+    NM  name, number of the dispersion formula, glass code, nd, Vd, exclusion, status, ...
+    GC  comment
+    ED  expansion from -30 to 70 °C and from 100 to 300 °C (1e-6/K), density, ΔPgF, ...
+    CD  coefficients of the dispersion formula (µm), some programs wrap them over several lines
+    TD  D0, D1, D2, E0, E1, λtk, reference temperature (°C): see `dolens.optics.thermal`
+    LD  the first and the last wavelength (µm) that the coefficients hold for
+    IT  wavelength (µm), internal transmittance, thickness (mm)
+
+A file is only data: nothing in it is run, and what is wrong in one glass refuses that glass alone.
+"""
+
+import codecs
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from dolens.errors import InputError
+from dolens.optics.agf_formulas import Dispersion, agf_dispersion
+from dolens.optics.thermal import ThermalCoefficients
+
+_LINE_END = re.compile(r"\r\n|\r|\n")
+_KEYWORD = re.compile(r"[A-Z]{2}")
+# Written where a catalogue has no value.
+_MISSING = ("-", "_", "--")
+_STATUS = {
+    0: "standard",
+    1: "preferred",
+    2: "obsolete",
+    3: "special",
+    4: "melt",
+    5: "inquiry",
+    6: "experimental",
+}
+
+
+@dataclass(frozen=True)
+class AgfGlass:
+    """A glass as a catalogue file gives it.
+
+    Attributes:
+        name: as written.
+        dispersion: formula and coefficients.
+        wavelengths: µm, the first and the last that the coefficients hold for.
+        nd: the index at the d line as the catalogue prints it; NaN where it prints none.
+        vd: its Abbe number likewise.
+        thermal: how the index depends on temperature; None where nothing is printed.
+        expansion: 1/K, linear, from -30 to 70 °C; None where nothing is printed.
+        transmittance: (wavelength in µm, internal transmittance, thickness in mm) in their order.
+        status: `standard`, `preferred`, `obsolete`, `special`, `melt`, `inquiry`, `experimental`,
+            or nothing.
+    """
+
+    name: str
+    dispersion: Dispersion
+    wavelengths: tuple[float, float]
+    nd: float
+    vd: float
+    thermal: ThermalCoefficients | None
+    expansion: float | None
+    transmittance: tuple[tuple[float, float, float], ...]
+    status: str
+
+
+@dataclass
+class AgfEntry:
+    """The lines of one glass, which `read_entry` reads when the glass is asked for.
+
+    Attributes:
+        name: as written.
+        place: name of the file and line in messages.
+        lines: keyword → the words of its lines.
+    """
+
+    name: str
+    place: str
+    lines: dict[str, list[list[str]]] = field(default_factory=dict)
+
+
+def decode_agf(data: bytes, where: str) -> str:
+    """Decode a catalogue: UTF-16 or UTF-8, with a byte order mark or without, or Latin-1.
+
+    Raises:
+        InputError: the file is no text.
+    """
+    encoding = "utf-8"
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    elif data.startswith(codecs.BOM_UTF8):
+        encoding = "utf-8-sig"
+    elif data[1:2] == b"\0":  # the first letter, in 16 bits
+        encoding = "utf-16-le"
+    elif data[:1] == b"\0":
+        encoding = "utf-16-be"
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError:
+        if encoding != "utf-8":
+            raise InputError(f"{where}: is not valid {encoding.upper()} text") from None
+        text = data.decode("latin-1")
+    if "\0" in text:
+        raise InputError(f"{where}: is no text (allowed: UTF-16, UTF-8 or Latin-1)")
+    return text
+
+
+def parse_agf(text: str, where: str) -> dict[str, AgfEntry]:
+    """Sort the lines of a catalogue by glass; of two glasses of one name the first is kept.
+
+    Args:
+        text: the file's content, decoded (see `decode_agf`).
+        where: name of the file in messages.
+
+    Returns:
+        Name in capitals without blanks → its entry.
+
+    Raises:
+        InputError: the file holds no glass.
+    """
+    entries: dict[str, AgfEntry] = {}
+    entry: AgfEntry | None = None
+    last = ""
+    for at, raw in enumerate(_LINE_END.split(text), 1):
+        words = raw.split()
+        if not words:
+            continue
+        keyword = words[0].upper()
+        if keyword == "NM" and len(words) > 1:
+            entry = AgfEntry(words[1], f"{where}: line {at}: glass '{words[1]}'")
+            entries.setdefault(words[1].upper(), entry)
+        if entry is None:
+            continue
+        if _KEYWORD.fullmatch(keyword):
+            entry.lines.setdefault(keyword, []).append(words[1:])
+            last = keyword
+        elif last == "CD":
+            entry.lines[last][-1].extend(words)
+    if not entries:
+        raise InputError(f"{where}: holds no glass (a catalogue lists them in lines NM)")
+    return entries
+
+
+def read_entry(entry: AgfEntry) -> AgfGlass:
+    """Read the numbers of one glass.
+
+    Raises:
+        InputError: its formula, coefficients or range of wavelengths are missing or no numbers;
+            the message is one line that names the file, the line and the glass.
+    """
+    place = entry.place
+    head = _numbers(entry, "NM", slice(1, None), optional=True)
+    number = head[0] if head else math.nan
+    if not number.is_integer():
+        raise InputError(f"{place}: line NM must give the number of its dispersion formula")
+    coefficients = _numbers(entry, "CD")
+    if not coefficients:
+        raise InputError(f"{place}: line CD with its coefficients is missing")
+    try:
+        dispersion = agf_dispersion(int(number), coefficients)
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+    limits = _numbers(entry, "LD")
+    if len(limits) < 2 or not 0.0 < limits[0] < limits[1]:
+        raise InputError(f"{place}: line LD must give the shortest and the longest wavelength, µm")
+    expansions = _numbers(entry, "ED", optional=True)
+    expansion = expansions[0] if expansions and math.isfinite(expansions[0]) else None
+    nd, vd = (head[at] if len(head) > at else math.nan for at in (2, 3))
+    status = head[5] if len(head) > 5 else math.nan
+    return AgfGlass(
+        entry.name,
+        dispersion,
+        (limits[0], limits[1]),
+        nd,
+        vd,
+        _thermal(entry),
+        None if expansion is None else 1e-6 * expansion,
+        _transmittance(entry),
+        _STATUS.get(int(status), "") if math.isfinite(status) else "",
+    )
+
+
+def internal_transmittance(glass: AgfGlass, wavelength: float, thickness: float) -> float:
+    """Return the share of light that a thickness of glass lets pass, without its surfaces' loss.
+
+    Beer's law gives τ = τ₀^(d/d₀) at the wavelengths of the catalogue; the exponent's rate is
+    interpolated linearly between them.
+
+    Args:
+        glass: an entry that gives transmittances.
+        wavelength: nm.
+        thickness: mm.
+
+    Raises:
+        InputError: the catalogue gives no transmittance at that wavelength.
+    """
+    micrometres = wavelength / 1000.0
+    rows = sorted(glass.transmittance)
+    if not rows or not rows[0][0] <= micrometres <= rows[-1][0]:
+        raise InputError(
+            f"glass '{glass.name}': its catalogue gives no transmittance at {wavelength:g} nm"
+        )
+    rates = [(at, -math.log(share) / path if share > 0.0 else math.inf) for at, share, path in rows]
+    if len(rates) == 1:
+        return math.exp(-rates[0][1] * thickness)
+    behind = next(n for n in range(1, len(rates)) if micrometres <= rates[n][0])
+    (first, low), (last, high) = rates[behind - 1 : behind + 1]
+    share = (micrometres - first) / (last - first) if last > first else 0.0
+    if share in (0.0, 1.0):
+        rate = high if share else low
+    else:
+        rate = low + share * (high - low) if math.isfinite(low + high) else math.inf
+    return math.exp(-rate * thickness)
+
+
+def _thermal(entry: AgfEntry) -> ThermalCoefficients | None:
+    values = _numbers(entry, "TD", optional=True)
+    if len(values) < 7 or not any(values[:5]) or not all(map(math.isfinite, values[:7])):
+        return None
+    return ThermalCoefficients(*values[:7])
+
+
+def _transmittance(entry: AgfEntry) -> tuple[tuple[float, float, float], ...]:
+    rows = []
+    for words in entry.lines.get("IT", []):
+        values = [_number(word, entry, "IT", True) for word in words[:3]]
+        complete = len(values) == 3 and all(map(math.isfinite, values))
+        if complete and values[0] > 0.0 and 0.0 <= values[1] <= 1.0 and values[2] > 0.0:
+            rows.append((values[0], values[1], values[2]))
+    return tuple(rows)
+
+
+def _numbers(
+    entry: AgfEntry, keyword: str, part: slice = slice(None), optional: bool = False
+) -> list[float]:
+    """Return the numbers of a line, NaN where an optional one has none."""
+    words: Sequence[str] = entry.lines.get(keyword, [[]])[-1]
+    return [_number(word, entry, keyword, optional) for word in words[part]]
+
+
+def _number(word: str, entry: AgfEntry, keyword: str, optional: bool) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if math.isfinite(value) and "_" not in word:
+        return value
+    if optional or word in _MISSING:
+        return math.nan if optional else 0.0
+    raise InputError(f"{entry.place}: line {keyword}: '{word}' must be a finite number")

@@ -1,0 +1,49 @@
+"""The media of a prescription: the materials of its rows, its surroundings, and what expands."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from dolens.errors import InputError
+from dolens.optics.materials import IndexModel, Medium, parse_material
+from dolens.optics.thermal import Environment
+from dolens.prescriptions.checks import as_number
+
+# 1e-6/K: of the mount of the air gap behind a surface, or of glass whose catalogue does not say.
+EXPANSION_KEY = "thermal_expansion"
+
+
+def environment_of(prescription: Mapping[str, Any], where: str) -> Environment | None:
+    """Return the temperature and pressure that a prescription gives; None where it gives neither.
+
+    Raises:
+        InputError: they are no numbers, or impossible.
+    """
+    given = {
+        key: as_number(prescription[key], f"{where}: '{key}'")
+        for key in ("temperature", "pressure")
+        if prescription.get(key) is not None
+    }
+    try:
+        return Environment(**given) if given else None
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def medium_of(value: object, model: IndexModel, place: str, air: Environment | None) -> Medium:
+    """Return the medium that a row names, at the prescription's temperature and pressure.
+
+    Raises:
+        InputError: there is none, or it is no medium.
+    """
+    if value is None:
+        raise InputError(f"{place}: 'material' is missing (the medium behind the surface)")
+    try:
+        return parse_material(str(value), model, air)
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+
+
+def expansion_of(row: Mapping[str, Any], place: str) -> float | None:
+    """Return the thermal expansion (1e-6/K) that a row gives, or None."""
+    rate = row.get(EXPANSION_KEY)
+    return None if rate is None else as_number(rate, f"{place}: '{EXPANSION_KEY}'")
