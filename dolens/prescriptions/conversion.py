@@ -189,7 +189,14 @@ def _effect(before: Lens, after: Lens) -> str:
 
 def _medium_name(material: str) -> str:
     """Return one name for a medium, however it is written."""
-    return "occluder" if material.strip().lower() == "occluder" else canonical(material)
+    if material.strip().lower() == "occluder":
+        return "occluder"
+    name = canonical(material)
+    parts = name.split("/")
+    try:
+        return "/".join(repr(float(part)) for part in parts) if len(parts) > 1 else name
+    except ValueError:
+        return name
 
 
 def _shown(value: Any) -> str:

@@ -247,7 +247,7 @@ def test_the_paraxial_image_solve(tmp_path):
         found = prescription(SINGLET[0], f"S -50 {written}\n CIR 5\n PIM", image="SI 0 -0.25")
         path = tmp_path / "lens.seq"
         path.write_text(system(SINGLET[0], f"S -50 {written}\n CIR 5\n PIM"))
-        lens = load_lens(path)
+        lens = load_lens(path).requires_grad_(False)
         focus = float(lens.first_order(587.6).bfd)
         assert float(lens.sensor_distance) == pytest.approx(focus, rel=1e-12)
         assert found["sensor"]["distance"] == pytest.approx(focus - 0.25, rel=1e-12)
@@ -353,3 +353,47 @@ def test_a_diffractive_lens(tmp_path):
     for wavelength in (486.1327, 587.5618, 656.2725):
         power = 2.0 * 0.001807322521767816 * wavelength / 587.5618
         assert float(lens.first_order(wavelength).efl) == pytest.approx(1.0 / power, rel=1e-12)
+
+
+# The double Gauss that comes with CODE V; sizes are ours.
+DOUBLE_GAUSS = """RDM N;LEN
+EPD   50.0
+WL    656.3 587.6 486.1
+REF   2
+YAN   0.0 10.0
+SO    0.0 993938392063.0
+S     0.01779284094091543 8.75 NSSK2_SCHOTT; CIR 30
+S     0.006566600536925569 0.5; CIR 30
+S     0.02653743294670983 12.5 NSK2_SCHOTT; CIR 27
+S     0.0 3.8 F5_SCHOTT; CIR 27
+S     0.04126892878570084 16.36944492653564; CIR 20
+S     0.0 13.74795696388906; STO
+S     -0.03523942654429074 3.8 F5_SCHOTT; CIR 20
+S     0.0 11.0 NSK16_SCHOTT; CIR 20
+S     -0.02636750828657709 0.5; CIR 25
+S     0.005636604951748545 7.0 NSK16_SCHOTT; CIR 25
+S     -0.0125926458590576 61.4875364179821; CIR 25; PIM
+SI    0.0 -0.4002686453541377
+GO
+"""
+
+
+def test_the_listing_of_code_v_itself(tmp_path):
+    """CODE V prints EFL 100.0038, BFL 61.4875 and IMG DIS 61.0873, and a ray of height 25 mm that
+    ends 0.014138 mm from the axis.
+    """
+    path = tmp_path / "lens.seq"
+    path.write_text(DOUBLE_GAUSS)
+    lens = load_lens(path).requires_grad_(False)
+    first = lens.first_order(587.6)
+    assert float(first.efl) == pytest.approx(100.0038, abs=6e-5)
+    assert float(first.bfd) == pytest.approx(61.4875, abs=6e-5)
+    assert float(lens.sensor_distance) == pytest.approx(61.0873, abs=6e-5)
+    assert float(first.entrance_pupil.z) == pytest.approx(57.9120, abs=6e-5)
+    rays = Rays(torch.tensor([25.0 - 1e-9, 0.0, -1.0]), torch.tensor([0.0, 0.0, 1.0]), 587.6)
+    assert float(lens.trace(rays).position[0]) == pytest.approx(0.014138, abs=2e-5)
+
+
+def test_opening_remarks_are_the_source():
+    found = prescription(*SINGLET, head="! US 1,987,878\n! example 2\nRDM\nEPD 8 ! not this\n")
+    assert found["source"] == "US 1,987,878\nexample 2"

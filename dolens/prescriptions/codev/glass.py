@@ -106,9 +106,8 @@ def canonical(material: str) -> str:
         name = parse_material(material, index_model("dfc")).name
     except InputError:
         return material
-    nd, slash, vd = name.partition("/")
-    if slash and "/" not in vd:
-        return f"{float(nd)!r}/{float(vd)!r}"
+    if "/" in name:
+        return "/".join(repr(float(part)) for part in name.split("/"))
     return "air" if name == "occluder" else name
 
 

@@ -6,6 +6,7 @@ bends rays is an error that names it.
 
 Surfaces without an aperture of their own are as large as the fields need, and do not clip.
 A plane in one medium that is there for its decenter or tilt becomes a coordinate break.
+Remarks in front of the first command are where the lens comes from.
 A file that does not say `RDM` gives curvatures, as CODE V then takes them.
 `PIM`, the paraxial image solve, sets the last gap: where the file has no value for it, or one that
 another last surface had, it is computed.
@@ -30,6 +31,7 @@ from dolens.prescriptions.codev.surface import (
     shape_is_given,
 )
 from dolens.prescriptions.codev.system import factor_to_mm, read_system
+from dolens.prescriptions.codev.text import opening_remarks
 from dolens.prescriptions.decimals import exact, nearest, number_in_text
 from dolens.prescriptions.paraxial_image import paraxial_image
 from dolens.prescriptions.read_file import ReadPrescription
@@ -68,6 +70,8 @@ def read_codev(text: str, where: str = "lens") -> ReadPrescription:
     _require_curvatures(blocks, factor, where)
     distance = _object_distance(target, factor, where)
     found = read_system(file, factor, distance is not None, where)
+    remarks = opening_remarks(text)
+    found |= {"source": remarks} if remarks else {}
     waves = found.get("wavelengths", [_D_LINE])
     used = (min(waves), max(waves))
     word = target.words[2] if len(target.words) > 2 else ""

@@ -56,6 +56,16 @@ def commands_of(text: str, where: str) -> list[Command]:
     return found + _commands(held, begins)
 
 
+def opening_remarks(text: str) -> str:
+    """Return the remarks in front of the first command, a line each."""
+    found = []
+    for line in _LINE_END.split(text):
+        if line.strip() and not line.startswith("!"):
+            break
+        found.append(line[1:].strip())
+    return "\n".join(found).strip()
+
+
 def unquoted(word: str) -> str:
     """Return a word without the quotes around it."""
     if word[:1] in ("'", '"'):

@@ -60,7 +60,8 @@ def codev_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
                 f"{where}: surface {n}: a .seq file cannot hold type '{row.get('type')}' "
                 f"(allowed: {', '.join(_TYPES)})"
             )
-    lines = ["RDM;LEN", *_system(prescription, where), *_private(prescription, surfaces)]
+    remarks = [f"! {line}" for line in str(prescription.get("source") or "").splitlines()]
+    lines = [*remarks, "RDM;LEN", *_system(prescription, where), *_private(prescription, surfaces)]
     distance = prescription.get("object_distance")
     far = _INFINITY if distance is None else _text(distance, where)
     medium = prescription.get("object_material", "air")
@@ -121,7 +122,7 @@ def _entrance_pupil(prescription: Mapping[str, Any], where: str) -> str:
     """Return the diameter of the entrance pupil, mm: the stop's own, or the next above it that has
     a short text, so that the stop's size is what clips.
     """
-    lens = lens_from_prescription(prescription, where=where)
+    lens = lens_from_prescription(prescription, where=where).requires_grad_(False)
     diameter = float(lens.first_order(lens.primary_wavelength).entrance_pupil.diameter)
     if not math.isfinite(diameter) or diameter <= 0.0:
         raise InputError(
