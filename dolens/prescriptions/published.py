@@ -1,4 +1,4 @@
-"""What a source publishes about a lens is read from a prescription and written to it.
+"""The numbers that a source publishes about a lens are read from a prescription and written to it.
 
 Every key is optional; lengths are in mm, angles in degrees::
 

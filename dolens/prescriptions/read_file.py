@@ -1,4 +1,4 @@
-"""What a reader of a lens format returns: a prescription, and what the file says besides."""
+"""A reader of a lens format returns a prescription, and what the file says besides."""
 
 from typing import Any, NamedTuple
 

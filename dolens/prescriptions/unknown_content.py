@@ -1,4 +1,4 @@
-"""What is no lens file that can be read is named in one line, by its first bytes."""
+"""A file that is no lens file is named for what it is in one line, by its first bytes."""
 
 from dolens.errors import InputError
 

@@ -1,4 +1,4 @@
-"""What a Zemax `.zmx` file says and no lens needs is listed in words."""
+"""Operands of a Zemax `.zmx` file that no lens needs are listed in words."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""What a CODE V `.seq` file says that bends no ray is listed; zoom positions are compared."""
+"""Words of a CODE V `.seq` file that bend no ray are listed; zoom positions are compared."""
 
 from dolens.errors import InputError
 from dolens.prescriptions.codev.file import CodeVFile
