@@ -84,8 +84,6 @@ _SURFACE_KEYS = (
     *("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", EXPANSION_KEY, "note"),
 )
 _SENSOR_KEYS = ("distance", "diameter")
-# A prescription may give the radius of the same name instead: `radius_x` for `curvature_x`.
-CURVATURES = ("curvature", "curvature_x", "curvature_y")
 
 
 def lens_from_prescription(
@@ -186,7 +184,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
             if key == "power" and surface.law is not None:
                 row |= power_row(number_value)
                 continue
-            if key in CURVATURES:
+            if key in surface.curvatures:
                 radius = _radius_key(key)
                 row[radius] = _radius(number_value)
                 if 1.0 / row[radius] != number_value:
@@ -239,14 +237,14 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
         if is_paraxial_lens(row):
             row = with_power(row)
         names = shape.parameter_names(row)
-        radii = [_radius_key(name) for name in names if name in CURVATURES]
+        radii = [_radius_key(name) for name in names if name in shape.curvatures]
         check_keys(row, (*_SURFACE_KEYS, *names, *radii), place)
         values = {
             key: (as_numbers if key in shape.arrays else as_number)(row.get(key, 0.0), f"'{key}'")
             for key in names
             if key in row or key not in shape.optional
         }
-        values |= {name: _curvature(row, name) for name in names if name in CURVATURES}
+        values |= {name: _curvature(row, name) for name in names if name in shape.curvatures}
         if "curvature" not in names and not math.isinf(
             as_number(row.get("radius", math.inf), "'radius'")
         ):

@@ -84,6 +84,8 @@ class Surface(nn.Module):
         constants: names among the parameters that no optimizer varies (knots); they are buffers.
         arrays: names that a prescription gives as lists; every other is one number.
         optional: names that a prescription may leave out; every other is then zero.
+        curvatures: names of which a prescription may give the radius instead: `radius` for
+            `curvature`, `radius_x` for `curvature_x`.
         kernel: where its fast kernels are; None: it has none, and the reference traces.
         rotational: whether the sag looks the same from every azimuth, whatever the parameters.
         closed_form: whether `intersect` needs no iteration, and no number that follows overflows.
@@ -99,6 +101,7 @@ class Surface(nn.Module):
     constants: ClassVar[tuple[str, ...]] = ()
     arrays: ClassVar[tuple[str, ...]] = ()
     optional: ClassVar[tuple[str, ...]] = ()
+    curvatures: ClassVar[tuple[str, ...]] = ("curvature",)
     rotational: ClassVar[bool] = False
     closed_form: ClassVar[bool] = False
     changes_axes: ClassVar[bool] = False

@@ -24,6 +24,7 @@ class Biconic(Surface):
 
     kind = "biconic"
     kernel = SurfaceKernel("dolens.kernels.cpu.biconic", "dolens.kernels.cuda.biconic")
+    curvatures = ("curvature_x", "curvature_y")
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:

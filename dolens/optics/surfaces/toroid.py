@@ -25,6 +25,7 @@ class Toroid(Surface):
 
     kind = "toroid"
     kernel = SurfaceKernel("dolens.kernels.cpu.toroid", "dolens.kernels.cuda.toroid")
+    curvatures = ("curvature_x", "curvature_y")
 
     @classmethod
     def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
