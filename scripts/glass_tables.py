@@ -20,7 +20,8 @@ from typing import Any
 import yaml
 
 from dolens.errors import InputError
-from dolens.optics.agf import decode_agf, parse_agf, read_entry
+from dolens.file_text import decode_text
+from dolens.optics.agf import parse_agf, read_entry
 from dolens.optics.dispersion import Formula, cauchy, polynomial, sellmeier, sellmeier_squared
 
 TABLES = Path(__file__).parents[1] / "dolens" / "optics" / "glass_data"
@@ -158,7 +159,7 @@ def row_of_page(path: Path, name: str, source: str) -> Row | None:
 def rows_of_catalogue(path: Path, source: str) -> dict[str, Row]:
     """Return the glasses of an `.agf` file by name in capitals."""
     rows = {}
-    for key, entry in parse_agf(decode_agf(path.read_bytes(), path.name), path.name).items():
+    for key, entry in parse_agf(decode_text(path.read_bytes(), path.name), path.name).items():
         try:
             glass = read_entry(entry)
         except InputError as error:

@@ -14,7 +14,6 @@ a keyword of two letters and its numbers:
 A file is only data: nothing in it is run, and what is wrong in one glass refuses that glass alone.
 """
 
-import codecs
 import math
 import re
 from collections.abc import Sequence
@@ -82,37 +81,11 @@ class AgfEntry:
     lines: dict[str, list[list[str]]] = field(default_factory=dict)
 
 
-def decode_agf(data: bytes, where: str) -> str:
-    """Decode a catalogue: UTF-16 or UTF-8, with a byte order mark or without, or Latin-1.
-
-    Raises:
-        InputError: the file is no text.
-    """
-    encoding = "utf-8"
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
-    elif data.startswith(codecs.BOM_UTF8):
-        encoding = "utf-8-sig"
-    elif data[1:2] == b"\0":  # the first letter, in 16 bits
-        encoding = "utf-16-le"
-    elif data[:1] == b"\0":
-        encoding = "utf-16-be"
-    try:
-        text = data.decode(encoding)
-    except UnicodeDecodeError:
-        if encoding != "utf-8":
-            raise InputError(f"{where}: is not valid {encoding.upper()} text") from None
-        text = data.decode("latin-1")
-    if "\0" in text:
-        raise InputError(f"{where}: is no text (allowed: UTF-16, UTF-8 or Latin-1)")
-    return text
-
-
 def parse_agf(text: str, where: str) -> dict[str, AgfEntry]:
     """Sort the lines of a catalogue by glass; of two glasses of one name the first is kept.
 
     Args:
-        text: the file's content, decoded (see `decode_agf`).
+        text: the file's content, decoded (see `dolens.file_text`).
         where: name of the file in messages.
 
     Returns:

@@ -14,7 +14,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from dolens.errors import InputError
-from dolens.optics.agf import AgfEntry, decode_agf, parse_agf, read_entry
+from dolens.file_text import decode_text
+from dolens.optics.agf import AgfEntry, parse_agf, read_entry
 from dolens.optics.glass import Glass
 
 VARIABLE = "DOLENS_GLASS"
@@ -103,4 +104,4 @@ def _entries(file: Path, changed: int, size: int) -> dict[str, AgfEntry]:
         data = file.read_bytes()
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror})") from None
-    return parse_agf(decode_agf(data, str(file)), str(file))
+    return parse_agf(decode_text(data, str(file)), str(file))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.file_text import decode_text
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
@@ -15,7 +16,7 @@ from dolens.prescriptions.oslo.reader import read_oslo
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.unknown_content import require_text
 from dolens.prescriptions.yaml_text import read_yaml, yaml_of
-from dolens.prescriptions.zemax import decode_zemax, encode_zemax
+from dolens.prescriptions.zemax import encode_zemax
 from dolens.prescriptions.zemax_reader import read_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
 
@@ -110,7 +111,7 @@ def read_lens(data: bytes, path: str | Path) -> ReadPrescription:
     if named is not None and named.name == "dolens YAML":
         # Anything may stand in YAML's texts, and its loader says best what is wrong with it.
         return named.read(_utf_8(data, where, "YAML"), where)
-    text = decode_zemax(data, where).removeprefix("\ufeff")
+    text = decode_text(data, where).removeprefix("\ufeff")
     begin = text[:_LOOKED_AT]
     by_content = next((each for each in FORMATS if each.signs and each.signs.search(begin)), None)
     chosen = by_content or named

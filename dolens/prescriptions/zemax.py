@@ -1,4 +1,4 @@
-"""Zemax `.zmx` files are decoded, and their operands sorted line by line.
+"""Operands of Zemax `.zmx` files are sorted line by line.
 
 A file is a list of lines, each an operand of capital letters and its arguments.  The first ones
 describe the system; from `SURF n` on they describe surface n, usually indented.  Surface 0 is the
@@ -71,32 +71,6 @@ class ZemaxFile:
     tail: list[Line] = field(default_factory=list)
     passed_over: dict[str, list[Line]] = field(default_factory=dict)
     skipped: list[int] = field(default_factory=list)
-
-
-def decode_zemax(data: bytes, where: str = "lens") -> str:
-    """Decode a `.zmx` file: UTF-16 or UTF-8, with a byte order mark or without, or Latin-1.
-
-    Raises:
-        InputError: the file is no text.
-    """
-    encoding = "utf-8"
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
-    elif data.startswith(codecs.BOM_UTF8):
-        encoding = "utf-8-sig"
-    elif data[1:2] == b"\0":  # the first letter, in 16 bits
-        encoding = "utf-16-le"
-    elif data[:1] == b"\0":
-        encoding = "utf-16-be"
-    try:
-        text = data.decode(encoding)
-    except UnicodeDecodeError:
-        if encoding != "utf-8":
-            raise InputError(f"{where}: is not valid {encoding.upper()} text") from None
-        text = data.decode("latin-1")
-    if "\0" in text:
-        raise InputError(f"{where}: is no text (allowed: UTF-16, UTF-8 or Latin-1)")
-    return text
 
 
 def encode_zemax(text: str) -> bytes:

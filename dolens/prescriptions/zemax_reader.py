@@ -55,7 +55,7 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     """Read a lens from the text of a `.zmx` file, and list what is passed over.
 
     Args:
-        text: the file's content, decoded (see `decode_zemax`).
+        text: the file's content, decoded (see `dolens.file_text`).
         where: name in messages, usually its path.
 
     Returns:

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from dolens import InputError
-from dolens.optics.agf import decode_agf, internal_transmittance, parse_agf, read_entry
+from dolens.file_text import decode_text
+from dolens.optics.agf import internal_transmittance, parse_agf, read_entry
 
 # Name, formula, nd as printed, coefficients, range: one glass of each formula that catalogues use.
 CATALOGUE = """CC a catalogue of many makers
@@ -149,7 +150,7 @@ def test_transmittance_by_beer_s_law():
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
 def test_encodings(encoding):
     data = CATALOGUE.replace("\n", "\r\n").encode(encoding)
-    assert catalogue(decode_agf(data, "glasses.agf")).keys() == catalogue().keys()
+    assert catalogue(decode_text(data, "glasses.agf")).keys() == catalogue().keys()
 
 
 NUMBERS = "CD 2.2 0 0 0 0 0\nLD 0.4 0.7\n"
@@ -188,5 +189,5 @@ def test_what_is_wrong_in_one_glass_refuses_that_glass(case):
 )
 def test_a_file_that_is_no_catalogue(data, said):
     with pytest.raises(InputError, match=said) as error:
-        parse_agf(decode_agf(data, "glasses.agf"), "glasses.agf")
+        parse_agf(decode_text(data, "glasses.agf"), "glasses.agf")
     assert str(error.value).startswith("glasses.agf: ")

@@ -11,12 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dolens import InputError, load_lens, save_lens
+from dolens.file_text import decode_text
 from dolens.prescriptions import lens_from_prescription, prescription_of
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.writer import codev_of
 from dolens.prescriptions.diffoptics_text import diffoptics_text_of, prescription_from_diffoptics
 from dolens.prescriptions.json_lenses import json_of, read_json
-from dolens.prescriptions.zemax import decode_zemax, encode_zemax
+from dolens.prescriptions.zemax import encode_zemax
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_writer import zemax_of
 from tests.prescriptions.samples import SINGLET
@@ -30,7 +31,7 @@ REFUSED = {
 }
 FORMATS = {
     ".txt": lambda data: prescription_from_diffoptics(diffoptics_text_of(data)),
-    ".zmx": lambda data: prescription_from_zemax(decode_zemax(encode_zemax(zemax_of(data)))),
+    ".zmx": lambda data: prescription_from_zemax(decode_text(encode_zemax(zemax_of(data)), "lens")),
     ".seq": lambda data: read_codev(codev_of(data), "lens").prescription,
     ".json": lambda data: read_json(json_of(data, "lens").decode(), "lens").prescription,
     ".yaml": lambda data: yaml.safe_load(yaml.safe_dump(data)),

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from dolens import InputError
-from dolens.prescriptions.zemax import decode_zemax
+from dolens.file_text import decode_text
 from tests.prescriptions.samples import require_refused
 from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet
 
@@ -111,4 +111,4 @@ def test_the_good_file_is_good(tmp_path):
 @pytest.mark.parametrize("data", [b"\xff\xfe\x00", b"\xef\xbb\xbf\xff", b"SURF 0\0\0\0"])
 def test_files_that_are_no_text(data):
     with pytest.raises(InputError, match=r"^x\.zmx: is no"):
-        decode_zemax(data, "x.zmx")
+        decode_text(data, "x.zmx")
