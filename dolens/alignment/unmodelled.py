@@ -11,10 +11,7 @@ from torch import Tensor
 
 from dolens.errors import InputError, call_with_settings
 from dolens.optics.lens import Lens
-from dolens.optics.materials import Medium
-
-# Media that are no glass, and have no melt that could be off.
-_NO_GLASS = ("air", "occluder", "mirror")
+from dolens.optics.materials import Medium, is_glass
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,7 @@ class Unmodelled:
             generator: on the CPU.
         """
         found = copy.deepcopy(lens)
-        glasses = [m for m in dict.fromkeys(lens.materials) if m.name not in _NO_GLASS]
+        glasses = [m for m in dict.fromkeys(lens.materials) if is_glass(m)]
         count = len(found.surfaces) + len(glasses)
         shares = 2.0 * torch.rand(count, generator=generator, dtype=torch.float64) - 1.0
         own, melts = shares[: len(found.surfaces)], shares[len(found.surfaces) :]

@@ -69,16 +69,18 @@ def show(
     from dolens.lens_page.overview import lens_overview
     from dolens.lens_page.preparation import prepared_lens
     from dolens.optics.tables import printable
-    from dolens.prescriptions import load_lens
-    from dolens.prescriptions.files import read_lens_file
+    from dolens.prescriptions import lens_from_prescription
+    from dolens.prescriptions.files import find_lens, read_lens_file
 
     if tolerances is not None and html is None and figures is None:
         raise InputError("--tolerances needs --html or --figures, where its figure goes")
     if html is not None:
         _check_page(html, Path(lens), force)
     fields = None if not field else [_field(text) for text in field]
+    path = find_lens(lens)
+    prescription, passed_over = read_lens_file(path)
     shown = prepared_lens(
-        load_lens(lens, index_model=index_model),
+        lens_from_prescription(prescription, index_model=index_model, where=str(path)),
         fields,
         wavelength or None,
         f_number,
@@ -89,7 +91,6 @@ def show(
     console.print()
     console.print(printable(overview.name), style="bold", markup=False)
     console.print(overview.summary, style="dim", markup=False)
-    passed_over = read_lens_file(lens).passed_over
     if passed_over:
         console.print(f"passed over: {'; '.join(passed_over)}", style="dim", markup=False)
     for section in overview.sections:

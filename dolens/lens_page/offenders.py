@@ -31,6 +31,7 @@ from dolens.errors import InputError, check_keys
 from dolens.lens_page.tables import Table, number
 from dolens.optics.elements import Element
 from dolens.optics.lens import Lens
+from dolens.optics.materials import is_glass
 from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
 from dolens.prescriptions.checks import require_mapping
 from dolens.prescriptions.files import decode_yaml
@@ -171,7 +172,7 @@ def _all_around(fields: list[list[float]]) -> list[tuple[float, float]]:
 def _add_elements(lens: Lens) -> None:
     """Make an element of every group of cemented glass that belongs to none."""
     taken = {n for e in lens.elements.values() for n in range(e.first, e.last + 1)}
-    glass = [medium.name not in ("air", "occluder", "mirror") for medium in lens.materials]
+    glass = [is_glass(medium) for medium in lens.materials]
     first = None
     for n in range(1, len(lens.surfaces) + 1):
         if first is None and glass[n]:
@@ -198,7 +199,7 @@ def _usual(lens: Lens, notes: list[str]) -> dict[str, Any]:
         given["elements.*.decenter_[xy]"] = length
         given["elements.*.shift_z"] = length
     for n, medium in enumerate(lens.materials[1:-1], 1):
-        if medium.name not in ("air", "occluder", "mirror"):
+        if is_glass(medium):
             given[f"thicknesses.{n}"] = length
     for n, surface in lens.surfaces.items():
         curvature = getattr(surface, "curvature", None)

@@ -12,6 +12,7 @@ from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.lens import Lens
+from dolens.optics.materials import is_glass
 from dolens.optics.rays import Rays
 from dolens.optics.surfaces.clear_aperture import Ellipse, Outline
 from dolens.optics.system import OpticalSystem
@@ -74,7 +75,7 @@ def solid(lens: Lens, where: Conditions, lit: Sequence[bool] | None = None) -> S
     rays = _field_rays(lens, where, lit)
     meshes: list[Mesh] = []
     rims: list[np.ndarray] = []
-    glass = [_is_glass(system, number) for number in range(len(system.surfaces) + 1)]
+    glass = [is_glass(system.materials[number]) for number in range(len(system.surfaces) + 1)]
     following = dict(system.neighbours)
     for number in system.met:
         surface = system.surfaces[number - 1]
@@ -91,10 +92,6 @@ def solid(lens: Lens, where: Conditions, lit: Sequence[bool] | None = None) -> S
     meshes.append(_stop(system))
     meshes.append(_sensor(lens, rays))
     return Solid(meshes, rims, rays)
-
-
-def _is_glass(system: OpticalSystem, number: int) -> bool:
-    return system.materials[number].name not in ("air", "occluder")
 
 
 def _placed(system: OpticalSystem, number: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from dolens.analysis.spot_diagram import SpotDiagram
 from dolens.optics.elements import POSE, TILTS
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
+from dolens.optics.materials import NO_GLASS
 from dolens.optics.prescription_table import SurfaceRow, prescription_table
 from dolens.optics.surfaces import CoordinateBreak, TiltFirstBreak
 from dolens.optics.surfaces.base import Surface
@@ -262,4 +263,4 @@ def _outline(outline: Outline) -> str:
 
 
 def _is_glass(row: SurfaceRow) -> bool:
-    return row.material not in ("", "air", "occluder", "mirror")
+    return row.material not in ("", *NO_GLASS)

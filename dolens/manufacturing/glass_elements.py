@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
-from dolens.optics.materials import Medium
+from dolens.optics.materials import Medium, is_glass
 from dolens.optics.straight import require_refracting
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture, Rectangle
@@ -27,7 +27,6 @@ SAME_LENGTH = 1e-6
 # Radii and azimuths at which the glass between two surfaces is measured.
 _RADII = 401
 _AZIMUTHS = 48
-_NOT_GLASS = ("air", "occluder")
 
 
 @dataclass(frozen=True)
@@ -245,9 +244,7 @@ def glass_elements(lens: Lens) -> list[GlassElement]:
     groups = {(e.first, e.last): name for name, e in lens.elements.items()}
     faces = {number: face_of(system, number) for number in range(1, len(system.surfaces) + 1)}
     inside = [
-        number
-        for number in range(1, len(system.surfaces))
-        if system.materials[number].name not in _NOT_GLASS
+        number for number in range(1, len(system.surfaces)) if is_glass(system.materials[number])
     ]
     if not inside:
         raise InputError(f"lens '{lens.name}' has no glass between its surfaces")

@@ -10,7 +10,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dolens.optics.elements import TILTS, Axes, ElementState, carriers, rotation_matrix
+from dolens.optics.elements import (
+    DISPLACEMENTS,
+    TILTS,
+    Axes,
+    ElementState,
+    Motion,
+    carriers,
+    rotation_matrix,
+)
 from dolens.optics.surfaces.state import SurfaceState
 
 
@@ -60,9 +68,7 @@ def broken_axes(
         broken = number <= len(surfaces) and surfaces[number - 1].shape.changes_axes
         carried = () if number > len(surfaces) else carriers(spans, number)
         for e in carried:
-            turn, pivot, displacement = motions[e]
-            origin = pivot + turn @ (origin - pivot) + displacement
-            rotation = turn @ rotation
+            origin, rotation = motions[e].moved(origin), motions[e].turn @ rotation
         segment += broken
         z = vertices[number - 1]
         if segment == 0 and not carried:
@@ -87,11 +93,11 @@ def _designed(surfaces: Sequence[SurfaceState], gaps: Sequence[Tensor]) -> list[
     return [*places, _Place(origin, rotation)]
 
 
-def _motion(element: ElementState, first: _Place) -> tuple[Tensor, Tensor, Tensor]:
+def _motion(element: ElementState, first: _Place) -> Motion:
     """Return rotation, pivot and displacement of an element, in the lens's axes."""
     p = element.parameters
     own = rotation_matrix(*(p[name].double() for name in TILTS))
     turn = first.rotation @ own @ first.rotation.mT
     pivot = first.origin + first.rotation @ first.origin.new_tensor(element.pivot)
-    shift = torch.stack([p[name].double() for name in ("decenter_x", "decenter_y", "shift_z")])
-    return turn, pivot, first.rotation @ shift
+    shift = torch.stack([p[name].double() for name in DISPLACEMENTS])
+    return Motion(turn, pivot, first.rotation @ shift)

@@ -90,6 +90,24 @@ class Axes(NamedTuple):
         return self.elements == other.elements and self.segment == other.segment
 
 
+class Motion(NamedTuple):
+    """An element's pose moves a point p to pivot + turn·(p - pivot) + displacement.
+
+    Attributes:
+        turn: (3, 3).
+        pivot: (3,), mm.
+        displacement: (3,), mm.
+    """
+
+    turn: Tensor
+    pivot: Tensor
+    displacement: Tensor
+
+    def moved(self, point: Tensor) -> Tensor:
+        """Return where a point (3,), mm, goes."""
+        return self.pivot + self.turn @ (point - self.pivot) + self.displacement
+
+
 LENS_AXES = Axes((), 0.0)
 
 
@@ -156,9 +174,8 @@ def surface_axes(
         origin = torch.stack([zero, zero, z])
         rotation = None
         for e in carried:
-            turn, pivot, displacement = motions[e]
-            origin = pivot + turn @ (origin - pivot) + displacement
-            rotation = turn if rotation is None else turn @ rotation
+            origin = motions[e].moved(origin)
+            rotation = motions[e].turn if rotation is None else motions[e].turn @ rotation
         axes.append(Axes(carried, z, rotation, origin))
     return axes
 
@@ -231,7 +248,7 @@ def from_lens_axes(ray: Components, axes: Axes) -> Components:
     return Components(*_turn(turn, x - ox, y - oy, z - oz), *_turn(turn, l, m, n))
 
 
-def _motion(element: ElementState, vertices: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def _motion(element: ElementState, vertices: Sequence[Tensor]) -> Motion:
     """Rotation, pivot and displacement of one element."""
     p = element.parameters
     z = vertices[element.first - 1]
@@ -239,7 +256,7 @@ def _motion(element: ElementState, vertices: Sequence[Tensor]) -> tuple[Tensor, 
     # Added as a tensor: a Python number makes a scalar double under torch.func's forward mode.
     pivot = torch.stack([zero, zero, z]) + z.new_tensor(element.pivot)
     displacement = torch.stack([p[name] for name in DISPLACEMENTS])
-    return rotation_matrix(*(p[name] for name in TILTS)), pivot, displacement
+    return Motion(rotation_matrix(*(p[name] for name in TILTS)), pivot, displacement)
 
 
 def _origin(axes: Axes, like: Tensor) -> Tensor:

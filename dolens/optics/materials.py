@@ -77,6 +77,9 @@ class Material:
 # prescription reads back as the same.
 Medium = Material | ModelGlass | Glass | Mirror
 
+# Names of what stands for a medium and is none but air.
+NO_GLASS = ("air", "occluder", MIRROR.name)
+
 
 def index_model(name: str) -> IndexModel:
     """The index model of that name; raises `InputError` naming the allowed ones."""
@@ -125,6 +128,11 @@ def parse_material(text: str, model: IndexModel, environment: Environment | None
     line_c, line_d, line_f = model.lines
     b = (nd - 1.0) / vd / (1.0 / line_f**2 - 1.0 / line_c**2)
     return Material(name, nd - b / line_d**2, b)
+
+
+def is_glass(medium: Medium) -> bool:
+    """Return whether light is in a solid or liquid there: not in air, and not at a mirror."""
+    return medium.name not in NO_GLASS
 
 
 def index_d(medium: Medium) -> float:

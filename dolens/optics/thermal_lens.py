@@ -21,6 +21,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.glass import Glass
 from dolens.optics.materials import Medium
+from dolens.optics.mirrors import media_of
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
 from dolens.optics.thermal import STANDARD_PRESSURE, STANDARD_TEMPERATURE, Environment
@@ -29,7 +30,6 @@ logger = logging.getLogger(__name__)
 
 _PER_KELVIN = 1e-6
 _EMPTY = ("air", "occluder", "MISC:VACUUM")
-_MIRROR = "mirror"
 # The power of length that a parameter has, by its name; a diffractive phase stays the same at the
 # point of the surface that has moved.
 _POWERS = {
@@ -79,7 +79,7 @@ def lens_at(lens: Any, temperature: float, pressure: float | None = None) -> Any
     found = copy.deepcopy(lens)
     found.temperature, found.pressure = environment.temperature, environment.pressure
     found.materials = tuple(medium_at(medium, environment) for medium in lens.materials)
-    media = _media(lens.materials)
+    media = media_of(lens.materials).materials
     _log_unknown(lens, media)
     surfaces = list(found.surfaces.values())
     mounts = [0.0 if rate is None else rate * _PER_KELVIN for rate in lens.thermal_expansions]
@@ -98,14 +98,6 @@ def lens_at(lens: Any, temperature: float, pressure: float | None = None) -> Any
         elif change != 0.0:
             edge = (gap - sags[n] + sags[n + 1]) * (1.0 + mounts[n] * change)
             gap.copy_(edge + expanded[n] - expanded[n + 1])
-    return found
-
-
-def _media(materials: Sequence[Medium]) -> list[Medium]:
-    """Return the media that light travels in: behind a mirror, the one in front of it."""
-    found: list[Medium] = []
-    for medium in materials:
-        found.append(found[-1] if found and medium.name == _MIRROR else medium)
     return found
 
 

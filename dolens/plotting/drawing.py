@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.materials import is_glass
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.number_text import with_minus
 from dolens.plotting.section import (
@@ -172,7 +173,7 @@ def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) 
     """Fill and outline every element; surfaces that bound no glass (stops) have no curve."""
     bounding: set[int] = set()
     for number, other in system.neighbours:
-        if _is_glass(system, number):
+        if is_glass(system.materials[number]):
             bounding |= {number, other}
             faces = profiles[number - 1], profiles[other - 1]
             if not (len(faces[0][0]) and len(faces[1][0])):
@@ -190,10 +191,6 @@ def _draw_glass(axes: Axes, system: OpticalSystem, profiles: Sequence[Profile]) 
         if mirror or number in bounding or (refracts and number != system.stop):
             width = 2.2 if mirror else 1.0
             axes.plot(z, y, color=_EDGE, linewidth=width, gid=f"surface {number}", zorder=2)
-
-
-def _is_glass(system: OpticalSystem, number: int) -> bool:
-    return system.materials[number].name not in ("air", "occluder")
 
 
 def _draw_rays(axes: Axes, fans: Sequence[Fan], legend: bool) -> None:

@@ -21,6 +21,7 @@ from dolens.optics.materials import index_model as find_index_model
 from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.compare import Difference, differences
 from dolens.prescriptions.files import decode_prescription, encode_prescription
+from dolens.prescriptions.media import canonical_digits
 from dolens.prescriptions.simplifications import (
     COMPARED_WAVELENGTHS,
     SIMPLIFICATIONS,
@@ -28,7 +29,6 @@ from dolens.prescriptions.simplifications import (
     of_other_program,
     surfaces_text,
 )
-from dolens.prescriptions.zemax_glass import canonical
 
 
 @dataclass(frozen=True)
@@ -191,12 +191,7 @@ def _medium_name(material: str) -> str:
     """Return one name for a medium, however it is written."""
     if material.strip().lower() == "occluder":
         return "occluder"
-    name = canonical(material)
-    parts = name.split("/")
-    try:
-        return "/".join(repr(float(part)) for part in parts) if len(parts) > 1 else name
-    except ValueError:
-        return name
+    return canonical_digits(material)
 
 
 def _shown(value: Any) -> str:

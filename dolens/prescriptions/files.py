@@ -26,7 +26,6 @@ __all__ = [
     "lens_names",
     "load_lens",
     "load_prescription",
-    "read_lens_data",
     "read_lens_file",
     "save_lens",
 ]
@@ -117,25 +116,12 @@ def read_lens_file(path: str | Path) -> ReadPrescription:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return read_lens_data(data, path)
+    return read_lens(data, path)
 
 
 def decode_prescription(data: bytes, path: str | Path) -> Any:
     """Read the content of a lens file as plain data; see `read_lens_data`."""
-    return read_lens_data(data, path).prescription
-
-
-def read_lens_data(data: bytes, path: str | Path) -> ReadPrescription:
-    """Read the content of a lens file as plain data, and list what is passed over.
-
-    Args:
-        data: what the file holds.
-        path: its name; see `dolens.prescriptions.lens_formats.read_lens`.
-
-    Raises:
-        InputError: see `load_prescription`.
-    """
-    return read_lens(data, path)
+    return read_lens(data, path).prescription
 
 
 def decode_yaml(data: bytes, where: str | Path) -> Any:

@@ -78,7 +78,9 @@ FORMATS: tuple[LensFormat, ...] = (
         read_codev,
         lambda prescription, where: codev_of(prescription, where).encode(),
     ),
-    LensFormat("JSON", (".json", ".roa"), re.compile(r"\A\s*\{"), read_json, json_of),
+    LensFormat("JSON", (".json",), re.compile(r"\A\s*\{"), read_json, json_of),
+    # Of ray-optics; its JSON is found by its content.
+    LensFormat("JSON", (".roa",), None, read_json, None),
     LensFormat(
         "dO text",
         (".txt",),
@@ -132,10 +134,9 @@ def encode_lens(prescription: Mapping[str, Any], path: str | Path) -> bytes:
     """
     suffix = Path(path).suffix.lower()
     chosen = next((each for each in FORMATS if suffix in each.suffixes), None)
-    if chosen is None or chosen.write is None or suffix == ".roa":
+    if chosen is None or chosen.write is None:
         why = f"{chosen.name} is read, not written" if chosen else "unknown suffix"
-        allowed = ", ".join(s for s in WRITTEN_SUFFIXES if s != ".roa")
-        raise InputError(f"{path}: {why}; lens files are written as {allowed}")
+        raise InputError(f"{path}: {why}; lens files are written as {', '.join(WRITTEN_SUFFIXES)}")
     return chosen.write(prescription, str(path))
 
 

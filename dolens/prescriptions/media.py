@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.materials import IndexModel, Medium, parse_material
+from dolens.optics.materials import IndexModel, Medium, index_model, parse_material
 from dolens.optics.thermal import Environment
 from dolens.prescriptions.checks import as_number
 
@@ -47,3 +47,24 @@ def expansion_of(row: Mapping[str, Any], place: str) -> float | None:
     """Return the thermal expansion (1e-6/K) that a row gives, or None."""
     rate = row.get(EXPANSION_KEY)
     return None if rate is None else as_number(rate, f"{place}: '{EXPANSION_KEY}'")
+
+
+def canonical(material: str) -> str:
+    """Return one name for a medium in another program's file, in which `occluder` is air; unchanged
+    if none.
+    """
+    try:
+        name = parse_material(material, index_model("dfc")).name
+    except InputError:
+        return material
+    return "air" if name == "occluder" else name
+
+
+def canonical_digits(material: str) -> str:
+    """Return the same, with the numbers of nd/Vd and nd/Vd/ΔPgF as their shortest digits."""
+    name = canonical(material)
+    parts = name.split("/")
+    try:
+        return "/".join(repr(float(part)) for part in parts) if len(parts) > 1 else name
+    except ValueError:
+        return name

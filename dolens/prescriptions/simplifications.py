@@ -5,15 +5,14 @@ from pathlib import PurePath
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.materials import abbe_number, index_d, parse_material
+from dolens.optics.materials import NO_GLASS, abbe_number, index_d, parse_material
 from dolens.optics.materials import index_model as find_index_model
 from dolens.prescriptions.codev.glass import glass_word
-from dolens.prescriptions.zemax_glass import canonical
+from dolens.prescriptions.media import canonical
 
 Prescription = dict[str, Any]
 # Indices are compared at these wavelengths, nm.
 COMPARED_WAVELENGTHS = (400.0, 450.0, 486.1327, 546.074, 587.5618, 656.2725, 700.0)
-_KNOWN_MEDIA = ("air", "occluder", "mirror")
 
 
 def _dfc_indices(prescription: Prescription, new: str) -> list[str]:
@@ -58,7 +57,7 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
 
 def _needs_numbers(name: str, new: str) -> bool:
     """Return whether a medium has no name in a format, and needs nd and Vd there."""
-    if name.lower() in _KNOWN_MEDIA or (name[:1].isdigit() and "/" not in name):
+    if name.lower() in NO_GLASS or (name[:1].isdigit() and "/" not in name):
         return False
     if _suffix(new) == ".txt":
         # nd/Vd/ΔPgF has a number too many.

@@ -10,11 +10,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.even_asphere import power_of
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.decimals import curvature_in_text, reciprocal
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
-from dolens.prescriptions.zemax_polynomials import named, text
+from dolens.prescriptions.zemax_polynomials import named, power_lines
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import conic_line, curvature_line
 
@@ -78,14 +77,8 @@ def _read_toroid(block: SurfaceBlock) -> Row:
 
 
 def _write_toroid(row: Mapping[str, Any], place: str) -> list[str]:
-    lines = _curve_lines(row, place)
-    for key in row:
-        power = power_of(key)
-        if power is not None:
-            if power > 2 * _TOROID_TERMS:
-                raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a2 to a14)")
-            lines.append(f"PARM {power // 2 + 1} {text(row[key], place)}")
-    return lines
+    powers = power_lines(row, place, 2, 2 * _TOROID_TERMS, lambda power: power // 2 + 1)
+    return [*_curve_lines(row, place), *powers]
 
 
 BICONIC = ZemaxShape("BICONICX", ("biconic",), _read_biconic, _write_biconic, parameters=(1, 2))

@@ -23,6 +23,7 @@ from dolens.optics.mirrors import MIRROR
 from dolens.optics.model_glass import deviation_of_two_terms
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.glass_order import catalogue_order
+from dolens.prescriptions.media import canonical
 from dolens.prescriptions.zemax_catalogues import (
     Pair,
     index_and_abbe_number,
@@ -115,17 +116,6 @@ def glass_line(material: object, place: str) -> list[str]:
     if deviation is None:
         deviation = f"{_deviation_of_two_terms(vd):.12f}"
     return [f"  GLAS {_BLANK} 1 0 {nd} {vd} {deviation} 0 0 0 0 0"]
-
-
-def canonical(material: str) -> str:
-    """Return one name for a medium in a `.zmx` file, in which `occluder` is air; unchanged if
-    none.
-    """
-    try:
-        name = parse_material(material, index_model("dfc")).name
-    except InputError:
-        return material
-    return "air" if name == "occluder" else name
 
 
 def catalogue_line(materials: Sequence[object], where: str) -> list[str]:

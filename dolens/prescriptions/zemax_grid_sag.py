@@ -10,11 +10,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.even_asphere import power_of
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.decimals import number_in_text, scaled
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
-from dolens.prescriptions.zemax_polynomials import named, text
+from dolens.prescriptions.zemax_polynomials import named, power_lines
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import conic_line, curvature_line
 
@@ -83,12 +82,7 @@ def _size(block: SurfaceBlock) -> tuple[int, int, dict[str, float]]:
 
 def _write(row: Mapping[str, Any], place: str) -> list[str]:
     lines = [curvature_line(row, place), conic_line(row, place)]
-    for key in row:
-        power = power_of(key)
-        if power is not None:
-            if power > 2 * _POWERS:
-                raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a2 to a16)")
-            lines.append(f"PARM {power // 2} {text(row[key], place)}")
+    lines += power_lines(row, place, 2, 2 * _POWERS, lambda power: power // 2)
     sag = row["sag"]
     sizes = [as_number(row.get(name), place) for name in ("spacing_x", "spacing_y")]
     lines.append(f"GDAT {len(sag[0])} {len(sag)} {sizes[0]!r} {sizes[1]!r} 0 0")

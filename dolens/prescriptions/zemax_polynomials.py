@@ -8,7 +8,7 @@ the coefficients; CONI counts for both, the departure of Q_bfs being along the c
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any
 
@@ -64,6 +64,34 @@ def text(value: object, place: str) -> str:
     return repr(as_number(value, place) or float(NAMED_ZERO))
 
 
+def power_lines(
+    row: Mapping[str, Any], place: str, least: int, most: int, parameter: Callable[[int], int]
+) -> list[str]:
+    """Return the PARM lines of the coefficients `a…` of a row.
+
+    Args:
+        row: of a prescription.
+        place: name in messages.
+        least: the lowest power that the file's type holds.
+        most: the highest.
+        parameter: the number of the parameter of a power.
+
+    Raises:
+        InputError: a power beyond it.
+    """
+    lines = []
+    for key in row:
+        power = power_of(key)
+        if power is None:
+            continue
+        if power > most:
+            raise InputError(
+                f"{place}: a .zmx file cannot hold '{key}' (allowed: a{least} to a{most})"
+            )
+        lines.append(f"PARM {parameter(power)} {text(row[key], place)}")
+    return lines
+
+
 def _base(block: SurfaceBlock, kind: str) -> Row:
     return {"type": kind, **curvature_row(block.curvature), "conic": block.number("CONI")}
 
@@ -74,14 +102,8 @@ def _read_odd(block: SurfaceBlock) -> Row:
 
 
 def _write_odd(row: Mapping[str, Any], place: str) -> list[str]:
-    lines = [curvature_line(row, place), conic_line(row, place)]
-    for key in row:
-        power = power_of(key)
-        if power is not None:
-            if power > _ODD_TERMS:
-                raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a1 to a8)")
-            lines.append(f"PARM {power} {text(row[key], place)}")
-    return lines
+    powers = power_lines(row, place, 1, _ODD_TERMS, lambda power: power)
+    return [curvature_line(row, place), conic_line(row, place), *powers]
 
 
 def _read_extended(block: SurfaceBlock, kind: str, step: int) -> Row:

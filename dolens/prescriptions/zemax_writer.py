@@ -7,9 +7,10 @@ from dolens.errors import InputError
 from dolens.prescriptions.checks import as_integer, as_number
 from dolens.prescriptions.compare import require_same
 from dolens.prescriptions.decimals import shifted
+from dolens.prescriptions.media import canonical
 from dolens.prescriptions.zemax_apertures import aperture_lines
 from dolens.prescriptions.zemax_fields import FIELD_KINDS, PUPIL_ANGLES, VIGNETTING_OPERANDS
-from dolens.prescriptions.zemax_glass import canonical, catalogue_line, glass_line
+from dolens.prescriptions.zemax_glass import catalogue_line, glass_line
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_shapes import shape_of_row
 

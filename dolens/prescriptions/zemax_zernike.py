@@ -11,11 +11,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.optics.surfaces.even_asphere import power_of
 from dolens.optics.surfaces.zernike import ZernikeFringe, ZernikeSag, ZernikeStandard
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
-from dolens.prescriptions.zemax_polynomials import named, number_of_terms, positive_extra, text
+from dolens.prescriptions.zemax_polynomials import (
+    named,
+    number_of_terms,
+    positive_extra,
+    power_lines,
+    text,
+)
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
 from dolens.prescriptions.zemax_standard import conic_line, curvature_line
 
@@ -57,14 +62,12 @@ def _require_inside(block: SurfaceBlock, row: Row) -> None:
 
 def _write(row: Mapping[str, Any], place: str) -> list[str]:
     lines = [curvature_line(row, place), conic_line(row, place)]
-    for key in row:
-        power = power_of(key)
-        if power is not None:
-            if power > 2 * _POWERS:
-                raise InputError(f"{place}: a .zmx file cannot hold '{key}' (allowed: a2 to a16)")
-            lines.append(f"PARM {power // 2} {text(row[key], place)}")
-        elif key in ("decenter_x", "decenter_y"):
-            lines.append(f"PARM {9 if key == 'decenter_x' else 10} {text(row[key], place)}")
+    lines += power_lines(row, place, 2, 2 * _POWERS, lambda power: power // 2)
+    lines += [
+        f"PARM {n} {text(row[key], place)}"
+        for n, key in ((9, "decenter_x"), (10, "decenter_y"))
+        if key in row
+    ]
     lines.append("PARM 0 1")
     terms = {int(m[1]): value for key, value in row.items() if (m := _TERM.fullmatch(key))}
     lines += [

@@ -17,9 +17,11 @@ SINGLET = {
 }  # fmt: skip
 
 
-def require_refused(path, text, said):
-    """A file of this text is refused in one line that names it and says this."""
-    path.write_text(text)
+def require_refused(path, content, said):
+    """A file of this text, or of these bytes, is refused in one line that names it and says
+    this.
+    """
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(InputError) as error:
         load_lens(path)
     message = str(error.value)

@@ -17,7 +17,7 @@ from dolens.kernels.cuda.even_asphere import (
     even_asphere_sums,
 )
 from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.jacobi import recurrence
+from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
 from dolens.kernels.cuda.layout import COLUMNS, DEGREE, SHAPE
 from dolens.kernels.cuda.sums import add_sum
 
@@ -83,11 +83,8 @@ def _total(record, codes, x, y):
     for k in range(tl.load(codes + COLUMNS)):
         if k > 0:
             e, f, g = _step(k, best_fit, unit)
-            next_h = (e * q + f) * h + 2.0 * e * d - g * low_h
-            next_d = (e * q + f) * d + e * p - g * low_d
-            next_p = (e * q + f) * p - g * low
-            low, low_d, low_h = p, d, h
-            p, d, h = next_p, next_d, next_h
+            h, low_h = advance_second(e, f, g, q, d, h, low_h)
+            p, low, d, low_d = advance(e, f, g, q, p, low, d, low_d)
         b = tl.load(record + OWN + 1 + k)
         t += b * p
         t1 += b * d
@@ -151,10 +148,7 @@ def forbes_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive):
     for k in range(tl.load(codes + COLUMNS)):
         if k > 0:
             alpha, beta, gamma = _step(k, best_fit, unit)
-            next_d = (alpha * q + beta) * d + alpha * p - gamma * low_d
-            next_p = (alpha * q + beta) * p - gamma * low
-            low, low_d = p, d
-            p, d = next_p, next_d
+            p, low, d, low_d = advance(alpha, beta, gamma, q, p, low, d, low_d)
         zero = tl.zeros_like(x)
         value, slope, _, _, _ = _departure(q, p, d, zero, conic, kappa, best_fit)
         add_sum(sums + OWN + 1 + k, of_sag * value + of_slope * slope, alive)

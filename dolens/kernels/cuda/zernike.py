@@ -15,7 +15,7 @@ from dolens.kernels.cuda.even_asphere import (
     even_asphere_sums,
 )
 from dolens.kernels.cuda.functions import SagFunctions
-from dolens.kernels.cuda.jacobi import recurrence
+from dolens.kernels.cuda.jacobi import advance, advance_second, recurrence
 from dolens.kernels.cuda.layout import COUNT, DEGREE, EXTRAS, SHAPE
 from dolens.kernels.cuda.sums import add_sum
 
@@ -66,10 +66,7 @@ def zernike_sag(record, codes, extras, x, y):
         for k in range(count):
             if k > 0:
                 e, f, g = recurrence(k, m, unit)
-                next_d = (e * q + f) * d + e * p - g * low_d
-                next_p = (e * q + f) * p - g * low
-                low, low_d = p, d
-                p, d = next_p, next_d
+                p, low, d, low_d = advance(e, f, g, q, p, low, d, low_d)
             norm = _norm(normalised, k, m, unit)
             of_cosine = norm * _coefficient(own, tl.load(cursor))
             of_sine = norm * _coefficient(own, tl.load(cursor + 1))
@@ -115,11 +112,8 @@ def zernike_hessian(record, codes, extras, x, y):
         for k in range(count):
             if k > 0:
                 e, f, g = recurrence(k, m, unit)
-                next_h = (e * q + f) * h + 2.0 * e * d - g * low_h
-                next_d = (e * q + f) * d + e * p - g * low_d
-                next_p = (e * q + f) * p - g * low
-                low, low_d, low_h = p, d, h
-                p, d, h = next_p, next_d, next_h
+                h, low_h = advance_second(e, f, g, q, d, h, low_h)
+                p, low, d, low_d = advance(e, f, g, q, p, low, d, low_d)
             norm = _norm(normalised, k, m, unit)
             of_cosine = norm * _coefficient(own, tl.load(cursor))
             of_sine = norm * _coefficient(own, tl.load(cursor + 1))
@@ -176,10 +170,7 @@ def zernike_sums(record, codes, extras, sums, x, y, of_sag, of_sx, of_sy, alive)
         for k in range(count):
             if k > 0:
                 e, f, g = recurrence(k, m, unit)
-                next_d = (e * q + f) * d + e * p - g * low_d
-                next_p = (e * q + f) * p - g * low
-                low, low_d = p, d
-                p, d = next_p, next_d
+                p, low, d, low_d = advance(e, f, g, q, p, low, d, low_d)
             norm = _norm(normalised, k, m, unit)
             cosine, sine = tl.load(cursor), tl.load(cursor + 1)
             cursor += 2

@@ -1,7 +1,7 @@
 """Rotational aspheres in Forbes's orthogonal polynomials: Q_con and Q_bfs."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -47,10 +47,12 @@ class ForbesSag(Surface):
         check_reach(self)
 
     @classmethod
-    def added_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Return the coefficients that the prescription names, by rising orders."""
+    def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
+        """Return curvature, conic constant, the coefficients that the prescription names, by rising
+        orders, and the normalisation radius.
+        """
         orders = sorted(int(match[1]) for key in keys if (match := _TERM.fullmatch(str(key))))
-        return [*(f"q{order}" for order in orders), *cls.constants]
+        return ["curvature", "conic", *(f"q{order}" for order in orders), *cls.constants]
 
     @classmethod
     def start(cls, p: Parameters, ray: PlaneRay, sense: float) -> Tensor:
@@ -74,11 +76,6 @@ class QCon(ForbesSag):
     rotational = True
 
     @classmethod
-    def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Return curvature, conic constant, coefficients, and the normalisation radius."""
-        return ["curvature", "conic", *cls.added_names(keys)]
-
-    @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
@@ -86,11 +83,8 @@ class QCon(ForbesSag):
         r2 = torch.addcmul(x * x, y, y)
         sag, slope, exists = conic_sag(p["curvature"], p["conic"], r2)
         scale = 1.0 / p["normalization_radius"] ** 2
-        q, total, derivative = r2 * scale, torch.zeros_like(r2), torch.zeros_like(r2)
-        for m, (value, d) in enumerate(jacobi(q, 4, _count(p))):
-            if f"q{m}" in p:
-                total = total + p[f"q{m}"] * value
-                derivative = derivative + p[f"q{m}"] * d
+        q = r2 * scale
+        total, derivative = _series(p, jacobi(q, 4, _count(p)), q)
         slope = slope + scale * q * (2.0 * total + q * derivative)
         return sag + q * q * total, 2.0 * x * slope, 2.0 * y * slope, exists
 
@@ -118,11 +112,6 @@ class QBfs(ForbesSag):
     rotational = True
 
     @classmethod
-    def parameter_names(cls, keys: Mapping[str, object]) -> list[str]:
-        """Return curvature, conic constant, coefficients, and the normalisation radius."""
-        return ["curvature", "conic", *cls.added_names(keys)]
-
-    @classmethod
     def sag_and_gradient(
         cls, p: Parameters, x: Tensor, y: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
@@ -134,11 +123,8 @@ class QBfs(ForbesSag):
         r2 = torch.addcmul(x * x, y, y)
         sag, slope, _ = conic_sag(c, k, r2)
         scale = 1.0 / p["normalization_radius"] ** 2
-        q, total, derivative = r2 * scale, torch.zeros_like(r2), torch.zeros_like(r2)
-        for m, (value, d) in enumerate(q_bfs(q, _count(p))):
-            if f"q{m}" in p:
-                total = total + p[f"q{m}"] * value
-                derivative = derivative + p[f"q{m}"] * d
+        q = r2 * scale
+        total, derivative = _series(p, q_bfs(q, _count(p)), q)
         turned = c * c * r2
         squared = 1.0 - (1.0 + k) * turned
         b = squared.clamp(min=_STEEPEST)
@@ -161,6 +147,18 @@ class QBfs(ForbesSag):
             given = torch.stack([p.get(f"q{m}", _zero(p)) for m in range(count)])
             numbers.append(torch.from_numpy(to_auxiliary(count)).to(given) @ given)
         return PackedShape(tuple(numbers), columns=count, degree=1)
+
+
+def _series(
+    p: Parameters, polynomials: Iterable[tuple[Tensor, Tensor]], q: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return Σ q_m·Q_m and its derivative, from the polynomials with theirs, at q."""
+    total, derivative = torch.zeros_like(q), torch.zeros_like(q)
+    for m, (value, d) in enumerate(polynomials):
+        if f"q{m}" in p:
+            total = total + p[f"q{m}"] * value
+            derivative = derivative + p[f"q{m}"] * d
+    return total, derivative
 
 
 def _count(p: Parameters) -> int:

@@ -100,17 +100,6 @@ def glass_word(material: str, place: str) -> str:
     return written
 
 
-def canonical(material: str) -> str:
-    """Return one name for a medium in a `.seq` file; unchanged if it is none."""
-    try:
-        name = parse_material(material, index_model("dfc")).name
-    except InputError:
-        return material
-    if "/" in name:
-        return "/".join(repr(float(part)) for part in name.split("/"))
-    return "air" if name == "occluder" else name
-
-
 def _code(nd: str, vd: str, place: str) -> str:
     """Write nd and Vd as CODE V's digits."""
     digits = Decimal(nd) - 1

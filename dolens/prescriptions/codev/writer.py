@@ -11,10 +11,11 @@ from dolens.prescriptions.build import lens_from_prescription
 from dolens.prescriptions.checks import as_integer, as_number
 from dolens.prescriptions.codev.apertures import aperture_lines
 from dolens.prescriptions.codev.axes import break_words
-from dolens.prescriptions.codev.glass import canonical, glass_word, private_glass
+from dolens.prescriptions.codev.glass import glass_word, private_glass
 from dolens.prescriptions.codev.reader import read_codev
 from dolens.prescriptions.codev.special import special_lines
 from dolens.prescriptions.compare import require_same
+from dolens.prescriptions.media import canonical_digits
 from dolens.prescriptions.system_data import PUPIL_KEYS
 
 _TYPES = (
@@ -73,7 +74,7 @@ def codev_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     lines += [*_image(sensor, where), "GO", ""]
     text = "\n".join(lines)
     found = read_codev(text, where).prescription
-    require_same(prescription, found, ".seq", where, canonical, _ALWAYS)
+    require_same(prescription, found, ".seq", where, canonical_digits, _ALWAYS)
     return text
 
 
