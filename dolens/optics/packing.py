@@ -118,6 +118,12 @@ def _lay_out(
             laws.append(LawForm(law.law.kernel.code, sizes))
             of_laws += [value for value in own if value is not None]
     scalars += (*of_laws, *system.thicknesses, system.sensor_distance)
+    image = None
+    if to_sensor and system.image is not None:
+        shape = system.image.shape
+        own = shape.packed(system.image.parameters).numbers
+        image = Form(shape.kernel.code, 0, 0, 0, (), tuple(value.shape for value in own))
+        scalars += own
     layout = records(
         Structure(
             tuple(forms),
@@ -131,6 +137,7 @@ def _lay_out(
             last,
             to_sensor,
             tuple(laws),
+            image,
         )
     )
     if layout.turns:

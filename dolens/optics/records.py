@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dolens.kernels.table import Code, Kind, Outline, Slot
 from dolens.optics.elements import carriers
+from dolens.optics.image_surface import WITHOUT_EDGE
 from dolens.optics.materials import Medium
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.refraction import FAR
@@ -72,6 +73,7 @@ class Structure(NamedTuple):
         last: number of the last.
         to_sensor: go on to the sensor plane (forward only).
         laws: what deflects light at each surface in the place of Snell's law, or None.
+        image: of the curved surface that rays end on; None of a plane, and short of the sensor.
     """
 
     forms: tuple[Form, ...]
@@ -85,6 +87,7 @@ class Structure(NamedTuple):
     last: int
     to_sensor: bool
     laws: tuple[LawForm | None, ...]
+    image: Form | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +95,8 @@ class Records:
     """Records as constants plus signed numbers of the lens: values[places] += signs·x[sources].
 
     The lens's numbers x come in this order: the scalars of all surfaces, those of all laws, the
-    gaps and the sensor's distance; the arrays of all surfaces; then step (3) and turn (9) of each
-    change of axes.
+    gaps, the sensor's distance and the image surface's; the arrays of all surfaces; then step (3)
+    and turn (9) of each change of axes.
 
     Attributes:
         constants: (V,), float64.
@@ -153,6 +156,8 @@ class _Writer:
             place += 0 if law is None else sum(size is not None for size in law.sizes)
         self.gaps = place
         place += len(structure.forms)
+        self.of_image = place
+        place += 0 if structure.image is None else len(structure.image.sizes)
         for of_surface in sizes:
             self.array.append(place)
             place += sum(size.numel() for size in of_surface if size != ())
@@ -307,6 +312,23 @@ class _Writer:
             row[Code.HOLE], *numbers = hole.packed()
             values[record + Slot.HOLE_X], values[record + Slot.HOLE_Y] = numbers
 
+    def image(self, line: tuple[int, tuple[int, ...]], now: int, at: int, medium: int) -> None:
+        """From the last surface to a curved sensor, which refracts nothing."""
+        s = self.structure
+        sensor = len(s.forms) + 1
+        turned = line != self.line(sensor)
+        if turned:
+            self.turn(self.step(Kind.CHANGE_AXES, medium, medium, sensor), now, sensor)
+        row = self.step(s.image.kind, medium, medium, sensor)
+        if not turned:
+            self.shift(row, at, sensor)
+        begin = row[Code.OFFSET]
+        self.constants[begin + Slot.SENSE_BEHIND] = self.constants[begin + Slot.SENSE]
+        self.aperture(row, WITHOUT_EDGE)
+        self.add(len(self.constants), self.of_image, len(s.image.sizes))
+        self.constants += [0.0] * len(s.image.sizes)
+        row[Code.LENGTH] = len(self.constants) - begin
+
     def leave(self, line: tuple[int, tuple[int, ...]], now: int, at: int, medium: int) -> None:
         """From the last surface, which an element may carry, to the lens's axes or the sensor.
 
@@ -314,7 +336,10 @@ class _Writer:
         """
         sensor = len(self.structure.forms) + 1
         own = self.structure.to_sensor and self.line(sensor) != self.line(0)
-        if own and line != self.line(sensor):
+        if self.structure.image is not None:
+            self.image(line, now, at, medium)
+            at = sensor
+        elif own and line != self.line(sensor):
             self.turn(self.step(Kind.CHANGE_AXES, medium, medium, sensor), now, sensor)
             self.step(Kind.SENSOR, medium, medium, sensor)
             at = sensor

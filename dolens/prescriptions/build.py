@@ -10,7 +10,7 @@ A prescription is a mapping::
       '2': ...                  # the last surface has no thickness
     elements:                   # optional, see poses.py; rectangular apertures: see apertures.py
       '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
-    sensor: {distance: 96.0, diameter: 1.7664}
+    sensor: {distance: 96.0, diameter: 1.7664}   # curved: see sensor_data.py
 
 Lengths are in mm; `radius: .inf` is a plane (some shapes have `radius_x` and `radius_y`);
 `material` is the medium behind the surface: `air`, `occluder`, a constant index (`1.5`), glass as
@@ -48,6 +48,7 @@ from dolens.prescriptions.checks import (
     as_numbers,
     require_mapping,
 )
+from dolens.prescriptions.curvatures import curvature_from, curvature_row, radius_key
 from dolens.prescriptions.deflections import (
     PHASE_KEY,
     is_paraxial_lens,
@@ -60,6 +61,7 @@ from dolens.prescriptions.field_data import set_object_fields
 from dolens.prescriptions.media import EXPANSION_KEY, environment_of, expansion_of, medium_of
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
+from dolens.prescriptions.sensor_data import sensor_from, sensor_row
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
     set_stop_semi_diameter,
@@ -83,7 +85,6 @@ _LENS_KEYS = (
 _SURFACE_KEYS = (
     *("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", EXPANSION_KEY, "note"),
 )
-_SENSOR_KEYS = ("distance", "diameter")
 
 
 def lens_from_prescription(
@@ -115,10 +116,7 @@ def lens_from_prescription(
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     rows = _rows(prescription, where)
-    sensor = prescription.get("sensor")
-    if not isinstance(sensor, Mapping) or "distance" not in sensor:
-        raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
-    check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
+    sensor = sensor_from(prescription, where)
     data = system_data(prescription, where)
     air = environment_of(prescription, where)
     surfaces, thicknesses, expansions = [], [], []
@@ -141,23 +139,21 @@ def lens_from_prescription(
             raise InputError(
                 f"{place}: the last surface has no 'thickness'; its gap is 'sensor.distance'"
             )
-    diameter = sensor.get("diameter")
     try:
         lens = Lens(
             surfaces,
             thicknesses,
-            as_number(sensor["distance"], f"{where}: 'sensor.distance'"),
-            materials,
-            as_integer(prescription.get("stop", 1), f"{where}: 'stop'"),
-            model.name,
-            name,
-            None if diameter is None else as_number(diameter, f"{where}: 'sensor.diameter'"),
-            dtype,
-            elements_from(prescription.get("elements"), dtype, where),
+            materials=materials,
+            stop=as_integer(prescription.get("stop", 1), f"{where}: 'stop'"),
+            index_model=model.name,
+            name=name,
+            dtype=dtype,
+            elements=elements_from(prescription.get("elements"), dtype, where),
             thermal_expansions=expansions,
             backend=backend,
             source=str(prescription.get("source") or ""),
             published=published_from(prescription.get(PUBLISHED_KEY), where),
+            **sensor,
             **data,
         )
         lens = set_object_fields(set_stop_semi_diameter(lens, prescription))
@@ -185,12 +181,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
                 row |= power_row(number_value)
                 continue
             if key in surface.curvatures:
-                radius = _radius_key(key)
-                row[radius] = _radius(number_value)
-                if 1.0 / row[radius] != number_value:
-                    # Rounding of 1/(1/c) loses a bit for some c: keep the parameter itself.
-                    del row[radius]
-                    row[key] = number_value
+                row |= curvature_row(key, number_value)
             else:
                 row[key] = number_value
         if surface.phase is not None:
@@ -201,9 +192,6 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         if lens.thermal_expansions[int(number) - 1] is not None:
             row[EXPANSION_KEY] = lens.thermal_expansions[int(number) - 1]
         rows[number] = row
-    sensor: dict[str, Any] = {"distance": float(lens.sensor_distance.detach())}
-    if lens.sensor_diameter is not None:
-        sensor["diameter"] = lens.sensor_diameter
     return {
         "name": lens.name,
         **({"source": lens.source} if lens.source else {}),
@@ -214,7 +202,7 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
         **system_data_of(lens),
         "surfaces": rows,
         **({"elements": element_rows(lens.elements)} if len(lens.elements) else {}),
-        "sensor": sensor,
+        "sensor": sensor_row(lens),
     }
 
 
@@ -237,14 +225,14 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
         if is_paraxial_lens(row):
             row = with_power(row)
         names = shape.parameter_names(row)
-        radii = [_radius_key(name) for name in names if name in shape.curvatures]
+        radii = [radius_key(name) for name in names if name in shape.curvatures]
         check_keys(row, (*_SURFACE_KEYS, *names, *radii), place)
         values = {
             key: (as_numbers if key in shape.arrays else as_number)(row.get(key, 0.0), f"'{key}'")
             for key in names
             if key in row or key not in shape.optional
         }
-        values |= {name: _curvature(row, name) for name in names if name in shape.curvatures}
+        values |= {name: curvature_from(row, name) for name in names if name in shape.curvatures}
         if "curvature" not in names and not math.isinf(
             as_number(row.get("radius", math.inf), "'radius'")
         ):
@@ -258,30 +246,6 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None
-
-
-def _curvature(row: Mapping[str, Any], name: str) -> float:
-    """Return a curvature of a row, which gives it or the radius of the same name."""
-    key = _radius_key(name)
-    if row.get(name) is not None and row.get(key) is not None:
-        raise InputError(f"give '{key}' or '{name}', not both")
-    if row.get(name) is not None:
-        return as_number(row[name], f"'{name}'")
-    if row.get(key) is None:
-        raise InputError(f"'{key}' is missing (mm; .inf for a plane)")
-    radius = as_number(row[key], f"'{key}'", finite=False)
-    if radius == 0.0:
-        raise InputError(f"'{key}' is 0; write .inf for a plane")
-    return 1.0 / radius
-
-
-def _radius_key(name: str) -> str:
-    """Return `radius_x` for `curvature_x`."""
-    return name.replace("curvature", "radius")
-
-
-def _radius(curvature: float) -> float:
-    return math.inf if curvature == 0.0 else 1.0 / curvature
 
 
 def _rows(prescription: Mapping[str, Any], where: str) -> list[Mapping[str, Any]]:
