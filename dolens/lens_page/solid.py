@@ -10,6 +10,7 @@ import torch
 from dolens.analysis.conditions import Conditions
 from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
+from dolens.optics.image_surface import image_reach
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
@@ -239,15 +240,25 @@ def _stop(system: OpticalSystem) -> Mesh:
 
 
 def _sensor(lens: Lens, rays: Sequence[Sequence[np.ndarray]]) -> Mesh:
-    """Return the sensor plane: the prescription's image circle, or what holds all rays."""
+    """Return the sensor, plane or curved: the prescription's image circle, or what holds all rays."""
     axes = lens.system().global_axes()
     rotation, origin = axes.rotation[-1].numpy(), axes.origin[-1].numpy()
     rays = [[(path - origin) @ rotation for path in field] for field in rays]
     ends = [np.hypot(*path[-1, :2]) for field in rays for path in field]
     reach = 0.5 * lens.sensor_diameter if lens.sensor_diameter else 1.1 * max(ends, default=1.0)
+    image = lens.system().image
+    if image is not None:
+        reach = min(reach, image_reach(image))
     angle = np.linspace(0.0, 2.0 * math.pi, AZIMUTHS, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(AZIMUTHS)], -1) * max(reach, 1e-6)
-    positions = np.stack([0.0 * ring, ring]) @ rotation.T + origin
+    positions = np.stack([0.0 * ring, ring])
+    if image is not None:
+        positions = np.linspace(0.0, 1.0, _RINGS)[:, None, None] * ring
+        x, y = torch.from_numpy(positions[..., 0]), torch.from_numpy(positions[..., 1])
+        sag, _, _, _ = image.double().shape.sag_and_gradient(image.double().parameters, x, y)
+        positions[..., 2] = sag.numpy()
+        return _mesh("sensor", positions @ rotation.T + origin)
+    positions = positions @ rotation.T + origin
     return _mesh("sensor", positions, np.broadcast_to(-rotation[:, 2], positions.shape))
 
 

@@ -4,6 +4,9 @@ It is one more surface behind the lens's last, at which nothing is refracted and
 lens without one ends on the plane of its sensor.
 """
 
+import math
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
@@ -55,19 +58,62 @@ def image_surface(lens: nn.Module, values: dict[str, Tensor]) -> SurfaceState | 
     return SurfaceState(Conic, {"curvature": curvature, "conic": conic}, WITHOUT_EDGE)
 
 
-def image_sag(image: SurfaceState | None, x: Tensor, y: Tensor) -> Tensor:
-    """Return the sag (mm) of the image surface at x and y (mm): zero of a plane.
-
-    Raises:
-        InputError: a point lies beyond the end of the surface.
+def image_reach(image: SurfaceState) -> float:
+    """Return the distance from the axis, mm, at which an image surface ends; `inf` where it goes
+    on.
     """
-    if image is None:
-        return torch.zeros_like(x + y)
-    sag, _, _, exists = image.shape.sag_and_gradient(image.parameters, x, y)
-    if exists is not None and not bool((exists >= 0.0).all()):
-        radius = float((x.detach() ** 2 + y.detach() ** 2).max().sqrt())
-        raise InputError(
-            f"the image surface, of radius {1.0 / float(image.parameters['curvature']):g} mm, ends "
-            f"short of {radius:g} mm from the axis"
-        )
-    return sag
+    c = float(image.parameters["curvature"].detach())
+    conic = image.parameters.get("conic")
+    alpha = (1.0 + (0.0 if conic is None else float(conic.detach()))) * c * c
+    return 1.0 / math.sqrt(alpha) if alpha > 0.0 else math.inf
+
+
+@dataclass(frozen=True)
+class TangentPlanes:
+    """Planes touch the image surface at N points.
+
+    Axes in such a plane are the sensor's own, turned by the smallest rotation that takes z to the
+    normal: along a meridian, lengths in it are lengths along the surface.
+
+    Attributes:
+        point: (..., 3), mm, in the sensor's axes from its vertex; no gradient.
+        normal: (..., 3), unit vectors towards +z; no gradient.
+    """
+
+    point: Tensor
+    normal: Tensor
+
+    @classmethod
+    @torch.no_grad()
+    def at(cls, image: SurfaceState, centre: Tensor) -> "TangentPlanes":
+        """Return the planes at x and y (..., 2) in mm.
+
+        Raises:
+            InputError: a point lies beyond the end of the surface.
+        """
+        x, y = centre.unbind(-1)
+        sag, _, _, exists = image.shape.sag_and_gradient(image.parameters, x, y)
+        if exists is not None and bool((exists < 0.0).any()):
+            radius = 1.0 / float(image.parameters["curvature"])
+            raise InputError(
+                f"the sensor's radius is {radius:g} mm: it ends short of "
+                f"{float(torch.hypot(x, y).nan_to_num().max()):g} mm from the axis"
+            )
+        normal = image.shape.normal(image.parameters, x, y, sag)
+        return cls(torch.stack((x, y, sag), -1), torch.stack(normal, -1))
+
+    def turned(self, vector: Tensor) -> Tensor:
+        """Return vectors (..., 3) of the sensor's axes in those of the planes.
+
+        With N the normal, v' = v - (N_x, N_y)·(v_z + (N_x·v_x + N_y·v_y)/(1 + N_z)) across it and
+        v'_z = v·N.
+        """
+        across = (vector[..., :2] * self.normal[..., :2]).sum(-1)
+        z, along = vector[..., 2], across + vector[..., 2] * self.normal[..., 2]
+        share = z + across / (1.0 + self.normal[..., 2])
+        turned = vector[..., :2] - self.normal[..., :2] * share[..., None]
+        return torch.cat([turned, along[..., None]], -1)
+
+    def unsqueeze(self, dim: int) -> "TangentPlanes":
+        """Return the same with a further dimension."""
+        return TangentPlanes(self.point.unsqueeze(dim), self.normal.unsqueeze(dim))

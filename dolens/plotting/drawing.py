@@ -21,6 +21,7 @@ from dolens.plotting.section import (
     broken_axis,
     element_edges,
     obscuration_profile,
+    sensor_curve,
     sensor_line,
     surface_profile,
     trace_fan,
@@ -108,7 +109,7 @@ def layout_drawing(
         half = max(half, 0.05 * height)
     else:
         half = reach
-    ends = sensor_line(system, half)
+    ends = sensor_curve(system, half)
     front = min([start, *(float(paths[..., 2].min()) for paths in lit), ends[:, 0].min()])
     back = max([back, *(float(paths[..., 2].max()) for paths in lit), ends[:, 0].max()])
     margin = 0.04 * (back - front)
@@ -140,7 +141,7 @@ def draw_layout(
     _draw_rays(axes, drawing.fans, legend)
     _draw_stop(axes, system, profiles, drawing.height)
     _draw_obscurations(axes, system)
-    ends = sensor_line(system, drawing.sensor)
+    ends = sensor_curve(system, drawing.sensor)
     axes.plot(*ends.T, color="black", linewidth=2.5, gid="sensor", zorder=4)
     axes.set(aspect="equal", xlim=z_limits, ylim=(-half_height, half_height))
     axes.set_xlabel("z (mm)", fontsize=SMALL + 1)

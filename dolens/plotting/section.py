@@ -25,6 +25,8 @@ _BISECTIONS = 60
 _NEWTON_STEPS = 20
 # Heights on the stop whose rays are tried where the lens is folded.
 _STOP_TRIALS = 81
+# Points of a curved sensor.
+_CURVE = 65
 
 
 def surface_profile(system: OpticalSystem, number: int) -> Profile:
@@ -285,3 +287,20 @@ def sensor_line(system: OpticalSystem, half: float) -> np.ndarray:
     axes = system.global_axes()
     origin, along = (v[-1].detach().cpu().numpy() for v in (axes.origin, axes.rotation[..., 1]))
     return np.stack([origin - half * along, origin + half * along])[:, [2, 1]]
+
+
+def sensor_curve(system: OpticalSystem, half: float) -> np.ndarray:
+    """Return z and y (N, 2), mm, of the sensor's section, up to half a length on both sides.
+
+    It is `sensor_line` of a plane one; a curved one ends where its surface does.
+    """
+    if system.image is None:
+        return sensor_line(system, half)
+    image = system.image.double()
+    y = torch.linspace(-half, half, _CURVE, dtype=torch.float64, device=system.device)
+    sag, _, _, exists = image.shape.sag_and_gradient(image.parameters, torch.zeros_like(y), y)
+    there = slice(None) if exists is None else exists > 0.0
+    local = torch.stack((torch.zeros_like(y), y, sag), -1)[there]
+    axes = system.global_axes()
+    points = local @ axes.rotation[-1].mT + axes.origin[-1]
+    return points.detach().cpu().numpy()[:, [2, 1]]

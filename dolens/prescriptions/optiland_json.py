@@ -246,4 +246,4 @@ def _image(surface: dict[str, Any], place: str) -> dict[str, float]:
     shape = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
     if shape["type"] not in ("plane", "sphere", "conic"):
         raise InputError(f"{place}: an image of this shape is not held")
-    return {key: shape[key] for key in ("radius", "conic") if key in shape}
+    return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}

@@ -30,7 +30,7 @@ from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
-from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_configurations import other_configurations
 from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_passed_over import passed_over
@@ -168,8 +168,7 @@ def _with_sensor(
     """Leave out the planes before the image that do nothing; put the image where it is."""
     place = f"{where}: the image"
     block = SurfaceBlock(image, factor, place)
-    if block.type != "STANDARD" or block.curvature != 0.0:
-        raise InputError(f"{place}: must be a plane of TYPE STANDARD")
+    shape = _image_shape(block)
     gaps = [rows[-1].pop("thickness")]
     while len(rows) > 1 and len(rows) != prescription["stop"] and not hard[len(rows) - 1]:
         if not _is_dummy(rows[-1], _medium_behind(rows[:-1], prescription)):
@@ -180,8 +179,24 @@ def _with_sensor(
     size = read_apertures(image, factor, place)[0].get("semi_diameter")
     if is_fixed(image) and size != AUTOMATIC:
         sensor["diameter"] = 2.0 * size
+    sensor |= shape
     surfaces = {str(n): row for n, row in enumerate(rows, 1)}
     return {**prescription, "surfaces": surfaces, "sensor": sensor}
+
+
+def _image_shape(block: SurfaceBlock) -> dict[str, float]:
+    """Return radius and conic constant of a curved image; nothing of a plane."""
+    if block.type not in ("STANDARD", "EVENASPH"):
+        raise InputError(
+            f"{block.place}: an image of this shape is not held (TYPE {block.type}; allowed: "
+            "a plane, sphere or conic)"
+        )
+    if block.type == "EVENASPH" and any(float(word) for word in block.parameters.values()):
+        raise InputError(f"{block.place}: an aspheric image is not held (allowed: a conic)")
+    if block.curvature == 0.0:
+        return {}
+    conic = block.number("CONI")
+    return curvature_row(block.curvature) | ({"conic": conic} if conic else {})
 
 
 def _object(

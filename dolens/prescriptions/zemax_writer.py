@@ -13,6 +13,7 @@ from dolens.prescriptions.zemax_fields import FIELD_KINDS, PUPIL_ANGLES, VIGNETT
 from dolens.prescriptions.zemax_glass import catalogue_line, glass_line
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_shapes import shape_of_row
+from dolens.prescriptions.zemax_standard import conic_line, curvature_line
 
 _D_LINE = 587.5618
 # Fields in the lists; further ones have lines of their own.
@@ -61,7 +62,7 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     lines += [
         f"SURF {len(surfaces) + 1}",
         "  TYPE STANDARD",
-        "  CURV 0.0",
+        *_image_shape(sensor, where),
         "  DISZ 0",
         f'  DIAM {diameter / 2.0!r} {int(diameter > 0.0)} 0 0 1 ""',
     ]
@@ -69,6 +70,14 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     found = prescription_from_zemax(text, where)
     require_same(prescription, found, ".zmx", where, canonical, _ALWAYS)
     return text
+
+
+def _image_shape(sensor: Mapping[str, Any], where: str) -> list[str]:
+    """Write the curvature of the image, and its conic constant."""
+    if sensor.get("radius") is None and sensor.get("curvature") is None:
+        return ["  CURV 0.0"]
+    conic = [f"  {conic_line(sensor, f'{where}: sensor')}"] if sensor.get("conic") else []
+    return [f"  {curvature_line(sensor, f'{where}: sensor')}", *conic]
 
 
 _ALWAYS = ("wavelengths", "reference_wavelength", "fields")

@@ -218,6 +218,8 @@ def _image(sensor: Mapping[str, Any], where: str) -> list[str]:
     place = f"{where}: sensor"
     radius = sensor.get("radius")
     lines = [f"SI    {_text(radius, place) if radius and math.isfinite(radius) else '0.0'} 0.0"]
+    if sensor.get("curvature") is not None:
+        lines.append(f"  CUY {_text(sensor['curvature'], place)}")
     if sensor.get("conic"):
         lines += ["  CON", f"  K {_text(sensor['conic'], place)}"]
     if sensor.get("diameter"):
