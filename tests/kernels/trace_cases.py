@@ -10,7 +10,7 @@ import torch
 from dolens import Rays, load_lens
 from dolens.optics.surfaces import register_surface, unregister_surface
 from dolens.optics.surfaces.spline_basis import clamped_knots
-from dolens.prescriptions import lens_from_prescription
+from dolens.prescriptions import lens_from_prescription, prescription_of
 from tests.kernels.own_surface.paraboloid import Paraboloid
 
 F64 = torch.float64
@@ -236,6 +236,26 @@ def _spectrometer():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": -20.0}})
 
 
+def _retina():
+    """A lens out of place in front of a deep sphere, whose rim some rays miss."""
+    front = {"type": "sphere", "radius": 12.0, "semi_diameter": 5.0, "thickness": 3.0,
+             "material": _GLASS}  # fmt: skip
+    back = {"type": "sphere", "radius": -12.0, "semi_diameter": 5.0, "material": "air"}
+    return lens_from_prescription({
+        "surfaces": {"1": front, "2": back},
+        "elements": {"1": {"surfaces": [1, 2], "tilt_x": 4.0, "tilt_y": -3.0, "decenter_x": 0.3}},
+        "sensor": {"distance": 9.0, "radius": -1.6},
+    })  # fmt: skip
+
+
+def _folded_film():
+    """The folded lens with a conic for a sensor, behind its last break."""
+    row = prescription_of(_folded())
+    return lens_from_prescription(
+        row | {"sensor": {"distance": 12.0, "radius": -15.0, "conic": -0.6}}
+    )
+
+
 def _plate(root):
     lens = load_lens(root / "conf/lens/wavefront_coding.yaml", F64)
     with torch.no_grad():
@@ -269,6 +289,8 @@ LENSES = {
     "spectrometer": lambda root: _spectrometer(),
     "mirrors": lambda root: _mirrors(),
     "folded": lambda root: _folded(),
+    "retina": lambda root: _retina(),
+    "folded_film": lambda root: _folded_film(),
 }
 
 
