@@ -162,9 +162,7 @@ def trace_ray_intercepts(
     )
 
 
-def _along_surface(
-    system: OpticalSystem, points: Tensor, chief: Tensor, reached: Tensor
-) -> Tensor:
+def _along_surface(system: OpticalSystem, points: Tensor, chief: Tensor, reached: Tensor) -> Tensor:
     """Return points (F, W, N, 3) of a curved sensor as x and y in the plane that touches it where
     the chief ray (F, 3) lands, from that point's own x and y on.
     """

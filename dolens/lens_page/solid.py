@@ -10,8 +10,8 @@ import torch
 from dolens.analysis.conditions import Conditions
 from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
-from dolens.optics.image_surface import image_reach
 from dolens.optics.elements import to_lens_axes
+from dolens.optics.image_surface import image_reach
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.rays import Rays
@@ -240,7 +240,7 @@ def _stop(system: OpticalSystem) -> Mesh:
 
 
 def _sensor(lens: Lens, rays: Sequence[Sequence[np.ndarray]]) -> Mesh:
-    """Return the sensor, plane or curved: the prescription's image circle, or what holds all rays."""
+    """Return the sensor: the prescription's image circle, or what holds all rays."""
     axes = lens.system().global_axes()
     rotation, origin = axes.rotation[-1].numpy(), axes.origin[-1].numpy()
     rays = [[(path - origin) @ rotation for path in field] for field in rays]

@@ -39,7 +39,9 @@ _UNIT_OF = {
     "sensor_distance": MILLIMETRE,
     "power": PER_MILLIMETRE,
     "grooves": PER_MILLIMETRE,
-    **dict.fromkeys(("curvature", "curvature_x", "curvature_y", "sensor_curvature"), PER_MILLIMETRE),
+    **dict.fromkeys(
+        ("curvature", "curvature_x", "curvature_y", "sensor_curvature"), PER_MILLIMETRE
+    ),
     "normalization_radius": MILLIMETRE,
 }
 # Of names whose last part is a number or a coordinate.

@@ -25,7 +25,7 @@ def per_radian(wavelength: float | Tensor, like: Tensor) -> float | Tensor:
 
 @dataclass(frozen=True)
 class OpticalSystem:
-    """A sequence of surfaces and a sensor, plane or curved, centred but for coordinate breaks and the poses of
+    """A sequence of surfaces and a sensor, centred but for coordinate breaks and the poses of
     elements.
 
     Attributes:

@@ -268,7 +268,9 @@ def _chief_ray_angle(operand: Operand, lens: LensProperties) -> dict[str, Tensor
     along = lens.system.senses[-1] * ray.n
     image = lens.system.image
     if image is not None:
-        nx, ny, nz = image.shape.normal(image.parameters, ray.x, ray.y, ray.z - lens.system.vertices[-1])
+        nx, ny, nz = image.shape.normal(
+            image.parameters, ray.x, ray.y, ray.z - lens.system.vertices[-1]
+        )
         cosine = nx * ray.l + ny * ray.m + nz * ray.n
         along = lens.system.senses[-1] * cosine
         across = torch.sqrt(

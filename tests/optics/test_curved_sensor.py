@@ -77,7 +77,8 @@ def test_the_intersection_is_that_of_80_digits(name, root):
         if point is None:
             continue
         compared += 1
-        error = [abs(exact.mp.mpf(a) - b) for a, b in zip(hit.position[ray].tolist(), point)]
+        found = hit.position[ray].tolist()
+        error = [abs(exact.mp.mpf(a) - b) for a, b in zip(found, point, strict=True)]
         assert max(error) < 1e-12
         assert abs(exact.mp.mpf(hit.path_length[ray].item()) - path) < 1e-12
     assert compared > 8
