@@ -25,7 +25,6 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.mirrors import MIRROR
 from dolens.prescriptions.apertures import AUTOMATIC
-from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
@@ -33,6 +32,7 @@ from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_configurations import other_configurations
 from dolens.prescriptions.zemax_glass import read_glass
+from dolens.prescriptions.zemax_own_axes import own_axes
 from dolens.prescriptions.zemax_passed_over import passed_over
 from dolens.prescriptions.zemax_shape import Row
 from dolens.prescriptions.zemax_shapes import shape_of_block
@@ -80,13 +80,21 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
             continue
         block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
         row, clips = _row(block, glass, pupil)
+        before, after = own_axes(block)
         # Behind a mirror, and behind a coordinate break, is the medium in front of it.
         if row.get("material", MIRROR.name) != MIRROR.name:
             medium = row["material"]
+        if before is not None:
+            rows.append(before | {"thickness": 0.0})
+            hard.append(False)
         rows.append(row)
         hard.append(clips)
         if block.stop:
             stops.append(len(rows))
+        if after is not None:
+            rows.append(after | {"thickness": row["thickness"]})
+            hard.append(False)
+            row["thickness"] = 0.0
     if len(stops) != 1:
         said = [n for n, lines in enumerate(file.surfaces) if "STOP" in lines]
         raise InputError(
@@ -116,7 +124,6 @@ def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, boo
         pupil: whether the file gives the pupil, which then sizes the stop.
     """
     shape = shape_of_block(block)
-    _refuse_own_axes(block)
     row: Row = {}
     aperture: Row = {}
     clips = False
@@ -175,6 +182,10 @@ def _with_sensor(
             break
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
+    before, _ = own_axes(block)
+    if before is not None:
+        rows[-1]["thickness"], gaps = math.fsum(gaps), [0.0]
+        rows.append(before)
     sensor = {"distance": math.fsum(gaps)}
     size = read_apertures(image, factor, place)[0].get("semi_diameter")
     if is_fixed(image) and size != AUTOMATIC:
@@ -207,6 +218,8 @@ def _object(
     block = SurfaceBlock(file.surfaces[0], factor, place)
     if block.type != "STANDARD" or block.curvature != 0.0:
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
+    if any(own_axes(block)):
+        raise InputError(f"{place}: a decentred or tilted object is not held (SCBD)")
     medium = glass(block.words("GLAS"), place=place)
     words = block.words("DISZ")
     if not words or words[0].upper() == "INFINITY":
@@ -226,15 +239,6 @@ def _is_ignored(lines: Block) -> bool:
     HIDE.
     """
     return "HIDE" in lines and lines["HIDE"][-1].arguments[5:6] == ["1"]
-
-
-def _refuse_own_axes(block: SurfaceBlock) -> None:
-    """Refuse the decenters and tilts that a surface has among its properties (SCBD)."""
-    for line in block.lines.get("SCBD", []):
-        if any(number_in_text(w, f"{block.place}: SCBD") for w in line.arguments[3:]):
-            raise InputError(
-                f"{block.place}: a surface with its own decenter or tilt is not held (SCBD)"
-            )
 
 
 def _is_dummy(row: Row, before: str | None) -> bool:

@@ -19,8 +19,10 @@ BAD = {
     "Fresnel lens": (singlet("TYPE FRESNELS", *GOOD), "surface 1: a Fresnel surface is not held"),
     "new type": (singlet("TYPE WOBBLE", *GOOD),
                  "surface 1: a kind of surface that is not known here is not held (TYPE WOBBLE"),
-    "own axes": (singlet(*GOOD, "SCBD 1 0 0 0.0 0.1 0.0 0.0 0.0"),
-                 "surface 1: a surface with its own decenter or tilt is not held (SCBD)"),
+    "own axes": (singlet(*GOOD, "SCBD 1 0 0 0.0 0.1 0.0 0.0 0.0\n  SCBD 2 0 1 0 0.2 0 0 0"),
+                 "surface 1: SCBD: the tilts and decenters after the surface are not those before"),
+    "axes of the object": (singlet(*GOOD).replace("SURF 1", "  SCBD 2 0 0 0 1 0 0 0\nSURF 1"),
+                           "the object: a decentred or tilted object is not held (SCBD)"),
 
     "spider": (singlet(*GOOD, "SPID 3 4"), "surface 1: a spider, which blocks light"),
     "drawn outline": (singlet(*GOOD, "USAP 0 0 0"), "surface 1: an aperture whose outline"),
