@@ -9,7 +9,8 @@ times Σ A_i·E_i: of BINARY_2 the powers ρ², ρ⁴, ..., of BINARY_1 the mono
 on are the coefficients.
 
 PARAXIAL is an ideal lens: PARM 1 its focal length (in air), PARM 2 its OPD mode, which moves no
-ray.  Every mode is read as mode 0; see `dolens.optics.surfaces.ideal_lens`.
+ray: it says which conjugates its path differences are computed from.  Every mode is read as mode 0,
+and another one listed (`zemax_passed_over`); see `dolens.optics.surfaces.ideal_lens`.
 """
 
 import re

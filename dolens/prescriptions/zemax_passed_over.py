@@ -75,12 +75,31 @@ def passed_over(file: ZemaxFile) -> list[str]:
             groups.setdefault(group, {})[operand] = None
     for number in file.skipped:
         groups.setdefault(f"surface {number}, which the file leaves out", {})
-    for group in _behind_the_surfaces(file):
+    for group in (*_opd_modes(file), *_behind_the_surfaces(file)):
         groups.setdefault(group, {})
     return [
         f"{group} ({', '.join(operands)})" if operands else group
         for group, operands in groups.items()
     ]
+
+
+def _opd_modes(file: ZemaxFile) -> list[str]:
+    """Return which paraxial lenses have an OPD mode other than 0 (PARM 2).
+
+    It says what the paths of light through an ideal lens are computed from: conjugates found by a
+    real ray (0) or a paraxial one (3), infinite conjugates (2), or the phase of each ray (1).  It
+    turns no ray.
+    """
+    found = []
+    for number, lines in enumerate(file.surfaces):
+        kind = lines["TYPE"][-1].arguments[:1] if "TYPE" in lines else []
+        modes = [line for line in lines.get("PARM", []) if line.arguments[:1] == ["2"]]
+        if kind == ["PARAXIAL"] and modes and _number((*modes[-1].arguments, "0")[1]) != 0.0:
+            found.append(
+                f"surface {number}: the OPD mode of a paraxial lens, whose paths are here those "
+                "between its conjugates"
+            )
+    return found
 
 
 def _behind_the_surfaces(file: ZemaxFile) -> list[str]:
