@@ -64,7 +64,7 @@ def test_the_real_marginal_ray_of_a_near_object(tmp_path):
 
 def test_a_real_marginal_ray_that_is_lost_before_the_stop_is_refused(tmp_path):
     text = f"{HEAD.replace('16', '42')}RAIM 0 2 1\n{BEHIND_A_SPHERE}"
-    with pytest.raises(InputError, match="real marginal ray.* does not reach it"):
+    with pytest.raises(InputError, match="real marginal ray"):
         lens_of(text, tmp_path)
 
 
@@ -96,7 +96,7 @@ def air(*lines):
 def test_a_gap_at_a_pressure_of_its_own_is_refused():
     own = ("PRES 0 1 0.0 0 0 0 1 1", 'GLSS 2 1 "" 0 0 0', "PRES 0 1 1.0 0 0 0", 'GLSS 1 1 ""')
     with pytest.raises(
-        InputError, match=r"surface 2: a medium at a temperature or pressure of its"
+        InputError, match="surface 2: a medium at a temp"
     ):
         read_zemax(air(*own))
 
@@ -107,8 +107,9 @@ def test_a_gap_at_a_pressure_of_its_own_is_refused():
         ("TEMP 0 1 20 0 0 0", "PRES 0 1 1 0 0 0", 'GLSS 1 1 "" 0 0'),
         ("PRES 0 2 0.5 0 0 0", 'GLSS 1 2 "" 0 0', 'GLSS 1 1 "" 0 0'),
         ("PRES 0 1 0.5 0 0 0", "THIC 1 1 4 0 0"),
+        ("MNUM 2", "TEMP 0 1 50 0 0 0", "TEMP 0 2 20 0 0", 'GLSS 1 1 "A" 0 0', 'GLSS 1 2 "A" 0 0'),
     ],
-    ids=["as the system", "of another configuration", "no glass behind it"],
+    ids=["as the system", "of another configuration", "no glass behind it", "one as the system"],
 )
 def test_media_in_the_air_of_the_system_are_held(lines):
     assert len(read_zemax(air(*lines)).prescription["surfaces"]) == 2
