@@ -34,7 +34,7 @@ def real_marginal_height(lens: Lens, z: float, radius: float, stop: float) -> fl
     direction = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     if vergence(lens.object_distance) != 0.0:
         # The object may lie behind a virtual pupil; light travels towards +z all the same.
-        direction = at - torch.tensor([0.0, 0.0, -float(lens.object_distance)]).double()
+        direction = at - at.new_tensor([0.0, 0.0, -float(lens.object_distance)])
         direction = torch.copysign(1.0 / direction.norm(), direction[2]) * direction
     system = lens.system().opened().traced_by("reference")
     surfaces = list(system.surfaces)

@@ -47,15 +47,15 @@ def test_the_stop_is_as_wide_as_the_aiming_of_the_file_makes_it(aiming, tmp_path
 
 
 def test_the_real_marginal_ray_of_a_near_object(tmp_path):
-    """It leaves the axis 60 mm before the sphere, for the rim of the paraxial pupil."""
+    """It leaves the axis 60.1 mm before the sphere, for the rim of the paraxial pupil."""
     text = f"{HEAD.replace('16', '10')}RAIM 0 2 1\n{BEHIND_A_SPHERE}"
-    lens = lens_of(text.replace("DISZ INFINITY", "DISZ 60"), tmp_path)
+    lens = lens_of(text.replace("DISZ INFINITY", "DISZ 60.1"), tmp_path)
     pupil = lens.first_order(550.0).entrance_pupil
-    slope = 5.0 / (60.0 + float(pupil.z))
-    # y = slope (z + 60) on the sphere (z - R)² + y² = R².
-    a, b, c = 1.0 + slope**2, 60.0 * slope**2 - RADIUS, (60.0 * slope) ** 2
+    slope = 5.0 / (60.1 + float(pupil.z))
+    # y = slope (z + 60.1) on the sphere (z - R)² + y² = R².
+    a, b, c = 1.0 + slope**2, 60.1 * slope**2 - RADIUS, (60.1 * slope) ** 2
     z = (-b - math.sqrt(b * b - a * c)) / a
-    y = slope * (z + 60.0)
+    y = slope * (z + 60.1)
     normal = math.asin(y / RADIUS)
     refracted = math.asin(math.sin(normal + math.atan(slope)) / INDEX) - normal
     expected = y + math.tan(refracted) * (THICK - z)
@@ -95,9 +95,7 @@ def air(*lines):
 
 def test_a_gap_at_a_pressure_of_its_own_is_refused():
     own = ("PRES 0 1 0.0 0 0 0 1 1", 'GLSS 2 1 "" 0 0 0', "PRES 0 1 1.0 0 0 0", 'GLSS 1 1 ""')
-    with pytest.raises(
-        InputError, match="surface 2: a medium at a temp"
-    ):
+    with pytest.raises(InputError, match="surface 2: a medium at a temp"):
         read_zemax(air(*own))
 
 
