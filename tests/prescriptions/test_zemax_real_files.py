@@ -111,3 +111,19 @@ def test_a_gap_at_a_pressure_of_its_own_is_refused():
 )
 def test_media_in_the_air_of_the_system_are_held(lines):
     assert len(read_zemax(air(*lines)).prescription["surfaces"]) == 2
+
+
+def test_a_glass_that_schott_gave_up_stands_beside_schotts_own_both_ways():
+    """Schott's SSK4 had the nd and Vd of Sumita's, which is read where GCAT names Schott first; and
+    SK16 was made by both.
+    """
+    glasses = {1: "SSK4", 2: "SK16", 3: "F15", 4: "SK1"}
+    head = "GCAT SCHOTT SUMITA\nENPD 4\n"
+    rows = [surface(n, "DISZ 2", f"CURV 0.0{n}", f"GLAS {name}") for n, name in glasses.items()]
+    rows[0] += "  STOP\n"
+    text = head + surface(0, "DISZ INFINITY") + "".join(rows)
+    text += surface(5, "CURV 0.01", "DISZ 9") + surface(6, "")
+    found = prescription_from_zemax(text)
+    named = [row["material"] for row in found["surfaces"].values()]
+    assert named == ["SUMITA:SSK4", "SCHOTT:SK16", "SCHOTT:F15", "SCHOTT:SK1", "air"]
+    assert prescription_from_zemax(zemax_of(found))["surfaces"] == found["surfaces"]
