@@ -68,7 +68,8 @@ def passed_over(file: ZemaxFile) -> list[str]:
     for drawing, which all files have, are left out.
     """
     groups: dict[str, dict[str, None]] = {}
-    for operand, lines in file.passed_over.items():
+    aiming = {"RAIM": file.system["RAIM"]} if "RAIM" in file.system else {}
+    for operand, lines in (*aiming.items(), *file.passed_over.items()):
         says = _SAYS.get(operand, lambda line: True)
         group = _GROUP_OF.get(operand, _UNKNOWN)
         if group not in _SILENT and any(says(line) for line in lines):

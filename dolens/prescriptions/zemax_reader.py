@@ -30,7 +30,7 @@ from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
-from dolens.prescriptions.zemax_configurations import other_configurations
+from dolens.prescriptions.zemax_configurations import other_configurations, refuse_own_air
 from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_own_axes import own_axes
 from dolens.prescriptions.zemax_passed_over import passed_over
@@ -71,6 +71,7 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     glass = _glass_reader(file)
     medium, distance = _object(file, glass, factor, where)
     prescription = read_system(file, factor, distance is not None, where)
+    refuse_own_air(file, where)
     prescription["stop"] = 1
     prescription["object_material"] = medium
     pupil = not prescription.keys().isdisjoint(PUPIL_KEYS)

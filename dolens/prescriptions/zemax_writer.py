@@ -109,6 +109,7 @@ def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where:
         _air(prescription, where),
         "GFAC 0 0",
         *catalogue_line(materials, where),
+        *(["RAIM 0 2 1 1 0 0 0 0 0"] if prescription.get("real_pupil") else []),
         *_fields(prescription, len(waves), where),
         *(
             f"WAVM {i} {shifted(wave, -3)} {_text(weight, where)}"
