@@ -260,6 +260,8 @@ def _outline(outline: Outline) -> str:
             return f"({number(outline.semi_diameter)}, does not clip)"
         case Circle():
             return number(outline.semi_diameter)
+        case _:
+            return outline.words(number)
 
 
 def _is_glass(row: SurfaceRow) -> bool:

@@ -20,7 +20,7 @@ from dolens.plotting.section import (
     axis_angle,
     broken_axis,
     element_edges,
-    obscuration_profile,
+    obscuration_profiles,
     sensor_line,
     surface_profile,
     trace_fan,
@@ -260,6 +260,5 @@ def _draw_stop(
 
 def _draw_obscurations(axes: Axes, system: OpticalSystem) -> None:
     for number in system.met:
-        profile = obscuration_profile(system, number)
-        if profile is not None and len(profile[0]):
+        for profile in obscuration_profiles(system, number):
             axes.plot(*profile, color="black", linewidth=2.5, gid="obscuration", zorder=4)

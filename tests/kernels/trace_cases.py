@@ -205,6 +205,28 @@ def _clipped():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
 
 
+def _figures():
+    """A pentagon, which is not convex, with a hole, and what blocks a circle in several ways."""
+    pentagon = [[-3.0, -2.0], [3.0, -2.0], [0.5, 0.0], [2.5, 2.5], [-2.5, 2.5]]
+    hole = [[-1.0, 0.5], [-0.5, 0.5], [-0.75, 1.25]]
+    front = {"type": "sphere", "radius": 40.0, "semi_diameter": 6.0,
+             "aperture": {"polygons": [pentagon, hole], "decenter_x": 0.25}}  # fmt: skip
+    blocked = [
+        {"semi_diameter": 0.4},
+        {"width": 0.2, "arms": 3, "angle": 30.0},
+        {"inner_semi_diameter": 1.5, "semi_diameter": 1.7, "decenter_x": 0.2},
+        {"half_width_x": 0.3, "half_width_y": 0.2, "decenter_y": -1.0},
+        {"semi_axis_x": 0.3, "semi_axis_y": 0.5, "decenter_x": 1.0},
+        {"polygons": [[[-1.5, 0.5], [-1.0, 0.5], [-1.25, 1.5]]]},
+    ]
+    surfaces = {
+        "1": {"thickness": 3.0, "material": _GLASS, **front},
+        "2": {"type": "conic", "radius": -90.0, "conic": -1.0, "semi_diameter": 5.0,
+              "material": "air", "obscuration": blocked},
+    }  # fmt: skip
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
+
+
 def _diffractive():
     """A radial phase on an asphere and an XY phase on a conic, and an ideal lens behind them."""
     front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "phase": {
@@ -264,6 +286,7 @@ LENSES = {
     "forbes": lambda root: _forbes(),
     "grid": lambda root: _grid(),
     "clipped": lambda root: _clipped(),
+    "figures": lambda root: _figures(),
     "own_surface": lambda root: _own_surface(),
     "diffractive": lambda root: _diffractive(),
     "spectrometer": lambda root: _spectrometer(),
