@@ -12,8 +12,8 @@ from dolens.optics.glass_catalog import Glass
 from dolens.optics.materials import abbe_number, index_d
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Rectangle
-from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.surfaces.conic import Conic
+from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
 _EVEN = re.compile(r"a\d+")

@@ -16,7 +16,6 @@ from dolens.optics.materials import is_glass
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.number_text import with_minus
 from dolens.plotting.section import (
-    Profile,
     axis_angle,
     broken_axis,
     element_edges,
@@ -26,6 +25,7 @@ from dolens.plotting.section import (
     trace_fan,
 )
 from dolens.plotting.style import SMALL, open_axes, ordered_colours, spectral_colour
+from dolens.plotting.surface_cut import Profile
 
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.1

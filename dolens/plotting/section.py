@@ -1,7 +1,6 @@
 """The meridional section of a lens is computed: surface profiles, edges of elements, ray fans."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -15,19 +14,13 @@ from dolens.optics.rays import Components
 from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces, trace_to_sensor, transfer
+from dolens.plotting.surface_cut import BISECTIONS, Profile, SurfaceCut, place_of, runs
 
-Profile = tuple[np.ndarray, np.ndarray]
-
-SAMPLES = 201
 # The real beam is looked for over this many paraxial pupil radii, because pupils have aberrations.
 _SEARCH = 1.5
 _TRIALS = 601
-_BISECTIONS = 60
-_NEWTON_STEPS = 20
 # Heights on the stop whose rays are tried where the lens is folded.
 _STOP_TRIALS = 81
-# Places along a cut, where outlines may be of several parts.
-_GRID = 2001
 _NOTHING: Profile = (np.zeros(0), np.zeros(0))
 
 
@@ -48,15 +41,15 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
     aperture = system.surfaces[number - 1].aperture
     edge = aperture.edge
     center = (0.0, 0.0) if edge.rotational else aperture.center
-    cut = _Cut(system, number)
+    cut = SurfaceCut(system, number)
 
     def inside(q: Tensor) -> Tensor:
         x, y, _, _ = cut.points(q)
         return edge.margin(x - center[0], y - center[1]) >= 0.0
 
     if isinstance(edge, Polygons):
-        runs = _runs(inside, aperture.semi_diameter)
-        return cut.profile(runs[0][0], runs[-1][1]) if runs else _NOTHING
+        found = runs(inside, aperture.semi_diameter)
+        return cut.profile(found[0][0], found[-1][1]) if found else _NOTHING
     # Along the cut, the place nearest to the outline's centre.
     begin = cut.along(*center)
     middle = torch.full((1,), begin, dtype=torch.float64)
@@ -65,7 +58,7 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
     # The rims: the last point inside on either side.
     near = middle.expand(2)
     far = begin + 1.5 * edge.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
-    for _ in range(_BISECTIONS):
+    for _ in range(BISECTIONS):
         half = 0.5 * (near + far)
         kept = inside(half)
         near, far = torch.where(kept, half, near), torch.where(kept, far, half)
@@ -78,7 +71,7 @@ def obscuration_profiles(system: OpticalSystem, number: int) -> list[Profile]:
     if aperture.obscuration is None:
         return []
     reach = aperture.semi_diameter
-    cut = _Cut(system, number)
+    cut = SurfaceCut(system, number)
 
     def blocked(q: Tensor) -> Tensor:
         x, y, _, _ = cut.points(q)
@@ -86,92 +79,12 @@ def obscuration_profiles(system: OpticalSystem, number: int) -> list[Profile]:
         u, v = x - aperture.center[0], y - aperture.center[1]
         return (aperture.obscuration.margin(u, v) >= 0.0) & (torch.hypot(x, y) <= reach)
 
-    return [cut.profile(*run) for run in _runs(blocked, reach)]
-
-
-def _runs(inside: Callable[[Tensor], Tensor], reach: float) -> list[tuple[float, float]]:
-    """Return from where to where along a cut points are inside; gaps below a grid's are not seen.
-
-    Args:
-        inside: of places along the cut.
-        reach: how far from the middle to look.
-    """
-    grid = torch.linspace(-1.01 * reach, 1.01 * reach, _GRID, dtype=torch.float64)
-    state = inside(grid)
-    change = torch.nonzero(state[1:] != state[:-1])[:, 0]
-    low, high, first = grid[change], grid[change + 1], state[change]
-    for _ in range(_BISECTIONS):
-        half = 0.5 * (low + high)
-        same = inside(half) == first
-        low, high = torch.where(same, half, low), torch.where(same, high, half)
-    rims = torch.where(first, low, high).tolist()
-    return list(zip(rims[::2], rims[1::2], strict=False))
-
-
-class _Cut:
-    """The plane x = 0 of the lens cuts a surface in a curve, along which a place is a number (mm).
-
-    Raises:
-        InputError: the surface faces along x.
-    """
-
-    def __init__(self, system: OpticalSystem, number: int) -> None:
-        self.system, self.number = system, number
-        self.rotation, self.origin = _place(system, number)
-        # In the surface's axes the plane is a·p + o = 0, with a the lens's x seen from the surface.
-        ax, ay, self.az = self.rotation[0]
-        self.offset = self.origin[0]
-        self.across = torch.hypot(ax, ay)
-        if float(self.across) < 1e-9:
-            raise InputError(
-                f"layout: surface {number} faces along x and has no meridional section"
-            )
-        self.ux, self.uy = ax / self.across, ay / self.across
-        # Along the cut, y of the lens grows.
-        rotation = self.rotation
-        grows = float(rotation[1, 1] * self.ux - rotation[1, 0] * self.uy) >= 0.0
-        sign = 1.0 if grows else -1.0
-        self.vx, self.vy = -sign * self.uy, sign * self.ux
-
-    def along(self, x: float, y: float) -> float:
-        """Return the place nearest to a point of the surface's axes."""
-        return float(self.vx) * x + float(self.vy) * y
-
-    def points(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return x, y, sag in the surface's axes at places q, and where the sag exists."""
-        across, offset, az = self.across, self.offset, self.az
-        w = (-offset / across).expand_as(q)
-        for _ in range(_NEWTON_STEPS if float(az.abs()) > 0.0 else 1):
-            x, y = self.vx * q + self.ux * w, self.vy * q + self.uy * w
-            sag, sx, sy, _ = sag_of(self.system, self.number, x, y)
-            slope = across + az * (sx * self.ux + sy * self.uy)
-            w = w - (across * w + offset + az * sag) / torch.where(slope == 0.0, across, slope)
-        x, y = self.vx * q + self.ux * w, self.vy * q + self.uy * w
-        sag, _, _, exists = sag_of(self.system, self.number, x, y)
-        return x, y, sag, exists
-
-    def profile(self, low: float, high: float) -> Profile:
-        """Return z and y, mm, of the lens between two places."""
-        share = torch.linspace(0.0, 1.0, SAMPLES, dtype=torch.float64)
-        x, y, sag, exists = self.points(low * (1.0 - share) + high * share)
-        points = torch.stack([x, y, sag]).T[exists] @ self.rotation.T + self.origin
-        return points[:, 2].numpy(), points[:, 1].numpy()
-
-
-def sag_of(
-    system: OpticalSystem, number: int, x: Tensor, y: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sag (mm) and slopes in double precision, and where they exist."""
-    surface = system.surfaces[number - 1]
-    parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
-    sag, sx, sy, exists = surface.shape.sag_and_gradient(parameters, x, y)
-    exists = torch.ones_like(sag, dtype=torch.bool) if exists is None else exists >= 0.0
-    return sag, sx, sy, exists
+    return [cut.profile(*run) for run in runs(blocked, reach)]
 
 
 def axis_angle(system: OpticalSystem, number: int) -> float:
     """Return the angle (radians) from z towards y of a surface's axis, seen along x."""
-    rotation, _ = _place(system, number)
+    rotation, _ = place_of(system, number)
     return math.atan2(float(rotation[1, 2]), float(rotation[2, 2]))
 
 
@@ -196,14 +109,6 @@ def _turn(profile: Profile, angle: float) -> Profile:
     z, y = profile
     c, s = math.cos(angle), math.sin(angle)
     return c * z - s * y, s * z + c * y
-
-
-def _place(system: OpticalSystem, number: int) -> tuple[Tensor, Tensor]:
-    axes = system.axes[number - 1]
-    if axes.rotation is None:
-        z = float(axes.z)
-        return torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, z], dtype=torch.float64)
-    return axes.rotation.detach().double().cpu(), axes.origin.detach().double().cpu()
 
 
 def _edge(front: Profile, back: Profile, end: int) -> np.ndarray:

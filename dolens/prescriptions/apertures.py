@@ -150,9 +150,7 @@ def _obscuration(value: object, place: str) -> tuple[Outline, tuple[float, float
         return _outline(value, _BLOCKING, place)
     if not value:
         raise InputError(f"{place}: is an empty list")
-    parts = [
-        _outline(part, _BLOCKING, f"{place} {number}") for number, part in enumerate(value, 1)
-    ]
+    parts = [_outline(part, _BLOCKING, f"{place} {number}") for number, part in enumerate(value, 1)]
     return Together(tuple(parts)), (0.0, 0.0)
 
 

@@ -39,9 +39,7 @@ class Ring(Composite):
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the lesser of ρ² - r² and r² - ρ² of both circles, mm²."""
         square = torch.addcmul(x * x, y, y)
-        return torch.minimum(
-            self.semi_diameter**2 - square, square - self.inner_semi_diameter**2
-        )
+        return torch.minimum(self.semi_diameter**2 - square, square - self.inner_semi_diameter**2)
 
     def depth(self, x: Tensor, y: Tensor) -> Tensor:
         """Return how far inside the nearer circle a point is, mm; negative outside."""

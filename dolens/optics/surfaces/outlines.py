@@ -106,9 +106,7 @@ class Polygons(Composite):
     def sides(self) -> list[tuple[Point, Point]]:
         """Return all sides, from vertex to vertex."""
         return [
-            (polygon[k - 1], polygon[k])
-            for polygon in self.polygons
-            for k in range(len(polygon))
+            (polygon[k - 1], polygon[k]) for polygon in self.polygons for k in range(len(polygon))
         ]
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
