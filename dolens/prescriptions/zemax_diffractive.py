@@ -37,7 +37,7 @@ _ASPHERE_TERMS = range(1, 9)
 def _read_grating(block: SurfaceBlock) -> Row:
     grooves = scaled(block.parameters.get(1, "0"), Fraction(1000), f"{block.place}: PARM 1")
     return {
-        **_base(block),
+        **conic_base(block),
         "phase": {"type": "grating", "order": _order(block, 2), "grooves": grooves},
     }
 
@@ -49,7 +49,7 @@ def _write_grating(row: Mapping[str, Any], place: str) -> list[str]:
     return [*STANDARD.write(row, place), f"PARM 1 {shifted(grooves, -3)}", f"PARM 2 {order}"]
 
 
-def _base(block: SurfaceBlock) -> Row:
+def conic_base(block: SurfaceBlock) -> Row:
     """Return a conic where CONI is given; a plane where CURV is `0`, without a decimal point."""
     if "CONI" in block.lines:
         conic = block.number("CONI")
@@ -73,7 +73,7 @@ def _asphere(block: SurfaceBlock) -> Row:
     words = [block.parameters.get(n, "0") for n in _ASPHERE_TERMS]
     if any(float(word) or word == NAMED_ZERO for word in words):
         return EVEN_ASPHERE.read(_without_order(block))
-    return _base(block)
+    return conic_base(block)
 
 
 def _without_order(block: SurfaceBlock) -> SurfaceBlock:

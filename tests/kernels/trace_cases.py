@@ -243,6 +243,21 @@ def _diffractive():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 25.0}})
 
 
+def _zernike_phases():
+    """Zernike phases in both orders, of a plane and of a sphere that refracts."""
+    front = {"type": "plane", "thickness": 2.0, "phase": {
+        "type": "zernike_fringe", "norm_radius": 4.0, "z2": 4.0, "z4": 12.0, "z5": -3.0, "z6": 2.0,
+        "z8": 1.5, "z9": -2.0, "z11": 0.4, "z37": 0.1}}  # fmt: skip
+    back = {"type": "sphere", "radius": -40.0, "phase": {
+        "type": "zernike_standard", "order": 2, "norm_radius": 6.0, "z3": 3.0, "z7": -0.5,
+        "z14": 0.3, "z22": 0.2, "z91": 0.01}}  # fmt: skip
+    surfaces = {
+        "1": {"semi_diameter": 4.0, "material": _GLASS, **front},
+        "2": {"semi_diameter": 5.0, "material": "air", **back},
+    }
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 70.0}})
+
+
 def _spectrometer():
     """A grating that transmits, one on a concave mirror, whose higher orders vanish, and an ideal
     lens that the light comes back to.
@@ -289,6 +304,7 @@ LENSES = {
     "figures": lambda root: _figures(),
     "own_surface": lambda root: _own_surface(),
     "diffractive": lambda root: _diffractive(),
+    "zernike_phases": lambda root: _zernike_phases(),
     "spectrometer": lambda root: _spectrometer(),
     "mirrors": lambda root: _mirrors(),
     "folded": lambda root: _folded(),
