@@ -35,7 +35,8 @@ def coverage(aperture: ClearAperture, x: Tensor, y: Tensor, radius: Tensor | Non
     if aperture.window is not None:
         share = torch.minimum(share, aperture.window.share(covered, u, v))
     if aperture.obscuration is not None:
-        share = torch.minimum(share, 1.0 - aperture.obscuration.share(covered, u, v))
+        # In cells of two edges, as where the arms of a spider end, these cross.
+        share = share * (1.0 - aperture.obscuration.share(covered, u, v))
     return share
 
 
