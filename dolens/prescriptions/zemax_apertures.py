@@ -27,6 +27,8 @@ Block = dict[str, list[Line]]
 _HALF_WIDTHS = ("half_width_x", "half_width_y")
 _SEMI_AXES = ("semi_axis_x", "semi_axis_y")
 _CENTER = ("decenter_x", "decenter_y")
+# A circle of this radius, mm, has no edge: Zemax's 1E+10 stands for infinity.
+_NO_EDGE = 1e9
 # Outlines of two numbers: what light passes, and what blocks it.
 _PASSED = {"SQAP": _HALF_WIDTHS, "ELAP": _SEMI_AXES}
 _BLOCKED = {"SQOB": _HALF_WIDTHS, "ELOB": _SEMI_AXES}
@@ -64,6 +66,10 @@ def read_apertures(
     if "CLAP" in block:
         inner, outer = _pair(block, "CLAP", factor, place)
         hole = {"obscuration": {"semi_diameter": inner}} if inner else {}
+        if outer >= _NO_EDGE:
+            return found | (
+                {"obscuration": hole["obscuration"] | beside} if hole else {}
+            ), inner > 0
         if beside:
             outline = {"aperture": {"semi_diameter": outer} | beside}
             return (found if stop else {}) | outline | hole, True

@@ -13,7 +13,13 @@ from dolens.errors import InputError
 from dolens.prescriptions.zemax_biconic_toroid import BICONIC, TOROID
 from dolens.prescriptions.zemax_block import SurfaceBlock
 from dolens.prescriptions.zemax_coordinate_break import COORDINATE_BREAK
-from dolens.prescriptions.zemax_diffractive import BINARY_1, BINARY_2, GRATING, PARAXIAL
+from dolens.prescriptions.zemax_diffractive import (
+    BINARY_1,
+    BINARY_2,
+    GRATING,
+    PARAXIAL,
+    TOROIDAL_GRATING,
+)
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_grid_sag import GRID_SAG
 from dolens.prescriptions.zemax_irregular import IRREGULAR
@@ -35,11 +41,7 @@ SHAPES: dict[str, ZemaxShape] = {
     shape.type: shape
     for shape in (
         *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL, COORDINATE_BREAK),
-        *(PARAXIAL, GRATING, BINARY_1, BINARY_2),
-        STANDARD,
-        EVEN_ASPHERE,
-        TILTED_PLANE,
-        XY_POLYNOMIAL,
+        *(PARAXIAL, GRATING, TOROIDAL_GRATING, BINARY_1, BINARY_2),
         ODD_ASPHERE,
         EXTENDED_ASPHERE,
         EXTENDED_ODD_ASPHERE,
