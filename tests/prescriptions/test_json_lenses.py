@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from dolens import load_lens, save_lens
 from dolens.prescriptions.json_lenses import json_of, read_json
 from tests.prescriptions.samples import SINGLET, require_refused
 
@@ -209,3 +210,14 @@ def test_what_is_not_held_is_refused_by_name(content, said, tmp_path):
 )
 def test_hostile_json_ends_in_one_line(text, said, tmp_path):
     require_refused(tmp_path / "lens.json", text, said)
+
+
+def test_what_a_source_publishes_and_draws_comes_back(tmp_path):
+    """Published numbers and obscurations are kept in JSON as in YAML."""
+    lens = load_lens("published/ritchey_chretien_hst")
+    for suffix in (".json", ".yaml"):
+        save_lens(lens, tmp_path / f"lens{suffix}")
+        again = load_lens(tmp_path / f"lens{suffix}")
+        assert again.published == lens.published
+        assert again.surfaces["1"].aperture.obscuration.semi_diameter == 396.0
+        assert again.source == lens.source

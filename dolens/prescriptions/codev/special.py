@@ -3,8 +3,10 @@
 `SPS XYP` adds a polynomial in x and y, `SPS ODD` all powers of r, `SPS QBF` is Forbes's Q_bfs;
 `SCO C4 0.1` gives their coefficient 4.  Of `SPS ODD` coefficient 1 is the conic constant (`SCO K`)
 and n + 1 that of rⁿ (`SCO ARn`), from r to r³⁰; 33 is a radius of normalisation, and 0 means none
-(Lens System Setup Reference Manual).  `DIF DOE` with `HCT R` is a radial phase: the path is Σ C_i·r^2i at the wavelength
-HWL, in order HOR, and φ = 2π·path/HWL.
+(Lens System Setup Reference Manual).
+
+`DIF DOE` with `HCT R` is a radial phase: the path is Σ C_i·r^2i at the wavelength HWL, in order
+HOR, and φ = 2π·path/HWL.
 """
 
 import math
