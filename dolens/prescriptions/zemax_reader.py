@@ -7,7 +7,8 @@ or METER.
 Everything else that bends rays is an error that names it.  What bends no ray is passed over, and
 listed (`zemax_passed_over`).
 
-Surfaces keep their numbers, but for those that the file says to ignore.  Only planes before the
+Surfaces keep their numbers, but for those that the file says to ignore, and behind one that has a
+tilt or decenter of its own, which becomes coordinate breaks around it.  Only planes before the
 image that neither refract nor clip are left out, and their gaps added to the sensor's distance.
 
 As in Zemax, apertures clip (CLAP, SQAP, and FLAP at a DIAM of the user's own), and a DIAM alone
@@ -25,7 +26,6 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.mirrors import MIRROR
 from dolens.prescriptions.apertures import AUTOMATIC
-from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
@@ -36,6 +36,7 @@ from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_passed_over import passed_over
 from dolens.prescriptions.zemax_shape import Row
 from dolens.prescriptions.zemax_shapes import shape_of_block
+from dolens.prescriptions.zemax_surface_axes import surface_axes
 from dolens.prescriptions.zemax_system import factor_to_mm, read_system
 
 # Zemax writes INFINITY, and takes any distance from here on for it.
@@ -83,10 +84,18 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
         # Behind a mirror, and behind a coordinate break, is the medium in front of it.
         if row.get("material", MIRROR.name) != MIRROR.name:
             medium = row["material"]
-        rows.append(row)
-        hard.append(clips)
-        if block.stop:
-            stops.append(len(rows))
+        own = [row]
+        before, after = surface_axes(block)
+        if before:
+            own.insert(0, {**before, "thickness": 0.0})
+        if after:
+            own.append({**after, "thickness": row["thickness"]})
+            row["thickness"] = 0.0
+        for part in own:
+            rows.append(part)
+            hard.append(clips and part is row)
+            if block.stop and part is row:
+                stops.append(len(rows))
     if len(stops) != 1:
         said = [n for n, lines in enumerate(file.surfaces) if "STOP" in lines]
         raise InputError(
@@ -116,7 +125,6 @@ def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, boo
         pupil: whether the file gives the pupil, which then sizes the stop.
     """
     shape = shape_of_block(block)
-    _refuse_own_axes(block)
     row: Row = {}
     aperture: Row = {}
     clips = False
@@ -211,15 +219,6 @@ def _is_ignored(lines: Block) -> bool:
     HIDE.
     """
     return "HIDE" in lines and lines["HIDE"][-1].arguments[5:6] == ["1"]
-
-
-def _refuse_own_axes(block: SurfaceBlock) -> None:
-    """Refuse the decenters and tilts that a surface has among its properties (SCBD)."""
-    for line in block.lines.get("SCBD", []):
-        if any(number_in_text(w, f"{block.place}: SCBD") for w in line.arguments[3:]):
-            raise InputError(
-                f"{block.place}: a surface with its own decenter or tilt is not held (SCBD)"
-            )
 
 
 def _is_dummy(row: Row, before: str | None) -> bool:
