@@ -221,3 +221,35 @@ def test_what_a_source_publishes_and_draws_comes_back(tmp_path):
         assert again.published == lens.published
         assert again.surfaces["1"].aperture.obscuration.semi_diameter == 396.0
         assert again.source == lens.source
+
+
+CIRCLE = {"type": "RadialAperture", "r_max": 10.0, "r_min": 0.0}
+RECTANGLE = {"type": "RectangularAperture", "x_min": -1.0, "x_max": 1.0, "y_min": 2.0, "y_max": 5.0}
+ELLIPSE = {"type": "EllipticalAperture", "a": 3.0, "b": 2.0, "offset_x": 0.5, "offset_y": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("aperture", "row"),
+    [
+        (CIRCLE | {"r_min": 2.0}, {"semi_diameter": 10.0, "obscuration": {"semi_diameter": 2.0}}),
+        (RECTANGLE, {"aperture": {"half_width_x": 1.0, "half_width_y": 1.5, "decenter_y": 3.5}}),
+        (ELLIPSE, {"aperture": {"semi_axis_x": 3.0, "semi_axis_y": 2.0, "decenter_x": 0.5}}),
+        (
+            {"type": "PolygonAperture", "x": [-4.0, 4.0, 0.0], "y": [-3.0, -3.0, 5.0]},
+            {"aperture": {"polygons": [[[-4.0, -3.0], [4.0, -3.0], [0.0, 5.0]]]}},
+        ),
+        (
+            {"type": "DifferenceAperture", "a": CIRCLE, "b": ELLIPSE},
+            {
+                "semi_diameter": 10.0,
+                "obscuration": {"semi_axis_x": 3.0, "semi_axis_y": 2.0, "decenter_x": 0.5},
+            },
+        ),
+    ],
+)
+def test_apertures_of_optiland(aperture, row):
+    """The keys that its classes write, and the points that they contain (version 0.6.3)."""
+    content = copy.deepcopy(OPTILAND)
+    content["surface_group"]["surfaces"][3]["aperture"] = aperture
+    found = read_json(json.dumps(content), "lens").prescription["surfaces"]["3"]
+    assert {key: found.get(key) for key in row} == row
