@@ -101,6 +101,14 @@ def test_a_floating_aperture_with_a_hole_is_a_ring_of_the_semi_diameter():
     assert row["obscuration"] == {"semi_diameter": 2.0}
 
 
+def test_a_circle_of_1e10_has_no_edge_but_its_hole():
+    """As the primary mirror of Zemax's own Schmidt-Cassegrain sample has it."""
+    text = singlet("CURV 0.01", "DIAM 5", GLASS, last="DIAM 6 0\n  CLAP 2 1.0E+10 0")
+    row = prescription_from_zemax(text)["surfaces"]["2"]
+    assert (row["semi_diameter"], row["clips"]) == (6.0, False)
+    assert row["obscuration"] == {"semi_diameter": 2.0}
+
+
 @pytest.mark.parametrize(
     "lines, message",
     [
