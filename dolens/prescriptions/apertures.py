@@ -94,7 +94,9 @@ def clear_aperture(row: Mapping[str, Any], place: str) -> ClearAperture:
     center = centers[0] if centers else (0.0, 0.0)
     if len(centers) == 2 and any(centers[1]) and centers[1] != center:
         hole = Together(((hole, centers[1]),))
-    if isinstance(hole, Together):
+    if isinstance(hole, Together) and len(hole.parts) == 1 and outline is None:
+        [(hole, center)] = hole.parts
+    elif isinstance(hole, Together):
         # Its parts have centres of their own.
         parts = tuple((part, (x - center[0], y - center[1])) for part, (x, y) in hole.parts)
         hole = parts[0][0] if len(parts) == 1 and parts[0][1] == CENTRE else Together(parts)

@@ -140,6 +140,10 @@ def test_a_prescription_is_read_as_it_is_written():
         {"aperture": {"half_width_x": 3.0, "half_width_y": 4.0, "decenter_y": 1.0},
          "obscuration": [{"inner_semi_diameter": 1.0, "semi_diameter": 2.0}]},
     ]  # fmt: skip
+    single = window(semi_diameter=5.0, obscuration=[{"semi_diameter": 1.0, "decenter_x": 2.0}])
+    plain = window(semi_diameter=5.0, obscuration={"semi_diameter": 1.0, "decenter_x": 2.0})
+    first, second = (lens_from_prescription(data).surfaces["1"] for data in (single, plain))
+    assert first.aperture == second.aperture
     for written in rows:
         row = prescription_of(lens_from_prescription(window(**written)))["surfaces"]["1"]
         assert {key: row.get(key) for key in written} == written
