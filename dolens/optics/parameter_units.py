@@ -32,6 +32,7 @@ DEGREE = Unit("deg", math.pi / 180.0)
 MILLIMETRE = Unit("mm")
 PER_MILLIMETRE = Unit("1/mm")
 RADIAN = Unit("rad")
+WAVE = Unit("waves")
 UNNAMED = Unit("")
 _UNIT_OF = {
     **dict.fromkeys(TILTS, DEGREE),
@@ -56,7 +57,10 @@ def unit_of(name: str) -> Unit:
     """
     first, _, _ = name.partition(".")
     group, _, last = name.rpartition(".")
-    others = RADIAN if group.endswith(".phase") else UNNAMED
+    others = UNNAMED
+    if group.endswith(".phase"):
+        # Zernike's coefficients are waves, all others radians.
+        others = WAVE if last[:1] == "z" else RADIAN
     return _UNIT_OF_GROUP.get(first) or _UNIT_OF.get(last, others)
 
 

@@ -12,6 +12,7 @@ from dolens.optics.mirrors import MIRROR
 from dolens.optics.parameter_units import to_file_units
 from dolens.optics.surfaces import CoordinateBreak
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse, Rectangle
+from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.tables import html_table, printable, text_table
 
 HEADINGS = (
@@ -260,6 +261,8 @@ def _aperture(aperture: ClearAperture) -> str:
         found = f"rectangle {_number(2.0 * edge.half_width_x)} × {_number(2.0 * edge.half_width_y)}"
     elif isinstance(edge, Ellipse):
         found = f"ellipse {_number(2.0 * edge.semi_axis_x)} × {_number(2.0 * edge.semi_axis_y)}"
+    elif isinstance(edge, Polygons):
+        found = edge.words(_number)
     else:
         found = "circle" if isinstance(edge, Circle) else "no edge"
     if aperture.window is not None:

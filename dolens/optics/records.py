@@ -188,6 +188,7 @@ class _Writer:
             row[Code.REFRACTS] = int(bends and law is None)
             self.aperture(row, s.apertures[number - 1])
             self.shape(row, number)
+            self.figures(row, s.apertures[number - 1])
             if law is not None:
                 row = self.step(Kind.DEFLECT, medium, medium + 1, number)
                 self.constants[row[Code.OFFSET] + Slot.SENSE_BEHIND] = sense_behind
@@ -328,6 +329,18 @@ class _Writer:
         self.add(len(self.constants), self.of_image, len(s.image.sizes))
         self.constants += [0.0] * len(s.image.sizes)
         row[Code.LENGTH] = len(self.constants) - begin
+
+    def figures(self, row: list[int], aperture: ClearAperture) -> None:
+        """Write the figures of a clear aperture, which have no cotangents, behind its shape."""
+        numbers: list[float] = []
+        count = 0
+        for blocks, figures in aperture.figures():
+            count += len(figures)
+            for kind, center, own in figures:
+                numbers += [float(kind), float(blocks), *center, float(len(own)), *own]
+        if count:
+            row[Code.FIGURES] = len(self.constants) - row[Code.OFFSET]
+            self.constants += [float(count), *numbers]
 
     def leave(self, line: tuple[int, tuple[int, ...]], now: int, at: int, medium: int) -> None:
         """From the last surface, which an element may carry, to the lens's axes or the sensor.

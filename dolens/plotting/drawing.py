@@ -16,17 +16,17 @@ from dolens.optics.materials import is_glass
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.number_text import with_minus
 from dolens.plotting.section import (
-    Profile,
     axis_angle,
     broken_axis,
     element_edges,
-    obscuration_profile,
+    obscuration_profiles,
     sensor_curve,
     sensor_line,
     surface_profile,
     trace_fan,
 )
 from dolens.plotting.style import SMALL, open_axes, ordered_colours, spectral_colour
+from dolens.plotting.surface_cut import Profile
 
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.1
@@ -261,6 +261,5 @@ def _draw_stop(
 
 def _draw_obscurations(axes: Axes, system: OpticalSystem) -> None:
     for number in system.met:
-        profile = obscuration_profile(system, number)
-        if profile is not None and len(profile[0]):
+        for profile in obscuration_profiles(system, number):
             axes.plot(*profile, color="black", linewidth=2.5, gid="obscuration", zorder=4)

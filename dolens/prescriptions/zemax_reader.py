@@ -7,7 +7,8 @@ or METER.
 Everything else that bends rays is an error that names it.  What bends no ray is passed over, and
 listed (`zemax_passed_over`).
 
-Surfaces keep their numbers, but for those that the file says to ignore.  Only planes before the
+Surfaces keep their numbers, but for those that the file says to ignore, and behind one that has a
+tilt or decenter of its own, which becomes coordinate breaks around it.  Only planes before the
 image that neither refract nor clip are left out, and their gaps added to the sensor's distance.
 
 As in Zemax, apertures clip (CLAP, SQAP, and FLAP at a DIAM of the user's own), and a DIAM alone

@@ -20,7 +20,7 @@ from tests.kernels.trace_cases import (
 
 # Every kind of surface; some of them backward too, where no code of its own is left to try.
 CASES = [(name, 1.0) for name in LENSES] + [
-    (name, -1.0) for name in ("posed", "polynomial", "clipped", "mirrors", "folded")
+    (name, -1.0) for name in ("posed", "polynomial", "clipped", "figures", "mirrors", "folded")
 ]
 SINGLE = ["cooke_triplet", "polynomial", "even_aspheres"]
 

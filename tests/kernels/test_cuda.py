@@ -102,6 +102,8 @@ LENSES = {
     "aspheres": (SPHERES, (EvenAsphere,)),
     "posed plates": (SPHERES | 1 << Kind.CHANGE_AXES | 1 << Kind.LENS_AXES, (XYPolynomial,)),
     "a surface of a user's own": (SPHERES, (Paraboloid,)),
+    # The bit behind those of the kinds of step: see `dolens.kernels.cuda.layout`.
+    "apertures made of figures": (SPHERES | 1 << Kind.BY_SAG, ()),
     "polynomials by recurrence": (SPHERES, (ZernikeStandard,)),
 }
 
@@ -115,6 +117,7 @@ LENSES = {
         ("posed plates", torch.float32),
         ("aspheres", torch.float64),
         ("a surface of a user's own", torch.float32),
+        ("apertures made of figures", torch.float32),
         ("polynomials by recurrence", torch.float64),
     ],
 )

@@ -37,6 +37,14 @@ def test_published_numbers_stand_beside_computed_ones():
     assert "US 2,838,978" in text
 
 
+def test_long_lists_of_coefficients_stay_within_the_terminal():
+    """An odd asphere of eight coefficients is a list that goes on in further lines."""
+    found = show("published/mobile_us7535658_odd")
+    assert max(map(len, found.output.splitlines())) <= 110
+    assert "a4=0.02426, a6=0.0008371" in found.output
+    assert "A semi-diameter in brackets clips nothing." in " ".join(found.output.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

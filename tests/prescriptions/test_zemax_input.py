@@ -11,8 +11,8 @@ from tests.prescriptions.zemax_samples import GLASS, lens_of, singlet
 
 GOOD = ("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
 BAD = {
-    "irregular surface": (singlet("TYPE IRREGULA", *GOOD),
-                          "surface 1: an irregular surface is not held (TYPE IRREGULA; allowed: "),
+    "superconic": (singlet("TYPE SUPERCON", *GOOD),
+                   "surface 1: a superconic is not held (TYPE SUPERCON; allowed: "),
     "gradient index": (singlet("TYPE GRINSUR5", *GOOD), "surface 1: a gradient-index medium is"),
     "non-sequential part": (singlet("TYPE NONSEQCO", *GOOD, "NSCS 1 7 _NONE_"),
                             "surface 1: a non-sequential component is not held"),
@@ -24,11 +24,11 @@ BAD = {
     "axes of the object": (singlet(*GOOD).replace("SURF 1", "  SCBD 2 0 0 0 1 0 0 0\nSURF 1"),
                            "the object: a decentred or tilted object is not held (SCBD)"),
 
-    "spider": (singlet(*GOOD, "SPID 3 4"), "surface 1: a spider, which blocks light"),
-    "drawn outline": (singlet(*GOOD, "USAP 0 0 0"), "surface 1: an aperture whose outline"),
+    "spider": (singlet(*GOOD, "SPID 3"), "surface 1: SPID needs the width of the arms"),
+    "drawn outline": (singlet(*GOOD, "USAP 0 0 0"),
+                      "surface 1: USAP: the outline that the user draws stands in another file"),
     "half a rectangle": (singlet(*GOOD, "SQAP 3"), "surface 1: SQAP needs two numbers"),
-    "ring": (singlet(*GOOD, "OBSC 1 2"), "surface 1: a ring that blocks light between"),
-    "floating ring": (singlet(*GOOD, "FLAP 1 5 0"), "surface 1: a floating aperture with a hole"),
+    "ring": (singlet(*GOOD, "OBSC 2 1"), "surface 1: 'obscuration': inner_semi_diameter 2 must"),
     "configurations": (singlet(*GOOD) + "MNUM 2.5 1\n",
                        "MNUM must have whole numbers, not '2.5 1'"),
     "non-sequential": (singlet(*GOOD, head="MODE NSC\n"),
