@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
 from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import VariableMap
@@ -200,7 +201,7 @@ def _variable_map(
     )
 
 
-@lru_cache(maxsize=256)
+@cached_tensors(maxsize=256)
 def _map_of_numbers(
     layout: Records, sizes: tuple[int, ...], columns: tuple[int, ...], count: int
 ) -> VariableMap:

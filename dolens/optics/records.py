@@ -6,13 +6,13 @@ elements carry what.  So records are laid out once, and packing is then one gath
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.cached_tensors import cached_tensors
 from dolens.kernels.table import Code, Kind, Outline, Slot
 from dolens.optics.elements import carriers
 from dolens.optics.image_surface import WITHOUT_EDGE
@@ -127,7 +127,7 @@ def tensor(numbers: Sequence, dtype: type) -> Tensor:
     return torch.from_numpy(np.array(numbers, dtype=dtype))
 
 
-@lru_cache(maxsize=256)
+@cached_tensors(maxsize=256)
 def records(structure: Structure) -> Records:
     """Lay out the steps of a lens in the order that light of this sense meets them."""
     return _Writer(structure).write()

@@ -41,7 +41,7 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
     if number in system.breaks:
         return _NOTHING
     aperture = system.surfaces[number - 1].aperture
-    edge = aperture.edge
+    edge = aperture.edge.drawn
     center = (0.0, 0.0) if edge.rotational else aperture.center
     cut = SurfaceCut(system, number)
 

@@ -40,6 +40,20 @@ def glass(figure):
     return {patch.get_gid(): patch.get_path() for patch in figure.axes[0].patches}
 
 
+def test_a_surface_that_clips_nothing_is_drawn_as_far_as_light_is_expected():
+    row = {"type": "sphere", "radius": 40.0, "semi_diameter": 6.0, "clips": False}
+    prescription = {
+        "surfaces": {
+            "1": {**row, "thickness": 3.0, "material": "1.5"},
+            "2": {**row, "material": "air"},
+        },
+        "sensor": {"distance": 90.0},
+    }
+    z, y = surface_profile(lens_from_prescription(prescription).system(), 1)
+    np.testing.assert_allclose(y[[0, -1]], [-6.0, 6.0], rtol=1e-12)
+    assert z[-1] == pytest.approx(40.0 - math.sqrt(40.0**2 - 6.0**2), rel=1e-12)
+
+
 @pytest.mark.parametrize("name", LENSES)
 def test_every_lens_is_drawn_to_its_rims_with_its_rays(lens, name):
     one = lens(name)

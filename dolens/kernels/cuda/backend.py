@@ -2,7 +2,7 @@
 
 import logging
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache, lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ import triton
 from torch import Tensor
 from triton.runtime.interpreter import InterpretedFunction
 
+from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
 from dolens.kernels.cuda.adjoint import adjoint_kernel
 from dolens.kernels.cuda.forward import forward_kernel
@@ -59,7 +60,7 @@ class DeviceCodes(NamedTuple):
     laws: tuple[LawShape, ...]
 
 
-@lru_cache(maxsize=128)
+@cached_tensors(maxsize=128)
 def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCodes:
     """Copy a lens's codes once, from int64: an optimization changes its numbers, not its codes."""
     rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()

@@ -156,6 +156,11 @@ class Unlimited(Simple):
         """Return how far light is expected along x and along y, mm."""
         return self.semi_diameter, self.semi_diameter
 
+    @property
+    def drawn(self) -> Circle:
+        """Return the circle that light is expected in."""
+        return Circle(self.semi_diameter)
+
     def packed(self) -> tuple[OutlineKind, float, float]:
         """Return its kind for the kernels, and no numbers."""
         return OutlineKind.NONE, 0.0, 0.0

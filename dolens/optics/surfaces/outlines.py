@@ -44,6 +44,11 @@ class Simple:
         """Return the outline with all lengths multiplied by a factor."""
         return replace(self, **{name: factor * size for name, size in self.lengths.items()})  # type: ignore[type-var]
 
+    @property
+    def drawn(self) -> Any:
+        """Return the outline that figures show."""
+        return self
+
     def row(self) -> dict[str, Any]:
         """Return the outline as a prescription writes it."""
         return dict(vars(self))
@@ -69,6 +74,11 @@ class Composite:
     def packed(self) -> tuple[OutlineKind, float, float]:
         """Return the kind for the kernels; the numbers stand in the figures."""
         return OutlineKind.FIGURES, 0.0, 0.0
+
+    @property
+    def drawn(self) -> Any:
+        """Return the outline that figures show."""
+        return self
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Return a number that is positive strictly inside and zero on the outline."""
