@@ -75,7 +75,7 @@ def number(value: float | Tensor, digits: int = 5, zeros: bool = False) -> str:
 def prescription_tables(lens: Lens) -> list[Table]:
     """Return the surfaces of a lens, one a row; its aspheric terms; and the poses of elements."""
     found = prescription_table(lens)
-    conics = any(row.conic for row in found.surfaces)
+    conics = bool(found.sensor_conic) or any(row.conic for row in found.surfaces)
     # A name such as 1.5168/64.17 says nd and Vd already.
     named = any(not row.material[:1].isdigit() and _is_glass(row) for row in found.surfaces)
     rows = []
@@ -91,7 +91,10 @@ def prescription_tables(lens: Lens) -> list[Table]:
             cells.append(number(row.conic) if row.conic else "")
         rows.append(tuple(cells))
     size = number(0.5 * found.sensor_diameter) if found.sensor_diameter else ""
-    rows.append(("", "sensor", "∞", "", "", *[""] * (2 * named), size, *[""] * conics))
+    cells = ["", "sensor", number(found.sensor_radius, 6), "", "", *[""] * (2 * named), size]
+    if conics:
+        cells.append(number(found.sensor_conic) if found.sensor_conic else "")
+    rows.append(tuple(cells))
     heads = ("#", "type", "radius", "thickness", "medium", *("nd", "Vd") * named)
     heads += ("semi-diam.", *("conic",) * conics)
     inside = (
