@@ -87,10 +87,10 @@ def solid(lens: Lens, where: Conditions, lit: Sequence[bool] | None = None) -> S
         surface = system.surfaces[number - 1]
         if number in system.mirrors:
             meshes.append(_surface_mesh(system, number, "mirror"))
-            rims.append(_rim(system, number, 1.0, close=True))
+            rims.append(_rim(system, number, close=True))
         elif glass[number - 1] or glass[number]:
             meshes.append(_surface_mesh(system, number, "glass"))
-            rims.append(_rim(system, number, 1.0, close=True))
+            rims.append(_rim(system, number, close=True))
         for sheet in blocked_sheets(surface.aperture):
             meshes.append(_sheet_mesh(system, number, "block", sheet))
         if number in following and glass[number]:
@@ -156,10 +156,9 @@ def _mesh(
     return Mesh(kind, positions.astype("<f4"), normals.astype("<f4"), closed)
 
 
-def _rim(system: OpticalSystem, number: int, scale: float = 1.0, close: bool = False) -> np.ndarray:
+def _rim(system: OpticalSystem, number: int, close: bool = False) -> np.ndarray:
     edge, center = _edge(system, number)
-    edge = center + scale * edge
-    points = _placed(system, number, edge[:, 0], edge[:, 1])
+    points = _placed(system, number, *(center + edge).T.copy())
     return np.concatenate([points, points[:1]]) if close else points
 
 

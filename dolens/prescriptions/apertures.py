@@ -22,6 +22,7 @@ A surface that clips nothing is drawn to its semi-diameter, and light passes it 
 light of the lens's fields needs (`dolens.prescriptions.automatic_apertures`).
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -132,8 +133,7 @@ def aperture_rows(aperture: ClearAperture) -> dict[str, Any]:
         rows["aperture"] = outline.row() | beside
     hole = aperture.obscuration
     if isinstance(hole, Together):
-        cx, cy = aperture.center
-        parts = [_beside(part.row(), (x + cx, y + cy)) for part, (x, y) in hole.parts]
+        parts = [_beside(part.row(), _absolute(at, aperture.center)) for part, at in hole.parts]
         alone = len(parts) == 1 and not parts[0].keys().isdisjoint(_CENTER)
         rows["obscuration"] = parts[0] if alone else parts
     elif hole is not None:
@@ -141,9 +141,19 @@ def aperture_rows(aperture: ClearAperture) -> dict[str, Any]:
     return rows
 
 
-def _beside(row: dict[str, Any], center: tuple[float, float]) -> dict[str, Any]:
+def _beside(row: dict[str, Any], center: tuple[float, ...]) -> dict[str, Any]:
     """Return an outline's row with the place of its centre."""
     return row | {key: value for key, value in zip(_CENTER, center, strict=True) if value}
+
+
+def _absolute(relative: tuple[float, float], center: tuple[float, float]) -> tuple[float, ...]:
+    """Return the place whose difference from a centre is this one to the last bit."""
+    found = []
+    for part, middle in zip(relative, center, strict=True):
+        guess = part + middle
+        near = (guess, math.nextafter(guess, -math.inf), math.nextafter(guess, math.inf))
+        found.append(next((x for x in near if x - middle == part), guess))
+    return tuple(found)
 
 
 def _obscuration(value: object, place: str) -> tuple[Outline, tuple[float, float]]:

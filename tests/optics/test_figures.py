@@ -144,6 +144,12 @@ def test_a_prescription_is_read_as_it_is_written():
     plain = window(semi_diameter=5.0, obscuration={"semi_diameter": 1.0, "decenter_x": 2.0})
     first, second = (lens_from_prescription(data).surfaces["1"] for data in (single, plain))
     assert first.aperture == second.aperture
+    # Centres are kept as differences: 0.1 - 0.3 + 0.3 is not 0.1.
+    aside = {"half_width_x": 3.0, "half_width_y": 4.0, "decenter_x": 0.3}
+    hole = {"semi_diameter": 1.0, "decenter_x": 0.1}
+    lens = lens_from_prescription(window(aperture=aside, obscuration=hole))
+    again = lens_from_prescription(prescription_of(lens))
+    assert again.surfaces["1"].aperture == lens.surfaces["1"].aperture
     for written in rows:
         row = prescription_of(lens_from_prescription(window(**written)))["surfaces"]["1"]
         assert {key: row.get(key) for key in written} == written
