@@ -23,7 +23,7 @@ from dolens.prescriptions.zemax_polynomials import (
     ODD_ASPHERE,
 )
 from dolens.prescriptions.zemax_shape import ZemaxShape
-from dolens.prescriptions.zemax_standard import STANDARD
+from dolens.prescriptions.zemax_standard import JONES_MATRIX, STANDARD
 from dolens.prescriptions.zemax_tilted_plane import TILTED_PLANE
 from dolens.prescriptions.zemax_xy_polynomial import XY_POLYNOMIAL
 from dolens.prescriptions.zemax_zernike import ZERNIKE_FRINGE, ZERNIKE_STANDARD
@@ -47,6 +47,7 @@ SHAPES: dict[str, ZemaxShape] = {
         ZERNIKE_FRINGE,
         FORBES,
         GRID_SAG,
+        JONES_MATRIX,
     )
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
@@ -72,7 +73,6 @@ _NOT_HELD = {
     "GRINSU": "a gradient-index medium",
     "HOLOGRM": "a hologram",
     "IRREGULA": "an irregular surface",
-    "JONESMAT": "a Jones matrix",
     "NONSEQCO": "a non-sequential component",
     "ODDCOSIN": "an odd cosine surface",
     "PARAX_XY": "a paraxial lens of two focal lengths",
