@@ -84,7 +84,7 @@ BAD = {
     "missing number": (singlet(*GOOD).replace("SURF 2", "SURF 5"), "expected SURF 2, not 'SURF 5'"),
     "no surfaces": ("MODE SEQ\n", "needs an object, a surface and an image"),
     "round image": (singlet(*GOOD, image="CURV 0.1"), "the image: must be a plane"),
-    "round object": (singlet(*GOOD).replace("SURF 1", "  CURV 0.1\nSURF 1"),
+    "round object": (singlet(*GOOD, head="FLOA\nYFLN 3\n").replace("SURF 1", "  CURV 0.1\nSURF 1"),
                      "the object: must be a plane"),
     "primary wavelength": (singlet(*GOOD, head="WAVM 1 0.55 1\nPWAV 2\n"),
                            "PWAV 2 is none of the wavelengths 1 to 1"),
