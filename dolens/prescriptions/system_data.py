@@ -178,8 +178,8 @@ def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
     target = as_positive(prescription[key], f"'{key}'")
     surface = lens.surfaces[str(lens.stop)]
     needed = _stop_for(key, target, exact)
-    if prescription.get("real_pupil", False):
-        needed = _of_real_ray(needed, exact)
+    if prescription.get("real_pupil", False) and math.isfinite(needed):
+        needed = real_marginal_height(exact, needed)
     if not (math.isfinite(needed) and needed > 0.0):
         raise InputError(f"'{key}' {prescription[key]!r}: no size of the stop makes this pupil")
     given = _stop_of(prescription, lens.stop).get("semi_diameter")
@@ -217,16 +217,6 @@ def _stop_for(key: str, target: float, lens: Lens) -> float:
     if key == "f_number":
         target = abs(float(first.efl)) / target
     return size * target / float(first.entrance_pupil.diameter)
-
-
-@torch.no_grad()
-def _of_real_ray(paraxial: float, lens: Lens) -> float:
-    """Return the semi-diameter (mm) of the stop that the real marginal ray of a pupil needs, given
-    the paraxial one.
-    """
-    pupil = lens.first_order(lens.primary_wavelength).entrance_pupil
-    share = paraxial / lens.surfaces[str(lens.stop)].semi_diameter
-    return real_marginal_height(lens, float(pupil.z), 0.5 * share * float(pupil.diameter), paraxial)
 
 
 @torch.no_grad()

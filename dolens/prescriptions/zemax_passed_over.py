@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dolens.errors import InputError
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.zemax import Line, ZemaxFile
+from dolens.prescriptions.zemax_standard import JONES_MATRIX
 
 # Operands that a surface's block may hold, and what they are about.  They bend no ray.
 _OF_SURFACES = {
@@ -74,6 +75,9 @@ def passed_over(file: ZemaxFile) -> list[str]:
         group = _GROUP_OF.get(operand, _UNKNOWN)
         if group not in _SILENT and any(says(line) for line in lines):
             groups.setdefault(group, {})[operand] = None
+    for number, block in enumerate(file.surfaces):
+        if any(line.arguments[:1] == [JONES_MATRIX.type] for line in block.get("TYPE", [])):
+            groups.setdefault(f"polarization: the Jones matrix of surface {number}", {})
     for number in file.skipped:
         groups.setdefault(f"surface {number}, which the file leaves out", {})
     for group in (*_opd_modes(file), *_behind_the_surfaces(file)):

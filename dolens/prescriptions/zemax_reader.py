@@ -32,6 +32,7 @@ from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_configurations import other_configurations, refuse_own_air
+from dolens.prescriptions.zemax_fields import is_axial
 from dolens.prescriptions.zemax_glass import read_glass
 from dolens.prescriptions.zemax_own_axes import own_axes
 from dolens.prescriptions.zemax_passed_over import passed_over
@@ -218,7 +219,8 @@ def _object(
     """Return the medium before surface 1, and the object's distance, None for infinity."""
     place = f"{where}: the object"
     block = SurfaceBlock(file.surfaces[0], factor, place)
-    if block.type != "STANDARD" or block.curvature != 0.0:
+    # On the axis a curved object is where a plane is.
+    if block.type != "STANDARD" or (block.curvature != 0.0 and not is_axial(file, where)):
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
     if any(own_axes(block)):
         raise InputError(f"{place}: a decentred or tilted object is not held (SCBD)")

@@ -30,7 +30,7 @@ from dolens.prescriptions.zemax_polynomials import (
     ODD_ASPHERE,
 )
 from dolens.prescriptions.zemax_shape import ZemaxShape
-from dolens.prescriptions.zemax_standard import STANDARD
+from dolens.prescriptions.zemax_standard import JONES_MATRIX, STANDARD
 from dolens.prescriptions.zemax_tilted_plane import TILTED_PLANE
 from dolens.prescriptions.zemax_xy_polynomial import XY_POLYNOMIAL
 from dolens.prescriptions.zemax_zernike import ZERNIKE_FRINGE, ZERNIKE_STANDARD
@@ -54,6 +54,7 @@ SHAPES: dict[str, ZemaxShape] = {
         IRREGULAR,
         FORBES,
         GRID_SAG,
+        JONES_MATRIX,
     )
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
@@ -77,7 +78,6 @@ _NOT_HELD = {
     "GRIDSAG": "a sag given on a grid",
     "GRINSU": "a gradient-index medium",
     "HOLOGRM": "a hologram",
-    "JONESMAT": "a Jones matrix",
     "NONSEQCO": "a non-sequential component",
     "ODDCOSIN": "an odd cosine surface",
     "PARAX_XY": "a paraxial lens of two focal lengths",

@@ -87,7 +87,7 @@ BAD = {
     "no surfaces": ("MODE SEQ\n", "needs an object, a surface and an image"),
     "aspheric image": (singlet(*GOOD, image="TYPE EVENASPH\n  CURV 0.1\n  PARM 2 1e-5"),
                        "the image: an aspheric image is not held"),
-    "round object": (singlet(*GOOD).replace("SURF 1", "  CURV 0.1\nSURF 1"),
+    "round object": (singlet(*GOOD, head="FLOA\nYFLN 3\n").replace("SURF 1", "  CURV 0.1\nSURF 1"),
                      "the object: must be a plane"),
     "primary wavelength": (singlet(*GOOD, head="WAVM 1 0.55 1\nPWAV 2\n"),
                            "PWAV 2 is none of the wavelengths 1 to 1"),

@@ -127,3 +127,26 @@ def test_a_glass_that_schott_gave_up_stands_beside_schotts_own_both_ways():
     named = [row["material"] for row in found["surfaces"].values()]
     assert named == ["SUMITA:SSK4", "SCHOTT:SK16", "SCHOTT:F15", "SCHOTT:SK1", "air"]
     assert prescription_from_zemax(zemax_of(found))["surfaces"] == found["surfaces"]
+
+
+def test_a_jones_matrix_is_a_plane_that_is_said_to_polarize(tmp_path):
+    jones = surface(1, "STOP", "TYPE JONESMAT", "PARM 1 1", "DISZ 4", "GLAS ___BLANK 1 0 1.5 0 0")
+    text = HEAD + surface(0, "DISZ INFINITY") + jones + surface(2, "CURV -0.05", "DISZ 39")
+    found = read_zemax(text + surface(3, ""))
+    assert "polarization: the Jones matrix of surface 1" in found.passed_over
+    assert found.prescription["surfaces"]["1"]["type"] == "plane"
+    assert float(lens_of(text + surface(3, ""), tmp_path).first_order(550.0).efl) == pytest.approx(
+        40
+    )
+
+
+@pytest.mark.parametrize(("field", "held"), [("0 0", True), ("0 2", False)])
+def test_a_curved_object_is_a_plane_to_fields_on_the_axis(field, held):
+    head = f"ENPD 6\nFTYP 1 0 2 1\nYFLN {field}\n"
+    text = singlet("CURV 0.02", "DISZ 4", "GLAS ___BLANK 1 0 1.5 0 0", head=head)
+    text = text.replace("DISZ INFINITY", "DISZ 90\n  CURV 0.1")
+    if held:
+        assert prescription_from_zemax(text)["object_distance"] == 90.0
+    else:
+        with pytest.raises(InputError, match="the object: must be a plane"):
+            prescription_from_zemax(text)
