@@ -32,7 +32,8 @@ def python(root, *arguments, **environment):
 @compiled
 def test_in_tritons_interpreter_the_kernels_are_the_reference(root):
     """`tests/kernels/interpreted_cuda.py`, in a process where Triton was told before it came up."""
-    tests = ["tests/kernels/interpreted_cuda.py", "-q", "--tb=short", "-p", "no:cacheprovider"]
+    options = ("-n", "0", "-q", "--tb=short", "-p", "no:cacheprovider")
+    tests = ["tests/kernels/interpreted_cuda.py", *options]
     run = python(root, "-m", "pytest", *tests, TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
     assert run.returncode == 0, run.stdout[-20000:] + run.stderr[-5000:]
     assert " passed" in run.stdout
