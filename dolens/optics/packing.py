@@ -19,7 +19,8 @@ from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 from dolens.optics.elements import LENS_AXES, relative_axes
 from dolens.optics.materials import Medium
-from dolens.optics.records import BREAK, Form, LawForm, Records, Structure, records, tensor
+from dolens.optics.record_structure import BREAK, Form, LawForm, Structure
+from dolens.optics.records import Records, records, tensor
 from dolens.optics.row_jacobian import jacobian_of
 from dolens.optics.system import OpticalSystem, per_radian
 

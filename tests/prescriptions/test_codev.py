@@ -375,7 +375,9 @@ def test_a_diffractive_lens(tmp_path):
     lens = load_lens(path)
     for wavelength in (486.1327, 587.5618, 656.2725):
         power = 2.0 * 0.001807322521767816 * wavelength / 587.5618
-        assert float(lens.first_order(wavelength).efl.detach()) == pytest.approx(1.0 / power, rel=1e-12)
+        assert float(lens.first_order(wavelength).efl.detach()) == pytest.approx(
+            1.0 / power, rel=1e-12
+        )
 
 
 # The double Gauss that comes with CODE V; sizes are ours.
