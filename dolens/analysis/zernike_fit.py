@@ -21,7 +21,7 @@ ORDERS = {"fringe": fringe, "standard": noll}
 # Terms that are fitted unless another number is asked for: all of the fringe order.
 TERMS = FRINGE_TERMS
 _MOST_STANDARD = 231
-# Singular values below this share of the largest belong to terms that the light does not tell apart.
+# Singular values below this share of the largest are of terms that the light does not tell apart.
 _RANK = 1e-9
 
 _GREEK = {0: "", 1: "secondary ", 2: "tertiary ", 3: "quaternary "}

@@ -34,8 +34,8 @@ _OVERSAMPLING = 1.5
 _DEGREES, _RESIDUAL = (10, 16), 0.005
 # Rays along each side of a beam where rays alone are used.
 _RAYS = 384
-# Share of the samples of a second computation, which tells what sampling changes: half of them.  The
-# difference is the error where that falls with the square of their distance.
+# Samples a side of a second computation, with half as many, over the first's: the difference is the
+# first's error where that falls with the square of their distance.
 COARSER = 2.0**-0.5
 # Share of the light whose rays the window of a point spread function holds.
 _HELD = 0.99
@@ -122,8 +122,7 @@ class FieldPupil:
         Args:
             x: (X,), mm from the centre, equally spaced.
             y: (Y,), mm.
-            share: of the samples across the pupil that are taken; below one, to see what a coarser
-                sampling changes.
+            share: of the samples across the pupil that are taken; below one for a coarser look.
 
         Returns:
             (Y, X), 1/mm², and the Strehl ratio's denominator: the irradiance of a perfect
@@ -151,8 +150,8 @@ class FieldPupil:
         Args:
             frequencies: (Q,), cycles/mm.
             direction: (2,), unit vector.
-            share: of the samples across the pupil that are taken, as in `irradiance`; of rays, below
-                one, every other.
+            share: of the samples across the pupil that are taken, as in `irradiance`; below one,
+                of rays every other.
 
         Returns:
             (2, Q), complex, of all wavelengths, along and across; and (2, Q), the modulus without

@@ -2,8 +2,8 @@
 
 Every ray of the pupil stands for a cell of the reference sphere, and sends a spherical wavelet to
 every point of the image, over the exact distance.  Nothing is expanded in small angles, so that the
-sum holds at low F-numbers, far out of focus, off the axis, for tilted images and behind mirrors, and
-where the edge of the pupil has no simple form; it takes a thousand times as long as a Fourier
+sum holds at low F-numbers, far out of focus, off the axis, for tilted images, behind mirrors, and
+where the edge of the pupil has no simple form.  It takes a hundred times as long as a Fourier
 transform.
 
 A wavelet's amplitude is A·dα·dβ, dα·dβ being the cell in direction cosines along the image plane
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from dolens.diffraction.field import direct_field
-from dolens.diffraction.field_pupil import FieldPupil
+from dolens.diffraction.field_pupil import COARSER, FieldPupil
 from dolens.diffraction.field_wavefronts import field_wavefronts, object_points
 from dolens.diffraction.point_spread import PointSpread, airy_radius_um, window_half_width
 from dolens.diffraction.prepared_pupils import part_of
@@ -28,11 +28,8 @@ from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
-# Neighbouring wavelets differ by half a turn at most; the second sampling, of which the error is
-# estimated, has fewer rays a side by this factor: of an error that falls with the square of the
-# rays' distance, the difference of the two is then the error of the finer one.
+# Neighbouring wavelets differ by half a turn at most.
 _HALF_TURNS = 2.0
-_COARSER = 2.0**-0.5
 # Fewest rays along each side, unless a number is given.
 _FEWEST = 128
 # Pairs of ray and image point that one field may take: some minutes of one core.
@@ -40,7 +37,9 @@ _MOST_PAIRS = 4e9
 _REASON = "sum of Huygens's wavelets"
 
 
-def huygens_irradiance(wavefront: Wavefront, x: Tensor, y: Tensor) -> Tensor:
+def huygens_irradiance(
+    wavefront: Wavefront, x: Tensor, y: Tensor, dtype: torch.dtype = torch.float64
+) -> Tensor:
     """Return the irradiance of N wavefronts at points of the image; differentiable in the lens.
 
     Memory is bounded, in the gradient too.
@@ -49,12 +48,13 @@ def huygens_irradiance(wavefront: Wavefront, x: Tensor, y: Tensor) -> Tensor:
         wavefront: of N points, by `pupil_wavefront`.
         x: (M,), mm from the centre of the reference sphere.
         y: (M,), mm.
+        dtype: of the sums; phases are in double precision.
 
     Returns:
         (N, M), 1/mm², with the flux as `Wavefront.flux` has it as unit of light.
     """
-    field = direct_field(wavefront, x, y)
-    return field.real.square() + field.imag.square()
+    field = direct_field(wavefront, x, y, dtype)
+    return field.real.double().square() + field.imag.double().square()
 
 
 @torch.no_grad()
@@ -84,8 +84,9 @@ def huygens_point_spread(
             differ by half a turn at most, 128 or more.
 
     Raises:
-        InputError: no fields or wavelengths, weights that do not fit, fewer than two cells, or too
-            few rays, whose copies of the image would reach the window; or more than can be added up.
+        InputError: no fields or wavelengths, weights that do not fit, fewer than two cells, too few
+            rays for the phases of neighbours to differ by less than half a turn, or more than can
+            be added up.
     """
     if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
@@ -103,8 +104,8 @@ def huygens_point_spread(
         sums = _Wavelets(lens, found.fields[number], object_distance, front, weights, half)
         finer = sums.rays(rays, cells)
         grid = (torch.arange(cells).to(weights) + 0.5) * (2.0 * half / cells) - half
-        irradiance, total, perfect = sums.added(finer, grid, grid)
-        coarser = sums.added(max(8, round(_COARSER * finer)), grid, grid)[0]
+        irradiance, perfect = sums.added(finer, grid, grid)
+        coarser = sums.added(max(8, round(COARSER * finer)), grid, grid)[0]
         row, column = divmod(int(irradiance.argmax()), cells)
         near = torch.linspace(-1.0, 1.0, 9).to(grid) * (2.0 * half / cells)
         highest = sums.added(finer, grid[column] + near, grid[row] + near)[0].amax()
@@ -128,6 +129,26 @@ def huygens_point_spread(
         reasons,
         torch.tensor(errors, dtype=torch.float64),
     )
+
+
+@torch.no_grad()
+def huygens_window(
+    lens: Lens,
+    field: Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> tuple[float, float]:
+    """Return the half width of a field's window, and the Airy radius, both in µm.
+
+    Arguments are those of `huygens_point_spread`, of one field (2,).  Without light both are those
+    of a perfect lens.
+    """
+    found = field_wavefronts(lens, field[None], wavelengths, object_distance, wavelength_weights)
+    airy = airy_radius_um(lens, found, object_distance)
+    if not bool(found.lit.any()):
+        return airy, airy
+    return 1e3 * _half_width(found.wavefront, found.weights.to(lens.device)), airy
 
 
 def _half_width(front: Wavefront, weights: Tensor) -> float:
@@ -170,9 +191,9 @@ class _Wavelets:
             )
         return chosen
 
-    def added(self, rays: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return irradiance (Y, X), 1/mm², with the light of the field as unit; that light; and the
-        irradiance of the same pupil without aberrations at the centre.
+    def added(self, rays: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return irradiance (Y, X), 1/mm², with the light of the field as unit, and that of the
+        same pupil without aberrations at the centre.
         """
         front = pupil_wavefront(
             self.system,
@@ -184,8 +205,9 @@ class _Wavelets:
         )
         total = self.weights @ front.flux
         rows, columns = torch.meshgrid(y, x, indexing="ij")
-        values = huygens_irradiance(front, columns.flatten(), rows.flatten())
+        # Sums in single precision err by 1e-6.
+        values = huygens_irradiance(front, columns.flatten(), rows.flatten(), torch.float32)
         mixed = (self.weights @ values).unflatten(0, (len(y), len(x))) / total
         wave = MM_PER_NM * front.wavelength / front.index
         perfect = (front.weight.sum((-2, -1)) / wave).square()
-        return mixed, total, self.weights @ perfect / total
+        return mixed, self.weights @ perfect / total

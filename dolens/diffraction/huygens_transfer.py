@@ -7,15 +7,14 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.modulation_transfer import field_directions
-from dolens.diffraction.huygens import huygens_point_spread
+from dolens.diffraction.huygens import huygens_point_spread, huygens_window
 from dolens.diffraction.transfer import DiffractionModulation
 from dolens.optics.lens import Lens
 
-# Airy radii from the spot to the window's sides, and points of the image to an Airy radius: three
-# leave the copies of a spectrum that ends at 1.22 over the radius well apart.
-_AIRY_RADII, _STEPS = 10.0, 3.0
-# Half width of the window of a look at the spot's size, cells.
-_LOOK = 8
+# Airy radii that the window is wider, on every side, than that of a point spread function; and
+# points of the image to an Airy radius: three leave the copies of a spectrum that ends at 1.22 over
+# the radius well apart.
+_AIRY_RADII, _STEPS = 4.0, 3.0
 
 
 @torch.no_grad()
@@ -55,12 +54,10 @@ def huygens_modulation(
     unknown = torch.full_like(frequency, math.nan)
     curves, errors, diffraction, reasons = [], [], [], []
     for field, way in zip(points, along, strict=True):
-        look = huygens_point_spread(lens, field[None], *arguments, cells=_LOOK)
-        found = look
-        if look.diffraction[0]:
-            half = float(look.half_width_um) + _AIRY_RADII * look.airy_radius_um
-            cells = math.ceil(2.0 * half * _STEPS / look.airy_radius_um)
-            found = huygens_point_spread(lens, field[None], *arguments, cells, half)
+        half, airy = huygens_window(lens, field, *arguments)
+        half += _AIRY_RADII * airy
+        cells = math.ceil(2.0 * half * _STEPS / airy)
+        found = huygens_point_spread(lens, field[None], *arguments, cells, half)
         reasons += found.reasons
         diffraction += found.diffraction
         if not found.diffraction[0]:
@@ -74,8 +71,8 @@ def huygens_modulation(
     limit = unknown.expand(len(points), -1)
     return DiffractionModulation(
         points,
-        look.field_unit,
-        look.wavelengths,
+        found.field_unit,
+        found.wavelengths,
         frequency,
         tangential,
         sagittal,

@@ -246,5 +246,6 @@ def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
 
 
 def airy_radius_um(lens: Lens, found: FieldWavefronts, object_distance: float | None) -> float:
+    """Return 1.22·λ·N, µm, with the paraxial working F-number, mean over wavelengths."""
     numbers = working_f_numbers(lens, found.wavelengths, object_distance)
     return float(found.weights @ (1e-3 * AIRY * found.wavelengths * numbers))

@@ -2,7 +2,8 @@
 
 Run with a Python that has Optiland, from this folder; it takes half a minute.  Nothing of dolens is
 used but the lens of wavefront_optiland.py.  Rays are aimed at the stop, whose rim is the disc's:
-the diameter of the entrance pupil is such that the real marginal ray meets it at 3.86 mm.  The sphere is about the chief ray's point; coefficients are in waves, in its signs.
+the diameter of the entrance pupil is such that the real marginal ray meets it at 3.86 mm.  The
+sphere is about the chief ray's point; coefficients are in waves, in Optiland's signs.
 """
 
 import json

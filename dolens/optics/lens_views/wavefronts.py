@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class WavefrontViews:
-    """Methods of `Lens` that show wavefronts and footprints; see `LensViews` for their arguments."""
+    """Methods of `Lens` about wavefronts and footprints; see `LensViews` for their arguments."""
 
     def wavefront(
         self,
