@@ -77,7 +77,7 @@ class WavefrontViews:
         edge: float | Sequence[float] | None = None,
         wavelengths: Wavelengths = None,
         object_distance: float | None = None,
-        count: int = 9,
+        count: int = 7,
         **aperture: float,
     ) -> Figure:
         """Plot Strehl ratios over the field; see `diffraction.strehl.strehl_ratios`.
