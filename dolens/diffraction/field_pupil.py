@@ -150,8 +150,7 @@ class FieldPupil:
         Args:
             frequencies: (Q,), cycles/mm.
             direction: (2,), unit vector.
-            share: of the samples across the pupil that are taken, as in `irradiance`; below one,
-                of rays every other.
+            share: of the samples that are taken, as in `irradiance`; below one, every other ray.
 
         Returns:
             (2, Q), complex, of all wavelengths, along and across; and (2, Q), the modulus without
@@ -275,7 +274,8 @@ class FieldPupil:
         unit = (middle[:, None, None] + offset - fit.centre[:, None, None]) / (
             fit.half_width[:, None, None]
         )
-        inside = (unit.abs() <= 1.0 + 2.0 / samples).all(-1)
+        near = unit.norm(dim=-1) <= fit.radius[:, None, None]
+        inside = near & (unit.abs() <= 1.0 + 2.0 / samples).all(-1)
         unit = unit.clamp(-1.0, 1.0).flatten(1, 2)
         pieces, degree = [], fit.coefficients.shape[-1] - 1
         for part in unit.split(_PIECE, 1):
