@@ -33,7 +33,7 @@ _HALF_TURNS = 2.0
 # Fewest rays along each side, unless a number is given.
 _FEWEST = 128
 # Steps of the search for the peak to an Airy radius, and how often it looks three times closer.
-_STEPS, _CLOSER = 2.5, 3
+_STEPS, _CLOSER = 2.5, 4
 # Pairs of ray and image point that one field may take: some minutes of one core.
 _MOST_PAIRS = 4e9
 _REASON = "sum of Huygens's wavelets"
