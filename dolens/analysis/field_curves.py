@@ -9,8 +9,12 @@ from torch import Tensor
 
 from dolens.analysis.conditions import FieldScan
 from dolens.analysis.parabasal import ParabasalRays, parabasal_rays
+from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
+
+# Ideal image heights of an object at infinity, and as figures write them.
+DISTORTION_REFERENCES = {"f_tan_theta": "f·tan θ", "f_theta": "f·θ"}
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,8 @@ class FieldCurves:
         sagittal: (F, W), mm: the same of the sagittal focus.
         distortion: (F,), percent of the ideal image height, positive where the image lies farther
             out (pincushion); zero on the axis.
+        distortion_reference: `f_tan_theta` or `f_theta`: the ideal image height; see
+            `image_displacement`.
     """
 
     scan: FieldScan
@@ -36,6 +42,7 @@ class FieldCurves:
     tangential: Tensor
     sagittal: Tensor
     distortion: Tensor
+    distortion_reference: str = "f_tan_theta"
 
 
 def field_curves(
@@ -43,27 +50,33 @@ def field_curves(
     scan: FieldScan,
     wavelengths: list[float] | Tensor,
     object_distance: float | None = None,
+    distortion_reference: str = "f_tan_theta",
 ) -> FieldCurves:
     """Compute field curvature and distortion from rays infinitely close to the chief rays.
 
     The tangential focus is where rays displaced along the scan come nearest to the chief ray (they
     meet it, in a centred lens), the sagittal one where rays displaced across it do.
 
-    Distortion compares the chief ray's image point with that of an ideal lens, whose image is
-    linear in the tangents of the field angles (f·tan θ), or in the object's heights.  The linear
-    image is the limit of the real one near the axis, on the sensor where it stands.
+    Distortion compares the chief ray's image point with that of an ideal lens; see
+    `image_displacement`.
 
     Args:
         lens: the lens; apertures clip no chief ray.
         scan: fields on a line through the axis (see `field_scans`).
         wavelengths: (W,), nm, of the field curvature.
         object_distance: mm in front of the first vertex; None for an object at infinity.
+        distortion_reference: `f_tan_theta`, or `f_theta` for an object at infinity.
+
+    Raises:
+        InputError: another reference, or `f_theta` of a near object.
     """
     waves = torch.as_tensor(wavelengths, dtype=torch.float64).reshape(-1)
     pencils = parabasal_rays(lens, scan.fields, waves, object_distance)
     along = scan.direction
     across = torch.stack((along[1], -along[0]))
-    chief = image_displacement(lens, scan, [lens.primary_wavelength], object_distance)
+    chief = image_displacement(
+        lens, scan, [lens.primary_wavelength], object_distance, distortion_reference
+    )
     return FieldCurves(
         scan,
         waves,
@@ -71,6 +84,7 @@ def field_curves(
         focus(pencils, along),
         focus(pencils, across),
         chief.distortion[:, 0],
+        distortion_reference,
     )
 
 
@@ -109,8 +123,26 @@ def image_displacement(
     scan: FieldScan,
     wavelengths: list[float] | Tensor,
     object_distance: float | None = None,
+    reference: str = "f_tan_theta",
 ) -> ImageDisplacement:
-    """Compare chief rays with the image of an ideal lens; arguments are those of `field_curves`."""
+    """Compare chief rays with the image of an ideal lens; arguments are those of `field_curves`.
+
+    The ideal image is linear in the object's heights; for an object at infinity in tan θ, as a lens
+    images that keeps straight lines straight, or in θ itself, as scan lenses and fisheyes are meant
+    to (Laikin, Lens Design).  θ is the angle between the field's light and the axis.  The linear
+    image is the limit of the real one near the axis, on the sensor where it stands.
+
+    Raises:
+        InputError: another reference, or `f_theta` of a near object.
+    """
+    if reference not in DISTORTION_REFERENCES:
+        known = ", ".join(DISTORTION_REFERENCES)
+        raise InputError(f"a distortion's reference is one of {known}, not '{reference}'")
+    infinite = vergence(object_distance) == 0.0
+    if reference == "f_theta" and not infinite:
+        raise InputError(
+            "distortion from f·θ is that of an object at infinity; a near object has heights"
+        )
     waves = torch.as_tensor(wavelengths, dtype=torch.float64).reshape(-1)
     axis = parabasal_rays(lens, [(0.0, 0.0)], [lens.primary_wavelength], object_distance)
     chief = parabasal_rays(lens, scan.fields, waves, object_distance).position
@@ -118,11 +150,10 @@ def image_displacement(
     rate = image.norm()
     outward = ((chief - axis.position[0]) * (image / rate)).sum(-1)
     linear = scan.coordinate
-    if vergence(object_distance) == 0.0:
-        linear = torch.deg2rad(linear).tan()
+    if infinite:
         # The line of field angles is one of tangents too only along x or y.
-        tangents = torch.deg2rad(scan.fields).tan()
-        linear = tangents.norm(dim=-1).copysign(linear)
+        tangents = torch.deg2rad(scan.fields).tan().norm(dim=-1)
+        linear = (tangents.atan() if reference == "f_theta" else tangents).copysign(linear)
     ideal = rate * linear
     distortion = 100.0 * (outward / ideal[:, None] - 1.0)
     return ImageDisplacement(outward, ideal, distortion.where(ideal[:, None] != 0.0, 0.0))

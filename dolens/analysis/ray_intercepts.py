@@ -114,6 +114,61 @@ def trace_ray_intercepts(
     Raises:
         InputError: no fields or wavelengths, or fields that are not pairs.
     """
+    launched = launch_through_stop(lens, fields, wavelengths, pupil, object_distance, exact)
+    system = in_double_precision(lens).system()
+    hit, chief = trace_rays(system, launched.rays), trace_rays(system, launched.chief)
+    valid = hit.valid & launched.started
+    reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
+    reached = reached & launched.chief_started
+    points = hit.position[..., :2]
+    if system.image is not None:
+        points = _along_surface(system, hit.position, chief.position, reached)
+    return RayIntercepts(
+        launched.fields.cpu(),
+        field_unit(object_distance),
+        launched.wavelengths.cpu(),
+        points.where(valid[..., None], math.nan).cpu(),
+        valid.cpu(),
+        chief.position[..., :2].where(reached[..., None], math.nan).cpu(),
+    )
+
+
+@dataclass(frozen=True)
+class StopRays:
+    """Holds rays in front of a lens, of F fields and W wavelengths, through N points of the stop.
+
+    Attributes:
+        fields: (F, 2), degrees or mm, float64 on the lens's device, as all of these.
+        wavelengths: (W,), nm.
+        rays: (F, W, N), in double precision.
+        started: (F, W, N), bool: the ray belongs to the field's beam; the numbers of others mean
+            nothing.
+        chief: (F,), chief rays of the reference wavelength.
+        chief_started: (F,), bool.
+    """
+
+    fields: Tensor
+    wavelengths: Tensor
+    rays: Rays
+    started: Tensor
+    chief: Rays
+    chief_started: Tensor
+
+
+@torch.no_grad()
+def launch_through_stop(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    pupil: Tensor,
+    object_distance: float | None = None,
+    exact: bool = False,
+) -> StopRays:
+    """Aim rays at points of the stop, in front of the lens; arguments of `trace_ray_intercepts`.
+
+    Raises:
+        InputError: no fields or wavelengths, or fields that are not pairs.
+    """
     lens = in_double_precision(lens)
     options = {"dtype": torch.float64, "device": lens.device}
     field = torch.as_tensor(fields, **options)
@@ -143,22 +198,9 @@ def trace_ray_intercepts(
         rays, started = _fitted(lens, field, aimed, nodes, pupil, object_distance)
         rays = Rays(rays.position[:, :count], rays.direction[:, :count], waves[:count, None])
         started = started[:, :count, None]
-    system = lens.system()
-    hit, chief = trace_rays(system, rays), trace_rays(system, chief_rays)
-    valid = hit.valid & started
-    valid = valid & (vignetting_margin(lens.fields, field, pupil) > 0.0)[:, None]
-    reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
-    reached = reached & aimed.converged[:, at, 0]
-    points = hit.position[..., :2]
-    if system.image is not None:
-        points = _along_surface(system, hit.position, chief.position, reached)
-    return RayIntercepts(
-        field.cpu(),
-        field_unit(object_distance),
-        waves[:count].cpu(),
-        points.where(valid[..., None], math.nan).cpu(),
-        valid.cpu(),
-        chief.position[..., :2].where(reached[..., None], math.nan).cpu(),
+    beam = (vignetting_margin(lens.fields, field, pupil) > 0.0)[:, None]
+    return StopRays(
+        field, waves[:count], rays, started & beam, chief_rays, aimed.converged[:, at, 0]
     )
 
 

@@ -20,7 +20,7 @@ from dolens.errors import InputError
 from dolens.optics.replay import replay
 
 # Pairs of ray and sensor point at a time in direct integration: some 100 bytes each.
-_CHUNK = 1 << 18
+_CHUNK = 1 << 16
 
 
 def fourier_field(

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from dolens.analysis.ray_intercepts import field_unit
 from dolens.analysis.spot_diagram import spectral_shares
-from dolens.diffraction.entrance_beam import find_beam
+from dolens.diffraction.entrance_beam import EntranceBeam, find_beam
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.system import OpticalSystem
 
 # Rays along each side of the beam that find where the light lands.
 _COARSE = 16
@@ -80,9 +81,7 @@ def field_wavefronts(
     points = object_points(every, object_distance)
     wave = waves.repeat(len(field))
     beam = find_beam(system, points, wave)
-    middle = field.new_zeros(len(every), 2)
-    # An infinite sphere is met by all rays, however far they land from its centre.
-    coarse = pupil_wavefront(system, points, wave, middle, _COARSE, math.inf, beam)
+    coarse = _coarse(system, points, wave, beam)
     light = (coarse.amplitude * coarse.weight).unflatten(0, shape) * spectrum[:, None, None]
     total = light.sum((1, 2, 3))
     landed = coarse.landed.unflatten(0, shape)
@@ -99,6 +98,26 @@ def field_wavefronts(
         front,
         (front.flux > 0.0).unflatten(0, shape).cpu(),
     )
+
+
+def light_centroids(
+    system: OpticalSystem, points: ObjectPoints, wavelength: Tensor, beam: EntranceBeam
+) -> Tensor:
+    """Return the centroids (N, 2), mm on the sensor, of the light of N points; zero without any."""
+    coarse = _coarse(system, points, wavelength, beam)
+    light = coarse.amplitude * coarse.weight
+    total = light.sum((1, 2))[:, None]
+    centre = (light[..., None] * coarse.intercept).sum((1, 2)) / total
+    return centre.where(total > 0.0, 0.0)
+
+
+def _coarse(
+    system: OpticalSystem, points: ObjectPoints, wavelength: Tensor, beam: EntranceBeam
+) -> Wavefront:
+    """Return wavefronts of few rays, about the sensor's origin."""
+    middle = torch.zeros_like(points.slopes)
+    # An infinite sphere is met by all rays, however far they land from its centre.
+    return pupil_wavefront(system, points, wavelength, middle, _COARSE, math.inf, beam)
 
 
 def object_points(fields: Tensor, object_distance: float | None) -> ObjectPoints:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dolens.analysis.encircled_energy import EncircledEnergy, checked_radii
 from dolens.analysis.spot_diagram import AIRY, working_f_numbers
-from dolens.diffraction.field_pupil import FieldPupil
+from dolens.diffraction.field_pupil import COARSER, FieldPupil
 from dolens.diffraction.field_wavefronts import FieldWavefronts
 from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
 from dolens.errors import InputError
@@ -40,6 +40,8 @@ class PointSpread:
         airy_radius_um: µm, 1.22·λ·N with the paraxial working F-number, mean over wavelengths.
         diffraction: whether diffraction is part of each field's image, or rays alone make it.
         reasons: why, of each.
+        sampling_error: (F,), of the irradiance, over its peak: the largest change by a second
+            computation with a coarser pupil (see `point_spread`); NaN where rays alone are used.
     """
 
     fields: Tensor
@@ -53,6 +55,7 @@ class PointSpread:
     airy_radius_um: float
     diffraction: tuple[bool, ...]
     reasons: tuple[str, ...]
+    sampling_error: Tensor
 
 
 @torch.no_grad()
@@ -68,7 +71,8 @@ def point_spread(
 ) -> PointSpread:
     """Compute the point spread function of every field, by the Fourier transform of its pupil.
 
-    Where the wavefront is too steep for that, rays alone make the image; `reasons` says so.
+    Where the wavefront is too steep for that, rays alone make the image; `reasons` says so.  The
+    sampling error is estimated by a second transform of half of the pupil's samples.
 
     Args:
         lens: the lens.
@@ -95,14 +99,14 @@ def point_spread(
     rows = []
     for pupil in prepared.pupils:
         if pupil is None:
-            rows.append((math.nan, dark, math.nan, math.nan, False, "no light passes"))
+            rows.append((math.nan, dark, math.nan, math.nan, False, "no light passes", math.nan))
             continue
-        half = _half_width(pupil) if half_width_um is None else 1e-3 * half_width_um
+        half = window_half_width(pupil) if half_width_um is None else 1e-3 * half_width_um
         irradiance, peak, perfect = _mean_irradiance(pupil, half, cells)
         held = float(irradiance.sum()) * (2.0 * half / cells) ** 2
-        strehl = peak / perfect
-        rows.append((1e3 * half, 1e-6 * irradiance, held, strehl, pupil.diffraction, pupil.reason))
-    half_widths, windows, held, strehl, diffraction, reasons = zip(*rows, strict=True)
+        how = pupil.diffraction, pupil.reason, _sampling_error(pupil, half, cells)
+        rows.append((1e3 * half, 1e-6 * irradiance, held, peak / perfect, *how))
+    half_widths, windows, held, strehl, diffraction, reasons, errors = zip(*rows, strict=True)
     return PointSpread(
         found.fields,
         found.field_unit,
@@ -112,9 +116,10 @@ def point_spread(
         torch.stack([window.cpu() for window in windows]),
         torch.tensor(held, dtype=torch.float64),
         torch.tensor(strehl, dtype=torch.float64),
-        _airy_um(lens, found, object_distance),
+        airy_radius_um(lens, found, object_distance),
         diffraction,
         reasons,
+        torch.tensor(errors, dtype=torch.float64),
     )
 
 
@@ -152,9 +157,9 @@ def diffraction_encircled_energy(
         lens, fields, wavelengths, object_distance, wavelength_weights
     )
     found, pupils = prepared.wavefronts, prepared.pupils
-    airy = _airy_um(lens, found, object_distance)
+    airy = airy_radius_um(lens, found, object_distance)
     if radii_um is None:
-        reach = max((_half_width(pupil) for pupil in pupils if pupil), default=4e-3 * airy)
+        reach = max((window_half_width(pupil) for pupil in pupils if pupil), default=4e-3 * airy)
         radii_um = torch.linspace(0.0, 1e3 * reach, 101, dtype=torch.float64)
     radii = checked_radii(radii_um)
     curves = [
@@ -172,7 +177,7 @@ def diffraction_encircled_energy(
     )
 
 
-def _half_width(pupil: FieldPupil) -> float:
+def window_half_width(pupil: FieldPupil) -> float:
     """Return the half width (mm) of a window that holds a field's light."""
     return _BEYOND * pupil.spot_radius + _AIRY_RADII * pupil.airy_radius
 
@@ -196,6 +201,17 @@ def _mean_irradiance(pupil: FieldPupil, half: float, cells: int) -> tuple[Tensor
     return means, peak, perfect
 
 
+def _sampling_error(pupil: FieldPupil, half: float, cells: int) -> float:
+    """Return the largest change of the irradiance at cells' centres, over its peak, where the pupil
+    has half of its samples; NaN where rays alone make the image.
+    """
+    if not pupil.diffraction:
+        return math.nan
+    grid = (torch.arange(cells).to(pupil.weights) + 0.5) * (2.0 * half / cells) - half
+    fine, coarse = (pupil.irradiance(grid, grid, share)[0] for share in (1.0, COARSER))
+    return float((fine - coarse).abs().amax() / fine.amax())
+
+
 # Windows of its own that a field's encircled energy is followed for.
 _FAR = 4.0
 
@@ -206,7 +222,7 @@ def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     if not pupil.diffraction:
         return pupil.encircled_rays(radii)
     # Far beyond its window, as the spot of another field may need, a field's curve stays level.
-    widest = _FAR * _half_width(pupil)
+    widest = _FAR * window_half_width(pupil)
     half = min(float(radii[-1]), widest) + 1e-9
     radii = radii.clamp(max=widest)
     wanted = math.ceil(2.0 * half * _STEPS / pupil.airy_radius)
@@ -229,6 +245,7 @@ def _encircled(pupil: FieldPupil, radii: Tensor) -> Tensor:
     return torch.stack(found)
 
 
-def _airy_um(lens: Lens, found: FieldWavefronts, object_distance: float | None) -> float:
+def airy_radius_um(lens: Lens, found: FieldWavefronts, object_distance: float | None) -> float:
+    """Return 1.22·λ·N, µm, with the paraxial working F-number, mean over wavelengths."""
     numbers = working_f_numbers(lens, found.wavelengths, object_distance)
     return float(found.weights @ (1e-3 * AIRY * found.wavelengths * numbers))

@@ -68,12 +68,12 @@ def _field_pupils(
         which = torch.arange(number * count, (number + 1) * count, device=system.device)
         field = found.fields[number].to(system.device).expand(count, 2)
         point = object_points(field, object_distance)
-        front = _part(found.wavefront, which)
+        front = part_of(found.wavefront, which)
         pupils.append(FieldPupil.of(system, point, front, weights, most_samples))
     return pupils
 
 
-def _part(front: Wavefront, which: Tensor) -> Wavefront:
+def part_of(front: Wavefront, which: Tensor) -> Wavefront:
     """Return some of the wavefronts, with the apertures that clip these."""
     values = {
         name: value[which] if isinstance(value, Tensor) else value

@@ -162,6 +162,17 @@ def direct_samples(wavefront: Wavefront, half_window: float, settings: Diffracti
     """
     if settings.samples is not None:
         return settings.samples
+    return _enough(turns_across(wavefront, half_window) * settings.oversampling)
+
+
+@torch.no_grad()
+def turns_across(wavefront: Wavefront, half_window: float) -> float:
+    """Return how many rays a side make the phases of neighbours differ by one turn at most.
+
+    Args:
+        wavefront: of N points.
+        half_window: mm, from the centre of the reference sphere to the sides of a square window.
+    """
     reach = (wavefront.intercept.abs() + half_window) / _wave(wavefront)[:, None, None, None]
     lit = wavefront.coverage > 0.0
     turns = 0.0
@@ -170,7 +181,7 @@ def direct_samples(wavefront: Wavefront, half_window: float, settings: Diffracti
         step = wavefront.direction.diff(dim=dim).abs() * reach.narrow(dim, 0, size)
         both = lit.narrow(dim, 0, size) & lit.narrow(dim, 1, size)
         turns = max(turns, float(torch.where(both, step.sum(-1), 0.0).amax()))
-    return _enough(turns * lit.shape[-1] * settings.oversampling)
+    return turns * lit.shape[-1]
 
 
 @torch.no_grad()

@@ -35,6 +35,9 @@ class PupilFit:
         low: (N, 2), direction cosines that bound the light; no gradient, unless
             `with_differentiable_bounds` gave them one.
         high: (N, 2).
+        radius: (N,), of a circle about the box's centre that holds the rays, u² + v² = radius²; no
+            gradient.  Beyond it, in the corners of the box, the polynomials are extrapolated, and
+            no light passes.
         residual: (N,), waves: the largest error of the fitted OPD at a ray inside the pupil, no
             gradient.
         wavefront: what was fitted.
@@ -45,6 +48,7 @@ class PupilFit:
     half_width: Tensor
     low: Tensor
     high: Tensor
+    radius: Tensor
     residual: Tensor
     wavefront: Wavefront
 
@@ -98,6 +102,7 @@ def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
         centre, half_width = _middle(*_bounds(alpha, used))
         low, high = _bounds(*_cells(wavefront.direction, passing, wavefront.valid))
         unit = ((alpha - centre[:, None]) / half_width[:, None]).clamp(-1.0, 1.0)
+        radius = torch.where(used, unit.norm(dim=-1), 0.0).amax(1)
         (x, dx), (y, dy) = (chebyshev(unit[..., axis], degree) for axis in (0, 1))
         rows, columns = _terms(degree, x.device)
         basis = x[:, columns] * y[:, rows] * used.to(x.dtype)[:, None]
@@ -120,6 +125,7 @@ def fit_pupil(wavefront: Wavefront, degree: int = 10) -> PupilFit:
         half_width=half_width,
         low=low,
         high=high,
+        radius=radius,
         residual=missed / (1e-6 * wavefront.wavelength),
         wavefront=wavefront,
     )
@@ -141,10 +147,13 @@ def regular_pupil(fit: PupilFit, samples: int, which: Tensor | None = None) -> R
     share = (step + 0.5) / samples
     cosines = low[..., None] + (high - low)[..., None] * share
     unit = (cosines - fit.centre[which][..., None]) / fit.half_width[which][..., None]
-    x, y = (chebyshev(unit[:, axis].clamp(-1.0, 1.0), degree)[0][:, None] for axis in (0, 1))
+    unit = unit.clamp(-1.0, 1.0)
+    x, y = (chebyshev(unit[:, axis], degree)[0][:, None] for axis in (0, 1))
     opd, whole, *crossings = (y.mT @ coefficients @ x).unbind(1)
     lit = (wavefront.coverage[which] > 0.0).flatten(1).any(-1)
-    passed = lit[:, None, None].to(opd.dtype).expand(opd.shape)
+    square = unit.detach().square()
+    near = square[:, 1, :, None] + square[:, 0, None] <= fit.radius[which, None, None].square()
+    passed = (lit[:, None, None] & near).to(opd.dtype)
     surfaces = wavefront.clipping.values()
     for surface, x, y in zip(surfaces, crossings[::2], crossings[1::2], strict=True):
         passed = torch.minimum(passed, coverage(surface.aperture, x, y, surface.edge))

@@ -138,6 +138,23 @@ def chief_ray_intercepts(system: OpticalSystem, points: ObjectPoints, wavelength
     Raises:
         InputError: one does not reach the sensor.
     """
+    landed, reached = find_chief_rays(system, points, wavelength)
+    if not bool(reached.all()):
+        at = int(torch.nonzero(~reached)[0])
+        raise InputError(
+            f"the chief ray of object point {at} does not reach the sensor; give its centre"
+        )
+    return landed
+
+
+@torch.no_grad()
+def find_chief_rays(
+    system: OpticalSystem, points: ObjectPoints, wavelength: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return where chief rays land (N, 2), mm on the sensor, and whether they do (N,), bool.
+
+    Arguments are those of `chief_ray_intercepts`.
+    """
     system = system.opened()
     infinite = points.vergence == 0.0
     distance = 1.0 / points.vergence
@@ -145,10 +162,4 @@ def chief_ray_intercepts(system: OpticalSystem, points: ObjectPoints, wavelength
     field = torch.where(infinite[:, None], points.slopes.atan(), -points.slopes * finite[:, None])
     chief = aim(system, field, torch.zeros_like(field), wavelength, distance)
     hit = trace_rays(system, chief)
-    reached = chief.converged & hit.valid
-    if not bool(reached.all()):
-        at = int(torch.nonzero(~reached)[0])
-        raise InputError(
-            f"the chief ray of object point {at} does not reach the sensor; give its centre"
-        )
-    return hit.position[:, :2]
+    return hit.position[:, :2], chief.converged & hit.valid

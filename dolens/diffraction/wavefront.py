@@ -26,7 +26,7 @@ from dolens.optics.vergence import with_vergences
 
 MM_PER_NM = 1e-6
 # Rays around the box, for differences of fourth order.
-_RIM = 2
+RIM = 2
 _FEWEST = 8
 _SMALLEST = 1e-30
 
@@ -170,7 +170,7 @@ def pupil_wavefront(
 
     # A cell around the beam, so that its edge lies inside the grid.
     half_width = beam.half_width * (samples / (samples - 2.0))
-    q = box_grid(beam.centre, half_width, samples, _RIM)
+    q = box_grid(beam.centre, half_width, samples, RIM)
     ray, every, opened = launched(points, q), waves[:, None, None], system.opened()
     rays = Rays.from_components(ray, every)
     hit = trace_rays(opened, rays)
@@ -185,7 +185,7 @@ def pupil_wavefront(
     opd = _inner(start + hit.path_length - index[:, None, None] * excess)
 
     # Light that is parallel at an infinite sphere has no area there.
-    area = torch.where(valid, _cell_areas(direction).clamp(min=_SMALLEST), 1.0)
+    area = torch.where(valid, cell_areas(direction).clamp(min=_SMALLEST), 1.0)
     cell = (2.0 / samples) ** 2 * half_width.prod(-1) / axial_flux(system, points, waves)
     amplitude = (flux_density(points, _inner(q), _inner(ray.n)) * cell[:, None, None] / area).sqrt()
 
@@ -223,8 +223,12 @@ def _crossing(system: OpticalSystem, rays: Rays, number: int) -> tuple[Tensor, T
     return there.x, there.y
 
 
-def _cell_areas(direction: Tensor) -> Tensor:
-    """(N, S, S): |∂(α_x, α_y)/∂(row, column)| by central differences of fourth order."""
+def cell_areas(direction: Tensor) -> Tensor:
+    """Return |∂(x, y)/∂(row, column)| (N, S, S) by central differences of fourth order.
+
+    Args:
+        direction: (N, S + 4, S + 4, 2), x and y at the centres of cells, two more on every side.
+    """
     up, along = _slope(direction, 1), _slope(direction, 2)
     return (along[..., 0] * up[..., 1] - along[..., 1] * up[..., 0]).abs()
 
@@ -232,23 +236,23 @@ def _cell_areas(direction: Tensor) -> Tensor:
 def _slope(values: Tensor, dim: int) -> Tensor:
     """(N, S, S, 2), per cell, of (N, S + 4, S + 4, 2)."""
     other = 3 - dim
-    values = values.narrow(other, _RIM, values.shape[other] - 2 * _RIM)
-    size = values.shape[dim] - 2 * _RIM
+    values = values.narrow(other, RIM, values.shape[other] - 2 * RIM)
+    size = values.shape[dim] - 2 * RIM
     far_before, before, behind, far_behind = (values.narrow(dim, at, size) for at in (0, 1, 3, 4))
     return (8.0 * (behind - before) - (far_behind - far_before)) / 12.0
 
 
 def _with_neighbours(valid: Tensor) -> Tensor:
     """(N, S, S), bool: where all rays are valid that the differences take."""
-    size = valid.shape[1] - 2 * _RIM
+    size = valid.shape[1] - 2 * RIM
     kept = torch.ones_like(_inner(valid))
-    for at in range(2 * _RIM + 1):
-        kept = kept & valid[:, at : at + size, _RIM:-_RIM] & valid[:, _RIM:-_RIM, at : at + size]
+    for at in range(2 * RIM + 1):
+        kept = kept & valid[:, at : at + size, RIM:-RIM] & valid[:, RIM:-RIM, at : at + size]
     return kept
 
 
 def _inner(values: Tensor) -> Tensor:
-    return values[:, _RIM:-_RIM, _RIM:-_RIM]
+    return values[:, RIM:-RIM, RIM:-RIM]
 
 
 def _share(weight: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dolens.errors import InputError
 from dolens.html import Child, Markup, joined
+from dolens.lens_page.content import Content, Section
 from dolens.lens_page.inline_svg import holds_pictures, inline_svg, rasterise
 from dolens.lens_page.markup import (
     GENERATOR,
@@ -19,7 +20,7 @@ from dolens.lens_page.markup import (
 )
 from dolens.lens_page.overview import Overview, lens_overview
 from dolens.lens_page.preparation import prepared_lens
-from dolens.lens_page.sections import Content, PageSections, Section
+from dolens.lens_page.sections import PageSections
 from dolens.lens_page.tables import number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens

@@ -3,12 +3,11 @@
 Every section is computed alone, so that one that fails leaves the others.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.analysis.conditions import (
@@ -19,6 +18,7 @@ from dolens.analysis.conditions import (
 )
 from dolens.analysis.encircled_energy import encircled_energy
 from dolens.analysis.field_curves import field_curves
+from dolens.analysis.footprint import footprint
 from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
 from dolens.analysis.modulation_transfer import frequency_range, modulation
 from dolens.analysis.ray_fans import ray_fans
@@ -28,17 +28,24 @@ from dolens.diffraction.point_spread import PointSpread, diffraction_encircled_e
 from dolens.diffraction.prepared_pupils import PreparedPupils, prepare_pupils
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.diffraction.wavefront_error import wavefront_errors
+from dolens.diffraction.wavefront_map import wavefront_maps
 from dolens.errors import InputError
-from dolens.html import Markup
+from dolens.lens_page.content import Content, Section
 from dolens.lens_page.offenders import offenders
 from dolens.lens_page.overview import Overview
 from dolens.lens_page.solid import solid
-from dolens.lens_page.tables import Table, number
 from dolens.lens_page.viewer import viewer_html
+from dolens.lens_page.wavefront_tables import (
+    distortion_table,
+    errors_table,
+    sampling_note,
+    zernike_table,
+)
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
 from dolens.plotting.encircled_energy import encircled_energy_figure
 from dolens.plotting.field_curves import field_curves_figure
+from dolens.plotting.footprint import footprint_figure
 from dolens.plotting.illumination import illumination_figure
 from dolens.plotting.lateral_colour import lateral_colour_figure
 from dolens.plotting.lens_section import lens_section_figure
@@ -47,45 +54,12 @@ from dolens.plotting.point_spread import point_spread_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
 from dolens.plotting.spots import spots_figure
+from dolens.plotting.wavefront_maps import wavefront_maps_figure
 
 # Of each field and wavelength.
-_MTF_RAYS, _RMS_RAYS = 6000, 2000
+_MTF_RAYS, _RMS_RAYS, _FOOTPRINT_RAYS = 6000, 2000, 400
 # Share of the brightest field's light that a field of tolerances has.
 _BRIGHT = 0.1
-
-
-@dataclass(frozen=True)
-class Content:
-    """What a section shows.
-
-    Attributes:
-        figures: file name without suffix → figure.
-        tables: below the figures.
-        note: a sentence above them.
-        html: elements above them.
-        problems: what could not be computed, and why, a sentence each.
-    """
-
-    figures: dict[str, Figure] = field(default_factory=dict)
-    tables: list[Table] = field(default_factory=list)
-    note: str = ""
-    html: Markup | None = None
-    problems: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Section:
-    """A section of a page.
-
-    Attributes:
-        name: in addresses within the page.
-        title: its heading.
-        make: computes what it shows.
-    """
-
-    name: str
-    title: str
-    make: Callable[[], Content]
 
 
 class PageSections:
@@ -122,6 +96,7 @@ class PageSections:
             Section("colour", "Lateral colour and focal shift", self.colour),
             Section("light", "Relative illumination", self.light),
             Section("wavefront", "Wavefront error", self.wavefront),
+            Section("footprint", "Footprints", self.footprint),
             *(last if self.tolerances is not None else ()),
         ]
 
@@ -184,13 +159,18 @@ class PageSections:
         )
         rays = modulation(self.lens, *self.scene, frequencies, _MTF_RAYS, self.distance)
         figure = modulation_comparison_figure(wave, rays, title="")
-        return Content({"mtf": figure}, problems=self._by_rays(wave.diffraction, wave.reasons))
+        return Content(
+            {"mtf": figure},
+            note=sampling_note("MTF with diffraction", wave.sampling_error),
+            problems=self._by_rays(wave.diffraction, wave.reasons),
+        )
 
     def psf(self) -> Content:
         """Show point spread functions."""
         found = self._spread
         return Content(
             {"psf": point_spread_figure(found, title="")},
+            note=sampling_note("irradiance, over its peak", found.sampling_error),
             problems=self._by_rays(found.diffraction, found.reasons),
         )
 
@@ -227,7 +207,8 @@ class PageSections:
         """Plot field curvature and distortion."""
         waves = self.where.wavelengths
         curves = [field_curves(self.lens, scan, waves, self.distance) for scan in self.scans]
-        return Content({"field_curves": field_curves_figure(curves, title="")})
+        tables = [] if self.distance is not None else [distortion_table(self.lens, self.scans)]
+        return Content({"field_curves": field_curves_figure(curves, title="")}, tables)
 
     def colour(self) -> Content:
         """Plot lateral colour, and the focus against the wavelength."""
@@ -245,24 +226,22 @@ class PageSections:
         return Content({"relative_illumination": illumination_figure(found, title="")})
 
     def wavefront(self) -> Content:
-        """List wavefront errors and Strehl ratios."""
+        """Show wavefront maps, and list errors, Strehl ratios and Zernike coefficients."""
         found = wavefront_errors(self.lens, *self.scene, self.distance)
-        numbers = (found.rms, found.peak_to_valley, found.strehl_ratio)
-        rows = [
-            (
-                field_label(point, found.field_unit),
-                f"{wave:g}",
-                *(number(values[row, column], 3) for values in numbers),
-            )
-            for row, point in enumerate(found.fields)
-            for column, wave in enumerate(found.wavelengths.tolist())
-        ]
-        table = Table(
-            ("field", "wavelength (nm)", "RMS (waves)", "peak to valley (waves)", "Strehl ratio"),
-            rows,
-            "On the sensor as it stands, tilt removed. – : no light passes.",
+        wave = self.where.reference_wavelength
+        maps = wavefront_maps(self.lens, self.where.fields, [wave], self.distance)
+        note = (
+            f"At {wave:g} nm, about the chief ray's point of the sensor; positive where the "
+            "wavefront is ahead of the reference sphere."
         )
-        return Content(tables=[table])
+        figure = wavefront_maps_figure(maps, title="")
+        return Content({"wavefront": figure}, [errors_table(found), zernike_table(maps)], note)
+
+    def footprint(self) -> Content:
+        """Show where the beams meet the surfaces."""
+        found = footprint(self.lens, self.where.fields, None, _FOOTPRINT_RAYS, self.distance)
+        note = f"Rays at {found.wavelength:g} nm, spread evenly over the stop."
+        return Content({"footprints": footprint_figure(found, title="")}, note=note)
 
     def rms(self) -> Content:
         """Plot RMS radii."""

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from dolens.analysis.conditions import FieldScan
-from dolens.analysis.field_curves import FieldCurves
+from dolens.analysis.field_curves import DISTORTION_REFERENCES, FieldCurves
 from dolens.plotting.legends import legend_below
 from dolens.plotting.style import (
     PAGE,
@@ -52,7 +52,8 @@ def field_curves_figure(
     grid[-1, 1].set_xlabel("distortion (%)", fontsize=SMALL + 1)
     grid[0, 0].set_title("Field curvature", fontsize=SMALL + 1)
     reference = rows[0].reference_wavelength
-    grid[0, 1].set_title(f"Distortion from f·tan θ, {reference:.4g} nm", fontsize=SMALL + 1)
+    ideal = DISTORTION_REFERENCES[rows[0].distortion_reference]
+    grid[0, 1].set_title(f"Distortion from {ideal}, {reference:.4g} nm", fontsize=SMALL + 1)
     if rows[0].scan.field_unit != "°":
         grid[0, 1].set_title(f"Distortion, {reference:.4g} nm", fontsize=SMALL + 1)
     handles = [

@@ -11,6 +11,7 @@ from dolens.analysis.modulation_transfer import Modulation
 from dolens.diffraction.transfer import DiffractionModulation
 from dolens.errors import InputError
 from dolens.optics.fields import field_label
+from dolens.plotting.number_text import number_text
 from dolens.plotting.style import PAGE, SMALL, ordered_colours, ruled_axes
 from dolens.plotting.titles import draw_title
 
@@ -44,6 +45,9 @@ def modulation_comparison_figure(
         name = "rays (geometric)"
         if isinstance(curves, DiffractionModulation):
             name = "with diffraction"
+            known = curves.sampling_error[curves.sampling_error.isfinite()]
+            if len(known):
+                name += f", sampling error {number_text(float(known.max()), 1)}"
             for number, diffraction in enumerate(curves.diffraction):
                 notes[number] = "" if diffraction else " (rays alone)"
         _draw(axes, curves)

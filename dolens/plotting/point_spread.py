@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from dolens.diffraction.point_spread import PointSpread
 from dolens.optics.fields import field_label
+from dolens.plotting.number_text import number_text
 from dolens.plotting.style import PAGE, SMALL
 from dolens.plotting.titles import draw_title
 
@@ -23,8 +24,8 @@ def point_spread_figure(psf: PointSpread, title: str | None = "Point spread func
     """Show the point spread function of every field in its own window, over its own peak.
 
     Brightness follows the square root of the irradiance, so that rings and flare show.  Above each
-    panel stand the field and the Strehl ratio; `rays alone` where the wavefront is too steep for
-    diffraction, or that no light passes.
+    panel stand the field, the Strehl ratio and the sampling error over the peak; `rays alone` where
+    the wavefront is too steep for diffraction, or that no light passes.
 
     Args:
         psf: the data.
@@ -35,7 +36,7 @@ def point_spread_figure(psf: PointSpread, title: str | None = "Point spread func
     rows = math.ceil(count / columns)
     norm = PowerNorm(0.5, 0.0, 1.0)
     width = PAGE if columns > 2 else 1.2 + 2.4 * columns
-    size = max(width, 4.2), ((width - 1.2) / columns + 0.55) * rows + 0.6
+    size = max(width, 4.2), ((width - 1.2) / columns + 0.7) * rows + 0.6
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for number, axes in enumerate(grid.flat):
@@ -76,5 +77,8 @@ def _draw(axes: Axes, psf: PointSpread, number: int, norm: PowerNorm) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(4, steps=(1, 2, 5, 10)))
     strehl = float(psf.strehl_ratio[number])
-    quality = f"Strehl ratio {strehl:.2g}" if psf.diffraction[number] else "rays alone"
+    quality = "rays alone"
+    if psf.diffraction[number]:
+        error = 100.0 * float(psf.sampling_error[number])
+        quality = f"Strehl ratio {strehl:.2g}\nsampling error {number_text(error, 1)} %"
     axes.set_title(f"{label}\n{quality}", fontsize=SMALL)

@@ -2,7 +2,9 @@
 
 A row that says `semi_diameter: auto` clips nothing, and a number is needed to draw the surface and
 to set the scale of tolerances.  It is the largest height of real rays through the rim of the
-entrance pupil, of all fields and wavelengths; where no ray gets through, the paraxial one.
+entrance pupil, of all fields and wavelengths.  The real pupil of a wide field may lie far from the
+paraxial one: where fewer than half of a field's rays get through, rays are aimed at the rim of the
+stop instead.  Where no ray gets through at all, the height is the paraxial one.
 """
 
 import math
@@ -13,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dolens.optics.aiming import aim
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.fields import Fields
 from dolens.optics.lens import Lens
@@ -123,14 +126,31 @@ def _real_heights(lens: Lens) -> dict[str, float]:
         towards = torch.where(towards[..., 2:] < 0.0, -towards, towards)
     towards = towards / towards.norm(dim=-1, keepdim=True)
     waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
-    rays = Rays(at[:, :, None], towards[:, :, None], waves)
     system = lens.system().opened().traced_by("reference")
-    hit = trace_rays(system, rays, 1.0, True)
-    if not bool(hit.valid.any()):
+    traced = [trace_rays(system, Rays(at[:, :, None], towards[:, :, None], waves), 1.0, True)]
+    missing = traced[0].valid.double().mean((1, 2)) < 0.5
+    if bool(missing.any()):
+        aimed = aim(
+            system,
+            _radians(lens, points[missing])[:, None, None],
+            rim[missing][:, :, None],
+            waves,
+            lens.object_distance,
+        )
+        hit = trace_rays(system, aimed, 1.0, True)
+        traced.append(replace(hit, valid=hit.valid & aimed.converged))
+    passed = [hit.points[:, hit.valid] for hit in traced]
+    points = torch.cat(passed, 1)
+    if not points.shape[1]:
         return {}
     found = {}
-    for number, axes, point in zip(lens.surfaces, system.axes, hit.points, strict=True):
-        x, y, z = point[hit.valid].unbind(-1)
+    for number, axes, point in zip(lens.surfaces, system.axes, points, strict=True):
+        x, y, z = point.unbind(-1)
         local = from_lens_axes(Components(x, y, z, x, y, z), axes)
         found[number] = float(torch.hypot(local.x, local.y).max())
     return found
+
+
+def _radians(lens: Lens, points: Tensor) -> Tensor:
+    """Return field points as `dolens.optics.aiming.aim` takes them: radians or mm."""
+    return torch.deg2rad(points) if vergence(lens.object_distance) == 0.0 else points

@@ -15,7 +15,8 @@ SECTIONS = [
     *("Section", "In space", "Prescription", "First-order data", "Seidel sums", "RMS spot radii"),
     *("Spot diagram", "Ray fans", "MTF", "Point spread functions"),
     *("RMS against field and wavelength", "Encircled energy", "Field curvature and distortion"),
-    *("Lateral colour and focal shift", "Relative illumination", "Wavefront error", "Tolerances"),
+    *("Lateral colour and focal shift", "Relative illumination", "Wavefront error"),
+    *("Footprints", "Tolerances"),
 ]
 
 

@@ -103,7 +103,8 @@ def test_summary_of_a_lens_without_light_says_so(root):
 
 METHODS = (
     "draw", "spots", "ray_fans", "mtf", "field_curves", "lateral_colour", "rms",
-    "encircled_energy", "relative_illumination", "psf",
+    "encircled_energy", "relative_illumination", "psf", "wavefront", "zernike", "strehl",
+    "footprint",
 )  # fmt: skip
 
 
@@ -127,6 +128,10 @@ def test_wrong_options_are_named(singlet):
         singlet.spots(f_numbre=4.0)
     with pytest.raises(InputError, match="object_distance"):
         singlet.draw(object_distance=-1.0)
+    with pytest.raises(InputError, match="fourier, huygens, not 'fft'"):
+        singlet.psf(kind="fft")
+    with pytest.raises(InputError, match="fringe, standard, not 'noll'"):
+        singlet.zernike(order="noll")
 
 
 def test_pyplot_knows_nothing_and_ipython_shows_a_figure_once(root):

@@ -12,9 +12,10 @@ The numbers behind each figure come from the functions that the methods call.
 from dolens.optics.lens_views.image_points import ImagePointViews
 from dolens.optics.lens_views.over_field import OverFieldViews
 from dolens.optics.lens_views.overview import OverviewViews
+from dolens.optics.lens_views.wavefronts import WavefrontViews
 
 
-class LensViews(OverviewViews, ImagePointViews, OverFieldViews):
+class LensViews(OverviewViews, ImagePointViews, OverFieldViews, WavefrontViews):
     """Methods of `Lens` that show it.
 
     Arguments that all of them share:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.optics.lens_views.conditions import looked_at, shown, title_of
 
 if TYPE_CHECKING:
@@ -14,6 +15,14 @@ if TYPE_CHECKING:
 
     from dolens.analysis.conditions import FieldPoints
     from dolens.optics.lens_views.conditions import Wavelengths
+
+KINDS = ("fourier", "huygens")
+
+
+def check_kind(kind: str) -> None:
+    """Raise `InputError` where a kind of diffraction calculation is none of `KINDS`."""
+    if kind not in KINDS:
+        raise InputError(f"kind must be one of {', '.join(KINDS)}, not '{kind}'")
 
 
 class ImagePointViews:
@@ -71,11 +80,13 @@ class ImagePointViews:
         frequencies: Sequence[float] | Tensor | None = None,
         diffraction: bool = True,
         geometric: bool = True,
+        kind: str = "fourier",
         **aperture: float,
     ) -> Figure:
         """Plot the MTF with diffraction and of rays, of all wavelengths together.
 
-        See `diffraction.transfer.diffraction_modulation` and
+        See `diffraction.transfer.diffraction_modulation`,
+        `diffraction.huygens_transfer.huygens_modulation` and
         `analysis.modulation_transfer.modulation`.
 
         Args:
@@ -85,9 +96,12 @@ class ImagePointViews:
             frequencies: cycles/mm; None for 61 as far as the best field leaves contrast.
             diffraction: whether to plot the MTF with diffraction.
             geometric: whether to plot the MTF of rays.
+            kind: of the diffraction: `fourier`, or `huygens`, which takes far longer.
             aperture: see the class.
         """
+        check_kind(kind)
         from dolens.analysis.modulation_transfer import frequency_range, modulation
+        from dolens.diffraction.huygens_transfer import huygens_modulation
         from dolens.diffraction.transfer import diffraction_modulation
         from dolens.plotting.modulation_comparison import modulation_comparison_figure
 
@@ -96,7 +110,8 @@ class ImagePointViews:
         distance = given.object_distance
         if frequencies is None:
             frequencies = frequency_range(lens, *scene, distance)
-        wave = diffraction_modulation(lens, *scene, frequencies, distance) if diffraction else None
+        by_waves = huygens_modulation if kind == "huygens" else diffraction_modulation
+        wave = by_waves(lens, *scene, frequencies, distance) if diffraction else None
         rays = modulation(lens, *scene, frequencies, 6000, distance) if geometric else None
         title = title_of("Modulation transfer function", lens, given)
         return shown(modulation_comparison_figure(wave, rays, title))
@@ -137,15 +152,28 @@ class ImagePointViews:
         fields: FieldPoints | None = None,
         wavelengths: Wavelengths = None,
         object_distance: float | None = None,
+        kind: str = "fourier",
         **aperture: float,
     ) -> Figure:
         """Show point spread functions with diffraction, of all wavelengths together.
 
-        See `diffraction.point_spread.point_spread`.
+        See `diffraction.point_spread.point_spread` and
+        `diffraction.huygens.huygens_point_spread`.
+
+        Args:
+            fields: see the class, as the other arguments that are not named here.
+            wavelengths: see the class.
+            object_distance: see the class.
+            kind: `fourier`, the transform of the pupil, or rays alone where the wavefront is too
+                steep for it; or `huygens`, the sum of wavelets, which takes far longer.
+            aperture: see the class.
         """
+        check_kind(kind)
+        from dolens.diffraction.huygens import huygens_point_spread
         from dolens.diffraction.point_spread import point_spread
         from dolens.plotting.point_spread import point_spread_figure
 
         lens, given = looked_at(self, fields, wavelengths, object_distance, aperture)
-        found = point_spread(lens, given.fields, given.wavelengths, given.object_distance)
+        by_waves = huygens_point_spread if kind == "huygens" else point_spread
+        found = by_waves(lens, given.fields, given.wavelengths, given.object_distance)
         return shown(point_spread_figure(found, title_of("Point spread functions", lens, given)))

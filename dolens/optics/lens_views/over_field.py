@@ -22,6 +22,7 @@ class OverFieldViews:
         edge: float | Sequence[float] | None = None,
         wavelengths: Wavelengths = None,
         object_distance: float | None = None,
+        distortion: str = "f_tan_theta",
         **aperture: float,
     ) -> Figure:
         """Plot field curvature and distortion; see `analysis.field_curves.field_curves`.
@@ -31,6 +32,7 @@ class OverFieldViews:
                 lens's fields.
             wavelengths: see the class, as the other arguments that are not named here.
             object_distance: see the class.
+            distortion: from `f_tan_theta`, or from `f_theta`, as of a fisheye or a scan lens.
             aperture: see the class.
         """
         from dolens.analysis.conditions import field_scans
@@ -40,7 +42,7 @@ class OverFieldViews:
         lens, given = looked_at(self, 0.0, wavelengths, object_distance, aperture)
         distance = given.object_distance
         curves = [
-            field_curves(lens, scan, given.wavelengths, distance)
+            field_curves(lens, scan, given.wavelengths, distance, distortion)
             for scan in field_scans(lens, distance, edge)
         ]
         return shown(field_curves_figure(curves, title_of("Field curves", lens, given)))

@@ -1,0 +1,231 @@
+"""Point spread functions by Huygens's principle: wavelets from the exit pupil, added up.
+
+Every ray of the pupil stands for a cell of the reference sphere, and sends a spherical wavelet to
+every point of the image, over the exact distance.  Nothing is expanded in small angles, so that the
+sum holds at low F-numbers, far out of focus, off the axis, for tilted images, behind mirrors, and
+where the edge of the pupil has no simple form.  It takes a hundred times as long as a Fourier
+transform.
+
+A wavelet's amplitude is A·dα·dβ, dα·dβ being the cell in direction cosines along the image plane
+and A² the flux per area there: by radiometry the flux through a point of the image is the radiance
+times the projected solid angle dα·dβ = cos θ·dΩ, which is what Parseval's theorem makes the sum
+conserve, on a plane of any tilt.  Cells of equal solid angle, or rays of equal weight, would not.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dolens.diffraction.field import direct_field
+from dolens.diffraction.field_pupil import COARSER, FieldPupil
+from dolens.diffraction.field_wavefronts import field_wavefronts, object_points
+from dolens.diffraction.point_spread import PointSpread, airy_radius_um, window_half_width
+from dolens.diffraction.prepared_pupils import part_of
+from dolens.diffraction.propagation import turns_across
+from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
+from dolens.errors import InputError
+from dolens.optics.lens import Lens
+
+# Neighbouring wavelets differ by half a turn at most.
+_HALF_TURNS = 2.0
+# Fewest rays along each side, unless a number is given.
+_FEWEST = 128
+# Steps of the search for the peak to an Airy radius, and how often it looks three times closer.
+_STEPS, _CLOSER = 2.5, 4
+# Pairs of ray and image point that one field may take: some minutes of one core.
+_MOST_PAIRS = 4e9
+_REASON = "sum of Huygens's wavelets"
+
+
+def huygens_irradiance(
+    wavefront: Wavefront, x: Tensor, y: Tensor, dtype: torch.dtype = torch.float64
+) -> Tensor:
+    """Return the irradiance of N wavefronts at points of the image; differentiable in the lens.
+
+    Memory is bounded, in the gradient too.
+
+    Args:
+        wavefront: of N points, by `pupil_wavefront`.
+        x: (M,), mm from the centre of the reference sphere.
+        y: (M,), mm.
+        dtype: of the sums; phases are in double precision.
+
+    Returns:
+        (N, M), 1/mm², with the flux as `Wavefront.flux` has it as unit of light.
+    """
+    field = direct_field(wavefront, x, y, dtype)
+    return field.real.double().square() + field.imag.double().square()
+
+
+@torch.no_grad()
+def huygens_point_spread(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+    cells: int = 64,
+    half_width_um: float | None = None,
+    rays: int | None = None,
+) -> PointSpread:
+    """Compute the point spread function of every field by adding up wavelets from the exit pupil.
+
+    The sampling error is estimated by a second sum over half of the rays.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        wavelength_weights: (W,), of any sum; None for equal ones.
+        cells: M, along each side of the window; the irradiance is that at their centres.
+        half_width_um: µm, of all windows; None: each holds 99 % of its rays and some rings around.
+        rays: along each side of a box about each beam; None: so many that the phases of neighbours
+            differ by half a turn at most, 128 or more.
+
+    Raises:
+        InputError: no fields or wavelengths, weights that do not fit, fewer than two cells, too few
+            rays for the phases of neighbours to differ by less than half a turn, or more than can
+            be added up.
+    """
+    if cells < 2 or (half_width_um is not None and not half_width_um > 0.0):
+        raise InputError(f"a window needs two cells and a positive width, not {cells}")
+    found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
+    weights = found.weights.to(lens.device)
+    dark = torch.full((cells, cells), math.nan, dtype=torch.float64)
+    rows = []
+    for number, lit in enumerate(found.lit.any(1).tolist()):
+        if not lit:
+            rows.append((math.nan, dark, math.nan, math.nan, math.nan, False, "no light passes"))
+            continue
+        which = number * len(weights) + torch.arange(len(weights), device=lens.device)
+        front = part_of(found.wavefront, which)
+        half = 1e-3 * half_width_um if half_width_um else _half_width(front, weights)
+        sums = _Wavelets(lens, found.fields[number], object_distance, front, weights, half)
+        finer = sums.rays(rays, cells)
+        grid = (torch.arange(cells).to(weights) + 0.5) * (2.0 * half / cells) - half
+        irradiance, perfect = sums.added(finer, grid, grid)
+        coarser = sums.added(max(8, round(COARSER * finer)), grid, grid)[0]
+        highest = sums.highest(finer, grid, irradiance)
+        error = (irradiance - coarser).abs().amax() / irradiance.amax()
+        held = float(irradiance.sum()) * (2.0 * half / cells) ** 2
+        reason = f"{_REASON}, {finer} × {finer} rays"
+        strehl = highest / float(perfect)
+        rows.append((1e3 * half, 1e-6 * irradiance.cpu(), held, strehl, float(error), True, reason))
+    half_widths, windows, held, strehl, errors, diffraction, reasons = zip(*rows, strict=True)
+    return PointSpread(
+        found.fields,
+        found.field_unit,
+        found.wavelengths,
+        found.centre,
+        torch.tensor(half_widths, dtype=torch.float64),
+        torch.stack(windows),
+        torch.tensor(held, dtype=torch.float64),
+        torch.tensor(strehl, dtype=torch.float64),
+        airy_radius_um(lens, found, object_distance),
+        diffraction,
+        reasons,
+        torch.tensor(errors, dtype=torch.float64),
+    )
+
+
+@torch.no_grad()
+def huygens_window(
+    lens: Lens,
+    field: Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+) -> tuple[float, float]:
+    """Return the half width of a field's window, and the Airy radius, both in µm.
+
+    Arguments are those of `huygens_point_spread`, of one field (2,).  Without light both are those
+    of a perfect lens.
+    """
+    found = field_wavefronts(lens, field[None], wavelengths, object_distance, wavelength_weights)
+    airy = airy_radius_um(lens, found, object_distance)
+    if not bool(found.lit.any()):
+        return airy, airy
+    return 1e3 * _half_width(found.wavefront, found.weights.to(lens.device)), airy
+
+
+def _half_width(front: Wavefront, weights: Tensor) -> float:
+    return window_half_width(FieldPupil(front, weights, None, ""))
+
+
+class _Wavelets:
+    """The wavelets of one field, W wavelengths, about one point of the image."""
+
+    def __init__(
+        self,
+        lens: Lens,
+        field: Tensor,
+        object_distance: float | None,
+        front: Wavefront,
+        weights: Tensor,
+        half: float,
+    ) -> None:
+        self.system, self.front, self.weights, self.half = lens.system(), front, weights, half
+        count = len(weights)
+        self.points = object_points(field.to(weights).expand(count, 2), object_distance)
+
+    def rays(self, given: int | None, cells: int) -> int:
+        """Return the rays along each side.
+
+        Raises:
+            InputError: too few are given, or more are needed than can be added up.
+        """
+        needed = math.ceil(_HALF_TURNS * turns_across(self.front, self.half))
+        chosen = given or max(_FEWEST, 4 * math.ceil(needed / 4.0))
+        if chosen < needed:
+            raise InputError(
+                f"{chosen} rays along each side are too few for this window: phases of neighbours "
+                f"differ by more than half a turn; give {needed} or more, or a smaller window"
+            )
+        if len(self.weights) * chosen**2 * cells**2 > _MOST_PAIRS:
+            raise InputError(
+                f"{chosen} × {chosen} rays to {cells} × {cells} points are too many to add up; "
+                "give fewer cells or a smaller window, or look at the rays alone"
+            )
+        return chosen
+
+    def highest(self, rays: int, grid: Tensor, irradiance: Tensor) -> float:
+        """Return the highest irradiance, 1/mm²: on a grid of steps that no peak slips through, and
+        then closer and closer about the highest point.
+        """
+        airy = FieldPupil(self.front, self.weights, None, "").airy_radius
+        count = math.ceil(2.0 * self.half * _STEPS / airy)
+        if count > len(grid):
+            grid = (torch.arange(count).to(grid) + 0.5) * (2.0 * self.half / count) - self.half
+            irradiance = self.added(round(COARSER * rays), grid, grid)[0]
+        row, column = divmod(int(irradiance.argmax()), len(grid))
+        x, y, reach = grid[column], grid[row], 2.0 * self.half / len(grid)
+        for _ in range(_CLOSER):
+            near = torch.linspace(-reach, reach, 7).to(grid)
+            found = self.added(rays, x + near, y + near)[0]
+            row, column = divmod(int(found.argmax()), 7)
+            x, y, reach = x + near[column], y + near[row], reach / 3.0
+        return float(found.amax())
+
+    def added(self, rays: int, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return irradiance (Y, X), 1/mm², with the light of the field as unit, and that of the
+        same pupil without aberrations at the centre.
+        """
+        front = pupil_wavefront(
+            self.system,
+            self.points,
+            self.front.wavelength,
+            self.front.centre,
+            rays,
+            1.0 / self.front.curvature,
+        )
+        total = self.weights @ front.flux
+        rows, columns = torch.meshgrid(y, x, indexing="ij")
+        # Sums in single precision err by 1e-6.
+        values = huygens_irradiance(front, columns.flatten(), rows.flatten(), torch.float32)
+        mixed = (self.weights @ values).unflatten(0, (len(y), len(x))) / total
+        wave = MM_PER_NM * front.wavelength / front.index
+        perfect = (front.weight.sum((-2, -1)) / wave).square()
+        return mixed, self.weights @ perfect / total

@@ -1,0 +1,156 @@
+"""Wavefront maps: the wavefront error of a field over the stop, and its Zernike coefficients."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.analysis.ray_intercepts import field_unit
+from dolens.analysis.zernike_fit import TERMS, ZernikeFit, zernike_fit
+from dolens.diffraction.entrance_beam import EntranceBeam, box_grid, find_beam, launched
+from dolens.diffraction.field_wavefronts import light_centroids, object_points
+from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.reference_sphere import find_chief_rays
+from dolens.diffraction.wavefront import MM_PER_NM, RIM, cell_areas, pupil_wavefront
+from dolens.errors import InputError
+from dolens.optics.elements import from_lens_axes
+from dolens.optics.lens import Lens
+from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.rays import Rays
+from dolens.optics.system import OpticalSystem
+
+
+@dataclass(frozen=True)
+class WavefrontMaps:
+    """Wavefront errors of F fields and W wavelengths at S × S rays each; float64 on the CPU.
+
+    The wavefront error W is measured on a sphere about the point of the sensor where the chief ray
+    of the same wavelength lands, through the centre of the paraxial exit pupil.  W is positive
+    where the wavefront is ahead of the sphere, as where light arrives early: the sign of Welford
+    and of Hopkins, and Optiland's.  It is minus `Wavefront.opd`.  Third-order spherical aberration
+    of a simple positive lens has W₀₄₀ > 0 at its paraxial focus.
+
+    Attributes:
+        fields: (F, 2), degrees or mm.
+        field_unit: `°` for an object at infinity, else `mm`.
+        wavelengths: (W,), nm.
+        stop: (F, W, S, S, 2), where the rays cross the stop, over its semi-diameter, in its axes;
+            the same numbers as the `pupil` of `Lens.aim`.
+        error: (F, W, S, S), waves, with a mean of zero over the light; NaN where none passes.
+        weight: (F, W, S, S), the ray's cell of the stop times the share of it that passes; its sum
+            is one, and every part of the stop counts alike.
+        inside: (F, W, S, S), bool: the ray itself passes; of an edge's cells some rays do not.
+        by_chief_ray: (F, W), bool: the sphere is about the chief ray's point; else, where that ray
+            does not arrive, about the centroid of the light.
+    """
+
+    fields: Tensor
+    field_unit: str
+    wavelengths: Tensor
+    stop: Tensor
+    error: Tensor
+    weight: Tensor
+    inside: Tensor
+    by_chief_ray: Tensor
+
+    @property
+    def rms(self) -> Tensor:
+        """(F, W), waves, about the mean; NaN where no light passes."""
+        square = self.error.square().nan_to_num(0.0)
+        return (self.weight * square).sum((-2, -1)).sqrt() + self._dark
+
+    @property
+    def peak_to_valley(self) -> Tensor:
+        """(F, W), waves, over the rays that pass."""
+        high = self.error.where(self.inside, -torch.inf).amax((-2, -1))
+        low = self.error.where(self.inside, torch.inf).amin((-2, -1))
+        return (high - low).clamp(min=0.0) + self._dark
+
+    def zernike(self, order: str = "fringe", count: int = TERMS) -> ZernikeFit:
+        """Fit Zernike polynomials over the disc of the stop; (F, W) fits, in waves.
+
+        Args:
+            order: `fringe` or `standard`.
+            count: terms.
+        """
+        error, weight = self.error.flatten(2), self.weight.flatten(2)
+        x, y = self.stop.flatten(2, 3).unbind(-1)
+        return zernike_fit(error.nan_to_num(0.0), x, y, weight, order, count)
+
+    @property
+    def _dark(self) -> Tensor:
+        return torch.where(self.weight.sum((-2, -1)) > 0.0, 0.0, torch.nan)
+
+
+@torch.no_grad()
+def wavefront_maps(
+    lens: Lens,
+    fields: Sequence[Sequence[float]] | Tensor,
+    wavelengths: Sequence[float] | Tensor,
+    object_distance: float | None = None,
+    samples: int = 64,
+) -> WavefrontMaps:
+    """Trace the wavefront error of every field and wavelength; see `WavefrontMaps`.
+
+    Args:
+        lens: the lens.
+        fields: (F, 2), degrees or mm, as `Lens.aim` takes them.
+        wavelengths: (W,), nm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+        samples: S, rays along each side of a box about each beam.
+
+    Raises:
+        InputError: no fields or wavelengths, or a sphere that cannot be placed.
+    """
+    system = lens.system().double()
+    options = {"dtype": torch.float64, "device": system.device}
+    field = torch.as_tensor(fields, **options)
+    waves = torch.as_tensor(wavelengths, **options).reshape(-1)
+    if field.ndim != 2 or field.shape[-1] != 2 or not len(field) or not len(waves):
+        raise InputError("fields must be pairs (x, y) and wavelengths numbers, at least one each")
+    shape = (len(field), len(waves))
+    points = object_points(field.repeat_interleave(len(waves), 0), object_distance)
+    wave = waves.repeat(len(field))
+    beam = find_beam(system, points, wave)
+    centre, reached = find_chief_rays(system, points, wave)
+    if not bool(reached.all()):
+        middle = light_centroids(system, points, wave, beam)
+        centre = torch.where(reached[:, None], centre, middle)
+    front = pupil_wavefront(system, points, wave, centre, samples, beam=beam)
+    stop, cell = _stop_coordinates(system, points, wave, beam, samples)
+    weight = (cell * front.coverage).where(front.valid & stop.isfinite().all(-1), 0.0)
+    weight = weight / weight.sum((-2, -1), keepdim=True)
+    weight = weight.nan_to_num(0.0)
+    mean = (weight * front.opd).sum((-2, -1), keepdim=True)
+    error = -(front.opd - mean) / (MM_PER_NM * wave[:, None, None])
+
+    def found(values: Tensor) -> Tensor:
+        return values.cpu().unflatten(0, shape)
+
+    return WavefrontMaps(
+        field.cpu(),
+        field_unit(object_distance),
+        waves.cpu(),
+        found(stop),
+        found(error.where(weight > 0.0, torch.nan)),
+        found(weight),
+        found((weight > 0.0) & (front.coverage >= 0.5)),
+        found(reached),
+    )
+
+
+def _stop_coordinates(
+    system: OpticalSystem, points: ObjectPoints, wave: Tensor, beam: EntranceBeam, samples: int
+) -> tuple[Tensor, Tensor]:
+    """Return where the rays of `pupil_wavefront` cross the stop over its semi-diameter,
+    (N, S, S, 2), and the areas of their cells there, (N, S, S).
+    """
+    half_width = beam.half_width * (samples / (samples - 2.0))
+    q = box_grid(beam.centre, half_width, samples, RIM)
+    rays = Rays.from_components(launched(points, q), wave[:, None, None])
+    hit = trace_rays(system.opened(), rays, last=system.stop)
+    there = from_lens_axes(hit.components(), system.axes[system.stop - 1])
+    radius = system.surfaces[system.stop - 1].semi_diameter
+    stop = torch.stack((there.x, there.y), -1) / radius
+    return stop[:, RIM:-RIM, RIM:-RIM], cell_areas(stop)

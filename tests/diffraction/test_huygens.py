@@ -1,0 +1,233 @@
+"""Point spread functions and MTF by Huygens's wavelets, and what sampling leaves of them."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import j1
+
+from dolens import load_lens
+from dolens.analysis.modulation_transfer import diffraction_limited_transfer
+from dolens.diffraction.huygens import huygens_irradiance, huygens_point_spread
+from dolens.diffraction.huygens_transfer import huygens_modulation
+from dolens.diffraction.object_points import ObjectPoints
+from dolens.diffraction.point_spread import point_spread
+from dolens.diffraction.transfer import diffraction_modulation
+from dolens.diffraction.wavefront import pupil_wavefront
+from dolens.errors import InputError
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.prescriptions import lens_from_prescription
+from tests.diffraction.perfect_lenses import N, hyperbola, relay
+
+WAVELENGTH, LAMBDA = 500.0, 500e-6
+AXIS = [(0.0, 0.0)]
+
+
+def cells(found):
+    """Distances (M, M), mm, of cells from the centre of a window."""
+    count, half = found.irradiance.shape[-1], 1e-3 * float(found.half_width_um[0])
+    place = (torch.arange(count).double() + 0.5) * (2.0 * half / count) - half
+    return torch.hypot(place[:, None], place[None]).numpy()
+
+
+def jinc(v):
+    """2·J₁(v)/v."""
+    v = np.maximum(np.abs(v), 1e-9)
+    return 2.0 * j1(v) / v
+
+
+def test_airy_s_pattern_and_its_sampling_error():
+    """[2J₁(v)/v]², with π·a²/(λf)² of the light at its peak; the estimate is the error's size."""
+    lens = hyperbola(100.0, 1.0)
+    found = huygens_point_spread(lens, AXIS, [WAVELENGTH], cells=24, half_width_um=60.0)
+    peak = 1e-6 * math.pi / (LAMBDA * 100.0) ** 2
+    expected = jinc(2.0 * math.pi / LAMBDA / 100.0 * cells(found)) ** 2
+    wrong = float(np.abs(found.irradiance[0].numpy() / peak - expected).max())
+    assert wrong < 4e-4
+    assert 0.0 < float(found.sampling_error) < 1e-3
+    assert float(found.strehl_ratio) == pytest.approx(1.0, abs=1e-4)
+    assert found.diffraction == (True,)
+
+
+@pytest.mark.parametrize("inner", [0.3, 0.6])
+def test_a_ring_s_pattern(inner):
+    """[2J₁(v)/v - ε²·2J₁(εv)/(εv)]²/(1 - ε²)² (Born and Wolf, 8.6.2)."""
+    stop = ClearAperture(Circle(1.0), Circle(inner))
+    found = huygens_point_spread(
+        hyperbola(100.0, stop), AXIS, [WAVELENGTH], cells=24, half_width_um=60.0
+    )
+    v = 2.0 * math.pi / LAMBDA / 100.0 * cells(found)
+    expected = ((jinc(v) - inner**2 * jinc(inner * v)) / (1.0 - inner**2)) ** 2
+    peak = 1e-6 * math.pi * (1.0 - inner**2) / (LAMBDA * 100.0) ** 2
+    np.testing.assert_allclose(found.irradiance[0].numpy() / peak, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("waves", [0.5, 1.6, 4.5])
+def test_far_out_of_focus_the_axis_follows_sinc_squared(waves):
+    """Fresnel's diffraction of a wave that converges at f beyond a hole of radius a, on the axis at
+    f + δ: π·a²/(λ(f + δ))²·(sin πW/πW)², W = a²/2λ·(1/f - 1/(f + δ)) (Born and Wolf, 8.8.2).
+
+    The hole is the exit pupil, which the lens makes of the stop 4 mm of glass before it.
+    """
+    focal, larger = 100.0, 1.0 / (1.0 - 4.0 / N / 100.0)
+    shift = 2.0 * waves * LAMBDA * focal**2
+    lens = hyperbola(focal, 1.0, defocus=shift)
+    front = pupil_wavefront(
+        lens.system(), ObjectPoints.at_infinity(AXIS), WAVELENGTH, [[0.0, 0.0]], 128
+    )
+    zero = torch.zeros(1).double()
+    centre = float(huygens_irradiance(front, zero, zero) / front.flux)
+    aperture, near, far = larger, focal * larger, focal * larger + shift
+    phase = math.pi * 0.5 * aperture**2 * (1.0 / near - 1.0 / far) / LAMBDA
+    perfect = math.pi * aperture**2 / (LAMBDA * far) ** 2
+    assert centre == pytest.approx((math.sin(phase) / phase) ** 2 * perfect, abs=2e-4 * perfect)
+
+
+def test_a_tilted_image_keeps_its_light_and_stretches():
+    """A plane turned by 60° about x meets the cone of light over twice the length along y; where
+    one point of it is in focus its pattern is Airy's, along y by 1/cos wider.
+    """
+    rows = {
+        "1": {
+            "type": "paraxial_lens",
+            "focal_length": 100.0,
+            "semi_diameter": 0.5,
+            "thickness": 100.0,
+            "material": "air",
+        },
+        "2": {"type": "coordinate_break", "tilt_x": 60.0},
+    }
+    lens = lens_from_prescription({"surfaces": rows, "sensor": {"distance": 0.0}})
+    found = huygens_point_spread(lens, AXIS, [WAVELENGTH], cells=24, half_width_um=150.0)
+    assert float(found.held) == pytest.approx(0.93, abs=0.04)
+    place = (torch.arange(24).double() + 0.5) * (300.0 / 24) - 150.0
+    x, y = 1e-3 * place[None].numpy(), 1e-3 * place[:, None].numpy() * math.cos(math.radians(60.0))
+    expected = jinc(2.0 * math.pi / LAMBDA * 0.5 / 100.0 * np.hypot(x, y)) ** 2
+    pattern = (found.irradiance[0] / found.irradiance[0].max()).numpy()
+    expected = expected / expected.max()
+    np.testing.assert_allclose(pattern, expected, atol=5e-3)
+
+
+def test_both_ways_agree_for_the_triplet(root):
+    """Off the axis, clipped: the transform of the fitted pupil, and the sum over its rays; they
+    differ by no more than they say of themselves.
+    """
+    lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
+    field = [(0.0, 20.0)]
+    sums = huygens_point_spread(lens, field, [587.5618], cells=17, half_width_um=30.0)
+    # At the centres of as many cells: the mean over a fifteenth of each.
+    fine = point_spread(lens, field, [587.5618], cells=17 * 15, half_width_um=30.0)
+    transform = fine.irradiance[0, 7::15, 7::15]
+    wrong = (sums.irradiance[0] - transform).abs().max() / transform.max()
+    assert float(wrong) < 2.0 * float(sums.sampling_error) + float(fine.sampling_error)
+    assert float(sums.sampling_error) < 0.01
+    assert float(sums.strehl_ratio) == pytest.approx(float(fine.strehl_ratio), abs=2e-3)
+
+
+def test_a_near_object_s_image_is_perfect_too():
+    """Two hyperboloids relay the axial point at 1:1 and F/6."""
+    found = huygens_point_spread(
+        relay(60.0), AXIS, [WAVELENGTH], 60.0, cells=24, half_width_um=12.0
+    )
+    assert float(found.strehl_ratio) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_fewer_rays_than_half_turns_are_refused():
+    lens = hyperbola(100.0, 2.0)
+    with pytest.raises(InputError, match="differ by more than half a turn; give 1"):
+        huygens_point_spread(lens, AXIS, [WAVELENGTH], half_width_um=1000.0, rays=64)
+    with pytest.raises(InputError, match="too many to add up"):
+        huygens_point_spread(lens, AXIS, [WAVELENGTH], cells=512, rays=1024)
+    with pytest.raises(InputError, match="two cells"):
+        huygens_point_spread(lens, AXIS, [WAVELENGTH], cells=1)
+
+
+def test_the_estimate_covers_the_error_of_coarse_sums():
+    """For 20 to 60 rays a side the peak of Airy's pattern errs by no more than three estimates."""
+    lens = hyperbola(100.0, 1.0)
+    peak = 1e-6 * math.pi / (LAMBDA * 100.0) ** 2
+    for rays in (20, 32, 45, 60):
+        found = huygens_point_spread(
+            lens, AXIS, [WAVELENGTH], cells=15, half_width_um=40.0, rays=rays
+        )
+        expected = jinc(2.0 * math.pi / LAMBDA / 100.0 * cells(found)) ** 2
+        wrong = float(np.abs(found.irradiance[0].numpy() / peak - expected).max())
+        assert wrong < 3.0 * float(found.sampling_error) + 2e-4, rays
+
+
+def test_mtf_is_the_overlap_of_two_pupils():
+    lens = hyperbola(100.0, 2.5)
+    cutoff = 1.0 / (LAMBDA * 20.0)
+    frequencies = cutoff * torch.tensor([0.0, 0.2, 0.5, 0.8]).double()
+    found = huygens_modulation(lens, AXIS, [WAVELENGTH], frequencies)
+    expected = diffraction_limited_transfer(frequencies, WAVELENGTH, 20.0)
+    for curve in (found.tangential[0], found.sagittal[0]):
+        wrong = (curve - expected).abs()
+        assert float(wrong.max()) < float(found.sampling_error)
+        # What lies beyond the window is missing at low frequencies alone.
+        assert float(wrong[1:].max()) < 3e-3
+    assert float(found.sampling_error) < 0.03
+
+
+def test_mtf_by_wavelets_is_the_autocorrelation_s(root):
+    lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
+    frequencies = [20.0, 50.0, 100.0]
+    sums = huygens_modulation(lens, [(0.0, 0.0)], [587.5618], frequencies)
+    other = diffraction_modulation(lens, [(0.0, 0.0)], [587.5618], frequencies)
+    allowed = float(sums.sampling_error + other.sampling_error)
+    for one, two in ((sums.tangential, other.tangential), (sums.sagittal, other.sagittal)):
+        assert float((one - two).abs().max()) < allowed
+    assert allowed < 0.05
+
+
+@pytest.mark.parametrize("inner", [0.4])
+def test_mtf_of_a_ring_is_that_of_o_neill(inner):
+    """The overlap of two rings from the areas of overlapping circles (O'Neill, J. Opt. Soc. Am. 46,
+    285, 1956).
+    """
+
+    def lens_area(a, b, d):
+        if d >= a + b:
+            return 0.0
+        if d <= abs(a - b):
+            return math.pi * min(a, b) ** 2
+        one = a * a * math.acos((d * d + a * a - b * b) / (2 * d * a))
+        two = b * b * math.acos((d * d + b * b - a * a) / (2 * d * b))
+        kite = (-d + a + b) * (d + a - b) * (d - a + b) * (d + a + b)
+        return one + two - 0.5 * math.sqrt(kite)
+
+    stop = ClearAperture(Circle(1.0), Circle(inner))
+    share = torch.tensor([0.1, 0.25, 0.45, 0.7, 0.9]).double()
+    frequencies = share / (LAMBDA * 50.0)
+    found = diffraction_modulation(hyperbola(100.0, stop), AXIS, [WAVELENGTH], frequencies)
+    whole = math.pi * (1.0 - inner**2)
+    expected = [
+        (lens_area(1, 1, 2 * s) - 2 * lens_area(1, inner, 2 * s) + lens_area(inner, inner, 2 * s))
+        / whole
+        for s in share.tolist()
+    ]
+    wrong = np.abs(found.tangential[0].numpy() - expected).max()
+    assert wrong < 2e-3
+    assert wrong < 3.0 * float(found.sampling_error) + 1e-4
+
+
+@pytest.mark.parametrize("name, step", [("surfaces.2.curvature", 1e-6), ("sensor_distance", 1e-4)])
+def test_gradients_are_derivatives(name, step):
+    lens = hyperbola(50.0, 5.0, defocus=0.02)
+    stored = dict(lens.named_parameters())[name].detach()
+    x, y = torch.tensor([0.0, 0.003, 0.001]).double(), torch.tensor([0.0, -0.002, 0.004]).double()
+
+    def values(value):
+        front = pupil_wavefront(
+            *(lens.system({name: value}), ObjectPoints.at_infinity(AXIS), WAVELENGTH),
+            *([[0.0, 0.0]], 24, 50.0),
+        )
+        return huygens_irradiance(front, x, y)[0]
+
+    at = stored.clone().requires_grad_()
+    gradient = torch.stack([torch.autograd.grad(v, at, retain_graph=True)[0] for v in values(at)])
+    near = [
+        (values(stored + k * step) - values(stored - k * step)) / (2 * k * step) for k in (1, 2)
+    ]
+    assert torch.allclose(gradient, (4.0 * near[0] - near[1]) / 3.0, rtol=2e-5)
