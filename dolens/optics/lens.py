@@ -14,6 +14,7 @@ from dolens.optics.broken_axes import GlobalAxes
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
+from dolens.optics.lens_states import InStates, LensStates
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.mirrors import MIRROR, media_of
@@ -28,11 +29,11 @@ from dolens.optics.thermal_lens import lens_at
 from dolens.optics.vergence import ideal_lenses, with_vergences
 
 
-class Lens(LensRays, LensViews, nn.Module):
+class Lens(LensRays, LensViews, InStates, nn.Module):
     """Surfaces, gaps, media and a sensor plane.
 
     Parameters are named as users write them: `surfaces.1.curvature`, `surfaces.5.x2y`,
-    `thicknesses.3`, `sensor_distance`.
+    `thicknesses.3`, `sensor_distance`, and `states.wide.thicknesses.3` of a state (`in_state`).
 
     Fields are angles in degrees, (x, y) for a ray along (tan x, tan y, 1), when the object is at
     infinity (`object_distance` None or `inf`); with a finite `object_distance`, mm in front of the
@@ -140,6 +141,7 @@ class Lens(LensRays, LensViews, nn.Module):
             raise InputError(f"lens '{name}': {error}") from None
         self.elements = nn.ModuleDict(dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
+        self.states, self.state_name = LensStates(), None
         self.to(dtype)
         self.reversals: tuple[int, ...] = ()
         self._check_breaks()

@@ -6,7 +6,7 @@ entrance pupil, of all fields and wavelengths; where no ray gets through, the pa
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -50,6 +50,19 @@ def set_automatic_semi_diameters(lens: Lens, prescription: Mapping[str, Any]) ->
         if not surface.aperture.clips and surface.semi_diameter > surface.reach:
             _resize(lens, n, surface.reach)
     return lens
+
+
+def set_common_semi_diameters(lenses: Sequence[Lens], numbers: Iterable[str]) -> None:
+    """Give automatic semi-diameters of states of one lens the largest value of all.
+
+    Args:
+        lenses: the lens as each of its states has it.
+        numbers: of the surfaces.
+    """
+    for n in numbers:
+        largest = max(lens.surfaces[n].semi_diameter for lens in lenses)
+        for lens in lenses:
+            _resize(lens, n, largest)
 
 
 def _resize(lens: Lens, number: str, semi_diameter: float) -> None:
