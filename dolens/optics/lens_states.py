@@ -10,13 +10,14 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dolens.errors import InputError, did_you_mean
 from dolens.optics.axial_ray import reversals
+from dolens.optics.state_names import values_in_state
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.thermal import STANDARD_TEMPERATURE
-from dolens.optics.thermal_lens import lens_at
+from dolens.optics.thermal_lens import expanded_values, lens_at
 
 # Attributes of a lens that a state may have otherwise.
 STATE_DATA = (
@@ -103,7 +104,7 @@ class InStates:
         the state's own: gradients of what is computed from it flow to both.  Lengths and curvatures
         changed later, in this lens or in that one, are changed in both.  In a state with a
         temperature or a pressure the lens is a heated copy (`Lens.at`): its parameters follow those
-        of this lens no longer, and have no gradient.
+        of this lens no longer, and have no gradient; `values_there` gives them with their graph.
 
         Args:
             name: of the state; None returns this lens itself.
@@ -129,7 +130,7 @@ def in_state(lens: Any, name: str) -> Any:
     found, data = overlaid(lens, name), lens.states[name].data
     if data.temperature is None and data.pressure is None:
         return found
-    heated = lens_at(found, _temperature(found, data), data.pressure)
+    heated = lens_at(found, state_temperature(lens, name), data.pressure)
     return heated.requires_grad_(False)
 
 
@@ -167,12 +168,31 @@ def _temperature(lens: Any, data: StateData) -> float:
     return STANDARD_TEMPERATURE if lens.temperature is None else lens.temperature
 
 
-def is_heated(lens: Any, name: str | None) -> bool:
-    """Return whether a state has a temperature or a pressure, so that its parameters are fixed."""
-    if name is None:
-        return False
-    data = lens.states[name].data
-    return data.temperature is not None or data.pressure is not None
+def state_temperature(lens: Any, name: str | None) -> float | None:
+    """Return the temperature (°C) that a state heats a lens to; None where it does not."""
+    data = StateData() if name is None else lens.states[name].data
+    if data.temperature is None and data.pressure is None:
+        return None
+    return _temperature(lens, data)
+
+
+def values_there(lens: Any, name: str | None, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return parameters of a lens in a state that follow from values of the lens's own.
+
+    In a state with a temperature these are all that expand: differentiable functions of the values.
+
+    Args:
+        lens: the lens with its states.
+        name: of the state; None for the lens itself.
+        values: name of a parameter in the lens → value.
+    """
+    there = values_in_state(lens, name, values)
+    temperature = state_temperature(lens, name)
+    if temperature is None:
+        return there
+    cold = overlaid(lens, name)
+    stored = {base: parameter.detach() for base, parameter in cold.named_parameters()}
+    return there | expanded_values(cold, temperature, stored | there)
 
 
 @torch.no_grad()
