@@ -141,7 +141,9 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
         for source in sources:
             pair = {**lens.variables([name]), **lens.variables([source])}
             if source == name or set(pair) != {name, source}:
-                raise InputError(f"variable '{name}': pickup must name one other parameter, or a list of others")
+                raise InputError(
+                    f"variable '{name}': pickup must name one other parameter, or a list of others"
+                )
             if pair[name].shape != pair[source].shape:
                 raise InputError(f"variable '{name}': pickup '{source}' has another shape")
         return Pickup(

@@ -107,6 +107,7 @@ class StatesMerit:
                 "variable 'sensor_distance': solve 'best_focus' of a sensor that all states share; "
                 "vary sensor_distance, or solve states.<name>.sensor_distance"
             )
+        followed = {name for d in variables.dependents for name in getattr(d, "sources", ())}
         for name in variables.names:
             state, base = split_state(name)
             if state is not None and state not in self.parts:
@@ -114,8 +115,10 @@ class StatesMerit:
                     f"variable '{name}': its state is none of merit.states "
                     f"({', '.join(self.parts)})"
                 )
-            if state is None and all(
-                f"{STATES}.{s}.{name}" in names_of_state(lens, s) for s in self.parts
+            if (
+                state is None
+                and name not in followed
+                and all(f"{STATES}.{s}.{name}" in names_of_state(lens, s) for s in self.parts)
             ):
                 raise InputError(
                     f"variable '{name}': every state has its own; vary states.*.{base}"

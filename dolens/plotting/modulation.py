@@ -1,7 +1,7 @@
 """The modulation transfer function is plotted against frequency."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from matplotlib.axes import Axes
@@ -20,7 +20,9 @@ _SAME = 2e-3
 
 
 def modulation_figure(
-    mtf: Modulation | Mapping[str, Modulation], title: str | None = "Geometric MTF"
+    mtf: Modulation | Mapping[str, Modulation],
+    title: str | None = "Geometric MTF",
+    labels: Sequence[str] | None = None,
 ) -> Figure:
     """Plot contrast against frequency: tangential solid, sagittal dotted, the diffraction limit
     dashed.
@@ -31,6 +33,7 @@ def modulation_figure(
     Args:
         mtf: the data, or name → data, the names written above.
         title: above the axes.
+        labels: one a field, where its place differs between the panels; None: its place.
 
     Returns:
         A figure; fields that no light reaches are named so in the legend.
@@ -40,7 +43,7 @@ def modulation_figure(
     grid = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
     names = {}
     for axes, (name, found) in zip(grid, panels.items(), strict=True):
-        names[name] = _draw(axes, found)
+        names[name] = _draw(axes, found, labels)
         if name:
             axes.set_title(name, fontsize=SMALL + 1)
     grid[0].set_ylabel("modulation (contrast)", fontsize=SMALL + 1)
@@ -59,7 +62,7 @@ def modulation_figure(
     return figure
 
 
-def _draw(axes: Axes, mtf: Modulation) -> dict[int, str]:
+def _draw(axes: Axes, mtf: Modulation, names: Sequence[str] | None = None) -> dict[int, str]:
     """Draw one lens; return labels of the legend, by the number of the field that is drawn."""
     frequency = mtf.frequencies.numpy()
     limit = {"color": "black", "linewidth": 1.1, "linestyle": "--", "label": "diffraction limit"}
@@ -67,7 +70,7 @@ def _draw(axes: Axes, mtf: Modulation) -> dict[int, str]:
     labels: dict[int, list[str]] = {}
     shades = ordered_colours(len(mtf.fields))
     for number, (field, colour) in enumerate(zip(mtf.fields, shades, strict=True)):
-        label = field_label(field, mtf.field_unit)
+        label = names[number] if names else field_label(field, mtf.field_unit)
         if math.isnan(float(mtf.tangential[number, 0])):
             labels[number] = [f"{label} (no light passes)"]
             continue

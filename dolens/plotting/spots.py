@@ -91,7 +91,9 @@ def spots_figure(
 
 
 def spots_comparison_figure(
-    compared: Mapping[str, SpotDiagram], title: str | None = "Spot diagrams"
+    compared: Mapping[str, SpotDiagram],
+    title: str | None = "Spot diagrams",
+    labels: Sequence[str] | None = None,
 ) -> Figure:
     """Plot the spots of several lenses, or of one before and after, on one scale.
 
@@ -102,9 +104,10 @@ def spots_comparison_figure(
     Args:
         compared: name → spots; of the same fields.
         title: above all panels.
+        labels: one a field, where its place differs between the lenses; None: its place.
 
     Raises:
-        InputError: nothing to compare, or fields that differ.
+        InputError: nothing to compare, or numbers of fields that differ.
     """
     diagrams = list(compared.values())
     if not diagrams or any(d.fields.shape != diagrams[0].fields.shape for d in diagrams):
@@ -134,7 +137,7 @@ def spots_comparison_figure(
             axes.set_title(heading + one.numbers(field), fontsize=SMALL)
         _label(grid[:, [column]], fields, half, False)
     for row, field in enumerate(diagrams[0].fields):
-        label = field_label(field, diagrams[0].field_unit)
+        label = labels[row] if labels else field_label(field, diagrams[0].field_unit)
         grid[row, 0].set_ylabel(f"{label}\ny (µm)", fontsize=SMALL + 1)
         for axes, (_, _, half) in zip(grid[row, 1:], columns[1:], strict=True):
             axes.tick_params(labelleft=half != reach)

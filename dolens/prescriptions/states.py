@@ -178,7 +178,10 @@ def _merged(prescription: Mapping[str, Any], overlay: Any, place: str) -> dict[s
             found = {key: value for key, value in found.items() if key not in keys}
     found |= {key: overlay[key] for key in _DATA if key in overlay}
     distance = found.get("object_distance")
-    if distance is not None and as_number(distance, f"{place}: 'object_distance'", False) == math.inf:
+    if (
+        distance is not None
+        and as_number(distance, f"{place}: 'object_distance'", False) == math.inf
+    ):
         del found["object_distance"]
     rows = {str(n): dict(row) for n, row in prescription["surfaces"].items()}
     for n, row in (overlay.get("surfaces") or {}).items():

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.design.states import set_edges
 from dolens.experiments.design.tables import spot_labels
 from dolens.optics.lens import Lens
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings
 from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
 from dolens.optimize.image_quality import ImageQuality
@@ -30,9 +30,11 @@ def fit_edges(lens: Lens, initial: Lens, settings: MeritSettings) -> None:
         sampling="gaussian_quadrature",
         sampling_options={"rings": _EDGE_RINGS, "arms": 2 * _EDGE_RINGS, "symmetry": True},
     )
-    edges = fitted_semi_diameters(lens, settings.rays(initial))
-    for number, semi_diameter in edges.items():
-        lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
+    edges = {}
+    for state in settings.states_of(lens) or (None,):
+        rays = settings.rays(initial.in_state(state))
+        edges[state] = fitted_semi_diameters(lens.in_state(state), rays)
+    set_edges(lens, edges)
 
 
 def refuse_lost_light(quality: ImageQuality, initial_light: Tensor) -> None:
