@@ -71,7 +71,7 @@ def with_states(lens: Lens, prescription: Mapping[str, Any], build: Build, where
             raise InputError(f"{place}: its name has letters, digits, '_' and '-' only")
         overlay = {} if overlay is None else overlay
         owned[str(name)] = _own_parameters(lens, overlay, place)
-        others[str(name)] = build(_merged(prescription, overlay, place), place)
+        others[str(name)] = build(merged_prescription(prescription, overlay, place), place)
     rows = {str(n): row for n, row in prescription["surfaces"].items()}
     automatic = [n for n, row in rows.items() if is_automatic(row) and n != str(lens.stop)]
     set_common_semi_diameters([lens, *others.values()], automatic)
@@ -170,8 +170,16 @@ def _own_parameters(lens: Lens, overlay: Any, place: str) -> list[str]:
     return [*found, *(["sensor_distance"] if sensor else [])]
 
 
-def _merged(prescription: Mapping[str, Any], overlay: Any, place: str) -> dict[str, Any]:
-    """Return the whole prescription of a state, but for its temperature and pressure."""
+def merged_prescription(
+    prescription: Mapping[str, Any], overlay: Any, place: str
+) -> dict[str, Any]:
+    """Return the whole prescription of a state, but for its temperature and pressure.
+
+    Args:
+        prescription: of the lens; its states are left out.
+        overlay: the state.
+        place: its name in messages.
+    """
     found = {key: value for key, value in prescription.items() if key != STATES_KEY}
     for keys in (PUPIL_KEYS, _WAVES):
         if any(key in overlay for key in keys):

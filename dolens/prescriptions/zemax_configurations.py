@@ -14,7 +14,7 @@ a file are those at that temperature).
 
 import copy
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from dolens.errors import InputError
@@ -320,6 +320,11 @@ def _names(
         (title,) = titles.get(number) or [""]
         own = bool(_NAME.fullmatch(title)) and title not in names.values()
         names[number] = title if own else f"c{number}"
-        if title and title == f"{lens.get('name', '')} itself":
+        if title == own_title(lens):
             names[number] = ""
     return names
+
+
+def own_title(lens: Mapping[str, Any]) -> str:
+    """Return the title of a configuration that is the lens itself and none of its states."""
+    return f"the lens itself: {lens.get('name', '')}".strip()
