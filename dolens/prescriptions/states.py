@@ -10,7 +10,8 @@ A state is a partial prescription that is laid over the lens: zoom, focus, tempe
 It may say numbers of surfaces (thickness, radius, conic, coefficients, clear aperture; tilts and
 decenters of a coordinate break), `sensor.distance`, `object_distance` (`.inf` for infinity),
 fields, wavelengths, one aperture key such as `f_number`, and what the source publishes of it.
-What it does not say is the lens's.  `temperature` and `pressure` heat the lens, as `Lens.at` does.
+What it does not say is the lens's, the F-number too; `f_number: null` leaves the stop as wide as
+it is in the lens, as a lens has it that is focused.  `temperature` and `pressure` heat the lens, as `Lens.at` does.
 What changes the structure, as a type, a glass or the stop, is refused: that is another lens.
 """
 
@@ -71,7 +72,12 @@ def with_states(lens: Lens, prescription: Mapping[str, Any], build: Build, where
             raise InputError(f"{place}: its name has letters, digits, '_' and '-' only")
         overlay = {} if overlay is None else overlay
         owned[str(name)] = _own_parameters(lens, overlay, place)
-        others[str(name)] = build(merged_prescription(prescription, overlay, place), place)
+        whole = merged_prescription(prescription, overlay, place)
+        if any(key in overlay and overlay[key] is None for key in PUPIL_KEYS):
+            number = str(lens.stop)
+            stop = aperture_rows(lens.surfaces[number].aperture)
+            whole["surfaces"][number] |= {"clips": True, **stop}
+        others[str(name)] = build(whole, place)
     rows = {str(n): row for n, row in prescription["surfaces"].items()}
     automatic = [n for n, row in rows.items() if is_automatic(row) and n != str(lens.stop)]
     set_common_semi_diameters([lens, *others.values()], automatic)

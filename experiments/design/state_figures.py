@@ -32,7 +32,9 @@ def state_figures(
     settings: MeritSettings,
     max_frequency: float | None,
 ) -> Figures:
-    """Return layouts, spots, MTF and field curves of a lens in its states, before and after.
+    """Return layouts, spots, MTF and field curves of a lens in its states, and of others.
+
+    Of the lens where the search began, layouts alone.
 
     Args:
         lens: the design.
@@ -51,6 +53,8 @@ def state_figures(
         figures[f"layout{last}"] = lambda there=there, title=title: states_layout_figure(
             there, title=title
         )
+        if kind == "initial":
+            continue
         figures[f"spots{last}"] = lambda there=there, title=title: _spots(there, settings, title)
         figures[f"modulation{last}"] = lambda there=there, title=title: _modulation(
             there, settings, max_frequency, title
@@ -93,7 +97,9 @@ def _curves(there: Mapping[str, Lens], title: str) -> Figure:
     for name, lens in there.items():
         distance = lens.object_distance
         scan = field_scans(lens, distance)[0]
-        found[name] = field_curves(lens, scan, [lens.primary_wavelength], distance)
+        # A test runs without gradients, which the slopes of these curves are.
+        with torch.inference_mode(False), torch.enable_grad():
+            found[name] = field_curves(lens, scan, [lens.primary_wavelength], distance)
     wave = next(iter(there.values())).primary_wavelength
     what = f"field curvature and distortion at {wave:.4g} nm"
     return states_field_curves_figure(found, f"{title}\n{what}")
