@@ -17,6 +17,8 @@ from dolens.plotting.titles import draw_title
 _TANGENTIAL, _SAGITTAL = "-", (0, (1, 1.2))
 # Curves that differ by less are one on paper.
 _SAME = 2e-3
+# More panels than these have no room for a label each.
+_FEW = 3
 
 
 def modulation_figure(
@@ -46,6 +48,10 @@ def modulation_figure(
         names[name] = _draw(axes, found, labels)
         if name:
             axes.set_title(name, fontsize=SMALL + 1)
+    if len(panels) > _FEW:
+        # Labels side by side would run into each other.
+        for axes in [a for n, a in enumerate(grid) if n != len(panels) // 2]:
+            axes.set_xlabel("")
     grid[0].set_ylabel("modulation (contrast)", fontsize=SMALL + 1)
     first = next(iter(panels.values()))
     shades = ordered_colours(len(first.fields))

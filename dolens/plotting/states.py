@@ -55,7 +55,7 @@ def states_layout_figure(
     behind = max(d.z_limits[1] - ends[name] for name, d in drawings.items())
     half_height = max(drawing.half_height for drawing in drawings.values())
     drawn = (WIDTH - _BESIDE) * 2.0 * half_height / (before + behind)
-    height = min(max(drawn, _LOWEST), 3.0) + _HEADING
+    height = min(max(drawn, _LOWEST), 2.0) + _HEADING
     figure = Figure(figsize=(WIDTH, height * len(states) + 0.6), layout="constrained")
     grid = figure.subplots(len(states), 1, squeeze=False)[:, 0]
     for axes, (name, drawing) in zip(grid, drawings.items(), strict=True):

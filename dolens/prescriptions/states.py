@@ -11,7 +11,8 @@ It may say numbers of surfaces (thickness, radius, conic, coefficients, clear ap
 decenters of a coordinate break), `sensor.distance`, `object_distance` (`.inf` for infinity),
 fields, wavelengths, one aperture key such as `f_number`, and what the source publishes of it.
 What it does not say is the lens's, the F-number too; `f_number: null` leaves the stop as wide as
-it is in the lens, as a lens has it that is focused.  `temperature` and `pressure` heat the lens, as `Lens.at` does.
+it is in the lens, as a lens has it that is focused.  `temperature` and `pressure` heat the lens, as
+`Lens.at` does.
 What changes the structure, as a type, a glass or the stop, is refused: that is another lens.
 """
 

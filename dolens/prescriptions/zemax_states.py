@@ -115,6 +115,8 @@ def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, 
                     found[Setting(_BY_LIST[operand], n)] = other
         elif operand in ("ENPD", "FNUM", "OBNA") and before[1:] == after[1:]:
             found[Setting("APER", 0)] = after[0]
+        elif operand == "FTYP":
+            raise InputError(f"{place}: a .zmx file has fields of one kind in all its states")
         elif operand != "NAME":
             raise InputError(f"{place}: no configuration of a .zmx file can change {operand}")
     for n, (before, after) in enumerate(zip(base.surfaces, file.surfaces, strict=True)):

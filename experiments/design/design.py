@@ -34,6 +34,7 @@ from dolens.optics.lens import Lens
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
 from dolens.optimize.start import start_values
+from dolens.optimize.states import StatesMerit, StatesValue
 from dolens.prescriptions import lens_from_prescription
 from dolens.stages import stage
 
@@ -61,13 +62,14 @@ class DesignModule(Experiment):
         optimizer: parameter groups → optimizer; one that takes residuals, as `DampedLeastSquares`,
             gets them, every other one the gradient of the merit.
         start: settings of `start_values`; None begins at the prescription.
-        keep_pupils: whether the stop of the start opens or closes to the entrance pupils of the
-            prescription, that of every state.
+        keep_pupils: whether the stop opens or closes to the entrance pupils of the prescription,
+            where the search begins and with every round; in every state to its own.
         published: a prescription to compare with, or None.
         evaluation: what RMS spot radii are reported of; None: the merit's own rays.
         semi_diameters: `fixed`: light passes where the prescription lets it; or `automatic`: the
             rays that pass the lens where the search begins are kept, and in the end every edge, and
-            the stop's, is put where they pass.
+            the stop's, is put where they pass; with `keep_pupils` each round's own rays are, and
+            every round begins with its edges.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
         mtf_max_frequency: the end of the MTF curves in figures, cycles/mm; see `design_figures`.
@@ -101,7 +103,7 @@ class DesignModule(Experiment):
         self.automatic_optimization = False
         generator = torch.Generator().manual_seed(seed)
         values = start_values(lens, start or {}, generator)
-        pupils = entrance_pupils(lens) if keep_pupils else {}
+        self._pupils = entrance_pupils(lens) if keep_pupils else {}
         with torch.no_grad():
             for name, parameter in lens.variables(list(values)).items():
                 parameter.copy_(values[name])
@@ -110,7 +112,7 @@ class DesignModule(Experiment):
             raise InputError("variables: there are none; name a parameter, as surfaces.*.curvature")
         self.variables.project()
         self.variables.write_to(self.lens)
-        set_entrance_pupils(self.lens, pupils)
+        set_entrance_pupils(self.lens, self._pupils)
         # In a tuple, so that checkpoints do not hold them.
         self._initial = (copy.deepcopy(self.lens),)
         self.published = None
@@ -131,7 +133,7 @@ class DesignModule(Experiment):
             self.merit_settings = replace(merit, max_vignetting=1.0)
         if not 0.0 <= round_tolerance < 1.0:
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
-        self.merit: MeritFunction | None = None
+        self.merit: MeritFunction | StatesMerit | None = None
         self.history: list[dict[str, float]] = []
         self.initial_merit = math.nan
         self._stopped: str | None = None
@@ -268,11 +270,17 @@ class DesignModule(Experiment):
             self.variables.scaled.copy_(self.best)
             self.variables.write_to(self.lens)
             set_foci(self.lens, self._focus_names, self.best_focus)
+        set_entrance_pupils(self.lens, self._pupils)
         if self.automatic_semi_diameters:
-            fit_edges(self.lens, self.initial, self.merit_settings)
+            fit_edges(self.lens, self.lens if self._pupils else self.initial, self.merit_settings)
 
-    def _build(self, lens: Lens) -> MeritFunction:
-        if not self.automatic_semi_diameters:
+    def _build(self, lens: Lens) -> MeritFunction | StatesMerit:
+        if self._pupils:
+            # The rays of each round are those of its pupils.
+            set_entrance_pupils(lens, self._pupils)
+            if self.automatic_semi_diameters:
+                fit_edges(lens, lens, self.merit_settings)
+        if self._pupils or not self.automatic_semi_diameters:
             return self.merit_settings.build(lens, self.variables)
         # The rays of the start serve every round.
         return self.merit or self.merit_settings.build(self.initial, self.variables)
@@ -282,7 +290,7 @@ class DesignModule(Experiment):
             if not self.automatic_semi_diameters:
                 refuse_lost_light(quality, self.initial_light[state])
 
-    def _keep_if_better(self, value: MeritValue) -> None:
+    def _keep_if_better(self, value: MeritValue | StatesValue) -> None:
         merit = value.sum_of_squares()
         if merit < float(self.best_merit):
             with torch.no_grad():

@@ -9,7 +9,7 @@ from torch import Tensor
 from dolens.experiments.design.tables import SpotTable, spot_metrics, spot_table
 from dolens.optics.aperture_setting import with_aperture
 from dolens.optics.lens import Lens
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Unlimited
 from dolens.optimize import MeritSettings
 
 logger = logging.getLogger(__name__)
@@ -24,9 +24,11 @@ def views(lens: Lens, settings: MeritSettings) -> dict[str, Lens]:
 
 
 def entrance_pupils(lens: Lens) -> dict[str | None, float]:
-    """Return the diameter (mm) of the entrance pupil of a lens, and in each of its states."""
+    """Return the diameter (mm) of the entrance pupil of a lens in each of its states, or, under
+    None, of a lens without states.
+    """
     found = {}
-    for name in (None, *lens.state_names):
+    for name in lens.state_names or (None,):
         there = lens.in_state(name)
         with torch.no_grad():
             first = there.first_order(there.primary_wavelength, there.object_distance)
@@ -35,7 +37,7 @@ def entrance_pupils(lens: Lens) -> dict[str | None, float]:
 
 
 def set_entrance_pupils(lens: Lens, diameters: Mapping[str | None, float]) -> None:
-    """Open or close the stop of a lens, and in each of its states, to entrance pupils (mm)."""
+    """Open or close the stop of a lens, in each of its states, to entrance pupils (mm)."""
     number = str(lens.stop)
     for name, diameter in diameters.items():
         closed = with_aperture(lens.in_state(name), entrance_pupil_diameter=diameter)
@@ -53,7 +55,8 @@ def set_aperture(lens: Lens, state: str | None, number: str, aperture: ClearAper
 def set_edges(lens: Lens, edges: Mapping[str | None, Mapping[str, float]]) -> None:
     """Put the edges of a lens where the light of its states needs them.
 
-    The stop opens in each state as that state needs it; every other edge lets all of the light pass.
+    The stop opens in each state as that state needs it; every other edge lets all of the light
+    pass, and one that clips nothing goes on clipping nothing.
 
     Args:
         lens: its clear apertures are replaced.
@@ -62,12 +65,12 @@ def set_edges(lens: Lens, edges: Mapping[str | None, Mapping[str, float]]) -> No
     numbers = dict.fromkeys(n for found in edges.values() for n in found)
     for number in numbers:
         sizes = {state: found[number] for state, found in edges.items() if number in found}
-        largest = ClearAperture(Circle(max(sizes.values())))
+        edge = Circle if lens.surfaces[number].aperture.clips else Unlimited
+        largest = ClearAperture(edge(max(sizes.values())))
         lens.surfaces[number].aperture = largest
         for state in lens.state_names:
             own = number == str(lens.stop) and state in sizes
-            aperture = ClearAperture(Circle(sizes[state])) if own else largest
-            set_aperture(lens, state, number, aperture)
+            set_aperture(lens, state, number, ClearAperture(edge(sizes[state])) if own else largest)
 
 
 def state_metrics(
