@@ -61,6 +61,7 @@ from dolens.prescriptions.field_data import set_object_fields
 from dolens.prescriptions.media import EXPANSION_KEY, environment_of, expansion_of, medium_of
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
+from dolens.prescriptions.radii import curvature_of, radius_key, radius_of_curvature
 from dolens.prescriptions.states import STATES_KEY, state_rows, with_states
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
@@ -201,8 +202,8 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
                 row |= power_row(number_value)
                 continue
             if key in surface.curvatures:
-                radius = _radius_key(key)
-                row[radius] = _radius(number_value)
+                radius = radius_key(key)
+                row[radius] = radius_of_curvature(number_value)
                 if 1.0 / row[radius] != number_value:
                     # Rounding of 1/(1/c) loses a bit for some c: keep the parameter itself.
                     del row[radius]
@@ -253,14 +254,14 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
         if is_paraxial_lens(row):
             row = with_power(row)
         names = shape.parameter_names(row)
-        radii = [_radius_key(name) for name in names if name in shape.curvatures]
+        radii = [radius_key(name) for name in names if name in shape.curvatures]
         check_keys(row, (*_SURFACE_KEYS, *names, *radii), place)
         values = {
             key: (as_numbers if key in shape.arrays else as_number)(row.get(key, 0.0), f"'{key}'")
             for key in names
             if key in row or key not in shape.optional
         }
-        values |= {name: _curvature(row, name) for name in names if name in shape.curvatures}
+        values |= {name: curvature_of(row, name) for name in names if name in shape.curvatures}
         if "curvature" not in names and not math.isinf(
             as_number(row.get("radius", math.inf), "'radius'")
         ):
@@ -274,30 +275,6 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None
-
-
-def _curvature(row: Mapping[str, Any], name: str) -> float:
-    """Return a curvature of a row, which gives it or the radius of the same name."""
-    key = _radius_key(name)
-    if row.get(name) is not None and row.get(key) is not None:
-        raise InputError(f"give '{key}' or '{name}', not both")
-    if row.get(name) is not None:
-        return as_number(row[name], f"'{name}'")
-    if row.get(key) is None:
-        raise InputError(f"'{key}' is missing (mm; .inf for a plane)")
-    radius = as_number(row[key], f"'{key}'", finite=False)
-    if radius == 0.0:
-        raise InputError(f"'{key}' is 0; write .inf for a plane")
-    return 1.0 / radius
-
-
-def _radius_key(name: str) -> str:
-    """Return `radius_x` for `curvature_x`."""
-    return name.replace("curvature", "radius")
-
-
-def _radius(curvature: float) -> float:
-    return math.inf if curvature == 0.0 else 1.0 / curvature
 
 
 def _rows(prescription: Mapping[str, Any], where: str) -> list[Mapping[str, Any]]:

@@ -11,13 +11,8 @@ from typing import Any, NamedTuple
 from dolens.errors import InputError
 from dolens.prescriptions.states import merged_prescription
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
-from dolens.prescriptions.zemax_configurations import (
-    OF_APERTURES,
-    OF_FIELDS,
-    OF_SURFACES,
-    TITLE,
-    own_title,
-)
+from dolens.prescriptions.zemax_configurations import TITLE, own_title
+from dolens.prescriptions.zemax_settings import OF_APERTURES, OF_FIELDS, OF_SURFACES
 
 _BY_LINE = {line: operand for operand, line in OF_SURFACES.items()}
 _BY_PLACE = {place: operand for operand, place in OF_APERTURES.items()}

@@ -8,7 +8,7 @@ from dolens.optimize import DampedLeastSquares, DesignVariables, MeritSettings
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.test_lens_states import DOUBLET
 
-SETTINGS = {"sampling_options": {"rings": 3, "arms": 6}, "reference_spectrum": "polychromatic"}
+SETTINGS = {"sampling_options": {"rings": 2, "arms": 6}, "reference_spectrum": "polychromatic"}
 VARIABLES = {
     "surfaces.[1-4].curvature": {"scale": 0.01},
     "thicknesses.2": None,
@@ -31,8 +31,7 @@ def merit_of(lens, variables, **settings):
     return MeritSettings(**{**SETTINGS, **settings}).build(lens, found), found
 
 
-@pytest.mark.parametrize("quality", ["spots", None])
-def test_the_gradient_is_that_of_finite_differences(quality):
+def test_the_gradient_is_that_of_finite_differences():
     """Of all states: zoom, a near object, and one that is heated."""
     operands = [
         {"kind": "efl", "target": 60.0, "state": ["wide", "hot"]},
@@ -40,7 +39,7 @@ def test_the_gradient_is_that_of_finite_differences(quality):
         {"kind": "air_gap", "min": 12.0},
         {"kind": "edge_air_gap", "min": 12.0, "state": "hot"},
     ]
-    merit, variables = merit_of(lens_of_all(), VARIABLES, quality=quality, operands=operands)
+    merit, variables = merit_of(lens_of_all(), VARIABLES, operands=operands)
     gradient = 2.0 * merit().linear_model().gradient
     start = variables.scaled.detach().clone()
     for place in range(len(start)):

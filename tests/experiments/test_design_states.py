@@ -1,0 +1,94 @@
+"""A design over the states of a lens as an experiment: metrics, files, figures, resumed."""
+
+import json
+
+import pytest
+import torch
+from omegaconf import open_dict
+from tiny_experiment import figure_names
+
+from dolens import InputError, load_lens
+from dolens.experiments.running.training import run
+
+QUIET = ["+trainer.enable_progress_bar=false", "optimizer=damped_least_squares"]
+SAMPLING = ["merit.sampling=gaussian_quadrature", "merit.sampling_options.half_width=null",
+            "merit.sampling_options.rings=3", "merit.sampling_options.arms=6"]  # fmt: skip
+STATES = {
+    "far": {"sensor": {"distance": 26.0}},
+    "near": {
+        "object_distance": 2000.0,
+        "fields": {"heights": [[0, 0], [0, 40]]},
+        "sensor": {"distance": 26.8},
+    },
+}
+VARIABLES = {
+    "surfaces.[12].curvature": {"scale": 0.01},
+    "states.far.sensor_distance": {"solve": "best_focus"},
+    "states.near.sensor_distance": None,
+}
+
+
+def tiny(composed, *more):
+    """The supplement's asphere, focused at two distances."""
+    folder = next((m.removeprefix("folder=") for m in more if m.startswith("folder=")), "run")
+    more = [m for m in more if not m.startswith("folder=")]
+    cfg = composed("experiment=asphere", *QUIET, *SAMPLING, *more, folder=folder)
+    with open_dict(cfg):
+        cfg.lens.surfaces["1"].semi_diameter = 6.0
+        cfg.lens.states, cfg.variables, cfg.published = STATES, VARIABLES, None
+        cfg.lens.fields = {"angles": [[0.0, 0.0], [0.0, 1.0]]}
+        cfg.merit.fields = cfg.evaluation = None
+        cfg.merit.operands = [{"kind": "efl", "state": "far", "target": 40.0}]
+    return cfg
+
+
+def metrics_of(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_a_run_folder_of_a_lens_with_states(composed, tmp_path):
+    rms = run(tiny(composed, "data.iterations=3", "trainer.max_epochs=1", "keep_pupils=true"))
+    metrics, lens = metrics_of(tmp_path / "run"), load_lens(tmp_path / "run/lens/final.yaml")
+    means = [metrics[f"rms_spot_um/final/{name}"] for name in STATES]
+    assert rms == metrics["rms_spot_um/final"] == pytest.approx(sum(means) / 2.0, rel=1e-6)
+    assert rms < metrics["rms_spot_um/initial"]
+    assert figure_names(tmp_path / "run") == {
+        "layout", "layout_initial", "spots", "modulation", "field_curves", "history"
+    }  # fmt: skip
+    assert "operand/far/efl" in (tmp_path / "run/history.csv").read_text().splitlines()[0]
+    # The stop lets the prescription's beams in, at both distances.
+    initial = load_lens(tmp_path / "run/lens/initial.yaml")
+    for name in STATES:
+        pupils = [
+            float(one.in_state(name).first_order().entrance_pupil.diameter.detach())
+            for one in (initial, lens)
+        ]
+        assert pupils[0] == pytest.approx(pupils[1], rel=1e-9)
+    assert metrics["efl_mm/far"] == pytest.approx(
+        float(lens.in_state("far").first_order(lens.primary_wavelength).efl.detach()), rel=1e-6
+    )
+
+
+def test_a_resumed_search_repeats_an_uninterrupted_one(composed, tmp_path):
+    settings = ["module.round_tolerance=0.0", "callbacks.pictures=null", "data.iterations=2"]
+    run(tiny(composed, *settings, "trainer.max_epochs=2", "folder=whole"))
+    run(tiny(composed, *settings, "trainer.max_epochs=1", "folder=first"))
+    checkpoint = tmp_path / "first/checkpoints/last.ckpt"
+    resumed = [*settings, "trainer.max_epochs=2", f"ckpt_path={checkpoint}", "folder=second"]
+    run(tiny(composed, *resumed))
+    ends = [load_lens(tmp_path / name / "lens/final.yaml") for name in ("whole", "second")]
+    others = dict(ends[1].named_parameters())
+    for name, value in ends[0].named_parameters():
+        assert torch.equal(value, others[name]), name
+
+
+def test_a_run_takes_one_state(composed, tmp_path):
+    cfg = tiny(composed, "state=near", "train=false", "callbacks.pictures=null")
+    cfg.variables = {"surfaces.1.curvature": None}
+    cfg.merit.operands = []
+    run(cfg)
+    lens = load_lens(tmp_path / "run/lens/final.yaml")
+    assert (lens.object_distance, float(lens.sensor_distance.detach())) == (2000.0, 26.8)
+    assert lens.state_names == ()
+    with pytest.raises(InputError, match="no state 'nearer'"):
+        run(tiny(composed, "state=nearer", "train=false", "folder=other"))
