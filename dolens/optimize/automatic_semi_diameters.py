@@ -6,7 +6,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components, Rays
-from dolens.optics.surfaces.clear_aperture import Circle
+from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 from dolens.optimize.image_quality import without_edges
 
 # Rays at the rim must lie strictly inside it.
@@ -35,7 +35,7 @@ def fitted_semi_diameters(lens: Lens, spots: SpotRays) -> dict[str, float]:
     found = {}
     for place, (number, surface) in enumerate(lens.surfaces.items()):
         aperture = surface.aperture
-        if not isinstance(aperture.edge, Circle) or aperture.obscuration is not None:
+        if not isinstance(aperture.edge, Circle | Unlimited) or aperture.obscuration is not None:
             continue
         x, y, z = hit.points[place].unbind(-1)
         local = from_lens_axes(Components(x, y, z, x, y, z), axes[place])
