@@ -14,7 +14,7 @@ from dolens.optics.broken_axes import GlobalAxes
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.lens_rays import LensRays
-from dolens.optics.lens_states import InStates, LensStates
+from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.mirrors import MIRROR, media_of
@@ -25,7 +25,6 @@ from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
-from dolens.optics.thermal_lens import lens_at
 from dolens.optics.vergence import ideal_lenses, with_vergences
 
 
@@ -247,7 +246,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
 
     def at(self, temperature: float, pressure: float | None = None) -> "Lens":
         """Return this lens at another temperature (°C) and pressure (atm); see `lens_at`."""
-        return lens_at(self, temperature, pressure)
+        return at_temperature(self, temperature, pressure)
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""

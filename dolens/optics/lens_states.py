@@ -168,6 +168,21 @@ def _temperature(lens: Any, data: StateData) -> float:
     return STANDARD_TEMPERATURE if lens.temperature is None else lens.temperature
 
 
+@torch.no_grad()
+def at_temperature(lens: Any, temperature: float, pressure: float | None = None) -> Any:
+    """Return a copy of a lens at another temperature and pressure, in all its states; see
+    `lens_at`.
+    """
+    found = lens_at(lens, temperature, pressure)
+    for name in lens.state_names:
+        hot, state = lens_at(overlaid(lens, name), temperature, pressure), found.states[name]
+        for base, parameter in state.named_parameters():
+            parameter.copy_(hot.get_parameter(base))
+        for number in state.data.apertures:
+            state.data.apertures[number] = hot.surfaces[number].aperture
+    return found
+
+
 def state_temperature(lens: Any, name: str | None) -> float | None:
     """Return the temperature (°C) that a state heats a lens to; None where it does not."""
     data = StateData() if name is None else lens.states[name].data

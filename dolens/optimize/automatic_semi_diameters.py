@@ -23,7 +23,7 @@ def fitted_semi_diameters(lens: Lens, spots: SpotRays) -> dict[str, float]:
 
     Returns:
         Number of each surface → mm: of rays of all fields; at the stop, of those nearest to the
-        axis, so that the axial beam stays what it was.  Surfaces whose aperture is not a circle
+        axis, so that the axial beam stays what it was.  Surfaces whose aperture is no circle
         without obscuration are left out.
     """
     opened = without_edges(lens)

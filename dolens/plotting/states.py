@@ -108,8 +108,11 @@ def states_field_curves_figure(
             ruled_axes(axes)
         above.set_xlabel("focus (mm)", fontsize=SMALL)
         below.set_xlabel("distortion (%)", fontsize=SMALL)
-    for axes in grid[:, 0]:
-        axes.set_ylabel(scan_label(next(iter(states.values())).scan), fontsize=SMALL + 1)
+    labels = [scan_label(curves.scan) for curves in states.values()]
+    for column, label in enumerate(labels):
+        if column == 0 or label != labels[column - 1]:
+            for axes in grid[:, column]:
+                axes.set_ylabel(label, fontsize=SMALL + 1)
     handles: Sequence[Line2D] = [
         Line2D([], [], color="0.25", linewidth=1.4, label="tangential"),
         Line2D([], [], color="0.25", linewidth=1.4, linestyle="--", label="sagittal"),

@@ -62,8 +62,6 @@ class DesignModule(Experiment):
         optimizer: parameter groups → optimizer; one that takes residuals, as `DampedLeastSquares`,
             gets them, every other one the gradient of the merit.
         start: settings of `start_values`; None begins at the prescription.
-        keep_pupils: whether the stop opens or closes to the entrance pupils of the prescription,
-            where the search begins and with every round; in every state to its own.
         published: a prescription to compare with, or None.
         evaluation: what RMS spot radii are reported of; None: the merit's own rays.
         semi_diameters: `fixed`: light passes where the prescription lets it; or `automatic`: the
@@ -73,6 +71,8 @@ class DesignModule(Experiment):
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
         mtf_max_frequency: the end of the MTF curves in figures, cycles/mm; see `design_figures`.
+        keep_pupils: whether the stop opens or closes to the entrance pupils of the prescription,
+            where the search begins and with every round; in every state to its own.
 
     Attributes:
         initial: the lens where the search began.
@@ -91,13 +91,13 @@ class DesignModule(Experiment):
         merit: MeritSettings,
         optimizer: Callable[..., torch.optim.Optimizer],
         start: Mapping[str, Any] | None,
-        keep_pupils: bool,
         published: Mapping[str, Any] | None,
         evaluation: MeritSettings | None,
         semi_diameters: str,
         round_tolerance: float,
         seed: int,
         mtf_max_frequency: float | None,
+        keep_pupils: bool = False,
     ) -> None:
         super().__init__(lens, experiment)
         self.automatic_optimization = False

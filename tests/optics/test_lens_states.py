@@ -117,6 +117,14 @@ def test_a_heated_state_is_the_heated_lens(lens):
     assert not any(parameter.requires_grad for parameter in hot.parameters())
 
 
+def test_a_heated_lens_is_heated_in_all_its_states(lens):
+    """To heat and to zoom may come in either order."""
+    first, last = lens.at(60.0).in_state("tele"), lens.in_state("tele").at(60.0)
+    assert torch.equal(first.trace(rays()).position, last.trace(rays()).position)
+    apertures = [[s.aperture for s in one.surfaces.values()] for one in (first, last)]
+    assert apertures[0] == apertures[1]
+
+
 @pytest.mark.parametrize("name", [SHARED, "thicknesses.2", "surfaces.3.curvature"])
 def test_a_heated_state_s_parameters_follow_with_their_derivatives(lens, name):
     """An air gap follows from the curvatures beside it, at the edges that hold it."""
