@@ -94,9 +94,8 @@ def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, 
     for operand in base.system.keys() | file.system.keys():
         before, after = _last(base.system, operand), _last(file.system, operand)
         if operand == "WAVM":
+            # As many in both, or FTYP differs.
             pairs = zip(base.system[operand], file.system.get(operand, []), strict=False)
-            if len(base.system[operand]) != len(file.system.get(operand, [])):
-                raise InputError(f"{place}: a .zmx file has as many wavelengths in all states")
             for one, other in pairs:
                 if one.arguments[2:] != other.arguments[2:]:
                     raise InputError(f"{place}: a .zmx file has one set of wavelength weights")
@@ -110,8 +109,12 @@ def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, 
                     found[Setting(_BY_LIST[operand], n)] = other
         elif operand in ("ENPD", "FNUM", "OBNA") and before[1:] == after[1:]:
             found[Setting("APER", 0)] = after[0]
-        elif operand == "FTYP":
+        elif operand == "FTYP" and before[0] != after[0]:
             raise InputError(f"{place}: a .zmx file has fields of one kind in all its states")
+        elif operand == "FTYP":
+            raise InputError(
+                f"{place}: a .zmx file has as many fields and wavelengths in all its states"
+            )
         elif operand != "NAME":
             raise InputError(f"{place}: no configuration of a .zmx file can change {operand}")
     for n, (before, after) in enumerate(zip(base.surfaces, file.surfaces, strict=True)):

@@ -11,8 +11,6 @@ from dolens import InputError, load_lens
 from dolens.experiments.running.training import run
 
 QUIET = ["+trainer.enable_progress_bar=false", "optimizer=damped_least_squares"]
-SAMPLING = ["merit.sampling=gaussian_quadrature", "merit.sampling_options.half_width=null",
-            "merit.sampling_options.rings=3", "merit.sampling_options.arms=6"]  # fmt: skip
 STATES = {
     "far": {"sensor": {"distance": 26.0}},
     "near": {
@@ -32,12 +30,14 @@ def tiny(composed, *more):
     """The supplement's asphere, focused at two distances."""
     folder = next((m.removeprefix("folder=") for m in more if m.startswith("folder=")), "run")
     more = [m for m in more if not m.startswith("folder=")]
-    cfg = composed("experiment=asphere", *QUIET, *SAMPLING, *more, folder=folder)
+    cfg = composed("experiment=asphere", *QUIET, *more, folder=folder)
     with open_dict(cfg):
         cfg.lens.surfaces["1"].semi_diameter = 6.0
         cfg.lens.states, cfg.variables, cfg.published = STATES, VARIABLES, None
         cfg.lens.fields = {"angles": [[0.0, 0.0], [0.0, 1.0]]}
         cfg.merit.fields = cfg.evaluation = None
+        cfg.merit.sampling = "gaussian_quadrature"
+        cfg.merit.sampling_options = {"rings": 3, "arms": 6}
         cfg.merit.operands = [{"kind": "efl", "state": "far", "target": 40.0}]
     return cfg
 
@@ -83,7 +83,7 @@ def test_a_resumed_search_repeats_an_uninterrupted_one(composed, tmp_path):
 
 
 def test_a_run_takes_one_state(composed, tmp_path):
-    cfg = tiny(composed, "state=near", "train=false", "callbacks.pictures=null")
+    cfg = tiny(composed, "state=near", "trainer.max_epochs=0", "callbacks.pictures=null")
     cfg.variables = {"surfaces.1.curvature": None}
     cfg.merit.operands = []
     run(cfg)
@@ -91,4 +91,4 @@ def test_a_run_takes_one_state(composed, tmp_path):
     assert (lens.object_distance, float(lens.sensor_distance.detach())) == (2000.0, 26.8)
     assert lens.state_names == ()
     with pytest.raises(InputError, match="no state 'nearer'"):
-        run(tiny(composed, "state=nearer", "train=false", "folder=other"))
+        run(tiny(composed, "state=nearer", "folder=other"))

@@ -39,7 +39,9 @@ def test_the_gradient_is_that_of_finite_differences():
         {"kind": "air_gap", "min": 12.0},
         {"kind": "edge_air_gap", "min": 12.0, "state": "hot"},
     ]
-    merit, variables = merit_of(lens_of_all(), VARIABLES, operands=operands)
+    some = VARIABLES | {"surfaces.[13].curvature": {"scale": 0.01}}
+    del some["surfaces.[1-4].curvature"]
+    merit, variables = merit_of(lens_of_all(), some, operands=operands)
     gradient = 2.0 * merit().linear_model().gradient
     start = variables.scaled.detach().clone()
     for place in range(len(start)):
@@ -106,11 +108,11 @@ def test_two_states_that_are_the_same_give_the_solution_of_one():
     for lens in (lens_with(), lens_with(a={}, b={})):
         merit, found = merit_of(lens, variables)
         optimizer = DampedLeastSquares([found.parameter_group()])
-        for _ in range(15):
+        for _ in range(8):
             optimizer.step(merit)
         ends.append((merit().sum_of_squares(), found.scaled.detach().clone()))
     assert ends[0][0] == pytest.approx(ends[1][0], rel=1e-9)
-    assert torch.allclose(ends[0][1], ends[1][1], rtol=1e-6)
+    assert torch.allclose(ends[0][1], ends[1][1], rtol=1e-5)
 
 
 def test_groups_move_by_pickups_and_each_state_has_its_best_focus():
@@ -177,5 +179,6 @@ def test_operands_are_of_the_states_that_they_name():
 )
 def test_a_mistake_takes_one_line(variables, settings, said):
     with pytest.raises(InputError, match=said) as refusal:
-        merit_of(lens_of_all(), variables, **settings)
+        bfd = {"operands": [{"kind": "bfd", "min": 1.0}], "quality": None}
+        merit_of(lens_of_all(), variables, **{**bfd, **settings})
     assert "\n" not in str(refusal.value)

@@ -125,7 +125,10 @@ def test_a_lens_that_is_none_of_its_states_stays_the_lens_itself(tmp_path):
     ("state", "said"),
     [
         ({"temperature": 40.0}, "state 'a': a .zmx file cannot hold 'temperature' of a state"),
-        ({"wavelengths": [500.0, 600.0]}, "state 'a': a .zmx file has as many wavelengths"),
+        (
+            {"wavelengths": [500.0, 600.0]},
+            "state 'a': a .zmx file has as many fields and wavelengths",
+        ),
         (
             {"object_distance": 100.0, "fields": {"heights": [[0, 0]]}},
             "state 'a': a .zmx file has fields of one kind in all its states",
