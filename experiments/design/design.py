@@ -272,14 +272,14 @@ class DesignModule(Experiment):
             set_foci(self.lens, self._focus_names, self.best_focus)
         set_entrance_pupils(self.lens, self._pupils)
         if self.automatic_semi_diameters:
-            fit_edges(self.lens, self.lens if self._pupils else self.initial, self.merit_settings)
+            fit_edges(self.lens, None if self._pupils else self.initial, self.merit_settings)
 
     def _build(self, lens: Lens) -> MeritFunction | StatesMerit:
         if self._pupils:
             # The rays of each round are those of its pupils.
             set_entrance_pupils(lens, self._pupils)
             if self.automatic_semi_diameters:
-                fit_edges(lens, lens, self.merit_settings)
+                fit_edges(lens, None, self.merit_settings)
         if self._pupils or not self.automatic_semi_diameters:
             return self.merit_settings.build(lens, self.variables)
         # The rays of the start serve every round.

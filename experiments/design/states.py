@@ -9,7 +9,7 @@ from torch import Tensor
 from dolens.experiments.design.tables import SpotTable, spot_metrics, spot_table
 from dolens.optics.aperture_setting import with_aperture
 from dolens.optics.lens import Lens
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Unlimited
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings
 
 logger = logging.getLogger(__name__)
@@ -55,8 +55,8 @@ def set_aperture(lens: Lens, state: str | None, number: str, aperture: ClearAper
 def set_edges(lens: Lens, edges: Mapping[str | None, Mapping[str, float]]) -> None:
     """Put the edges of a lens where the light of its states needs them.
 
-    The stop opens in each state as that state needs it; every other edge lets all of the light
-    pass, and one that clips nothing goes on clipping nothing.
+    The stop opens in each state as that state needs it, or stays; every other edge lets the light
+    of all states pass.
 
     Args:
         lens: its clear apertures are replaced.
@@ -65,12 +65,13 @@ def set_edges(lens: Lens, edges: Mapping[str | None, Mapping[str, float]]) -> No
     numbers = dict.fromkeys(n for found in edges.values() for n in found)
     for number in numbers:
         sizes = {state: found[number] for state, found in edges.items() if number in found}
-        edge = Circle if lens.surfaces[number].aperture.clips else Unlimited
-        largest = ClearAperture(edge(max(sizes.values())))
+        largest = ClearAperture(Circle(max(sizes.values())))
         lens.surfaces[number].aperture = largest
         for state in lens.state_names:
             own = number == str(lens.stop) and state in sizes
-            set_aperture(lens, state, number, ClearAperture(edge(sizes[state])) if own else largest)
+            set_aperture(
+                lens, state, number, ClearAperture(Circle(sizes[state])) if own else largest
+            )
 
 
 def state_metrics(
