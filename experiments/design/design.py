@@ -244,7 +244,9 @@ class DesignModule(Experiment):
             self.round_start.copy_(self.variables.scaled)
             self.round_start_focus.copy_(foci(self.lens, self._focus_names))
         optimizer = self.optimizers().optimizer
-        if not before - reached > self.round_tolerance * before:
+        gained, least = before - reached, self.round_tolerance * before
+        # With pupils of its own a round begins with other edges, and may end worse than the best.
+        if abs(gained) <= least if self._pupils else not gained > least:
             self.trainer.should_stop = True
         elif hasattr(optimizer, "restart"):
             optimizer.restart()
