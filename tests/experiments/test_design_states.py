@@ -1,11 +1,10 @@
-"""A design over the states of a lens as an experiment: metrics, files, figures, resumed."""
+"""A design over the states of a lens as an experiment: metrics, files, resumed."""
 
 import json
 
 import pytest
 import torch
 from omegaconf import open_dict
-from tiny_experiment import figure_names
 
 from dolens import InputError, load_lens
 from dolens.experiments.running.training import run
@@ -15,7 +14,7 @@ STATES = {
     "far": {"sensor": {"distance": 26.0}},
     "near": {
         "object_distance": 2000.0,
-        "fields": {"heights": [[0, 0], [0, 40]]},
+        "fields": {"heights": [[0, 0]]},
         "sensor": {"distance": 26.8},
     },
 }
@@ -38,7 +37,7 @@ def tiny(composed, *more):
         cfg.lens.surfaces["1"].semi_diameter = 6.0
         cfg.lens.surfaces["2"].clips = False
         cfg.lens.states, cfg.variables, cfg.published = STATES, VARIABLES, None
-        cfg.lens.fields = {"angles": [[0.0, 0.0], [0.0, 1.0]]}
+        cfg.lens.fields = {"angles": [[0.0, 0.0]]}
         cfg.merit.fields = cfg.evaluation = None
         cfg.merit.sampling = "gaussian_quadrature"
         cfg.merit.sampling_options = {"rings": 3, "arms": 6}
@@ -51,14 +50,12 @@ def metrics_of(folder):
 
 
 def test_a_run_folder_of_a_lens_with_states(composed, tmp_path):
-    rms = run(tiny(composed, "data.iterations=3", "trainer.max_epochs=1", "keep_pupils=true"))
+    small = ["data.iterations=2", "trainer.max_epochs=1", "callbacks.pictures=null"]
+    rms = run(tiny(composed, *small, "keep_pupils=true"))
     metrics, lens = metrics_of(tmp_path / "run"), load_lens(tmp_path / "run/lens/final.yaml")
     means = [metrics[f"rms_spot_um/final/{name}"] for name in STATES]
     assert rms == metrics["rms_spot_um/final"] == pytest.approx(sum(means) / 2.0, rel=1e-6)
     assert rms < metrics["rms_spot_um/initial"]
-    assert figure_names(tmp_path / "run") == {
-        "layout", "layout_initial", "spots", "modulation", "field_curves", "history"
-    }  # fmt: skip
     assert "operand/far/efl" in (tmp_path / "run/history.csv").read_text().splitlines()[0]
     # The stop lets the prescription's beams in, at both distances.
     initial = load_lens(tmp_path / "run/lens/initial.yaml")
