@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from dolens.cli.app import main
+
 TRAINING = (
     "hydra",
     "omegaconf",
@@ -72,8 +74,11 @@ def test_a_command_says_which_packages_it_lacks(command):
     assert "Traceback" not in done.stderr
 
 
-def test_an_unknown_lens_is_one_line_with_the_nearest_name():
-    done = run("-m", "dolens.cli", "show", "cooke_triplett")
-    assert done.returncode == 1
-    (line,) = done.stderr.strip().splitlines()
-    assert line.startswith("error: ") and "cooke_triplet" in line
+def test_an_unknown_lens_is_one_line_with_the_nearest_name(monkeypatch, capfd):
+    """Python prints a text that ends a program to stderr, and its status is 1."""
+    monkeypatch.setattr(sys, "argv", ["dolens", "show", "cooke_triplett"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = ended.value.code
+    assert said.startswith("error: ") and "cooke_triplet" in said and "\n" not in said
+    assert "".join(capfd.readouterr()) == ""

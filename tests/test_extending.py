@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -41,36 +42,52 @@ SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block
 TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in COMMANDS]
 
 
-@pytest.fixture
-def checkout(tmp_path):
-    """A folder with the repository's files, those of the document, and a `python`."""
-    for name in ("train.py", "conf", "dolens", "experiments"):
-        (tmp_path / name).symlink_to(ROOT / name)
-    for path, text in FILES.items():
-        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / path).write_text(text, encoding="utf-8")
-    python = tmp_path / "bin/python"
-    python.parent.mkdir()
-    python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n', encoding="utf-8")
-    python.chmod(0o755)
-    return tmp_path
+# Runs what follows on its command line as `python` runs it, one after the other, in one process:
+# to start Python with PyTorch and Lightning takes longer than most of them.
+IN_ONE_PROCESS = """
+import json, runpy, sys
+for arguments in json.loads(sys.argv[1]):
+    sys.argv = arguments
+    runpy.run_path(arguments[0], run_name="__main__")
+"""
 
 
-def run(checkout, command, **environment):
-    path = (checkout / "bin", Path(sys.executable).parent, os.environ["PATH"])
+def run_in_one_process(folder, *commands):
     done = subprocess.run(
-        command,
-        cwd=checkout,
-        env={
-            **{key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
-            "PATH": os.pathsep.join(map(str, path)),
-            "OMP_NUM_THREADS": "1",
-            **environment,
-        },
+        [sys.executable, "-c", IN_ONE_PROCESS, json.dumps(commands)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": "mine", "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory):
+    """A folder with the repository's files and those of the document."""
+    folder = tmp_path_factory.mktemp("checkout")
+    for name in ("train.py", "conf", "dolens", "experiments"):
+        (folder / name).symlink_to(ROOT / name)
+    for path, text in FILES.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(checkout):
+    """The folder of the runs of all commands.
+
+    What is registered in one serves no other: each is of a section, whose files it alone uses.
+    """
+    commands = []
+    for block in COMMANDS:
+        paths, python, *arguments = shlex.split(block.text)
+        assert (paths, python, arguments[0]) == ("PYTHONPATH=mine", "python", "train.py")
+        commands.append(arguments)
+    run_in_one_process(checkout, *commands)
+    return checkout / "outputs"
 
 
 def table(path):
@@ -128,18 +145,16 @@ PROMISES = {
 @pytest.mark.parametrize(
     ("block", "experiment"), TRAININGS, ids=[block.section for block in COMMANDS]
 )
-def test_a_command_leaves_what_the_text_promises(checkout, block, experiment):
-    run(checkout, ["sh", "-e", "-c", block.text])
-    (folder,) = (checkout / "outputs" / experiment).iterdir()
+def test_a_command_leaves_what_the_text_promises(trained, block, experiment):
+    (folder,) = (trained / experiment).iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
     PROMISES[block.section, experiment](folder, metrics)
 
 
-@pytest.mark.parametrize("block", SCRIPTS, ids=lambda block: block.section)
-def test_a_script_runs(checkout, block):
-    script = checkout / "script.py"
-    script.write_text(block.text, encoding="utf-8")
-    run(checkout, ["python", str(script)], PYTHONPATH="mine")
+def test_the_scripts_run(checkout):
+    for number, block in enumerate(SCRIPTS):
+        (checkout / f"script{number}.py").write_text(block.text, encoding="utf-8")
+    run_in_one_process(checkout, *([f"script{number}.py"] for number in range(len(SCRIPTS))))
 
 
 def test_every_command_has_a_promise():

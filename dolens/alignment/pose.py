@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import to_lens_units
+from dolens.optics.straight import require_plane_sensor
 from dolens.optimize.variables import DesignVariables
 from dolens.rendering.spot_image import SpotImage, SpotImager
 
@@ -49,6 +50,7 @@ class Pose(DesignVariables):
         planes: Sequence[float] = (0.0,),
         shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
+        require_plane_sensor(lens.system(), "poses")
         options = {"dtype": torch.float64, "device": lens.device}
         places = torch.tensor(sources, **options).reshape(-1, 3)
         offset = torch.tensor(shift, **options)

@@ -14,6 +14,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError, check_choice
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
+from dolens.optics.straight import require_plane_sensor
 from dolens.optics.trace import trace_surfaces, trace_to_sensor
 
 # Where the sensor is, mm: across, where it is from where it should be, and along the axis.
@@ -196,6 +197,7 @@ def moment_model(
         raise InputError("spots: rays of the whole pupil are needed (symmetry=False)")
     for name in sensor:
         check_choice(name, SENSOR, "sensor")
+    require_plane_sensor(lens.system(), "moments of spots")
     nominal = {name: value.detach() for name, value in lens.variables(names).items()}
     names = tuple(names)
     start = torch.stack([nominal[name] for name in names])

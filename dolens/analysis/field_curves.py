@@ -23,8 +23,8 @@ class FieldCurves:
         scan: the fields.
         wavelengths: (W,), nm.
         reference_wavelength: nm, of the distortion.
-        tangential: (F, W), mm: z of the tangential focus from the sensor, positive behind it;
-            infinite where the light is parallel.
+        tangential: (F, W), mm: z of the tangential focus from the sensor where the chief ray meets
+            it, plane or curved, positive behind it; infinite where the light is parallel.
         sagittal: (F, W), mm: the same of the sagittal focus.
         distortion: (F,), percent of the ideal image height, positive where the image lies farther
             out (pincushion); zero on the axis.

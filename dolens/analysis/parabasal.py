@@ -29,7 +29,8 @@ class ParabasalRays:
         position: (F, W, 2), mm, of the chief rays on the sensor.
         slope: (F, W, 2), dx/dz and dy/dz behind the last surface.
         position_rate: (F, W, 2, 2), ∂position/∂q, with q (mm) across the beam in the plane
-            through the first vertex that faces the field (see `dolens.optics.aiming.launch`).
+            through the first vertex that faces the field (see `dolens.optics.aiming.launch`).  Of a
+            curved sensor on the plane z = const. through the chief ray's point.
         slope_rate: (F, W, 2, 2), ∂slope/∂q, 1/mm.
         image_rate: (F, W, 2, 2), mm, ∂position/∂(tan x, tan y) for an object at infinity, else
             ∂position/∂(object height), without unit: how the chief ray moves with the field.
@@ -81,6 +82,10 @@ def parabasal_rays(
         reached = reached & _arrives(hit.status)
         position = hit.position[..., :2]
         slope = hit.direction[..., :2] / hit.direction[..., 2:]
+        if lens.sensor_curvature is not None:
+            # On the plane through the chief ray's point, where the sag does not move.
+            z = hit.position[..., 2:]
+            position = position - slope * (z - z.detach())
         rates = _rates(position, q), _rates(slope, q)
 
     def found(values: Tensor) -> Tensor:

@@ -17,10 +17,12 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays, field_tangents, launch
 from dolens.optics.fields import vignetting_margin
+from dolens.optics.image_surface import TangentPlanes
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, Status
+from dolens.optics.system import OpticalSystem
 
 _DEGREE = 8
 # Rings and azimuths of the points that are aimed at; they determine a polynomial of that degree.
@@ -40,7 +42,9 @@ class RayIntercepts:
         fields: (F, 2), degrees or mm, double precision, on the CPU like all of these.
         field_unit: `°` for an object at infinity, else `mm`.
         wavelengths: (W,), nm.
-        points: (F, W, N, 2), mm, double precision; NaN where a ray does not pass.
+        points: (F, W, N, 2), mm, double precision; NaN where a ray does not pass.  On a curved
+            sensor distances from the chief ray's point are those in the plane that touches it
+            there.
         valid: (F, W, N), bool.
         chief: (F, 2), mm, intercepts of the chief rays of the reference wavelength, whether
             apertures clip them or not; NaN where one does not reach the sensor.
@@ -145,14 +149,27 @@ def trace_ray_intercepts(
     valid = valid & (vignetting_margin(lens.fields, field, pupil) > 0.0)[:, None]
     reached = (chief.status == Status.OK) | (chief.status == Status.VIGNETTED)
     reached = reached & aimed.converged[:, at, 0]
+    points = hit.position[..., :2]
+    if system.image is not None:
+        points = _along_surface(system, hit.position, chief.position, reached)
     return RayIntercepts(
         field.cpu(),
         field_unit(object_distance),
         waves[:count].cpu(),
-        hit.position[..., :2].where(valid[..., None], math.nan).cpu(),
+        points.where(valid[..., None], math.nan).cpu(),
         valid.cpu(),
         chief.position[..., :2].where(reached[..., None], math.nan).cpu(),
     )
+
+
+def _along_surface(system: OpticalSystem, points: Tensor, chief: Tensor, reached: Tensor) -> Tensor:
+    """Return points (F, W, N, 3) of a curved sensor as x and y in the plane that touches it where
+    the chief ray (F, 3) lands, from that point's own x and y on.
+    """
+    there = torch.where(reached[:, None], chief, 0.0)[..., :2]
+    planes = TangentPlanes.at(system.image, there).unsqueeze(1).unsqueeze(1)
+    away = points - system.vertices[-1] * points.new_tensor([0.0, 0.0, 1.0]) - planes.point
+    return planes.turned(away)[..., :2] + planes.point[..., :2]
 
 
 def field_unit(object_distance: float | None) -> str:

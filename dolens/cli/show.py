@@ -158,7 +158,7 @@ def _print_table(console: "Console", table: "Table") -> None:
         shown.add_column(
             Text(head),
             justify="left" if words else "right",
-            no_wrap=not words or table.numbered,
+            no_wrap=not words or (table.numbered and column not in table.listed),
             overflow="fold",
         )
     last = len(table.rows) - 1

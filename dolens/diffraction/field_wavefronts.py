@@ -85,7 +85,7 @@ def field_wavefronts(
     coarse = pupil_wavefront(system, points, wave, middle, _COARSE, math.inf, beam)
     light = (coarse.amplitude * coarse.weight).unflatten(0, shape) * spectrum[:, None, None]
     total = light.sum((1, 2, 3))
-    landed = coarse.intercept.unflatten(0, shape)
+    landed = coarse.landed.unflatten(0, shape)
     centre = (light[..., None] * landed).sum((1, 2, 3)) / total[:, None]
     centre = centre.where(total[:, None] > 0.0, 0.0)
     centres = centre.repeat_interleave(len(waves), 0)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from dolens.optics.surfaces.clear_aperture import ClearAperture, Unlimited
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Unlimited
 
 # Smallest slope along one axis of a grid over that along the other: an edge along the grid.
 _ALONG = 1e-3
@@ -25,17 +25,18 @@ def coverage(aperture: ClearAperture, x: Tensor, y: Tensor, radius: Tensor | Non
     """
     share = torch.ones_like(x)
     u, v = x - aperture.center[0], y - aperture.center[1]
-    if not isinstance(aperture.edge, Unlimited):
-        margin = aperture.edge.margin(*((x, y) if aperture.edge.rotational else (u, v)))
-        if radius is not None:
-            # A circle's margin is r² - ρ².
-            squared = radius.to(x).square()
-            margin = margin + (squared - squared.detach())
-        share = covered(margin)
+    edge = aperture.edge
+    if isinstance(edge, Circle) and radius is not None:
+        # A circle's margin is r² - ρ².
+        squared = radius.to(x).square()
+        share = covered(edge.margin(x, y) + (squared - squared.detach()))
+    elif not isinstance(edge, Unlimited):
+        share = edge.share(covered, *((x, y) if edge.rotational else (u, v)))
     if aperture.window is not None:
-        share = torch.minimum(share, covered(aperture.window.margin(u, v)))
+        share = torch.minimum(share, aperture.window.share(covered, u, v))
     if aperture.obscuration is not None:
-        share = torch.minimum(share, covered(-aperture.obscuration.margin(u, v)))
+        # In cells of two edges, as where the arms of a spider end, these cross.
+        share = share * (1.0 - aperture.obscuration.share(covered, u, v))
     return share
 
 

@@ -11,8 +11,11 @@ from torch import Tensor
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.errors import InputError
 from dolens.optics.aiming import aim
+from dolens.optics.image_surface import TangentPlanes
 from dolens.optics.paraxial import exit_pupil
 from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.rays import TracedRays
+from dolens.optics.surfaces.refraction import GRAZING
 from dolens.optics.system import OpticalSystem
 
 
@@ -43,6 +46,32 @@ def to_sphere(away: Tensor, direction: Tensor, curvature: Tensor) -> tuple[Tenso
     scale = curvature * along + root
     alpha = torch.stack((scale * l - curvature * ex, scale * m - curvature * ey), -1)
     return along - curvature * h2 / (1.0 + root), alpha, squared.detach() > 1e-9
+
+
+def on_tangent_planes(
+    system: OpticalSystem, hit: TracedRays, centre: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Carry rays from a curved sensor to the planes that touch it at centres.
+
+    Args:
+        system: with a curved sensor.
+        hit: (N, ..., 3), rays on it.
+        centre: (N, 2), mm.
+
+    Returns:
+        x and y (N, ..., 2), mm, from the centre, and directions (N, ..., 3), both in the planes'
+        axes (see `TangentPlanes`); and the distance that rays were carried, mm.
+    """
+    planes = TangentPlanes.at(system.image, centre)
+    for _ in range(hit.position.ndim - 2):
+        planes = planes.unsqueeze(1)
+    vertex = torch.nn.functional.pad(system.vertices[-1].reshape(1), (2, 0))
+    away = planes.turned(hit.position - vertex - planes.point)
+    direction = planes.turned(hit.direction)
+    cosine = direction[..., 2]
+    grazing = cosine.abs() < GRAZING
+    distance = -away[..., 2] / torch.where(grazing, torch.ones_like(cosine), cosine)
+    return away[..., :2] + distance[..., None] * direction[..., :2], direction, distance
 
 
 def path_beyond(alpha_rho: Tensor, rho_squared: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,7 +112,10 @@ def sphere_curvature(
     """
     if radius is None:
         # Against the light's own travel, which goes towards -z behind an odd number of mirrors.
-        to_pupil = system.senses[-1] * (system.vertices[-1] - exit_pupil(system, wavelength).z)
+        z = system.vertices[-1]
+        if system.image is not None:
+            z = z + TangentPlanes.at(system.image, centre).point[:, 2]
+        to_pupil = system.senses[-1] * (z - exit_pupil(system, wavelength).z)
         length = torch.sqrt(to_pupil.square() + centre.square().sum(-1))
         radius = length * to_pupil.sign()
     if bool((radius == 0.0).any()):

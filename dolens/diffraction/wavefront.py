@@ -10,7 +10,12 @@ from dolens.diffraction.entrance_beam import EntranceBeam, box_grid, find_beam, 
 from dolens.diffraction.object_flux import axial_flux, flux_density, path_before
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.pupil_edges import coverage
-from dolens.diffraction.reference_sphere import chief_ray_intercepts, sphere_curvature, to_sphere
+from dolens.diffraction.reference_sphere import (
+    chief_ray_intercepts,
+    on_tangent_planes,
+    sphere_curvature,
+    to_sphere,
+)
 from dolens.errors import InputError
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.ray_tracing import trace_rays
@@ -40,7 +45,8 @@ class Wavefront:
             Positive where light arrives late; Welford's W has the other sign.
         direction: (N, S, S, 2), x and y of the unit vector from the ray's point of the sphere
             towards its centre.
-        intercept: (N, S, S, 2), mm, where the rays meet the sensor, from the sphere's centre.
+        intercept: (N, S, S, 2), mm, where the rays meet the sensor, from the sphere's centre; of a
+            curved sensor the plane that touches it there, whose axes `direction` has too.
         area: (N, S, S), of the ray's cell, in direction cosines.
         amplitude: (N, S, S), root of the flux per area in direction cosines: amplitude²·area is the
             flux of a whole cell over that of the axial point of the same object plane through the
@@ -57,6 +63,7 @@ class Wavefront:
         curvature: (N,), 1/mm, of the reference sphere.
         wavelength: (N,), nm.
         index: (N,), before the sensor.
+        landed: (N, S, S, 2), mm, x and y where the rays meet the sensor.
     """
 
     opd: Tensor
@@ -73,6 +80,7 @@ class Wavefront:
     curvature: Tensor
     wavelength: Tensor
     index: Tensor
+    landed: Tensor
 
     @property
     def waves(self) -> Tensor:
@@ -166,8 +174,11 @@ def pupil_wavefront(
     ray, every, opened = launched(points, q), waves[:, None, None], system.opened()
     rays = Rays.from_components(ray, every)
     hit = trace_rays(opened, rays)
-    away = hit.position[..., :2] - centre[:, None, None]
-    excess, direction, meets = to_sphere(away, hit.direction, curvature[:, None, None])
+    away, arriving, path = hit.position[..., :2] - centre[:, None, None], hit.direction, 0.0
+    if system.image is not None:
+        away, arriving, path = on_tangent_planes(system, hit, centre)
+    excess, direction, meets = to_sphere(away, arriving, curvature[:, None, None])
+    excess = excess - path
     valid = _with_neighbours(hit.valid & meets)
     index = system.materials[-1].index(waves) * torch.ones_like(waves)
     start = system.materials[0].index(every) * path_before(points, q)
@@ -201,6 +212,7 @@ def pupil_wavefront(
         curvature=curvature,
         wavelength=waves,
         index=index,
+        landed=_inner(hit.position[..., :2]),
     )
 
 

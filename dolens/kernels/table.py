@@ -77,7 +77,8 @@ class Code:
     BASE = 13  # the kind of the surface that it stands on
     WAVE = 14  # row of `indices` that holds λ/2π, mm
     NUMBERS = 15  # where the law's numbers begin in the record
-    ROW = 16  # length of a row
+    FIGURES = 16  # of the aperture, in a row of numbers: where it begins in the record, or 0
+    ROW = 17  # length of a row
 
 
 class Outline(IntEnum):
@@ -87,6 +88,22 @@ class Outline(IntEnum):
     CIRCLE = 1
     RECTANGLE = 2
     ELLIPSE = 3
+    FIGURES = 4  # its numbers stand behind the shape's
+
+
+class Figure(IntEnum):
+    """Outlines that have no numbers in the header are made of figures.
+
+    Behind the record's other numbers stand how many there are, and for each of them its kind,
+    whether it blocks (1) or passes (0) light, x and y of its centre, how many numbers follow, and
+    these.  Lengths are in mm, and points are told from the centre.
+    """
+
+    ELLIPTIC = 0  # a, b, low, high: the points with low ≤ a·x² + b·y² ≤ high
+    ARM = 1  # c, s, half: those with c·x + s·y ≥ 0 and |c·y - s·x| ≤ half
+    # x and y of both ends of each side; points with an odd number of sides towards +x, and those
+    # on a side, which block light in either case.
+    POLYGON = 2
 
 
 class Failure:

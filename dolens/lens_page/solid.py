@@ -10,15 +10,21 @@ import torch
 from dolens.analysis.conditions import Conditions
 from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
+from dolens.lens_page.blocked_areas import (
+    AZIMUTHS,
+    Sheet,
+    blocked_sheets,
+    edge_points,
+    rings,
+)
 from dolens.optics.elements import to_lens_axes
+from dolens.optics.image_surface import image_reach
 from dolens.optics.lens import Lens
 from dolens.optics.materials import is_glass
 from dolens.optics.rays import Rays
-from dolens.optics.surfaces.clear_aperture import Ellipse, Outline
 from dolens.optics.system import OpticalSystem
-from dolens.plotting.section import sag_of
+from dolens.plotting.surface_cut import sag_of
 
-AZIMUTHS = 64
 _RINGS = 10
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.12
@@ -80,13 +86,13 @@ def solid(lens: Lens, where: Conditions, lit: Sequence[bool] | None = None) -> S
     for number in system.met:
         surface = system.surfaces[number - 1]
         if number in system.mirrors:
-            meshes.append(_surface_mesh(system, number, "mirror", surface.aperture.edge))
-            rims.append(_rim(system, number, 1.0, close=True))
+            meshes.append(_surface_mesh(system, number, "mirror"))
+            rims.append(_rim(system, number, close=True))
         elif glass[number - 1] or glass[number]:
-            meshes.append(_surface_mesh(system, number, "glass", surface.aperture.edge))
-            rims.append(_rim(system, number, 1.0, close=True))
-        if surface.aperture.obscuration is not None:
-            meshes.append(_surface_mesh(system, number, "block", surface.aperture.obscuration))
+            meshes.append(_surface_mesh(system, number, "glass"))
+            rims.append(_rim(system, number, close=True))
+        for sheet in blocked_sheets(surface.aperture):
+            meshes.append(_sheet_mesh(system, number, "block", sheet))
         if number in following and glass[number]:
             meshes.extend(_sides(system, number, following[number]))
     meshes.append(_stop(system))
@@ -109,24 +115,23 @@ def _turned(system: OpticalSystem, number: int, vectors: np.ndarray, moved: bool
     return turned + axes.origin.double().numpy() if moved else turned
 
 
-def _edge(outline: Outline) -> np.ndarray:
-    """Return x and y of an outline at even azimuths, (azimuths, 2); corners are kept."""
-    angle = np.linspace(0.0, 2.0 * math.pi, AZIMUTHS, endpoint=False)
-    unit = np.stack([np.cos(angle), np.sin(angle)], -1)
-    if outline.rotational:
-        return outline.semi_diameter * unit
-    half = np.array(outline.extent)
-    # Azimuths of a square hit all four corners; stretched, they hit those of the rectangle.
-    if isinstance(outline, Ellipse):
-        return half * unit
-    return half * unit / np.abs(unit).max(-1, keepdims=True)
+def _edge(system: OpticalSystem, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of a surface's edge about its centre, (azimuths, 2), and the centre, mm."""
+    aperture = system.surfaces[number - 1].aperture
+    center = (0.0, 0.0) if aperture.edge.rotational else aperture.center
+    return edge_points(aperture.edge), np.array(center)
 
 
-def _surface_mesh(system: OpticalSystem, number: int, kind: str, outline: Outline) -> Mesh:
-    """Return a surface over an outline, ring by ring from its vertex."""
-    edge = _edge(outline)
-    share = np.concatenate([[0.0], np.sqrt(np.linspace(0.0, 1.0, _RINGS + 1)[1:])])
-    x, y = (share[:, None] * edge[None, :, axis] for axis in (0, 1))
+def _surface_mesh(system: OpticalSystem, number: int, kind: str) -> Mesh:
+    """Return a surface over its clear aperture, ring by ring from its centre."""
+    edge, center = _edge(system, number)
+    return _sheet_mesh(system, number, kind, (rings(edge) + center, True))
+
+
+def _sheet_mesh(system: OpticalSystem, number: int, kind: str, sheet: Sheet) -> Mesh:
+    """Return the part of a surface over a grid of points."""
+    points, closed = sheet
+    x, y = (np.ascontiguousarray(points[..., axis]) for axis in (0, 1))
     _, sx, sy, _ = sag_of(system, number, torch.from_numpy(x), torch.from_numpy(y))
     normals = np.stack([-sx.numpy(), -sy.numpy(), np.ones_like(x)], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -134,23 +139,26 @@ def _surface_mesh(system: OpticalSystem, number: int, kind: str, outline: Outlin
         kind,
         _placed(system, number, x, y),
         np.broadcast_to(_turned(system, number, normals, False), (*x.shape, 3)),
+        closed,
     )
 
 
-def _mesh(kind: str, positions: np.ndarray, normals: np.ndarray | None = None) -> Mesh:
-    """Return a mesh of closed rings (R, azimuths, 3); without normals, with those of its shape."""
+def _mesh(
+    kind: str, positions: np.ndarray, normals: np.ndarray | None = None, closed: bool = True
+) -> Mesh:
+    """Return a mesh of rings (R, azimuths, 3); without normals, with those of its shape."""
     if normals is None:
         along = np.gradient(positions, axis=0)
         across = np.roll(positions, -1, 1) - np.roll(positions, 1, 1)
         normals = np.cross(across, along)
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = normals / np.where(length > 0.0, length, 1.0)
-    return Mesh(kind, positions.astype("<f4"), normals.astype("<f4"))
+    return Mesh(kind, positions.astype("<f4"), normals.astype("<f4"), closed)
 
 
-def _rim(system: OpticalSystem, number: int, scale: float = 1.0, close: bool = False) -> np.ndarray:
-    edge = scale * _edge(system.surfaces[number - 1].aperture.edge)
-    points = _placed(system, number, edge[:, 0], edge[:, 1])
+def _rim(system: OpticalSystem, number: int, close: bool = False) -> np.ndarray:
+    edge, center = _edge(system, number)
+    points = _placed(system, number, *(center + edge).T.copy())
     return np.concatenate([points, points[:1]]) if close else points
 
 
@@ -171,7 +179,7 @@ def _sides(system: OpticalSystem, number: int, following: int) -> list[Mesh]:
     ratio = max(size.semi_diameter for size in sizes) / min(size.semi_diameter for size in sizes)
     if together and round_faces and ratio > 1.0 + 1e-9:
         # The smaller face's rim, widened in its own plane.
-        edge = _edge(sizes[int(small == following)])
+        edge = edge_points(sizes[int(small == following)])
         rim = np.zeros((AZIMUTHS, 3))
         rim[:, :2] = edge
         sag, _, _, _ = sag_of(
@@ -182,7 +190,7 @@ def _sides(system: OpticalSystem, number: int, following: int) -> list[Mesh]:
         corner = _turned(system, small, wide, True)
         flat = _turned(system, small, rim, True)
         share = np.linspace(1.0 / ratio, 1.0, 8)[:, None]
-        outer = _edge(sizes[int(large == following)])
+        outer = edge_points(sizes[int(large == following)])
         beyond = _placed(system, large, share * outer[None, :, 0], share * outer[None, :, 1])
         axis = _turned(system, small, np.array([0.0, 0.0, 1.0]), False)
         # Along the small face's axis, from it to the large one.
@@ -214,7 +222,8 @@ def _cap(system: OpticalSystem, numbers: tuple[int, int], corners: np.ndarray | 
     share = np.linspace(-1.0, 1.0, 2 * _RINGS + 1)
     lines = []
     for n in numbers:
-        y = share * system.surfaces[n - 1].aperture.edge.extent[1]
+        edge, center = _edge(system, n)
+        y = center[1] + share * np.abs(edge[:, 1]).max()
         lines.append(_placed(system, n, np.zeros_like(y), y))
     front, back = lines
     if corners is not None:
@@ -228,9 +237,10 @@ def _cap(system: OpticalSystem, numbers: tuple[int, int], corners: np.ndarray | 
 
 def _stop(system: OpticalSystem) -> Mesh:
     """Return a ring around the stop's edge, in the plane of its rim."""
-    edge = _edge(system.surfaces[system.stop - 1].aperture.edge)
+    around, center = _edge(system, system.stop)
     largest = max(surface.semi_diameter for surface in system.surfaces)
-    outer = edge * (1.0 + 0.22 * largest / np.linalg.norm(edge, axis=-1).max())
+    edge = center + around
+    outer = center + around * (1.0 + 0.22 * largest / np.linalg.norm(around, axis=-1).max())
     sag, _, _, _ = sag_of(
         system, system.stop, torch.from_numpy(edge[:, 0]), torch.from_numpy(edge[:, 1])
     )
@@ -239,15 +249,25 @@ def _stop(system: OpticalSystem) -> Mesh:
 
 
 def _sensor(lens: Lens, rays: Sequence[Sequence[np.ndarray]]) -> Mesh:
-    """Return the sensor plane: the prescription's image circle, or what holds all rays."""
+    """Return the sensor: the prescription's image circle, or what holds all rays."""
     axes = lens.system().global_axes()
     rotation, origin = axes.rotation[-1].numpy(), axes.origin[-1].numpy()
     rays = [[(path - origin) @ rotation for path in field] for field in rays]
     ends = [np.hypot(*path[-1, :2]) for field in rays for path in field]
     reach = 0.5 * lens.sensor_diameter if lens.sensor_diameter else 1.1 * max(ends, default=1.0)
+    image = lens.system().image
+    if image is not None:
+        reach = min(reach, image_reach(image))
     angle = np.linspace(0.0, 2.0 * math.pi, AZIMUTHS, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(AZIMUTHS)], -1) * max(reach, 1e-6)
-    positions = np.stack([0.0 * ring, ring]) @ rotation.T + origin
+    positions = np.stack([0.0 * ring, ring])
+    if image is not None:
+        positions = np.linspace(0.0, 1.0, _RINGS)[:, None, None] * ring
+        x, y = torch.from_numpy(positions[..., 0]), torch.from_numpy(positions[..., 1])
+        sag, _, _, _ = image.double().shape.sag_and_gradient(image.double().parameters, x, y)
+        positions[..., 2] = sag.numpy()
+        return _mesh("sensor", positions @ rotation.T + origin)
+    positions = positions @ rotation.T + origin
     return _mesh("sensor", positions, np.broadcast_to(-rotation[:, 2], positions.shape))
 
 

@@ -19,8 +19,8 @@ from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Outline, Rectangle, Unlimited
 from dolens.optics.surfaces.coordinate_break import BREAK
 
-# Columns of coefficients that a page is wide enough for.
-_MOST_TERMS = 8
+# Columns of coefficients that a page and a terminal are wide enough for.
+_MOST_TERMS = 6
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class Table:
         total: whether the last row is a total.
         lit: numbers of rows that are set apart.
         numbered: whether the first column numbers the rows.
+        listed: the columns that hold lists, which may go on in further lines.
     """
 
     heads: tuple[str, ...]
@@ -44,6 +45,7 @@ class Table:
     total: bool = False
     lit: frozenset[int] = frozenset()
     numbered: bool = False
+    listed: frozenset[int] = frozenset()
 
 
 def number(value: float | Tensor, digits: int = 5, zeros: bool = False) -> str:
@@ -73,7 +75,7 @@ def number(value: float | Tensor, digits: int = 5, zeros: bool = False) -> str:
 def prescription_tables(lens: Lens) -> list[Table]:
     """Return the surfaces of a lens, one a row; its aspheric terms; and the poses of elements."""
     found = prescription_table(lens)
-    conics = any(row.conic for row in found.surfaces)
+    conics = bool(found.sensor_conic) or any(row.conic for row in found.surfaces)
     # A name such as 1.5168/64.17 says nd and Vd already.
     named = any(not row.material[:1].isdigit() and _is_glass(row) for row in found.surfaces)
     rows = []
@@ -89,13 +91,19 @@ def prescription_tables(lens: Lens) -> list[Table]:
             cells.append(number(row.conic) if row.conic else "")
         rows.append(tuple(cells))
     size = number(0.5 * found.sensor_diameter) if found.sensor_diameter else ""
-    rows.append(("", "sensor", "∞", "", "", *[""] * (2 * named), size, *[""] * conics))
+    cells = ["", "sensor", number(found.sensor_radius, 6), "", "", *[""] * (2 * named), size]
+    if conics:
+        cells.append(number(found.sensor_conic) if found.sensor_conic else "")
+    rows.append(tuple(cells))
     heads = ("#", "type", "radius", "thickness", "medium", *("nd", "Vd") * named)
     heads += ("semi-diam.", *("conic",) * conics)
     inside = (
         [] if found.object_material == "air" else [f"The object is in {found.object_material}."]
     )
-    caption = " ".join(["Lengths in mm; the medium is the one behind the surface.", *inside])
+    open_ones = any(not surface.aperture.clips for surface in lens.surfaces.values())
+    drawn = ["A semi-diameter in brackets clips nothing."] if open_ones else []
+    first = "Lengths in mm; the medium is the one behind the surface."
+    caption = " ".join([first, *drawn, *inside])
     surfaces = Table(
         heads, rows, caption, frozenset({1, 4}), lit=frozenset({lens.stop - 1}), numbered=True
     )
@@ -133,12 +141,14 @@ def _terms_table(lens: Lens) -> Table | None:
     rows = []
     for n in lens.surfaces:
         terms = dict(found).get(n, {})
-        texts = [f"{name} {number(value)}" for name, value in terms.items() if value]
+        texts = [f"{name}={number(value)}" for name, value in terms.items() if value]
         if n in sized:
             texts.append(sized[n])
         if terms or n in sized:
             rows.append((n, ", ".join(texts) or "all zero"))
-    return Table(("#", "coefficients"), rows, "In powers of mm.", frozenset({1}), numbered=True)
+    caption = "In powers of mm; those not named are zero."
+    words = frozenset({1})
+    return Table(("#", "coefficients"), rows, caption, words, numbered=True, listed=words)
 
 
 def breaks_table(lens: Lens) -> Table | None:
@@ -257,9 +267,11 @@ def _outline(outline: Outline) -> str:
         case Ellipse():
             return f"ellipse {number(outline.semi_axis_x)} × {number(outline.semi_axis_y)}"
         case Unlimited():
-            return f"({number(outline.semi_diameter)}, does not clip)"
+            return f"({number(outline.semi_diameter)})"
         case Circle():
             return number(outline.semi_diameter)
+        case _:
+            return outline.words(number)
 
 
 def _is_glass(row: SurfaceRow) -> bool:

@@ -24,6 +24,7 @@ from dolens.manufacturing.glass_elements import GlassElement, face_of
 from dolens.manufacturing.shop_tolerances import AGREE, ShopTolerances
 from dolens.optics.elements import DISPLACEMENTS, TILTS
 from dolens.optics.lens import Lens
+from dolens.plotting.section import sensor_curve
 
 # Surfaces in one table.
 ROWS = 26
@@ -144,7 +145,8 @@ def _draw(
         last = -math.inf if raised else centre
         axes.plot([centre, centre], [top - 1.0 * unit, level - 1.2 * unit], color="0.5", lw=0.4)
         axes.text(centre, level, element.name, fontsize=TEXT, ha="center", va="center")
-    axes.plot([z, z], [zero - half, zero + half], color=INK, lw=2.0, zorder=3)
+    curve = sensor_curve(lens.system(), half)
+    axes.plot(curve[:, 0] - middle[0], curve[:, 1] + zero, color=INK, lw=2.0, zorder=3)
     # Above the axis, whatever the sensor's size.
     label = zero + max(0.6 * half, 2.5 * unit)
     axes.text(z + 2.0 * unit, label, "sensor", fontsize=TEXT, va="center")
@@ -195,6 +197,9 @@ def _notes(figure: Figure, lens: Lens, tolerances: ShopTolerances, continues: bo
         ("Object", f"{length(lens.object_distance)} mm before S1" if near else "at infinity"),
         ("Sensor behind last surface", f"{length(float(lens.sensor_distance.detach()))} mm"),
     ]
+    if lens.sensor_curvature is not None and float(lens.sensor_curvature.detach()):
+        radius = 1.0 / float(lens.sensor_curvature.detach())
+        lines.append(("Radius of the sensor", f"{length(radius)} mm"))
     if lens.sensor_diameter:
         lines.append(("Image circle", f"Ø {length(lens.sensor_diameter)} mm"))
     lines.append(("Stop", f"surface {lens.stop}, drawn in red"))

@@ -13,6 +13,7 @@ from dolens.optics.materials import abbe_number, index_d
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.clear_aperture import Circle, Ellipse, Rectangle
 from dolens.optics.surfaces.conic import Conic
+from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 
 _EVEN = re.compile(r"a\d+")
@@ -166,6 +167,8 @@ def clear_aperture_text(face: Face) -> str:
         if isinstance(edge, Rectangle)
         else f"ellipse {length(2.0 * edge.semi_axis_x)} × {length(2.0 * edge.semi_axis_y)}"
         if isinstance(edge, Ellipse)
+        else edge.words(length)
+        if isinstance(edge, Polygons)
         else f"Ø {length(2.0 * edge.semi_diameter)}"
     )
     obscured = face.aperture.obscuration
@@ -173,7 +176,7 @@ def clear_aperture_text(face: Face) -> str:
         return text
     if isinstance(obscured, Circle):
         return f"{text}, obscured to Ø {length(2.0 * obscured.semi_diameter)}"
-    return f"{text}, obscured in the middle"
+    return f"{text}, obscured"
 
 
 def surface_rows(

@@ -132,6 +132,8 @@ def _tensors(system: OpticalSystem, rays: Rays | None) -> Iterator[Tensor]:
             yield from surface.deflection.parameters.values()
     yield from system.thicknesses
     yield system.sensor_distance
+    if system.image is not None:
+        yield from system.image.parameters.values()
     for element in system.elements:
         yield from element.parameters.values()
     if rays is not None:

@@ -13,6 +13,7 @@ from dolens.optics.backend import check_backend, is_few
 from dolens.optics.broken_axes import GlobalAxes
 from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
+from dolens.optics.image_surface import image_surface, register_image_surface
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.lens_views import LensViews
@@ -29,7 +30,7 @@ from dolens.optics.vergence import ideal_lenses, with_vergences
 
 
 class Lens(LensRays, LensViews, InStates, nn.Module):
-    """Surfaces, gaps, media and a sensor plane.
+    """Surfaces, gaps, media and a sensor, plane or curved.
 
     Parameters are named as users write them: `surfaces.1.curvature`, `surfaces.5.x2y`,
     `thicknesses.3`, `sensor_distance`, and `states.wide.thicknesses.3` of a state (`in_state`).
@@ -63,6 +64,8 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
             as the stop makes them.
         source: the patent, book or catalogue that the prescription is taken from.
         published: the numbers that the source prints beside it; nothing is computed from them.
+        sensor_curvature: 1/mm, of a curved sensor at its vertex; None: a plane.
+        sensor_conic: conic constant of a curved sensor; None: a sphere.
     """
 
     def __init__(
@@ -89,6 +92,8 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         telecentric_object: bool = False,
         source: str = "",
         published: Published | None = None,
+        sensor_curvature: float | None = None,
+        sensor_conic: float | None = None,
     ) -> None:
         super().__init__()
         count = len(surfaces)
@@ -141,6 +146,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.elements = nn.ModuleDict(dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.states, self.state_name = LensStates(), None
+        register_image_surface(self, sensor_curvature, sensor_conic)
         self.to(dtype)
         self.reversals: tuple[int, ...] = ()
         self._check_breaks()
@@ -226,6 +232,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
             for name, element in self.elements.items()
         ]
         sensor_distance = values.pop("sensor_distance", self.sensor_distance)
+        image = image_surface(self, values)
         if values:
             raise InputError(f"lens '{self.name}' has no parameter '{next(iter(values))}'")
         materials, mirrors = media_of(self.materials)
@@ -239,6 +246,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
             self.backend,
             mirrors,
             self.reversals,
+            image,
         )
         if not ideal_lenses(system):
             return system
@@ -255,7 +263,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
     def trace(
         self, rays: Rays, record: bool = False, first: int = 1, last: int | None = None
     ) -> TracedRays:
-        """Trace rays from the object through every surface to the sensor plane.
+        """Trace rays from the object through every surface to the sensor, plane or curved.
 
         With backend `auto`, fast kernels trace many rays, and PyTorch a few, so that these wait for
         no compiler; see `dolens.optics.backend.is_few`.  Results agree to rounding.  A loop over

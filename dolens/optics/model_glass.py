@@ -12,7 +12,10 @@ A polynomial in 1/λ² through the same three numbers errs by three times as muc
 
 Zemax's own formula for model glass is not published.  Its makers say that it takes nd, Vd and ΔPgF
 from this normal line, and that it is accurate to about 1e-4 in the visible (Zemax Knowledge Base,
-"How to Use the Model Glass", 2005).  So differences of that size are to be expected.
+"How to Use the Model Glass", 2005).  So differences of that size are to be expected.  At the lines
+themselves they are smaller: the foci that OpticStudio has written into 15 files are met within 1e-6
+of the focal length here, and would be within 2e-8 if nd, nF and nC were those at 587.6, 486.1 and
+656.3 nm.
 """
 
 from dataclasses import dataclass

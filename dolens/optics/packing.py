@@ -13,12 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
 from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 from dolens.optics.elements import LENS_AXES, relative_axes
 from dolens.optics.materials import Medium
-from dolens.optics.records import BREAK, Form, LawForm, Records, Structure, records, tensor
+from dolens.optics.record_structure import BREAK, Form, LawForm, Structure
+from dolens.optics.records import Records, records, tensor
 from dolens.optics.row_jacobian import jacobian_of
 from dolens.optics.system import OpticalSystem, per_radian
 
@@ -118,6 +120,12 @@ def _lay_out(
             laws.append(LawForm(law.law.kernel.code, sizes))
             of_laws += [value for value in own if value is not None]
     scalars += (*of_laws, *system.thicknesses, system.sensor_distance)
+    image = None
+    if to_sensor and system.image is not None:
+        shape = system.image.shape
+        own = shape.packed(system.image.parameters).numbers
+        image = Form(shape.kernel.code, 0, 0, 0, (), tuple(value.shape for value in own))
+        scalars += own
     layout = records(
         Structure(
             tuple(forms),
@@ -131,6 +139,7 @@ def _lay_out(
             last,
             to_sensor,
             tuple(laws),
+            image,
         )
     )
     if layout.turns:
@@ -193,7 +202,7 @@ def _variable_map(
     )
 
 
-@lru_cache(maxsize=256)
+@cached_tensors(maxsize=256)
 def _map_of_numbers(
     layout: Records, sizes: tuple[int, ...], columns: tuple[int, ...], count: int
 ) -> VariableMap:

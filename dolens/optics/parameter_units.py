@@ -33,6 +33,7 @@ DEGREE = Unit("deg", math.pi / 180.0)
 MILLIMETRE = Unit("mm")
 PER_MILLIMETRE = Unit("1/mm")
 RADIAN = Unit("rad")
+WAVE = Unit("waves")
 UNNAMED = Unit("")
 _UNIT_OF = {
     **dict.fromkeys(TILTS, DEGREE),
@@ -40,7 +41,9 @@ _UNIT_OF = {
     "sensor_distance": MILLIMETRE,
     "power": PER_MILLIMETRE,
     "grooves": PER_MILLIMETRE,
-    **dict.fromkeys(("curvature", "curvature_x", "curvature_y"), PER_MILLIMETRE),
+    **dict.fromkeys(
+        ("curvature", "curvature_x", "curvature_y", "sensor_curvature"), PER_MILLIMETRE
+    ),
     "normalization_radius": MILLIMETRE,
 }
 # Of names whose last part is a number or a coordinate.
@@ -57,7 +60,10 @@ def unit_of(name: str) -> Unit:
     _, name = split_state(name)
     first, _, _ = name.partition(".")
     group, _, last = name.rpartition(".")
-    others = RADIAN if group.endswith(".phase") else UNNAMED
+    others = UNNAMED
+    if group.endswith(".phase"):
+        # Zernike's coefficients are waves, all others radians.
+        others = WAVE if last[:1] == "z" else RADIAN
     return _UNIT_OF_GROUP.get(first) or _UNIT_OF.get(last, others)
 
 

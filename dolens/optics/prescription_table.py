@@ -12,6 +12,7 @@ from dolens.optics.mirrors import MIRROR
 from dolens.optics.parameter_units import to_file_units
 from dolens.optics.surfaces import CoordinateBreak
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture, Ellipse, Rectangle
+from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.tables import html_table, printable, text_table
 
 HEADINGS = (
@@ -106,6 +107,8 @@ class PrescriptionTable:
         sensor_distance: mm from the last vertex.
         sensor_diameter: mm; None where the prescription gives none.
         elements: name of an element with a pose → its parameters that are not zero, degrees and mm.
+        sensor_radius: mm, of a curved sensor; `inf` of a plane one.
+        sensor_conic: its conic constant; 0 of a sphere.
     """
 
     name: str
@@ -116,6 +119,8 @@ class PrescriptionTable:
     sensor_distance: float
     sensor_diameter: float | None
     elements: dict[str, dict[str, float]]
+    sensor_radius: float = math.inf
+    sensor_conic: float = 0.0
 
     @property
     def heading(self) -> str:
@@ -140,6 +145,10 @@ class PrescriptionTable:
         sensor = "" if self.sensor_diameter is None else _number(0.5 * self.sensor_diameter)
         first = ["object", "", "", _number(self.object_distance), self.object_material, "", "", ""]
         last = ["sensor", "plane", "", "", "", sensor, "", ""]
+        if not math.isinf(self.sensor_radius):
+            last[1] = "conic" if self.sensor_conic else "sphere"
+            last[2] = _number(self.sensor_radius)
+            last[6] = _number(self.sensor_conic) if self.sensor_conic else ""
         return [first, *(row.cells() for row in self.surfaces), last]
 
     def text(self) -> str:
@@ -204,7 +213,15 @@ def prescription_table(lens: nn.Module) -> PrescriptionTable:
         gaps[-1],
         lens.sensor_diameter,
         {name: _pose(element) for name, element in lens.elements.items()},
+        *_sensor_shape(lens),
     )
+
+
+def _sensor_shape(lens: nn.Module) -> tuple[float, float]:
+    """Return radius (mm) and conic constant of the sensor."""
+    curvature, conic = lens.sensor_curvature, lens.sensor_conic
+    radius = math.inf if curvature is None or float(curvature) == 0.0 else 1.0 / float(curvature)
+    return radius, 0.0 if conic is None else float(conic)
 
 
 def _break_row(
@@ -244,6 +261,8 @@ def _aperture(aperture: ClearAperture) -> str:
         found = f"rectangle {_number(2.0 * edge.half_width_x)} × {_number(2.0 * edge.half_width_y)}"
     elif isinstance(edge, Ellipse):
         found = f"ellipse {_number(2.0 * edge.semi_axis_x)} × {_number(2.0 * edge.semi_axis_y)}"
+    elif isinstance(edge, Polygons):
+        found = edge.words(_number)
     else:
         found = "circle" if isinstance(edge, Circle) else "no edge"
     if aperture.window is not None:

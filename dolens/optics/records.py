@@ -6,85 +6,18 @@ elements carry what.  So records are laid out once, and packing is then one gath
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dolens.cached_tensors import cached_tensors
 from dolens.kernels.table import Code, Kind, Outline, Slot
 from dolens.optics.elements import carriers
-from dolens.optics.materials import Medium
+from dolens.optics.image_surface import WITHOUT_EDGE
+from dolens.optics.record_structure import BREAK, LawForm, Structure
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.refraction import FAR
-
-# Stands in a `Form` for the code of a kernel.
-BREAK = -1
-
-
-class Form(NamedTuple):
-    """A shape without its numbers; see `PackedShape`.
-
-    Attributes:
-        kind: the code of its kernel, or `BREAK` of a coordinate break, which is no step.
-        count: as in `PackedShape`, and the three that follow.
-        columns: of a spline; 1 for a polynomial with a b·z² term.
-        degree: highest power of x or y.
-        extras: further integers.
-        sizes: the shape of each number's tensor; None: the number is zero.
-        data: as in `PackedShape`.
-    """
-
-    kind: int
-    count: int
-    columns: int
-    degree: int
-    extras: tuple[int, ...]
-    sizes: tuple[torch.Size | None, ...]
-    data: int = 0
-
-
-class LawForm(NamedTuple):
-    """A law of deflection without its numbers.
-
-    Attributes:
-        code: of its kernel.
-        sizes: the shape of each number's tensor; None: the number is zero.
-    """
-
-    code: int
-    sizes: tuple[torch.Size | None, ...]
-
-
-class Structure(NamedTuple):
-    """The structure of a lens, which the layout of the records depends on.
-
-    Attributes:
-        forms: of all the lens's surfaces.
-        apertures: of all of them.
-        materials: before surface 1 and after each surface.
-        elements: first and last surface of each element.
-        mirrors: numbers of the surfaces that reflect.
-        senses: of the light in each medium, +1 towards +z and -1 towards -z, in forward mode.
-        sense: +1 from the object towards the sensor, -1 backwards.
-        first: number of the first surface that is packed, as the prescription counts.
-        last: number of the last.
-        to_sensor: go on to the sensor plane (forward only).
-        laws: what deflects light at each surface in the place of Snell's law, or None.
-    """
-
-    forms: tuple[Form, ...]
-    apertures: tuple[ClearAperture, ...]
-    materials: tuple[Medium, ...]
-    elements: tuple[tuple[int, int], ...]
-    mirrors: tuple[int, ...]
-    senses: tuple[float, ...]
-    sense: float
-    first: int
-    last: int
-    to_sensor: bool
-    laws: tuple[LawForm | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +25,8 @@ class Records:
     """Records as constants plus signed numbers of the lens: values[places] += signs·x[sources].
 
     The lens's numbers x come in this order: the scalars of all surfaces, those of all laws, the
-    gaps and the sensor's distance; the arrays of all surfaces; then step (3) and turn (9) of each
-    change of axes.
+    gaps, the sensor's distance and the image surface's; the arrays of all surfaces; then step (3)
+    and turn (9) of each change of axes.
 
     Attributes:
         constants: (V,), float64.
@@ -124,7 +57,7 @@ def tensor(numbers: Sequence, dtype: type) -> Tensor:
     return torch.from_numpy(np.array(numbers, dtype=dtype))
 
 
-@lru_cache(maxsize=256)
+@cached_tensors(maxsize=256)
 def records(structure: Structure) -> Records:
     """Lay out the steps of a lens in the order that light of this sense meets them."""
     return _Writer(structure).write()
@@ -153,6 +86,8 @@ class _Writer:
             place += 0 if law is None else sum(size is not None for size in law.sizes)
         self.gaps = place
         place += len(structure.forms)
+        self.of_image = place
+        place += 0 if structure.image is None else len(structure.image.sizes)
         for of_surface in sizes:
             self.array.append(place)
             place += sum(size.numel() for size in of_surface if size != ())
@@ -183,6 +118,7 @@ class _Writer:
             row[Code.REFRACTS] = int(bends and law is None)
             self.aperture(row, s.apertures[number - 1])
             self.shape(row, number)
+            self.figures(row, s.apertures[number - 1])
             if law is not None:
                 row = self.step(Kind.DEFLECT, medium, medium + 1, number)
                 self.constants[row[Code.OFFSET] + Slot.SENSE_BEHIND] = sense_behind
@@ -307,6 +243,35 @@ class _Writer:
             row[Code.HOLE], *numbers = hole.packed()
             values[record + Slot.HOLE_X], values[record + Slot.HOLE_Y] = numbers
 
+    def image(self, line: tuple[int, tuple[int, ...]], now: int, at: int, medium: int) -> None:
+        """From the last surface to a curved sensor, which refracts nothing."""
+        s = self.structure
+        sensor = len(s.forms) + 1
+        turned = line != self.line(sensor)
+        if turned:
+            self.turn(self.step(Kind.CHANGE_AXES, medium, medium, sensor), now, sensor)
+        row = self.step(s.image.kind, medium, medium, sensor)
+        if not turned:
+            self.shift(row, at, sensor)
+        begin = row[Code.OFFSET]
+        self.constants[begin + Slot.SENSE_BEHIND] = self.constants[begin + Slot.SENSE]
+        self.aperture(row, WITHOUT_EDGE)
+        self.add(len(self.constants), self.of_image, len(s.image.sizes))
+        self.constants += [0.0] * len(s.image.sizes)
+        row[Code.LENGTH] = len(self.constants) - begin
+
+    def figures(self, row: list[int], aperture: ClearAperture) -> None:
+        """Write the figures of a clear aperture, which have no cotangents, behind its shape."""
+        numbers: list[float] = []
+        count = 0
+        for blocks, figures in aperture.figures():
+            count += len(figures)
+            for kind, center, own in figures:
+                numbers += [float(kind), float(blocks), *center, float(len(own)), *own]
+        if count:
+            row[Code.FIGURES] = len(self.constants) - row[Code.OFFSET]
+            self.constants += [float(count), *numbers]
+
     def leave(self, line: tuple[int, tuple[int, ...]], now: int, at: int, medium: int) -> None:
         """From the last surface, which an element may carry, to the lens's axes or the sensor.
 
@@ -314,7 +279,10 @@ class _Writer:
         """
         sensor = len(self.structure.forms) + 1
         own = self.structure.to_sensor and self.line(sensor) != self.line(0)
-        if own and line != self.line(sensor):
+        if self.structure.image is not None:
+            self.image(line, now, at, medium)
+            at = sensor
+        elif own and line != self.line(sensor):
             self.turn(self.step(Kind.CHANGE_AXES, medium, medium, sensor), now, sensor)
             self.step(Kind.SENSOR, medium, medium, sensor)
             at = sensor

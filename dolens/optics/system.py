@@ -25,7 +25,7 @@ def per_radian(wavelength: float | Tensor, like: Tensor) -> float | Tensor:
 
 @dataclass(frozen=True)
 class OpticalSystem:
-    """A sequence of surfaces and a sensor plane, centred but for coordinate breaks and the poses of
+    """A sequence of surfaces and a sensor, centred but for coordinate breaks and the poses of
     elements.
 
     Attributes:
@@ -38,6 +38,7 @@ class OpticalSystem:
         mirrors: numbers of the surfaces that reflect; the medium behind one is the one in front.
         reversals: numbers of the coordinate breaks that turn the axes so far that light travels the
             other way along z behind them.
+        image: the curved surface that rays end on, its vertex at the sensor; None: a plane.
         backend: the implementation that traces rays through it: `reference`, `cpu`, `cuda`, or
             `auto`; see `dolens.optics.backend.choose_backend`.
     """
@@ -51,6 +52,7 @@ class OpticalSystem:
     backend: str = "auto"
     mirrors: tuple[int, ...] = ()
     reversals: tuple[int, ...] = ()
+    image: SurfaceState | None = None
 
     @cached_property
     def senses(self) -> tuple[float, ...]:
@@ -172,6 +174,7 @@ class OpticalSystem:
             surfaces=[s.double() for s in self.surfaces],
             thicknesses=[gap.double() for gap in self.thicknesses],
             sensor_distance=self.sensor_distance.double(),
+            image=None if self.image is None else self.image.double(),
             elements=[
                 replace(e, parameters={n: p.double() for n, p in e.parameters.items()})
                 for e in self.elements

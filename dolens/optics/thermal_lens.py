@@ -12,7 +12,7 @@ import copy
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -199,14 +199,8 @@ def _expand_unvaried(surface: Surface, factor: float) -> None:
     surface.aperture = replace(
         aperture,
         center=(factor * aperture.center[0], factor * aperture.center[1]),
-        **{name: outline and _scaled(outline, factor) for name, outline in outlines.items()},
+        **{name: outline and outline.scaled(factor) for name, outline in outlines.items()},
     )
-
-
-def _scaled(outline: Any, factor: float) -> Any:
-    """Return an outline whose sizes, all of them lengths, are multiplied by a factor."""
-    sizes = {field.name: factor * getattr(outline, field.name) for field in fields(outline)}
-    return replace(outline, **sizes)
 
 
 def _power(name: str, place: str) -> int:

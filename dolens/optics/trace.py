@@ -11,6 +11,7 @@ from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes,
 from dolens.optics.rays import Components, Rays, Status, TracedRays
 from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem, per_radian
 
 
@@ -63,6 +64,45 @@ def distance_to_plane(ray: Components, z: Tensor | float, sense: float) -> tuple
     """
     cosine = (ray.n if sense > 0.0 else -ray.n).clamp(min=GRAZING)
     return sense * (z - ray.z) / cosine, cosine.detach() - GRAZING
+
+
+class Meeting(NamedTuple):
+    """Rays meet a surface.
+
+    Attributes:
+        ray: on the surface, in its axes.
+        to_plane: distance (mm) to the vertex plane.
+        t: distance (mm) from there to the surface.
+        met: a margin that is positive where they meet it.
+    """
+
+    ray: Components
+    to_plane: Tensor
+    t: Tensor
+    met: Tensor
+
+
+def meet(surface: SurfaceState, ray: Components, sense: float) -> Meeting:
+    """Find where rays, in a surface's axes, meet it, coming towards +z (sense +1) or -z."""
+    shape = surface.shape
+    to_plane, towards = distance_to_plane(ray, 0.0, sense)
+    limit = FAR * surface.semi_diameter
+    l, m, n = ray[3:]  # noqa: E741
+    x = torch.addcmul(ray.x, to_plane, l).clamp(-limit, limit)
+    y = torch.addcmul(ray.y, to_plane, m).clamp(-limit, limit)
+    at_plane = PlaneRay(x, y, l, m, n)
+    t, met = shape.intersect(surface.parameters, at_plane, sense, surface.semi_diameter)
+    met = towards if met is None else torch.minimum(towards, met)
+    t = t.clamp(-limit, limit)
+    # What was held at the limit is not where the ray goes.
+    across = torch.maximum(x.detach().abs(), y.detach().abs())
+    met = torch.minimum(met, limit - torch.maximum(across, t.detach().abs()))
+    x, y = torch.addcmul(x, t, l), torch.addcmul(y, t, m)
+    if not shape.closed_form:
+        # There is no point of the surface to refract at, and a sag far off may overflow.
+        lost = ~(met > 0.0)
+        x, y, t = (v.masked_fill(lost, 0.0) for v in (x, y, t))
+    return Meeting(Components(x, y, t * n, l, m, n), to_plane, t, met)
 
 
 def enter_lens(
@@ -137,24 +177,7 @@ def trace_surfaces(
         arriving, leaving = sense * senses[front], sense * senses[back]
         here, carried = change_axes(ray, axes, places[i])
         axes = places[i]
-        to_plane, towards = distance_to_plane(here, 0.0, arriving)
-        limit = FAR * surface.semi_diameter
-        l, m, n = here[3:]  # noqa: E741
-        x = torch.addcmul(here.x, to_plane, l).clamp(-limit, limit)
-        y = torch.addcmul(here.y, to_plane, m).clamp(-limit, limit)
-        ray_here = PlaneRay(x, y, l, m, n)
-        t, met = shape.intersect(parameters, ray_here, arriving, surface.semi_diameter)
-        met = towards if met is None else torch.minimum(towards, met)
-        t = t.clamp(-limit, limit)
-        # What was held at the limit is not where the ray goes.
-        across = torch.maximum(x.detach().abs(), y.detach().abs())
-        met = torch.minimum(met, limit - torch.maximum(across, t.detach().abs()))
-        x, y = torch.addcmul(x, t, l), torch.addcmul(y, t, m)
-        if not shape.closed_form:
-            # There is no point of the surface to refract at, and a sag far off may overflow.
-            lost = ~(met > 0.0)
-            x, y, t = (v.masked_fill(lost, 0.0) for v in (x, y, t))
-        z = t * n
+        (x, y, z, l, m, n), to_plane, t, met = meet(surface, here, arriving)  # noqa: E741
         inside = surface.aperture.margin(x, y)
         if path is not None:
             path = path + before * (to_plane + t if carried is None else carried + to_plane + t)
@@ -187,12 +210,18 @@ def _all_positive(margins: list[Margins], like: Tensor) -> Tensor:
 
 
 def trace_to_sensor(system: OpticalSystem, traced: Trace, wavelength: float | Tensor) -> Trace:
-    """Carry rays on from the last surface to the sensor plane, and into the sensor's axes.
+    """Carry rays on from the last surface to the sensor, plane or curved, and into its axes.
 
-    Rays that do not travel in the sense of the light there are no longer valid.
+    Rays that do not travel in the sense of the light there, or miss a curved sensor, are no longer
+    valid.
     """
     z = system.vertices[-1]
-    if system.breaks:
+    if system.image is not None:
+        at_level, carried = change_axes(traced.local, traced.axes, system.all_axes[-1])
+        landed, to_plane, t, towards = meet(system.image, at_level, system.senses[-1])
+        distance = to_plane + t if carried is None else carried + to_plane + t
+        ray = landed._replace(z=landed.z + z)
+    elif system.breaks:
         # Carried to the level of the sensor's vertex before they are turned.
         at_level, carried = change_axes(traced.local, traced.axes, system.all_axes[-1])
         to_plane, towards = distance_to_plane(at_level, 0.0, system.senses[-1])

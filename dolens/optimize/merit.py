@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
+from dolens.optics.straight import require_plane_sensor
 from dolens.optimize.image_quality import ImageQuality, QualityValues, without_edges
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.operand_model import OperandModel
@@ -71,6 +72,9 @@ class MeritFunction:
                 "variable 'sensor_distance': solve 'best_focus' goes with the merit's spots or "
                 "wavefronts; vary sensor_distance instead"
             )
+        if variables.best_focus:
+            # Landing points are linear in the distance of a plane alone.
+            require_plane_sensor(lens.system(), "variable 'sensor_distance': solve 'best_focus'")
         self.crossings: dict[tuple[float, float], Tensor] = {}
         self._last: tuple[Tensor, MeritValue] | None = None
 

@@ -274,6 +274,18 @@ def _chief_ray_angle(operand: Operand, lens: LensProperties) -> dict[str, Tensor
     ray = lens.chief_ray(operand.field)
     across = torch.hypot(ray.l, ray.m)
     along = lens.system.senses[-1] * ray.n
+    image = lens.system.image
+    if image is not None:
+        nx, ny, nz = image.shape.normal(
+            image.parameters, ray.x, ray.y, ray.z - lens.system.vertices[-1]
+        )
+        cosine = nx * ray.l + ny * ray.m + nz * ray.n
+        along = lens.system.senses[-1] * cosine
+        across = torch.sqrt(
+            (ny * ray.n - nz * ray.m) ** 2
+            + (nz * ray.l - nx * ray.n) ** 2
+            + (nx * ray.m - ny * ray.l) ** 2
+        )
     return {_labelled(operand): torch.rad2deg(torch.atan2(across, along))}
 
 

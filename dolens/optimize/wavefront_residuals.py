@@ -11,6 +11,7 @@ from dolens.errors import InputError
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
 from dolens.optics.rays import TracedRays
+from dolens.optics.straight import require_plane_sensor
 from dolens.optimize.image_quality import ImageQuality
 
 _OUTPUTS = ("x", "y", "path_length", "l", "m")
@@ -108,3 +109,4 @@ class WavefrontResiduals(ImageQuality):
     def _check(self, lens: Lens) -> None:
         if lens.dtype != torch.float64:
             raise InputError("merit.quality 'wavefront' needs double precision: lens_dtype=float64")
+        require_plane_sensor(lens.system(), "merit.quality 'wavefront'")

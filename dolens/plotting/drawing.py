@@ -16,16 +16,17 @@ from dolens.optics.materials import is_glass
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.number_text import with_minus
 from dolens.plotting.section import (
-    Profile,
     axis_angle,
     broken_axis,
     element_edges,
-    obscuration_profile,
+    obscuration_profiles,
+    sensor_curve,
     sensor_line,
     surface_profile,
     trace_fan,
 )
 from dolens.plotting.style import SMALL, open_axes, ordered_colours, spectral_colour
+from dolens.plotting.surface_cut import Profile
 
 # Rays start this far in front of the lens, in units of the distance from lens to sensor.
 _LEAD = 0.1
@@ -108,7 +109,7 @@ def layout_drawing(
         half = max(half, 0.05 * height)
     else:
         half = reach
-    ends = sensor_line(system, half)
+    ends = sensor_curve(system, half)
     front = min([start, *(float(paths[..., 2].min()) for paths in lit), ends[:, 0].min()])
     back = max([back, *(float(paths[..., 2].max()) for paths in lit), ends[:, 0].max()])
     margin = 0.04 * (back - front)
@@ -140,7 +141,7 @@ def draw_layout(
     _draw_rays(axes, drawing.fans, legend)
     _draw_stop(axes, system, profiles, drawing.height)
     _draw_obscurations(axes, system)
-    ends = sensor_line(system, drawing.sensor)
+    ends = sensor_curve(system, drawing.sensor)
     axes.plot(*ends.T, color="black", linewidth=2.5, gid="sensor", zorder=4)
     axes.set(aspect="equal", xlim=z_limits, ylim=(-half_height, half_height))
     axes.set_xlabel("z (mm)", fontsize=SMALL + 1)
@@ -260,6 +261,5 @@ def _draw_stop(
 
 def _draw_obscurations(axes: Axes, system: OpticalSystem) -> None:
     for number in system.met:
-        profile = obscuration_profile(system, number)
-        if profile is not None and len(profile[0]):
+        for profile in obscuration_profiles(system, number):
             axes.plot(*profile, color="black", linewidth=2.5, gid="obscuration", zorder=4)

@@ -14,8 +14,8 @@ from dolens.optics.paraxial import first_order
 from dolens.optics.system import OpticalSystem
 from dolens.plotting.drawing import draw_layout, layout_drawing
 from dolens.plotting.number_text import number_text, with_minus
-from dolens.plotting.section import SAMPLES, sag_of
 from dolens.plotting.style import PAGE, SMALL, open_axes
+from dolens.plotting.surface_cut import SAMPLES, sag_of
 from dolens.plotting.titles import draw_axes_title
 
 # A sag below this share of the height of the drawing cannot be seen.

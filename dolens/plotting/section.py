@@ -11,20 +11,19 @@ from dolens.optics.aiming import aim
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
-from dolens.optics.surfaces.clear_aperture import Outline
+from dolens.optics.surfaces.outlines import Polygons
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces, trace_to_sensor, transfer
+from dolens.plotting.surface_cut import BISECTIONS, Profile, SurfaceCut, place_of, runs
 
-Profile = tuple[np.ndarray, np.ndarray]
-
-SAMPLES = 201
 # The real beam is looked for over this many paraxial pupil radii, because pupils have aberrations.
 _SEARCH = 1.5
 _TRIALS = 601
-_BISECTIONS = 60
-_NEWTON_STEPS = 20
 # Heights on the stop whose rays are tried where the lens is folded.
 _STOP_TRIALS = 81
+# Points of a curved sensor.
+_CURVE = 65
+_NOTHING: Profile = (np.zeros(0), np.zeros(0))
 
 
 def surface_profile(system: OpticalSystem, number: int) -> Profile:
@@ -40,82 +39,54 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
         coordinate break.
     """
     if number in system.breaks:
-        return np.zeros(0), np.zeros(0)
+        return _NOTHING
     aperture = system.surfaces[number - 1].aperture
-    centred = aperture.edge.rotational
-    return _cut(system, number, aperture.edge, (0.0, 0.0) if centred else aperture.center)
-
-
-def obscuration_profile(system: OpticalSystem, number: int) -> Profile | None:
-    """Return the profile over the surface's obscuration; None where it has none."""
-    aperture = system.surfaces[number - 1].aperture
-    obscuration = aperture.obscuration
-    return None if obscuration is None else _cut(system, number, obscuration, aperture.center)
-
-
-def _cut(
-    system: OpticalSystem, number: int, outline: Outline, center: tuple[float, float]
-) -> Profile:
-    rotation, origin = _place(system, number)
-    # In the surface's axes the plane is a·p + o = 0, with a the lens's x seen from the surface.
-    ax, ay, az = rotation[0]
-    offset = origin[0]
-    across = torch.hypot(ax, ay)
-    if float(across) < 1e-9:
-        raise InputError(f"layout: surface {number} faces along x and has no meridional section")
-    ux, uy = ax / across, ay / across
-    # Along the cut, y of the lens grows.
-    sign = 1.0 if float(rotation[1, 1] * ux - rotation[1, 0] * uy) >= 0.0 else -1.0
-    vx, vy = -sign * uy, sign * ux
-
-    def point(q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Points of the cut at q along it: x, y, sag in the surface's axes, and where it exists."""
-        w = (-offset / across).expand_as(q)
-        for _ in range(_NEWTON_STEPS if float(az.abs()) > 0.0 else 1):
-            x, y = vx * q + ux * w, vy * q + uy * w
-            sag, sx, sy, exists = sag_of(system, number, x, y)
-            slope = across + az * (sx * ux + sy * uy)
-            w = w - (across * w + offset + az * sag) / torch.where(slope == 0.0, across, slope)
-        x, y = vx * q + ux * w, vy * q + uy * w
-        sag, _, _, exists = sag_of(system, number, x, y)
-        return x, y, sag, exists
+    edge = aperture.edge.drawn
+    center = (0.0, 0.0) if edge.rotational else aperture.center
+    cut = SurfaceCut(system, number)
 
     def inside(q: Tensor) -> Tensor:
-        x, y, _, _ = point(q)
-        return outline.margin(x - center[0], y - center[1]) >= 0.0
+        x, y, _, _ = cut.points(q)
+        return edge.margin(x - center[0], y - center[1]) >= 0.0
 
+    if isinstance(edge, Polygons):
+        found = runs(inside, aperture.semi_diameter)
+        return cut.profile(found[0][0], found[-1][1]) if found else _NOTHING
     # Along the cut, the place nearest to the outline's centre.
-    begin = float(vx) * center[0] + float(vy) * center[1]
+    begin = cut.along(*center)
     middle = torch.full((1,), begin, dtype=torch.float64)
     if not bool(inside(middle)):
-        return np.zeros(0), np.zeros(0)
+        return _NOTHING
     # The rims: the last point inside on either side.
     near = middle.expand(2)
-    far = begin + 1.5 * outline.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
-    for _ in range(_BISECTIONS):
+    far = begin + 1.5 * edge.semi_diameter * torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    for _ in range(BISECTIONS):
         half = 0.5 * (near + far)
         kept = inside(half)
         near, far = torch.where(kept, half, near), torch.where(kept, far, half)
-    share = torch.linspace(0.0, 1.0, SAMPLES, dtype=torch.float64)
-    x, y, sag, exists = point(near[0] * (1.0 - share) + near[1] * share)
-    points = torch.stack([x, y, sag]).T[exists] @ rotation.T + origin
-    return points[:, 2].numpy(), points[:, 1].numpy()
+    return cut.profile(*near.tolist())
 
 
-def sag_of(
-    system: OpticalSystem, number: int, x: Tensor, y: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sag (mm) and slopes in double precision, and where they exist."""
-    surface = system.surfaces[number - 1]
-    parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}
-    sag, sx, sy, exists = surface.shape.sag_and_gradient(parameters, x, y)
-    exists = torch.ones_like(sag, dtype=torch.bool) if exists is None else exists >= 0.0
-    return sag, sx, sy, exists
+def obscuration_profiles(system: OpticalSystem, number: int) -> list[Profile]:
+    """Return the profiles over what the surface's obscuration blocks of its aperture."""
+    aperture = system.surfaces[number - 1].aperture
+    if aperture.obscuration is None:
+        return []
+    reach = aperture.semi_diameter
+    cut = SurfaceCut(system, number)
+
+    def blocked(q: Tensor) -> Tensor:
+        x, y, _, _ = cut.points(q)
+        # Arms of a spider end at the edge.
+        u, v = x - aperture.center[0], y - aperture.center[1]
+        return (aperture.obscuration.margin(u, v) >= 0.0) & (torch.hypot(x, y) <= reach)
+
+    return [cut.profile(*run) for run in runs(blocked, reach)]
 
 
 def axis_angle(system: OpticalSystem, number: int) -> float:
     """Return the angle (radians) from z towards y of a surface's axis, seen along x."""
-    rotation, _ = _place(system, number)
+    rotation, _ = place_of(system, number)
     return math.atan2(float(rotation[1, 2]), float(rotation[2, 2]))
 
 
@@ -140,14 +111,6 @@ def _turn(profile: Profile, angle: float) -> Profile:
     z, y = profile
     c, s = math.cos(angle), math.sin(angle)
     return c * z - s * y, s * z + c * y
-
-
-def _place(system: OpticalSystem, number: int) -> tuple[Tensor, Tensor]:
-    axes = system.axes[number - 1]
-    if axes.rotation is None:
-        z = float(axes.z)
-        return torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, z], dtype=torch.float64)
-    return axes.rotation.detach().double().cpu(), axes.origin.detach().double().cpu()
 
 
 def _edge(front: Profile, back: Profile, end: int) -> np.ndarray:
@@ -285,3 +248,20 @@ def sensor_line(system: OpticalSystem, half: float) -> np.ndarray:
     axes = system.global_axes()
     origin, along = (v[-1].detach().cpu().numpy() for v in (axes.origin, axes.rotation[..., 1]))
     return np.stack([origin - half * along, origin + half * along])[:, [2, 1]]
+
+
+def sensor_curve(system: OpticalSystem, half: float) -> np.ndarray:
+    """Return z and y (N, 2), mm, of the sensor's section, up to half a length on both sides.
+
+    It is `sensor_line` of a plane one; a curved one ends where its surface does.
+    """
+    if system.image is None:
+        return sensor_line(system, half)
+    image = system.image.double()
+    y = torch.linspace(-half, half, _CURVE, dtype=torch.float64, device=system.device)
+    sag, _, _, exists = image.shape.sag_and_gradient(image.parameters, torch.zeros_like(y), y)
+    there = slice(None) if exists is None else exists > 0.0
+    local = torch.stack((torch.zeros_like(y), y, sag), -1)[there]
+    axes = system.global_axes()
+    points = local @ axes.rotation[-1].mT + axes.origin[-1]
+    return points.detach().cpu().numpy()[:, [2, 1]]

@@ -1,19 +1,28 @@
 """Clear apertures of surfaces are read from a prescription and written to it.
 
-A surface gives `semi_diameter`, or `aperture` with a rectangle, an ellipse or a circle, which may
-be beside the vertex, or both, where light must pass both; `obscuration` is what is blocked::
+A surface gives `semi_diameter`, or `aperture` with a rectangle, an ellipse, a circle or polygons,
+which may be beside the vertex, or both, where light must pass both; `obscuration` is what is
+blocked, by one outline or by a list of them, each with a centre of its own::
 
     '1': {type: plane, semi_diameter: 6.35, obscuration: {semi_diameter: 2.0}, ...}
     '2': {type: plane, aperture: {half_width_x: 5.0, half_width_y: 4.0}, ...}
     '3': {type: plane, aperture: {semi_axis_x: 5.0, semi_axis_y: 7.0, decenter_y: 30.0}, ...}
     '4': {type: sphere, radius: 20, semi_diameter: 7.0, clips: false, ...}
     '5': {type: sphere, radius: 25, semi_diameter: auto, ...}
+    '6': {type: plane, aperture: {polygons: [[[-4, -3], [4, -3], [0, 5]]]}, ...}
+    '7': {type: plane, semi_diameter: 100, obscuration: [{semi_diameter: 34},
+          {width: 2, arms: 4, angle: 45}, {inner_semi_diameter: 60, semi_diameter: 62}], ...}
+
+`polygons` are lists of vertices [x, y] (mm): light passes inside each of them, and one inside
+another is a hole.  A spider has `arms` of a `width` (mm), the first at an `angle` (degrees from +x
+towards +y).
 
 A surface that clips nothing is drawn to its semi-diameter, and light passes it wherever it is.
 `auto` clips nothing either: when the lens is built, the semi-diameter becomes the one that the
 light of the lens's fields needs (`dolens.prescriptions.automatic_apertures`).
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,20 +32,33 @@ from dolens.optics.surfaces.clear_aperture import (
     ClearAperture,
     Ellipse,
     Outline,
+    Polygons,
     Rectangle,
+    Ring,
+    Spider,
+    Together,
     Unlimited,
 )
-from dolens.prescriptions.checks import as_number, require_mapping
+from dolens.optics.surfaces.outlines import CENTRE
+from dolens.prescriptions.checks import as_number, as_numbers, require_mapping
 
 APERTURE_KEYS = ("semi_diameter", "clips", "aperture", "obscuration")
 AUTOMATIC = "auto"
 # Stands for an automatic semi-diameter (mm) until the light of the fields is known.
 _UNKNOWN = 1.0
+# Keys of an outline, all of them necessary, and what is made of their numbers.
 _OUTLINES: tuple[tuple[tuple[str, ...], type[Outline]], ...] = (
     (("semi_diameter",), Circle),
     (("half_width_x", "half_width_y"), Rectangle),
     (("semi_axis_x", "semi_axis_y"), Ellipse),
+    (("polygons",), Polygons),
 )
+_BLOCKING: tuple[tuple[tuple[str, ...], type[Outline]], ...] = (
+    (("inner_semi_diameter", "semi_diameter"), Ring),
+    *_OUTLINES,
+    (("width", "arms"), Spider),
+)
+_OPTIONAL = {Spider: ("angle",)}
 _CENTER = ("decenter_x", "decenter_y")
 
 
@@ -65,14 +87,20 @@ def clear_aperture(row: Mapping[str, Any], place: str) -> ClearAperture:
         length = _UNKNOWN if is_automatic(row) else as_number(size, f"{place}: 'semi_diameter'")
         edge = Circle(length) if clips else Unlimited(length)
     if outline is not None:
-        window, center = _outline(outline, f"{place}: 'aperture'")
+        window, center = _outline(outline, _OUTLINES, f"{place}: 'aperture'")
         centers.append(center)
     if row.get("obscuration") is not None:
-        hole, center = _outline(row["obscuration"], f"{place}: 'obscuration'")
+        hole, center = _obscuration(row["obscuration"], f"{place}: 'obscuration'")
         centers.append(center)
     center = centers[0] if centers else (0.0, 0.0)
     if len(centers) == 2 and any(centers[1]) and centers[1] != center:
-        raise InputError(f"{place}: 'aperture' and 'obscuration' must have one decenter")
+        hole = Together(((hole, centers[1]),))
+    if isinstance(hole, Together) and len(hole.parts) == 1 and outline is None:
+        [(hole, center)] = hole.parts
+    elif isinstance(hole, Together):
+        # Its parts have centres of their own.
+        parts = tuple((part, (x - center[0], y - center[1])) for part, (x, y) in hole.parts)
+        hole = parts[0][0] if len(parts) == 1 and parts[0][1] == CENTRE else Together(parts)
     if edge is None:
         edge, window = window, None
         if isinstance(edge, Circle) and any(center):
@@ -102,24 +130,88 @@ def aperture_rows(aperture: ClearAperture) -> dict[str, Any]:
     else:
         outline = aperture.edge
     if outline is not None:
-        rows["aperture"] = vars(outline) | beside
-    if aperture.obscuration is not None:
-        rows["obscuration"] = vars(aperture.obscuration) | (beside if outline is None else {})
+        rows["aperture"] = outline.row() | beside
+    hole = aperture.obscuration
+    if isinstance(hole, Together):
+        parts = [_beside(part.row(), _absolute(at, aperture.center)) for part, at in hole.parts]
+        alone = len(parts) == 1 and not parts[0].keys().isdisjoint(_CENTER)
+        rows["obscuration"] = parts[0] if alone else parts
+    elif hole is not None:
+        rows["obscuration"] = hole.row() | (beside if outline is None else {})
     return rows
 
 
-def _outline(value: object, place: str) -> tuple[Outline, tuple[float, float]]:
-    """Return an outline, and the centre of it."""
+def _beside(row: dict[str, Any], center: tuple[float, ...]) -> dict[str, Any]:
+    """Return an outline's row with the place of its centre."""
+    return row | {key: value for key, value in zip(_CENTER, center, strict=True) if value}
+
+
+def _absolute(relative: tuple[float, float], center: tuple[float, float]) -> tuple[float, ...]:
+    """Return the place whose difference from a centre is this one to the last bit."""
+    found = []
+    for part, middle in zip(relative, center, strict=True):
+        guess = part + middle
+        near = (guess, math.nextafter(guess, -math.inf), math.nextafter(guess, math.inf))
+        found.append(next((x for x in near if x - middle == part), guess))
+    return tuple(found)
+
+
+def _obscuration(value: object, place: str) -> tuple[Outline, tuple[float, float]]:
+    """Return what is blocked, and the centre of it: that of the vertex where there are several."""
+    if not isinstance(value, list | tuple):
+        return _outline(value, _BLOCKING, place)
+    if not value:
+        raise InputError(f"{place}: is an empty list")
+    parts = [_outline(part, _BLOCKING, f"{place} {number}") for number, part in enumerate(value, 1)]
+    return Together(tuple(parts)), (0.0, 0.0)
+
+
+def _outline(
+    value: object, outlines: tuple[tuple[tuple[str, ...], type[Outline]], ...], place: str
+) -> tuple[Outline, tuple[float, float]]:
+    """Return an outline, one of some kinds, and the centre of it."""
     require_mapping(value, place)
-    check_keys(value, (*(key for keys, _ in _OUTLINES for key in keys), *_CENTER), place)
+    optional = [key for keys in _OPTIONAL.values() for key in keys if outlines is _BLOCKING]
+    known = dict.fromkeys((*(key for keys, _ in outlines for key in keys), *optional, *_CENTER))
+    check_keys(value, tuple(known), place)
     x, y = (as_number(value.get(key, 0.0), f"{place}: '{key}'") for key in _CENTER)
-    given = [(keys, make) for keys, make in _OUTLINES if any(key in value for key in keys)]
+    given = [entry for entry in outlines if any(key in value for key in entry[0])]
+    if len(given) > 1 and given[0][1] is Ring and "inner_semi_diameter" not in value:
+        given = given[1:]
+    elif given and given[0][1] is Ring:
+        given = [entry for entry in given if entry[1] is not Circle]
     if len(given) != 1:
-        raise InputError(
-            f"{place}: give one of {', '.join(' and '.join(keys) for keys, _ in _OUTLINES)}"
-        )
+        kinds = dict.fromkeys(" and ".join(keys) for keys, _ in outlines)
+        raise InputError(f"{place}: give one of {', '.join(kinds)}")
     keys, make = given[0]
     for key in keys:
         if value.get(key) is None:
             raise InputError(f"{place}: '{key}' is missing (mm)")
-    return make(*(as_number(value[key], f"{place}: '{key}'") for key in keys)), (x, y)
+    known = (*keys, *_OPTIONAL.get(make, ()))
+    check_keys(value, (*known, *_CENTER), place)
+    numbers = {key: value[key] for key in known if value.get(key) is not None}
+    try:
+        if make is Polygons:
+            return Polygons(_vertices(numbers["polygons"], f"{place}: 'polygons'")), (x, y)
+        return make(**{k: as_number(v, f"{place}: '{k}'") for k, v in numbers.items()}), (x, y)
+    except InputError as error:
+        message = str(error)
+        raise InputError(message if message.startswith(place) else f"{place}: {message}") from None
+
+
+def _vertices(value: object, place: str) -> tuple[tuple[tuple[float, float], ...], ...]:
+    """Return the vertices of polygons."""
+    found = as_numbers(value, place)
+    polygons = found if isinstance(found, list) else []
+    for polygon in polygons:
+        if not isinstance(polygon, list) or not all(
+            isinstance(vertex, list)
+            and len(vertex) == 2
+            and not any(isinstance(number, list) for number in vertex)
+            for vertex in polygon
+        ):
+            polygons = []
+            break
+    if not polygons:
+        raise InputError(f"{place}: must be a list of lists of vertices [x, y] (mm)")
+    return tuple(tuple((x, y) for x, y in polygon) for polygon in polygons)

@@ -26,6 +26,8 @@ from dolens.prescriptions.apertures import is_automatic
 _RIM = 16
 # Where nothing tells a size, mm.
 _UNKNOWN = 1.0
+# Of the light's height: a drawn semi-diameter below is not where the light is.
+_TINY = 0.01
 
 
 @torch.no_grad()
@@ -33,12 +35,13 @@ def set_automatic_semi_diameters(lens: Lens, prescription: Mapping[str, Any]) ->
     """Give the surfaces of a new lens the semi-diameters that its prescription leaves to the light.
 
     A surface that clips nothing is also drawn no farther than it reaches, whatever its prescription
-    says.
+    says, and where what it says is nothing beside the light, as far as the light goes.
     """
     rows = {str(n): row for n, row in prescription["surfaces"].items()}
     # The stop has its size from the pupil, and clips.
     others = [n for n in lens.surfaces if n in rows and n != str(lens.stop)]
     automatic = [n for n in others if is_automatic(rows[n])]
+    automatic += _too_small(lens, [n for n in others if n not in automatic])
     if automatic:
         heights = _paraxial_heights(lens)
         for n in automatic:
@@ -63,6 +66,18 @@ def set_common_semi_diameters(lenses: Sequence[Lens], numbers: Iterable[str]) ->
         largest = max(lens.surfaces[n].semi_diameter for lens in lenses)
         for lens in lenses:
             _resize(lens, n, largest)
+
+
+def _too_small(lens: Lens, numbers: Sequence[str]) -> list[str]:
+    """Return the surfaces that clip nothing and whose semi-diameter cannot be meant for the light:
+    programs give a tiny one to what is not to be drawn.
+    """
+    sizes = {n: surface.semi_diameter for n, surface in lens.surfaces.items()}
+    free = [n for n in numbers if not lens.surfaces[n].aperture.clips]
+    least = _TINY * max(sizes.values())
+    small = [n for n in free if sizes[n] < least]
+    heights = _paraxial_heights(lens) if small else {}
+    return [n for n in small if sizes[n] < _TINY * heights[n]]
 
 
 def _resize(lens: Lens, number: str, semi_diameter: float) -> None:

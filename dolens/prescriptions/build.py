@@ -10,7 +10,7 @@ A prescription is a mapping::
       '2': ...                  # the last surface has no thickness
     elements:                   # optional, see poses.py; rectangular apertures: see apertures.py
       '1': {surfaces: [1, 3], tilt_x: 0.1, decenter_y: 0.02}
-    sensor: {distance: 96.0, diameter: 1.7664}
+    sensor: {distance: 96.0, diameter: 1.7664}   # curved: see sensor_data.py
 
 Lengths are in mm; `radius: .inf` is a plane (some shapes have `radius_x` and `radius_y`);
 `material` is the medium behind the surface: `air`, `occluder`, a constant index (`1.5`), glass as
@@ -49,6 +49,7 @@ from dolens.prescriptions.checks import (
     as_numbers,
     require_mapping,
 )
+from dolens.prescriptions.curvatures import curvature_from, curvature_row, radius_key
 from dolens.prescriptions.deflections import (
     PHASE_KEY,
     is_paraxial_lens,
@@ -61,7 +62,7 @@ from dolens.prescriptions.field_data import set_object_fields
 from dolens.prescriptions.media import EXPANSION_KEY, environment_of, expansion_of, medium_of
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
-from dolens.prescriptions.radii import curvature_of, radius_key, radius_of_curvature
+from dolens.prescriptions.sensor_data import sensor_from, sensor_row
 from dolens.prescriptions.states import STATES_KEY, state_rows, with_states
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
@@ -87,7 +88,6 @@ _LENS_KEYS = (
 _SURFACE_KEYS = (
     *("type", "radius", *APERTURE_KEYS, PHASE_KEY, "thickness", "material", EXPANSION_KEY, "note"),
 )
-_SENSOR_KEYS = ("distance", "diameter")
 
 
 def lens_from_prescription(
@@ -119,10 +119,7 @@ def lens_from_prescription(
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     rows = _rows(prescription, where)
-    sensor = prescription.get("sensor")
-    if not isinstance(sensor, Mapping) or "distance" not in sensor:
-        raise InputError(f"{where}: 'sensor.distance' is missing (mm from the last surface)")
-    check_keys(sensor, _SENSOR_KEYS, f"{where}: sensor")
+    sensor = sensor_from(prescription, where)
     data = system_data(prescription, where)
     air = environment_of(prescription, where)
     surfaces, thicknesses, expansions = [], [], []
@@ -145,23 +142,21 @@ def lens_from_prescription(
             raise InputError(
                 f"{place}: the last surface has no 'thickness'; its gap is 'sensor.distance'"
             )
-    diameter = sensor.get("diameter")
     try:
         lens = Lens(
             surfaces,
             thicknesses,
-            as_number(sensor["distance"], f"{where}: 'sensor.distance'"),
-            materials,
-            as_integer(prescription.get("stop", 1), f"{where}: 'stop'"),
-            model.name,
-            name,
-            None if diameter is None else as_number(diameter, f"{where}: 'sensor.diameter'"),
-            dtype,
-            elements_from(prescription.get("elements"), dtype, where),
+            materials=materials,
+            stop=as_integer(prescription.get("stop", 1), f"{where}: 'stop'"),
+            index_model=model.name,
+            name=name,
+            dtype=dtype,
+            elements=elements_from(prescription.get("elements"), dtype, where),
             thermal_expansions=expansions,
             backend=backend,
             source=str(prescription.get("source") or ""),
             published=published_from(prescription.get(PUBLISHED_KEY), where),
+            **sensor,
             **data,
         )
         lens = set_object_fields(set_stop_semi_diameter(lens, prescription))
@@ -202,12 +197,7 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
                 row |= power_row(number_value)
                 continue
             if key in surface.curvatures:
-                radius = radius_key(key)
-                row[radius] = radius_of_curvature(number_value)
-                if 1.0 / row[radius] != number_value:
-                    # Rounding of 1/(1/c) loses a bit for some c: keep the parameter itself.
-                    del row[radius]
-                    row[key] = number_value
+                row |= curvature_row(key, number_value)
             else:
                 row[key] = number_value
         if surface.phase is not None:
@@ -218,9 +208,6 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
         if lens.thermal_expansions[int(number) - 1] is not None:
             row[EXPANSION_KEY] = lens.thermal_expansions[int(number) - 1]
         rows[number] = row
-    sensor: dict[str, Any] = {"distance": float(lens.sensor_distance.detach())}
-    if lens.sensor_diameter is not None:
-        sensor["diameter"] = lens.sensor_diameter
     return {
         "name": lens.name,
         **({"source": lens.source} if lens.source else {}),
@@ -231,7 +218,7 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
         **system_data_of(lens),
         "surfaces": rows,
         **({"elements": element_rows(lens.elements)} if len(lens.elements) else {}),
-        "sensor": sensor,
+        "sensor": sensor_row(lens),
     }
 
 
@@ -261,7 +248,7 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
             for key in names
             if key in row or key not in shape.optional
         }
-        values |= {name: curvature_of(row, name) for name in names if name in shape.curvatures}
+        values |= {name: curvature_from(row, name) for name in names if name in shape.curvatures}
         if "curvature" not in names and not math.isinf(
             as_number(row.get("radius", math.inf), "'radius'")
         ):

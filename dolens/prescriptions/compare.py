@@ -93,13 +93,24 @@ def _flat(prescription: Mapping[str, Any], medium: Callable[[str], str]) -> dict
                     ((f"surface {n}", k), v) for k, v in _row({"type": "sphere"} | {**row}).items()
                 )
         elif key == "sensor":
-            flat.update(((key, k), _plain(v)) for k, v in value.items() if v is not None)
+            flat.update(((key, k), v) for k, v in _sensor(value).items())
         elif value is not None and value not in ({}, [], ""):
             flat[(key,)] = _plain(value)
     if ("wavelengths",) in flat:
         flat.setdefault(("reference_wavelength",), flat[("wavelengths",)][0])
     # A constant index is a number in YAML and a name in a lens.
     return {k: medium(str(v)) if "material" in k[-1] else v for k, v in flat.items()}
+
+
+def _sensor(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sensor; a plane one has neither curvature nor conic constant."""
+    plain = _row({"type": "conic"} | {**row})
+    if not plain.get("curvature"):
+        plain = {key: value for key, value in plain.items() if key not in ("curvature", "conic")}
+    if not plain.get("conic"):
+        plain.pop("conic", None)
+    del plain["type"]
+    return plain
 
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:

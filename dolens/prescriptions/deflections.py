@@ -5,10 +5,11 @@ A surface of any shape may have a phase::
     '3': {type: sphere, radius: -80, ..., phase: {type: grating, grooves: 600, order: -1}}
     '4': {type: plane, ..., phase: {type: radial, norm_radius: 10, p2: -1133.35, p4: 341.9}}
     '5': {type: plane, ..., phase: {type: xy, norm_radius: 10, x: 12.5, x2y: 3.0}}
+    '6': {type: plane, ..., phase: {type: zernike_fringe, norm_radius: 10, z4: 0.5, z9: -0.1}}
 
 `grooves` are per mm, parallel to x.  Coefficients are radians of the first order, of
-(r/norm_radius)² and so on.  `order` is 1 and `norm_radius` 1 mm unless they are given.
-`efficiency`, from 0 to 1, is data.
+(r/norm_radius)² and so on; those of Zernike polynomials are waves.  `order` is 1 and `norm_radius`
+1 mm unless they are given.  `efficiency`, from 0 to 1, is data.
 
 An ideal lens is `{type: paraxial_lens, focal_length: 100}` (mm) or has its `power` (1/mm).
 """

@@ -190,8 +190,8 @@ def load_lens(
 def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None) -> None:
     """Write a lens in the format that the suffix names (.yaml, .yml, .txt or .zmx).
 
-    Reading it back gives the same parameters to the last bit.  YAML alone holds the numbers that
-    the lens's source publishes.
+    Reading it back gives the same parameters to the last bit.  YAML and JSON alone hold the numbers
+    that the lens's source publishes.
 
     Args:
         lens: as it is now.

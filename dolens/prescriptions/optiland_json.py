@@ -13,6 +13,7 @@ from dolens.errors import InputError
 from dolens.optics.glass_catalog import find_glass
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.json_values import difference, mapping, number, require_unset, rows
+from dolens.prescriptions.optiland_apertures import aperture_row
 from dolens.prescriptions.read_file import ReadPrescription
 
 _FIELDS = {
@@ -81,7 +82,7 @@ def _row(surface: dict[str, Any], stop: bool, before: str, place: str) -> dict[s
     row = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
     if row == {"type": "plane"} and stop and material == before:
         row = {"type": "aperture"}
-    return row | {"material": material} | _aperture(surface, place)
+    return row | {"material": material} | aperture_row(surface.get("aperture"), place)
 
 
 def _shape(geometry: dict[str, Any], place: str) -> dict[str, Any]:
@@ -139,19 +140,6 @@ def _medium(surface: dict[str, Any], place: str) -> str:
 
 def _first(value: object) -> object:
     return value[0] if isinstance(value, list) and len(value) == 1 else value
-
-
-def _aperture(surface: dict[str, Any], place: str) -> dict[str, Any]:
-    aperture = surface.get("aperture")
-    if aperture is None:
-        return {"semi_diameter": "auto"}
-    aperture = mapping(aperture, f"{place}: 'aperture'")
-    if aperture.get("type") not in ("RadialAperture", "ConfigurableRadialAperture"):
-        raise InputError(f"{place}: an aperture of type {aperture.get('type')!r} is not held")
-    row: dict[str, Any] = {"semi_diameter": number(aperture, "r_max", place)}
-    if number(aperture, "r_min", place, 0.0):
-        row["obscuration"] = {"semi_diameter": number(aperture, "r_min", place)}
-    return row
 
 
 def _position(surface: dict[str, Any], place: str) -> float:
@@ -246,4 +234,4 @@ def _image(surface: dict[str, Any], place: str) -> dict[str, float]:
     shape = _shape(mapping(surface.get("geometry"), f"{place}: 'geometry'"), place)
     if shape["type"] not in ("plane", "sphere", "conic"):
         raise InputError(f"{place}: an image of this shape is not held")
-    return {key: shape[key] for key in ("radius", "conic") if key in shape}
+    return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}

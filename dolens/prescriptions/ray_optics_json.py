@@ -71,7 +71,9 @@ def read_ray_optics(content: dict[str, Any], where: str) -> ReadPrescription:
     shape = _shape(image, profiles, f"{where}: the image")
     if shape["type"] not in ("plane", "sphere", "conic"):
         raise InputError(f"{where}: an image of this shape is not held")
-    prescription["sensor"] |= {key: shape[key] for key in ("radius", "conic") if key in shape}
+    prescription["sensor"] |= {
+        key: shape[key] for key in ("radius", "curvature", "conic") if key in shape
+    }
     return ReadPrescription(prescription, [])
 
 

@@ -26,7 +26,8 @@ each fills (`dolens.optics.fields.Vignetting`)::
              vignetting: [{}, {decenter_y: -0.05, compression_y: 0.3}]}
 
 A pupil closes the stop: its semi-diameter becomes the one whose paraxial image has that diameter
-at the reference wavelength, and stays what the prescription says where that is smaller.
+at the reference wavelength, and stays what the prescription says where that is smaller.  With
+`real_pupil: true` its rim is where the real marginal ray to the rim of that image crosses it.
 A lens has fields by angles or by heights on the object: those that a prescription gives by the
 image or the pupil are converted when the lens is built (`dolens.optics.image_heights`).
 """
@@ -41,6 +42,7 @@ import torch
 from dolens.errors import InputError
 from dolens.optics.image_heights import in_double_precision
 from dolens.optics.lens import Lens
+from dolens.optics.marginal_ray import real_marginal_height
 from dolens.optics.paraxial import matrix_to_stop
 from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 from dolens.prescriptions.apertures import is_automatic
@@ -56,6 +58,7 @@ SYSTEM_DATA_KEYS = (
     "object_distance",
     *PUPIL_KEYS,
     "telecentric_object",
+    "real_pupil",
     "temperature",
     "pressure",
 )
@@ -100,8 +103,9 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     if air["pressure"] is not None and air["pressure"] < 0.0:
         raise InputError(f"{where}: 'pressure' must not be negative, not {air['pressure']!r}")
     telecentric = prescription.get("telecentric_object", False)
-    if not isinstance(telecentric, bool):
-        raise InputError(f"{where}: 'telecentric_object' must be true or false")
+    for key in ("telecentric_object", "real_pupil"):
+        if not isinstance(prescription.get(key, False), bool):
+            raise InputError(f"{where}: '{key}' must be true or false")
     distance = prescription.get("object_distance")
     if distance is not None:
         distance = as_number(distance, f"{where}: 'object_distance'")
@@ -174,6 +178,8 @@ def set_stop_semi_diameter(lens: Lens, prescription: Mapping[str, Any]) -> Lens:
     target = as_positive(prescription[key], f"'{key}'")
     surface = lens.surfaces[str(lens.stop)]
     needed = _stop_for(key, target, exact)
+    if prescription.get("real_pupil", False) and math.isfinite(needed):
+        needed = real_marginal_height(exact, needed)
     if not (math.isfinite(needed) and needed > 0.0):
         raise InputError(f"'{key}' {prescription[key]!r}: no size of the stop makes this pupil")
     given = _stop_of(prescription, lens.stop).get("semi_diameter")

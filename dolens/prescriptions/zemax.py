@@ -33,7 +33,7 @@ UNREAD_OF_SURFACES = (
 # What describes the whole system: title, unit, air, aperture, fields, wavelengths.
 SYSTEM_OPERANDS = (
     *("MODE", "NAME", "NOTE", "UNIT", "GCAT", "ENVD"),
-    *("ENPD", "FNUM", "OBNA", "FLOA"),
+    *("ENPD", "FNUM", "OBNA", "FLOA", "RAIM"),
     *("FTYP", "XFLN", "YFLN", "XFLD", "YFLD", "FWGN", "FWGT", "FENF", "FEFD"),
     *("VDXN", "VDYN", "VCXN", "VCYN", "VANN", "ZVDX", "ZVDY", "ZVCX", "ZVCY", "ZVAN"),
     *("WAVM", "WAVL", "WAVN", "WWGT", "WWGN", "PWAV"),

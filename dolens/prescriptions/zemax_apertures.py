@@ -1,8 +1,11 @@
-"""Apertures of a Zemax surface are circles, rings, rectangles, ellipses, and obscurations.
+"""Apertures of a Zemax surface are circles, rings, rectangles, ellipses, polygons, obscurations.
 
-`CLAP` and `FLAP` are circles (the first may have an inner radius, an obscuration), `SQAP` is a
-rectangle of half widths, `ELAP` an ellipse; `OBSC`, `SQOB` and `ELOB` block such outlines.  A
-surface has one of them, and `OBDC` says where it is beside the vertex.
+`CLAP` and `FLAP` are circles (which may have an inner radius, an obscuration), `SQAP` is a
+rectangle of half widths, `ELAP` an ellipse; `OBSC`, `SQOB` and `ELOB` block such outlines, and
+`OBSC` with an inner radius blocks a ring.  `SPID` is a spider: the width of its arms and their
+number, the first along +x.  `USAP` and `USOB` are outlines that the user draws, whose corners
+`UDAD` lists (`zemax_drawn_outlines`).  A surface has one of them, and `OBDC` says where it is
+beside the vertex.
 
 `DIAM` is the semi-diameter that a surface is drawn to, and clips nothing, whether a user or Zemax
 has written it.  `DIAM 0`, or none, leaves the size to the light of the fields.
@@ -15,19 +18,17 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.checks import as_number
-from dolens.prescriptions.decimals import scaled
+from dolens.prescriptions.decimals import number_in_text, scaled
 from dolens.prescriptions.zemax import Line
+from dolens.prescriptions.zemax_drawn_outlines import polygon_lines, read_polygons
 
 Block = dict[str, list[Line]]
 
-_NOT_HELD = {
-    "SPID": "a spider, which blocks light with its arms,",
-    "USAP": "an aperture whose outline the user draws",
-    "USOB": "an obscuration whose outline the user draws",
-}
 _HALF_WIDTHS = ("half_width_x", "half_width_y")
 _SEMI_AXES = ("semi_axis_x", "semi_axis_y")
 _CENTER = ("decenter_x", "decenter_y")
+# A circle of this radius, mm, has no edge: Zemax's 1E+10 stands for infinity.
+_NO_EDGE = 1e9
 # Outlines of two numbers: what light passes, and what blocks it.
 _PASSED = {"SQAP": _HALF_WIDTHS, "ELAP": _SEMI_AXES}
 _BLOCKED = {"SQOB": _HALF_WIDTHS, "ELOB": _SEMI_AXES}
@@ -51,9 +52,6 @@ def read_apertures(
     Raises:
         InputError: an outline that a prescription does not hold.
     """
-    for operand, what in _NOT_HELD.items():
-        if operand in block:
-            raise InputError(f"{place}: {what} is not held ({operand})")
     center = [scaled(word, factor, f"{place}: OBDC") for word in _words(block, "OBDC")[:2]]
     beside = {key: value for key, value in zip(_CENTER, center, strict=False) if value}
     drawn = scaled((_words(block, "DIAM") or ["0"])[0], factor, f"{place}: DIAM")
@@ -68,18 +66,27 @@ def read_apertures(
     if "CLAP" in block:
         inner, outer = _pair(block, "CLAP", factor, place)
         hole = {"obscuration": {"semi_diameter": inner}} if inner else {}
+        if outer >= _NO_EDGE:
+            return found | (
+                {"obscuration": hole["obscuration"] | beside} if hole else {}
+            ), inner > 0
         if beside:
             outline = {"aperture": {"semi_diameter": outer} | beside}
             return (found if stop else {}) | outline | hole, True
         return {"semi_diameter": min(outer, drawn or outer) if stop else outer, **hole}, True
     if "OBSC" in block:
         inner, outer = _pair(block, "OBSC", factor, place)
-        if inner:
-            raise InputError(
-                f"{place}: a ring that blocks light between two circles is not held (OBSC)"
-            )
-        hole = {"obscuration": {"semi_diameter": outer} | beside} if outer else {}
+        ring = {"inner_semi_diameter": inner} if inner else {}
+        hole = {"obscuration": {**ring, "semi_diameter": outer} | beside} if outer else {}
         return found | hole, True
+    if "SPID" in block:
+        return found | {"obscuration": _spider(block, factor, place) | beside}, True
+    if "USAP" in block:
+        drawn_by_user = {"polygons": read_polygons(block, factor, f"{place}: USAP")}
+        return (found if stop else {}) | {"aperture": drawn_by_user | beside}, True
+    if "USOB" in block:
+        drawn_by_user = {"polygons": read_polygons(block, factor, f"{place}: USOB")}
+        return found | {"obscuration": drawn_by_user | beside}, True
     for operand, keys in _BLOCKED.items():
         if operand in block:
             sides = dict(zip(keys, _pair(block, operand, factor, place), strict=True))
@@ -87,10 +94,13 @@ def read_apertures(
     if "FLAP" in block:
         # A floating aperture is as large as the semi-diameter: an automatic one passes all light.
         inner, outer = _pair(block, "FLAP", factor, place)
-        if inner:
-            raise InputError(f"{place}: a floating aperture with a hole is not held (FLAP)")
+        hole = {"obscuration": {"semi_diameter": inner} | beside} if inner else {}
         if is_fixed(block) and (drawn or outer):
-            return {"semi_diameter": drawn or outer}, True
+            if beside:
+                outline = {"aperture": {"semi_diameter": drawn or outer} | beside}
+                return (found if stop else {}) | outline | hole, True
+            return {"semi_diameter": drawn or outer} | hole, True
+        return found | hole, bool(hole)
     return found, False
 
 
@@ -102,6 +112,10 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
     """
     size, outline = row.get("semi_diameter"), row.get("aperture") or {}
     hole = row.get("obscuration") or {}
+    if isinstance(hole, list | tuple):
+        if len(hole) != 1:
+            raise InputError(f"{place}: a .zmx file holds one obscuration a surface, not several")
+        hole = hole[0]
     clips = row.get("clips", size != AUTOMATIC) and size is not None and not outline
     center = [{**hole, **outline}.get(key, 0.0) for key in _CENTER]
     automatic = size in (None, AUTOMATIC)
@@ -110,15 +124,38 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
         for operand, keys in table.items():
             if all(key in given for key in keys):
                 lines.append(f"{operand} {' '.join(_text(given[key], place) for key in keys)}")
-    inner = _text(hole.get("semi_diameter", 0), place)
-    if clips or "semi_diameter" in outline:
+    if "polygons" in outline:
+        lines += ["USAP 0 0 0"]
+    elif "polygons" in hole:
+        lines += ["USOB 0 0 0"]
+    if "arms" in hole:
+        lines.append(f"SPID {_text(hole['width'], place)} {_text(hole['arms'], place)} 0")
+    ring = hole.get("inner_semi_diameter")
+    inner = _text(0 if ring else hole.get("semi_diameter", 0), place)
+    if ring:
+        lines.append(f"OBSC {_text(ring, place)} {_text(hole['semi_diameter'], place)} 0")
+    elif clips or "semi_diameter" in outline:
         outer = _text(size if clips else outline["semi_diameter"], place)
         lines.append(f"CLAP {inner} {outer} 0")
     elif inner != "0":
         lines.append(f"OBSC 0 {inner} 0")
     if any(float(as_number(value, place)) for value in center):
         lines.append(f"OBDC {' '.join(_text(value, place) for value in center)}")
+    drawn = outline.get("polygons") or hole.get("polygons")
+    if drawn:
+        lines += polygon_lines(drawn, place)
     return [f"  {line}" for line in lines]
+
+
+def _spider(block: Block, factor: Fraction, place: str) -> dict[str, float]:
+    """Return the arms of a spider."""
+    words = _words(block, "SPID")
+    if len(words) < 2:
+        raise InputError(f"{place}: SPID needs the width of the arms and their number")
+    arms = number_in_text(words[1], f"{place}: SPID")
+    if arms != int(arms) or arms < 1:
+        raise InputError(f"{place}: SPID: the number of arms must be whole, from 1, not {words[1]}")
+    return {"width": scaled(words[0], factor, f"{place}: SPID"), "arms": int(arms)}
 
 
 def is_fixed(block: Block) -> bool:

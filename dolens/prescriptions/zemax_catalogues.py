@@ -135,6 +135,16 @@ def may_have(known: str | None, name: str) -> bool:
     return known == "SCHOTT" and is_old_name(name)
 
 
+def may_have_another(known: str, name: str, glass: str) -> bool:
+    """Return whether a catalogue may have a glass of that name that differs from the one of another
+    catalogue.
+
+    Schott's own SSK4 had the nd and Vd of Sumita's: there either will do.
+    """
+    lost = _LOST.get(name.upper()) if known == "SCHOTT" else None
+    return may_have(known, name) and not (lost and _agrees(glass, lost))
+
+
 def _owner(name: str) -> str | None:
     """Return the only catalogue that gives a name, if it is a maker's own or a product's."""
     having = [catalogue for catalogue in makers_of(name) if catalogue != "PLASTIC"]

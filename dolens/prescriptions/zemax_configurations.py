@@ -148,8 +148,9 @@ def _refuse_other_structure(lens: dict[str, Any], there: dict[str, Any]) -> None
         for key in ("type", "material", "phase"):
             if row.get(key) != there["surfaces"][n].get(key):
                 raise InputError(f"surface {n}: it changes '{key}'")
-    if lens["sensor"].get("diameter") != there["sensor"].get("diameter"):
-        raise InputError("it changes the size of the image")
+    for key in (lens["sensor"].keys() | there["sensor"].keys()) - {"distance"}:
+        if lens["sensor"].get(key) != there["sensor"].get(key):
+            raise InputError(f"the image: it changes '{key}'")
 
 
 def _states(

@@ -1,7 +1,8 @@
 """TYPEs of a Zemax `.zmx` file that deflect light otherwise than by refraction alone.
 
 DGRATING is a plane, sphere or conic with straight grooves parallel to x: PARM 1 their number per
-µm, PARM 2 the order.
+µm, PARM 2 the order.  TOROGRAT is a toroid with such grooves: PARM 1 its radius of rotation, PARM 2
+and 3 as those.
 
 BINARY_1 and BINARY_2 are even aspheres (PARM 1 to 8: r² to r¹⁶) with a phase in radians, PARM 0
 times Σ A_i·E_i: of BINARY_2 the powers ρ², ρ⁴, ..., of BINARY_1 the monomials x, y, x², xy, y²,
@@ -9,11 +10,13 @@ times Σ A_i·E_i: of BINARY_2 the powers ρ², ρ⁴, ..., of BINARY_1 the mono
 on are the coefficients.
 
 PARAXIAL is an ideal lens: PARM 1 its focal length (in air), PARM 2 its OPD mode, which moves no
-ray.  Every mode is read as mode 0; see `dolens.optics.surfaces.ideal_lens`.
+ray: it says which conjugates its path differences are computed from.  Every mode is read as mode 0,
+and another one listed (`zemax_passed_over`); see `dolens.optics.surfaces.ideal_lens`.
 """
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -22,6 +25,7 @@ from dolens.optics.surfaces.xy_polynomial import monomial_powers
 from dolens.prescriptions.checks import as_integer, as_number
 from dolens.prescriptions.decimals import number_in_text, scaled, shifted
 from dolens.prescriptions.deflections import power_of
+from dolens.prescriptions.zemax_biconic_toroid import TOROID
 from dolens.prescriptions.zemax_block import NAMED_ZERO, SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_shape import Row, ZemaxShape
@@ -37,7 +41,7 @@ _ASPHERE_TERMS = range(1, 9)
 def _read_grating(block: SurfaceBlock) -> Row:
     grooves = scaled(block.parameters.get(1, "0"), Fraction(1000), f"{block.place}: PARM 1")
     return {
-        **_base(block),
+        **conic_base(block),
         "phase": {"type": "grating", "order": _order(block, 2), "grooves": grooves},
     }
 
@@ -49,7 +53,25 @@ def _write_grating(row: Mapping[str, Any], place: str) -> list[str]:
     return [*STANDARD.write(row, place), f"PARM 1 {shifted(grooves, -3)}", f"PARM 2 {order}"]
 
 
-def _base(block: SurfaceBlock) -> Row:
+def _read_toroidal_grating(block: SurfaceBlock) -> Row:
+    grooves = scaled(block.parameters.get(2, "0"), Fraction(1000), f"{block.place}: PARM 2")
+    own = [line for line in block.lines.get("PARM", []) if float(line.arguments[0]) == 1.0]
+    toroid = replace(block, lines={**block.lines, "PARM": own})
+    return {
+        **TOROID.read(toroid),
+        "phase": {"type": "grating", "order": _order(block, 3), "grooves": grooves},
+    }
+
+
+def _write_toroidal_grating(row: Mapping[str, Any], place: str) -> list[str]:
+    if any(key.startswith("a") and key[1:].isdigit() for key in row):
+        raise InputError(f"{place}: a .zmx file cannot hold a grating on an aspheric toroid")
+    grating = _write_grating({"phase": row["phase"]}, place)[-2:]
+    lines = (line.split() for line in grating)
+    return [*TOROID.write(row, place), *(f"PARM {int(n) + 1} {word}" for _, n, word in lines)]
+
+
+def conic_base(block: SurfaceBlock) -> Row:
     """Return a conic where CONI is given; a plane where CURV is `0`, without a decimal point."""
     if "CONI" in block.lines:
         conic = block.number("CONI")
@@ -73,7 +95,7 @@ def _asphere(block: SurfaceBlock) -> Row:
     words = [block.parameters.get(n, "0") for n in _ASPHERE_TERMS]
     if any(float(word) or word == NAMED_ZERO for word in words):
         return EVEN_ASPHERE.read(_without_order(block))
-    return _base(block)
+    return conic_base(block)
 
 
 def _without_order(block: SurfaceBlock) -> SurfaceBlock:
@@ -174,6 +196,14 @@ _BASES = ("plane", "sphere", "conic")
 
 GRATING = ZemaxShape(
     "DGRATING", _BASES, _read_grating, _write_grating, parameters=(1, 2), phase="grating"
+)
+TOROIDAL_GRATING = ZemaxShape(
+    "TOROGRAT",
+    ("toroid",),
+    _read_toroidal_grating,
+    _write_toroidal_grating,
+    parameters=(1, 2, 3),
+    phase="grating",
 )
 BINARY_1 = ZemaxShape(
     "BINARY_1",

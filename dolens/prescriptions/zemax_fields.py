@@ -123,6 +123,15 @@ def read_fields(
     return {"fields": fields}
 
 
+def is_axial(file: ZemaxFile, where: str) -> bool:
+    """Return whether all fields are on the axis."""
+    fields = read_fields(file, Fraction(1), True, where).get("fields", {})
+    points = next(
+        (fields[kind] for kind in (*FIELD_KINDS.values(), PUPIL_ANGLES) if kind in fields), []
+    )
+    return not any(value for point in points for value in point)
+
+
 def is_telecentric(file: ZemaxFile, where: str) -> bool:
     """Return whether the second number of FTYP asks for parallel chief rays in object space."""
     return _argument(file, 1, where) == 1

@@ -28,7 +28,7 @@ from dolens.prescriptions.zemax_catalogues import (
     Pair,
     index_and_abbe_number,
     known_catalogue,
-    may_have,
+    may_have_another,
     named_glass,
 )
 
@@ -131,7 +131,7 @@ def catalogue_line(materials: Sequence[object], where: str) -> list[str]:
         return []
 
     def must_precede(catalogue: str, word: str, other: str) -> bool:
-        return other in makers_of(word) or may_have(other, word)
+        return other in makers_of(word) or may_have_another(other, word, f"{catalogue}:{word}")
 
     order = catalogue_order(glasses, must_precede)
     if order is None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dolens.errors import InputError
 from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.zemax import Line, ZemaxFile
+from dolens.prescriptions.zemax_standard import JONES_MATRIX
 
 # Operands that a surface's block may hold, and what they are about.  They bend no ray.
 _OF_SURFACES = {
@@ -68,19 +69,42 @@ def passed_over(file: ZemaxFile) -> list[str]:
     for drawing, which all files have, are left out.
     """
     groups: dict[str, dict[str, None]] = {}
-    for operand, lines in file.passed_over.items():
+    aiming = {"RAIM": file.system["RAIM"]} if "RAIM" in file.system else {}
+    for operand, lines in (*aiming.items(), *file.passed_over.items()):
         says = _SAYS.get(operand, lambda line: True)
         group = _GROUP_OF.get(operand, _UNKNOWN)
         if group not in _SILENT and any(says(line) for line in lines):
             groups.setdefault(group, {})[operand] = None
+    for number, block in enumerate(file.surfaces):
+        if any(line.arguments[:1] == [JONES_MATRIX.type] for line in block.get("TYPE", [])):
+            groups.setdefault(f"polarization: the Jones matrix of surface {number}", {})
     for number in file.skipped:
         groups.setdefault(f"surface {number}, which the file leaves out", {})
-    for group in _behind_the_surfaces(file):
+    for group in (*_opd_modes(file), *_behind_the_surfaces(file)):
         groups.setdefault(group, {})
     return [
         f"{group} ({', '.join(operands)})" if operands else group
         for group, operands in groups.items()
     ]
+
+
+def _opd_modes(file: ZemaxFile) -> list[str]:
+    """Return which paraxial lenses have an OPD mode other than 0 (PARM 2).
+
+    It says what the paths of light through an ideal lens are computed from: conjugates found by a
+    real ray (0) or a paraxial one (3), infinite conjugates (2), or the phase of each ray (1).  It
+    turns no ray.
+    """
+    found = []
+    for number, lines in enumerate(file.surfaces):
+        kind = lines["TYPE"][-1].arguments[:1] if "TYPE" in lines else []
+        modes = [line for line in lines.get("PARM", []) if line.arguments[:1] == ["2"]]
+        if kind == ["PARAXIAL"] and modes and _number((*modes[-1].arguments, "0")[1]) != 0.0:
+            found.append(
+                f"surface {number}: the OPD mode of a paraxial lens, whose paths are here those "
+                "between its conjugates"
+            )
+    return found
 
 
 def _behind_the_surfaces(file: ZemaxFile) -> list[str]:

@@ -7,7 +7,8 @@ or METER.
 Everything else that bends rays is an error that names it.  What bends no ray is passed over, and
 listed (`zemax_passed_over`).
 
-Surfaces keep their numbers, but for those that the file says to ignore.  Only planes before the
+Surfaces keep their numbers, but for those that the file says to ignore, and behind one that has a
+tilt or decenter of its own, which becomes coordinate breaks around it.  Only planes before the
 image that neither refract nor clip are left out, and their gaps added to the sensor's distance.
 
 As in Zemax, apertures clip (CLAP, SQAP, and FLAP at a DIAM of the user's own), and a DIAM alone
@@ -25,15 +26,17 @@ from typing import Any
 from dolens.errors import InputError
 from dolens.optics.mirrors import MIRROR
 from dolens.prescriptions.apertures import AUTOMATIC
-from dolens.prescriptions.decimals import number_in_text
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
-from dolens.prescriptions.zemax_block import SurfaceBlock
+from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
 from dolens.prescriptions.zemax_configurations import read_configurations
+from dolens.prescriptions.zemax_fields import is_axial
 from dolens.prescriptions.zemax_glass import read_glass
+from dolens.prescriptions.zemax_own_air import refuse_own_air
+from dolens.prescriptions.zemax_own_axes import own_axes
 from dolens.prescriptions.zemax_passed_over import passed_over
 from dolens.prescriptions.zemax_shape import Row
 from dolens.prescriptions.zemax_shapes import shape_of_block
@@ -81,6 +84,7 @@ def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
     factor = factor_to_mm(file, where)
     medium, distance = _object(file, glass, factor, where)
     prescription = read_system(file, factor, distance is not None, where)
+    refuse_own_air(file, where)
     prescription["stop"] = 1
     prescription["object_material"] = medium
     pupil = not prescription.keys().isdisjoint(PUPIL_KEYS)
@@ -90,13 +94,21 @@ def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
             continue
         block = SurfaceBlock(lines, factor, f"{where}: surface {n}", medium)
         row, clips = _row(block, glass, pupil)
+        before, after = own_axes(block)
         # Behind a mirror, and behind a coordinate break, is the medium in front of it.
         if row.get("material", MIRROR.name) != MIRROR.name:
             medium = row["material"]
+        if before is not None:
+            rows.append(before | {"thickness": 0.0})
+            hard.append(False)
         rows.append(row)
         hard.append(clips)
         if block.stop:
             stops.append(len(rows))
+        if after is not None:
+            rows.append(after | {"thickness": row["thickness"]})
+            hard.append(False)
+            row["thickness"] = 0.0
     if len(stops) != 1:
         said = [n for n, lines in enumerate(file.surfaces) if "STOP" in lines]
         raise InputError(
@@ -137,7 +149,6 @@ def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, boo
         pupil: whether the file gives the pupil, which then sizes the stop.
     """
     shape = shape_of_block(block)
-    _refuse_own_axes(block)
     row: Row = {}
     aperture: Row = {}
     clips = False
@@ -189,20 +200,39 @@ def _with_sensor(
     """Leave out the planes before the image that do nothing; put the image where it is."""
     place = f"{where}: the image"
     block = SurfaceBlock(image, factor, place)
-    if block.type != "STANDARD" or block.curvature != 0.0:
-        raise InputError(f"{place}: must be a plane of TYPE STANDARD")
+    shape = _image_shape(block)
     gaps = [rows[-1].pop("thickness")]
     while len(rows) > 1 and len(rows) != prescription["stop"] and not hard[len(rows) - 1]:
         if not _is_dummy(rows[-1], _medium_behind(rows[:-1], prescription)):
             break
         rows.pop()
         gaps.append(rows[-1].pop("thickness"))
+    before, _ = own_axes(block)
+    if before is not None:
+        rows[-1]["thickness"], gaps = math.fsum(gaps), [0.0]
+        rows.append(before)
     sensor = {"distance": math.fsum(gaps)}
     size = read_apertures(image, factor, place)[0].get("semi_diameter")
     if is_fixed(image) and size != AUTOMATIC:
         sensor["diameter"] = 2.0 * size
+    sensor |= shape
     surfaces = {str(n): row for n, row in enumerate(rows, 1)}
     return {**prescription, "surfaces": surfaces, "sensor": sensor}
+
+
+def _image_shape(block: SurfaceBlock) -> dict[str, float]:
+    """Return radius and conic constant of a curved image; nothing of a plane."""
+    if block.type not in ("STANDARD", "EVENASPH"):
+        raise InputError(
+            f"{block.place}: an image of this shape is not held (TYPE {block.type}; allowed: "
+            "a plane, sphere or conic)"
+        )
+    if block.type == "EVENASPH" and any(float(word) for word in block.parameters.values()):
+        raise InputError(f"{block.place}: an aspheric image is not held (allowed: a conic)")
+    if block.curvature == 0.0:
+        return {}
+    conic = block.number("CONI")
+    return curvature_row(block.curvature) | ({"conic": conic} if conic else {})
 
 
 def _object(
@@ -211,8 +241,11 @@ def _object(
     """Return the medium before surface 1, and the object's distance, None for infinity."""
     place = f"{where}: the object"
     block = SurfaceBlock(file.surfaces[0], factor, place)
-    if block.type != "STANDARD" or block.curvature != 0.0:
+    # On the axis a curved object is where a plane is.
+    if block.type != "STANDARD" or (block.curvature != 0.0 and not is_axial(file, where)):
         raise InputError(f"{place}: must be a plane of TYPE STANDARD")
+    if any(own_axes(block)):
+        raise InputError(f"{place}: a decentred or tilted object is not held (SCBD)")
     medium = glass(block.words("GLAS"), place=place)
     words = block.words("DISZ")
     if not words or words[0].upper() == "INFINITY":
@@ -232,15 +265,6 @@ def _is_ignored(lines: Block) -> bool:
     HIDE.
     """
     return "HIDE" in lines and lines["HIDE"][-1].arguments[5:6] == ["1"]
-
-
-def _refuse_own_axes(block: SurfaceBlock) -> None:
-    """Refuse the decenters and tilts that a surface has among its properties (SCBD)."""
-    for line in block.lines.get("SCBD", []):
-        if any(number_in_text(w, f"{block.place}: SCBD") for w in line.arguments[3:]):
-            raise InputError(
-                f"{block.place}: a surface with its own decenter or tilt is not held (SCBD)"
-            )
 
 
 def _is_dummy(row: Row, before: str | None) -> bool:

@@ -13,9 +13,16 @@ from dolens.errors import InputError
 from dolens.prescriptions.zemax_biconic_toroid import BICONIC, TOROID
 from dolens.prescriptions.zemax_block import SurfaceBlock
 from dolens.prescriptions.zemax_coordinate_break import COORDINATE_BREAK
-from dolens.prescriptions.zemax_diffractive import BINARY_1, BINARY_2, GRATING, PARAXIAL
+from dolens.prescriptions.zemax_diffractive import (
+    BINARY_1,
+    BINARY_2,
+    GRATING,
+    PARAXIAL,
+    TOROIDAL_GRATING,
+)
 from dolens.prescriptions.zemax_even_asphere import EVEN_ASPHERE
 from dolens.prescriptions.zemax_grid_sag import GRID_SAG
+from dolens.prescriptions.zemax_irregular import IRREGULAR
 from dolens.prescriptions.zemax_polynomials import (
     EXTENDED_ASPHERE,
     EXTENDED_ODD_ASPHERE,
@@ -23,21 +30,18 @@ from dolens.prescriptions.zemax_polynomials import (
     ODD_ASPHERE,
 )
 from dolens.prescriptions.zemax_shape import ZemaxShape
-from dolens.prescriptions.zemax_standard import STANDARD
+from dolens.prescriptions.zemax_standard import JONES_MATRIX, STANDARD
 from dolens.prescriptions.zemax_tilted_plane import TILTED_PLANE
 from dolens.prescriptions.zemax_xy_polynomial import XY_POLYNOMIAL
 from dolens.prescriptions.zemax_zernike import ZERNIKE_FRINGE, ZERNIKE_STANDARD
+from dolens.prescriptions.zemax_zernike_phase import FRINGE_PHASE, STANDARD_PHASE
 
 # One line here makes a shape known to the reader and the writer.
 SHAPES: dict[str, ZemaxShape] = {
     shape.type: shape
     for shape in (
         *(STANDARD, EVEN_ASPHERE, TILTED_PLANE, XY_POLYNOMIAL, COORDINATE_BREAK),
-        *(PARAXIAL, GRATING, BINARY_1, BINARY_2),
-        STANDARD,
-        EVEN_ASPHERE,
-        TILTED_PLANE,
-        XY_POLYNOMIAL,
+        *(PARAXIAL, GRATING, TOROIDAL_GRATING, BINARY_1, BINARY_2),
         ODD_ASPHERE,
         EXTENDED_ASPHERE,
         EXTENDED_ODD_ASPHERE,
@@ -45,8 +49,12 @@ SHAPES: dict[str, ZemaxShape] = {
         TOROID,
         ZERNIKE_STANDARD,
         ZERNIKE_FRINGE,
+        FRINGE_PHASE,
+        STANDARD_PHASE,
+        IRREGULAR,
         FORBES,
         GRID_SAG,
+        JONES_MATRIX,
     )
 }
 # What the beginning of a TYPE means that no row holds: a file that has one is refused by this name.
@@ -63,7 +71,6 @@ _NOT_HELD = {
     "EGRATING": "an elliptical grating",
     "ELLIPGRA": "an elliptical grating",
     "FRESNEL": "a Fresnel surface",
-    "FZERNPHA": "a Zernike phase",
     "GENFRESN": "a Fresnel surface",
     "GRADIUM": "a gradient-index medium",
     "GRID_PHA": "a phase given on a grid",
@@ -71,8 +78,6 @@ _NOT_HELD = {
     "GRIDSAG": "a sag given on a grid",
     "GRINSU": "a gradient-index medium",
     "HOLOGRM": "a hologram",
-    "IRREGULA": "an irregular surface",
-    "JONESMAT": "a Jones matrix",
     "NONSEQCO": "a non-sequential component",
     "ODDCOSIN": "an odd cosine surface",
     "PARAX_XY": "a paraxial lens of two focal lengths",
@@ -82,7 +87,6 @@ _NOT_HELD = {
     "RETRO": "a retro-reflector",
     "SLIDE": "a slide (a picture that light passes)",
     "SUPERCON": "a superconic",
-    "SZERNPHA": "a Zernike phase",
     "TOROIDGR": "a toroidal grating",
     "TOROIDHO": "a toroidal hologram",
     "USERSURF": "a surface that a program of the user computes",

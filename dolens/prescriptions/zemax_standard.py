@@ -60,3 +60,6 @@ STANDARD = ZemaxShape(
     parameters=None,
     extra_data=None,
 )
+# A polarizer or retarder: its eight numbers change the light's polarization and bend no ray.  Its
+# plane is written as any other.
+JONES_MATRIX = ZemaxShape("JONESMAT", (), _read, _write, parameters=range(1, 9))

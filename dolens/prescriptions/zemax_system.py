@@ -6,6 +6,7 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.prescriptions.decimals import number_in_text, scaled
+from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import ZemaxFile
 from dolens.prescriptions.zemax_fields import is_telecentric, last, read_fields, read_wavelengths
 
@@ -49,7 +50,18 @@ def read_system(
         if not finite_object:
             raise InputError(f"{where}: FTYP: a telecentric object space needs a finite object")
         found["telecentric_object"] = True
+    elif _aims_real_rays(file) and not found.keys().isdisjoint(PUPIL_KEYS):
+        found["real_pupil"] = True
     return found | _air(file, where)
+
+
+def _aims_real_rays(file: ZemaxFile) -> bool:
+    """Return whether rays are aimed at the stop that the real marginal ray fills: RAIM x 2.
+
+    With RAIM x 0 and 1 the paraxial marginal ray fills it.
+    """
+    line = last(file, "RAIM")
+    return line is not None and line.arguments[1:2] == ["2"]
 
 
 def _pupil(file: ZemaxFile, factor: Fraction, finite_object: bool, where: str) -> dict[str, Any]:

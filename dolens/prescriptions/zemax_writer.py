@@ -15,6 +15,7 @@ from dolens.prescriptions.zemax_fields import FIELD_KINDS, PUPIL_ANGLES, VIGNETT
 from dolens.prescriptions.zemax_glass import catalogue_line, glass_line
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_shapes import shape_of_row
+from dolens.prescriptions.zemax_standard import conic_line, curvature_line
 from dolens.prescriptions.zemax_states import configurations_of
 
 _D_LINE = 587.5618
@@ -93,11 +94,19 @@ def _written(prescription: Mapping[str, Any], where: str) -> str:
     lines += [
         f"SURF {len(surfaces) + 1}",
         "  TYPE STANDARD",
-        "  CURV 0.0",
+        *_image_shape(sensor, where),
         "  DISZ 0",
         f'  DIAM {diameter / 2.0!r} {int(diameter > 0.0)} 0 0 1 ""',
     ]
     return "\n".join((*lines, ""))
+
+
+def _image_shape(sensor: Mapping[str, Any], where: str) -> list[str]:
+    """Write the curvature of the image, and its conic constant."""
+    if sensor.get("radius") is None and sensor.get("curvature") is None:
+        return ["  CURV 0.0"]
+    conic = [f"  {conic_line(sensor, f'{where}: sensor')}"] if sensor.get("conic") else []
+    return [f"  {curvature_line(sensor, f'{where}: sensor')}", *conic]
 
 
 _ALWAYS = ("wavelengths", "reference_wavelength", "fields")
@@ -129,6 +138,7 @@ def _system(prescription: Mapping[str, Any], surfaces: Mapping[str, Any], where:
         _air(prescription, where),
         "GFAC 0 0",
         *catalogue_line(materials, where),
+        *(["RAIM 0 2 1 1 0 0 0 0 0"] if prescription.get("real_pupil") else []),
         *_fields(prescription, len(waves), where),
         *(
             f"WAVM {i} {shifted(wave, -3)} {_text(weight, where)}"

@@ -1,12 +1,12 @@
 """Chief-ray maps: distortion and lateral colour of a sensor's pixels, as smooth functions."""
 
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from dolens.cached_tensors import cached_tensors
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.plane_points import chief_ray_points
 from dolens.sensor.pixels import Sensor
@@ -128,7 +128,7 @@ def chebyshev_points(order: int) -> Tensor:
     return -torch.cos(angle)
 
 
-@cache
+@cached_tensors()
 def _to_coefficients(order: int) -> Tensor:
     """(order, order): from values at the points to coefficients."""
     return torch.linalg.inv(_at(chebyshev_points(order), order))

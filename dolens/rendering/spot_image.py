@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from dolens.errors import InputError
 from dolens.optics.elements import from_lens_axes, to_lens_axes
 from dolens.optics.rays import Components
-from dolens.optics.straight import require_refracting
+from dolens.optics.straight import require_plane_sensor, require_refracting
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.rendering.binning import bin_rays
@@ -104,6 +104,7 @@ class SpotImager:
                 rays aim at.
         """
         require_refracting(system, "images of point sources")
+        require_plane_sensor(system, "images of point sources")
         options = {"dtype": system.dtype, "device": system.device}
         grid = torch.zeros(self.sensor.height, self.sensor.width, **options)
         sums = torch.zeros(3, **options)

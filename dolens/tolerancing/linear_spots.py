@@ -11,6 +11,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
 from dolens.optics.jacobian import ray_jacobian
 from dolens.optics.lens import Lens
+from dolens.optics.straight import require_plane_sensor
 from dolens.tolerancing.through_focus import FocusCurves
 
 
@@ -76,9 +77,11 @@ def linear_spots(lens: Lens, spots: SpotRays, names: Sequence[str]) -> LinearSpo
         names: of the parameters, each a single number; the order is kept.
 
     Raises:
-        InputError: rays that stand for mirror images, or that do not pass the lens.
+        InputError: rays that stand for mirror images, or that do not pass the lens, or a curved
+            sensor.
     """
     check_whole_pupil(spots)
+    require_plane_sensor(lens.system(), "tolerances")
     # Rays are straight behind the lens: their points on a second sensor give the tangents exactly.
     behind = copy.deepcopy(lens)
     with torch.no_grad():

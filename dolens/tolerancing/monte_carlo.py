@@ -13,6 +13,7 @@ from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
+from dolens.optics.straight import require_plane_sensor
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.tolerancing.linear_spots import check_whole_pupil
 from dolens.tolerancing.through_focus import FocusCurves
@@ -69,6 +70,7 @@ def trace_perturbed(
         InputError: a lens in single precision, or rays that stand for mirror images.
     """
     check_whole_pupil(spots)
+    require_plane_sensor(lens.system(), "tolerances")
     if lens.dtype != torch.float64:
         raise InputError(f"lens_dtype: tolerances need float64, not {lens.dtype}")
     nominal = {name: parameter.detach() for name, parameter in lens.variables(names).items()}

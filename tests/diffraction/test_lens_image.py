@@ -15,6 +15,7 @@ from dolens.diffraction.point_spread import diffraction_encircled_energy, point_
 from dolens.diffraction.transfer import diffraction_modulation
 from dolens.diffraction.wavefront_error import wavefront_errors
 from dolens.errors import InputError
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.prescriptions import lens_from_prescription
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.relative_illumination import relative_illumination as by_pixels
@@ -67,6 +68,39 @@ def test_mtf_of_a_perfect_lens_is_the_diffraction_limit(perfect):
     expected = diffraction_limited_transfer(frequency, WAVE, F_NUMBER)
     for curve in (found.tangential, found.sagittal, found.tangential_limit):
         np.testing.assert_allclose(curve[0], expected, atol=2e-3)
+
+
+def overlap(a, b, distance):
+    """The area that two discs share (Weisstein, "Circle-circle intersection", equation 14)."""
+    if distance <= abs(a - b):
+        return math.pi * min(a, b) ** 2
+    if distance >= a + b:
+        return 0.0
+    first = (distance**2 + a**2 - b**2) / (2.0 * distance)
+    second = distance - first
+    return sum(
+        r * r * math.acos(d / r) - d * math.sqrt(r * r - d * d)
+        for r, d in ((a, first), (b, second))
+    )
+
+
+def test_mtf_of_an_obscured_pupil_is_o_neill_s():
+    """The autocorrelation of a ring, O'Neill, J. Opt. Soc. Am. 46, 285 (1956): with the share ε
+    of the radius that is blocked, (A(1, 1) - 2·A(1, ε) + A(ε, ε))/(π·(1 - ε²)).
+    """
+    inner = 1.0
+    share = brentq(lambda sine: hyperbola_height(sine, 50.0) - inner, 0.005, 0.1) / SINE
+    lens = hyperbola(50.0, ClearAperture(Circle(2.5), Circle(inner)))
+    frequency = torch.linspace(0.0, 190.0, 20, dtype=torch.float64)
+    found = diffraction_modulation(lens, AXIS, [WAVE], frequency)
+    shear = (2.0 * frequency * WAVE * 1e-6 * F_NUMBER).tolist()
+    expected = [
+        (overlap(1.0, 1.0, d) - 2.0 * overlap(1.0, share, d) + overlap(share, share, d))
+        / (math.pi * (1.0 - share**2))
+        for d in shear
+    ]
+    np.testing.assert_allclose(found.tangential[0], expected, atol=3e-3)
+    np.testing.assert_allclose(found.sagittal[0], expected, atol=3e-3)
 
 
 def test_defocus_lowers_the_strehl_ratio_by_its_sinc():

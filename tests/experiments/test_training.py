@@ -258,10 +258,10 @@ def test_the_paper_scale_composes_and_runs_two_steps(composed, tmp_path):
         pixels = generator.integers(0, 256, (340, 360, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(images / f"{i}.png")
     # The perceptual term is required; random features stand in for the 500 MB of real ones.
-    from torchvision.models import vgg16
+    from torchvision.models.vgg import cfgs, make_layers
 
     with torch.random.fork_rng():
-        features = vgg16().features[:15].state_dict()
+        features = make_layers(cfgs["D"])[:15].state_dict()
     weights = {f"features.{name}": value for name, value in features.items()}
     torch.save(weights, tmp_path / "vgg16.pth")
     run(

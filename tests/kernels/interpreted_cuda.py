@@ -18,9 +18,10 @@ from tests.kernels.trace_cases import (
     traced,
 )
 
-# Every kind of surface; some of them backward too, where no code of its own is left to try.
-CASES = [(name, 1.0) for name in LENSES] + [
-    (name, -1.0) for name in ("posed", "polynomial", "clipped", "mirrors", "folded")
+# Every kind of surface; some of them backward too, where no code of its own is left to try.  The
+# Nikon lens, of spheres and even aspheres, has no kind of its own, and takes longest.
+CASES = [(name, 1.0) for name in LENSES if name != "nikon"] + [
+    (name, -1.0) for name in ("posed", "polynomial", "clipped", "figures", "mirrors", "folded")
 ]
 SINGLE = ["cooke_triplet", "polynomial", "even_aspheres"]
 

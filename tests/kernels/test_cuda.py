@@ -32,7 +32,8 @@ def python(root, *arguments, **environment):
 @compiled
 def test_in_tritons_interpreter_the_kernels_are_the_reference(root):
     """`tests/kernels/interpreted_cuda.py`, in a process where Triton was told before it came up."""
-    tests = ["tests/kernels/interpreted_cuda.py", "-q", "--tb=short", "-p", "no:cacheprovider"]
+    options = ("-n", "0", "-q", "--tb=short", "-p", "no:cacheprovider")
+    tests = ["tests/kernels/interpreted_cuda.py", *options]
     run = python(root, "-m", "pytest", *tests, TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
     assert run.returncode == 0, run.stdout[-20000:] + run.stderr[-5000:]
     assert " passed" in run.stdout
@@ -102,6 +103,8 @@ LENSES = {
     "aspheres": (SPHERES, (EvenAsphere,)),
     "posed plates": (SPHERES | 1 << Kind.CHANGE_AXES | 1 << Kind.LENS_AXES, (XYPolynomial,)),
     "a surface of a user's own": (SPHERES, (Paraboloid,)),
+    # The bit behind those of the kinds of step: see `dolens.kernels.cuda.layout`.
+    "apertures made of figures": (SPHERES | 1 << Kind.BY_SAG, ()),
     "polynomials by recurrence": (SPHERES, (ZernikeStandard,)),
 }
 
@@ -115,6 +118,7 @@ LENSES = {
         ("posed plates", torch.float32),
         ("aspheres", torch.float64),
         ("a surface of a user's own", torch.float32),
+        ("apertures made of figures", torch.float32),
         ("polynomials by recurrence", torch.float64),
     ],
 )

@@ -10,7 +10,7 @@ import torch
 from dolens import Rays, load_lens
 from dolens.optics.surfaces import register_surface, unregister_surface
 from dolens.optics.surfaces.spline_basis import clamped_knots
-from dolens.prescriptions import lens_from_prescription
+from dolens.prescriptions import lens_from_prescription, prescription_of
 from tests.kernels.own_surface.paraboloid import Paraboloid
 
 F64 = torch.float64
@@ -205,6 +205,28 @@ def _clipped():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
 
 
+def _figures():
+    """A pentagon, which is not convex, with a hole, and what blocks a circle in several ways."""
+    pentagon = [[-3.0, -2.0], [3.0, -2.0], [0.5, 0.0], [2.5, 2.5], [-2.5, 2.5]]
+    hole = [[-1.0, 0.5], [-0.5, 0.5], [-0.75, 1.25]]
+    front = {"type": "sphere", "radius": 40.0, "semi_diameter": 6.0,
+             "aperture": {"polygons": [pentagon, hole], "decenter_x": 0.25}}  # fmt: skip
+    blocked = [
+        {"semi_diameter": 0.4},
+        {"width": 0.2, "arms": 3, "angle": 30.0},
+        {"inner_semi_diameter": 1.5, "semi_diameter": 1.7, "decenter_x": 0.2},
+        {"half_width_x": 0.3, "half_width_y": 0.2, "decenter_y": -1.0},
+        {"semi_axis_x": 0.3, "semi_axis_y": 0.5, "decenter_x": 1.0},
+        {"polygons": [[[-1.5, 0.5], [-1.0, 0.5], [-1.25, 1.5]]]},
+    ]
+    surfaces = {
+        "1": {"thickness": 3.0, "material": _GLASS, **front},
+        "2": {"type": "conic", "radius": -90.0, "conic": -1.0, "semi_diameter": 5.0,
+              "material": "air", "obscuration": blocked},
+    }  # fmt: skip
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 60.0}})
+
+
 def _diffractive():
     """A radial phase on an asphere and an XY phase on a conic, and an ideal lens behind them."""
     front = {"type": "even_asphere", "radius": 30.0, "conic": -0.8, "a4": 2e-5, "phase": {
@@ -221,6 +243,21 @@ def _diffractive():
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 25.0}})
 
 
+def _zernike_phases():
+    """Zernike phases in both orders, of a plane and of a sphere that refracts."""
+    front = {"type": "plane", "thickness": 2.0, "phase": {
+        "type": "zernike_fringe", "norm_radius": 4.0, "z2": 4.0, "z4": 12.0, "z5": -3.0, "z6": 2.0,
+        "z8": 1.5, "z9": -2.0, "z11": 0.4, "z37": 0.1}}  # fmt: skip
+    back = {"type": "sphere", "radius": -40.0, "phase": {
+        "type": "zernike_standard", "order": 2, "norm_radius": 6.0, "z3": 3.0, "z7": -0.5,
+        "z14": 0.3, "z22": 0.2, "z91": 0.01}}  # fmt: skip
+    surfaces = {
+        "1": {"semi_diameter": 4.0, "material": _GLASS, **front},
+        "2": {"semi_diameter": 5.0, "material": "air", **back},
+    }
+    return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": 70.0}})
+
+
 def _spectrometer():
     """A grating that transmits, one on a concave mirror, whose higher orders vanish, and an ideal
     lens that the light comes back to.
@@ -234,6 +271,26 @@ def _spectrometer():
               "material": "air"},
     }  # fmt: skip
     return lens_from_prescription({"surfaces": surfaces, "sensor": {"distance": -20.0}})
+
+
+def _retina():
+    """A lens out of place in front of a deep sphere, whose rim some rays miss."""
+    front = {"type": "sphere", "radius": 12.0, "semi_diameter": 5.0, "thickness": 3.0,
+             "material": _GLASS}  # fmt: skip
+    back = {"type": "sphere", "radius": -12.0, "semi_diameter": 5.0, "material": "air"}
+    return lens_from_prescription({
+        "surfaces": {"1": front, "2": back},
+        "elements": {"1": {"surfaces": [1, 2], "tilt_x": 4.0, "tilt_y": -3.0, "decenter_x": 0.3}},
+        "sensor": {"distance": 9.0, "radius": -1.6},
+    })  # fmt: skip
+
+
+def _folded_film():
+    """The folded lens with a conic for a sensor, behind its last break."""
+    row = prescription_of(_folded())
+    return lens_from_prescription(
+        row | {"sensor": {"distance": 12.0, "radius": -15.0, "conic": -0.6}}
+    )
 
 
 def _plate(root):
@@ -264,11 +321,15 @@ LENSES = {
     "forbes": lambda root: _forbes(),
     "grid": lambda root: _grid(),
     "clipped": lambda root: _clipped(),
+    "figures": lambda root: _figures(),
     "own_surface": lambda root: _own_surface(),
     "diffractive": lambda root: _diffractive(),
+    "zernike_phases": lambda root: _zernike_phases(),
     "spectrometer": lambda root: _spectrometer(),
     "mirrors": lambda root: _mirrors(),
     "folded": lambda root: _folded(),
+    "retina": lambda root: _retina(),
+    "folded_film": lambda root: _folded_film(),
 }
 
 

@@ -51,6 +51,14 @@ def test_states_are_listed_and_shown():
     assert rows["thicknesses.5"] == ("1.65", "9.04", "18.89")
 
 
+def test_long_lists_of_coefficients_stay_within_the_terminal():
+    """An odd asphere of eight coefficients is a list that goes on in further lines."""
+    found = show("published/mobile_us7535658_odd")
+    assert max(map(len, found.output.splitlines())) <= 110
+    assert "a4=0.02426, a6=0.0008371" in found.output
+    assert "A semi-diameter in brackets clips nothing." in " ".join(found.output.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

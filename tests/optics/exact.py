@@ -110,6 +110,11 @@ def trace(lens, values, origin, direction, wavelength, near=None):
     if sense * d[2] <= 0:
         return MISSED, len(lens.surfaces) + 1, None, None, None
     t = -p[2] / d[2]
+    if "sensor_curvature" in values:
+        own = {n: values[f"sensor_{n}"] for n in ("curvature", "conic") if f"sensor_{n}" in values}
+        t, _, _ = _meet("conic", own, None, p, d, None, sense)
+        if t is None:
+            return MISSED, len(lens.surfaces) + 1, None, None, None
     p = p + t * d
     p[2] += mp.fsum(v for k, v in values.items() if k.startswith("thicknesses."))
     p[2] += values["sensor_distance"]

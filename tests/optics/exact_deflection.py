@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dolens.optics.surfaces.xy_polynomial import monomial_powers
+from dolens.optics.surfaces.zernike_terms import fringe, noll
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,14 @@ def _phase_path(at, number):
                 for name, a in p.items()
             )
         )
+    if phase.type.startswith("zernike"):
+        term = fringe if phase.type == "zernike_fringe" else noll
+        return lambda x, y: (
+            order
+            * at.wavelength
+            * mp.fsum(a * _zernike(mp, term(int(name[1:])), x / radius, y / radius)
+                      for name, a in p.items())
+        )  # fmt: skip
     powers = {name: monomial_powers(name) for name in p}
     return lambda x, y: (
         scale
@@ -86,6 +95,20 @@ def _phase_path(at, number):
             for name, a in p.items()
         )
     )
+
+
+def _zernike(mp, term, u, v):
+    """norm · R_n^m(ρ) · cos(mφ) or sin(mφ), less its value at the centre, by the sum of powers."""
+    n, m, sine, _ = term
+    rho, phi = mp.sqrt(u**2 + v**2), mp.atan2(v, u)
+    radial = mp.fsum(
+        (-1) ** s * mp.factorial(n - s) * rho ** (n - 2 * s)
+        / (mp.factorial(s) * mp.factorial((n + m) // 2 - s) * mp.factorial((n - m) // 2 - s))
+        for s in range((n - m) // 2 + 1)
+    )  # fmt: skip
+    norm = 1 if term.norm == 1.0 else mp.sqrt((n + 1) * (2 if m else 1))
+    centre = (-1) ** (n // 2) if m == 0 else 0
+    return norm * (radial * (mp.sin(m * phi) if sine else mp.cos(m * phi)) - centre)
 
 
 def _ideal_lens(at, point, direction):

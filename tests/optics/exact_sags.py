@@ -4,6 +4,7 @@ Zernike polynomials come from their factorial sums and the angle, Q_con from the
 Jacobi polynomials, Q_bfs from the orthogonality of slopes: nothing here is dolens's recurrence.
 """
 
+import math
 from functools import lru_cache
 
 import mpmath
@@ -61,13 +62,16 @@ def _toroid(p, x, y):
 
 def _radial(n, m, rho):
     """R_n^m by its factorial sum (Born and Wolf, 9.2.1)."""
-    return mp.fsum(
-        (-1) ** s
-        * mp.factorial(n - s)
-        / (mp.factorial(s) * mp.factorial((n + m) // 2 - s) * mp.factorial((n - m) // 2 - s))
-        * rho ** (n - 2 * s)
-        for s in range((n - m) // 2 + 1)
-    )
+    return rho**m * mp.polyval(_radial_coefficients(n, m), rho**2)
+
+
+@lru_cache(maxsize=512)
+def _radial_coefficients(n, m):
+    """Of falling powers of ρ², from (n - m)/2 to 0: whole numbers."""
+    half, f = (n - m) // 2, math.factorial
+    return [
+        (-1) ** s * f(n - s) // (f(s) * f((n + m) // 2 - s) * f(half - s)) for s in range(half + 1)
+    ]
 
 
 @lru_cache(maxsize=512)
@@ -135,9 +139,13 @@ def _q_con(p, x, y):
 
 def q_con_polynomial(m, q):
     """P_m^(0, 4)(2q - 1) as the sum over powers of q - 1 (Abramowitz and Stegun 22.5.42)."""
-    return mp.fsum(
-        mp.binomial(m, s) * mp.binomial(m + s + 4, s) * (q - 1) ** s for s in range(m + 1)
-    )
+    return mp.polyval(_jacobi_coefficients(m), q - 1)
+
+
+@lru_cache(maxsize=64)
+def _jacobi_coefficients(m):
+    """Of falling powers of q - 1: whole numbers."""
+    return [math.comb(m, s) * math.comb(m + s + 4, s) for s in range(m, -1, -1)]
 
 
 def _q_bfs(p, x, y):

@@ -269,6 +269,16 @@ CASES: dict[str, HardCase] = {
         rays=[((3.0, -4.0, -5.0), at_angle(20.0, 50.0)), ((-2.0, 6.0, -5.0), AXIAL)],
         object_material=GLASS,
     ),
+    "Zernike phases of radial orders 6 and 8 on a plane and a mirror": HardCase(
+        [surface("plane", semi_diameter=9.0, material="air", thickness=8.0,
+                 phase={"type": "zernike_standard", "order": -2, "norm_radius": 9.0, "z4": 40.0,
+                        "z6": -20.0, "z7": 11.0, "z22": 7.0}),
+         surface("conic", radius=-90.0, conic=-3.0, semi_diameter=12.0, material="mirror",
+                 phase={"type": "zernike_fringe", "norm_radius": 10.0, "z3": 30.0, "z5": -9.0,
+                        "z25": 0.5})],
+        rays=[((3.0, -4.0, -5.0), at_angle(8.0, 50.0)), ((-2.0, 6.0, -5.0), AXIAL)],
+        sensor=-20.0,
+    ),
     "an ideal lens in glass at 60°": HardCase(
         [surface(radius=30.0, thickness=5.0),
          surface("paraxial_lens", focal_length=25.0, thickness=5.0, material="1.7"),

@@ -40,6 +40,20 @@ def glass(figure):
     return {patch.get_gid(): patch.get_path() for patch in figure.axes[0].patches}
 
 
+def test_a_surface_that_clips_nothing_is_drawn_as_far_as_light_is_expected():
+    row = {"type": "sphere", "radius": 40.0, "semi_diameter": 6.0, "clips": False}
+    prescription = {
+        "surfaces": {
+            "1": {**row, "thickness": 3.0, "material": "1.5"},
+            "2": {**row, "material": "air"},
+        },
+        "sensor": {"distance": 90.0},
+    }
+    z, y = surface_profile(lens_from_prescription(prescription).system(), 1)
+    np.testing.assert_allclose(y[[0, -1]], [-6.0, 6.0], rtol=1e-12)
+    assert z[-1] == pytest.approx(40.0 - math.sqrt(40.0**2 - 6.0**2), rel=1e-12)
+
+
 @pytest.mark.parametrize("name", LENSES)
 def test_every_lens_is_drawn_to_its_rims_with_its_rays(lens, name):
     one = lens(name)
@@ -328,3 +342,40 @@ def test_a_tilted_element_s_edges_run_along_its_own_axis():
         assert math.degrees(math.atan2(dy, dz)) == pytest.approx(-20.0, abs=1e-9)
     [blocked] = [line.get_xydata() for line in axes.lines if line.get_gid() == "obscuration"]
     assert np.linalg.norm(blocked[-1] - blocked[0]) == pytest.approx(4.0, rel=1e-12)
+
+
+def obscured_window(**aperture):
+    """A glass plate whose front has an aperture, 40 mm in front of the sensor."""
+    front = {"radius": 50.0, "thickness": 2.0, "material": "1.5168/64.17", **aperture}
+    back = {"type": "plane", "semi_diameter": 12.0, "material": "air"}
+    return lens_from_prescription({"surfaces": {"1": front, "2": back}, "sensor": {"distance": 40}})
+
+
+@pytest.mark.parametrize(
+    "obscuration, heights",
+    [
+        ({"inner_semi_diameter": 3.0, "semi_diameter": 4.0}, [(-4.0, -3.0), (3.0, 4.0)]),
+        # One arm lies along +y, the two others pass x = 0 at the centre, under it.
+        ({"width": 1.0, "arms": 3, "angle": 90.0}, [(-0.5 / math.cos(math.pi / 6), 10.0)]),
+        (
+            [{"semi_diameter": 2.0}, {"half_width_x": 1.0, "half_width_y": 0.5, "decenter_y": 6.0}],
+            [(-2.0, 2.0), (5.5, 6.5)],
+        ),
+        ({"polygons": [[[-1.0, -3.0], [1.0, -3.0], [0.0, -1.0]]]}, [(-3.0, -1.0)]),
+    ],
+)
+def test_the_section_shows_what_blocks_light_in_its_plane(obscuration, heights):
+    lens = obscured_window(semi_diameter=10.0, obscuration=obscuration)
+    axes = layout_figure(lens).axes[0]
+    blocked = [line.get_xydata() for line in axes.lines if line.get_gid() == "obscuration"]
+    found = sorted((line[:, 1].min(), line[:, 1].max()) for line in blocked)
+    np.testing.assert_allclose(found, heights, atol=1e-6)
+    for line in blocked:
+        sag = 50.0 - np.sqrt(2500.0 - line[:, 1] ** 2)
+        np.testing.assert_allclose(line[:, 0], sag, atol=1e-9)
+
+
+def test_a_polygon_s_section_reaches_from_its_lowest_side_to_its_highest():
+    lens = obscured_window(aperture={"polygons": [[[-8.0, -3.0], [8.0, -3.0], [0.0, 7.0]]]})
+    _, y = surface_profile(lens.system(), 1)
+    assert (y.min(), y.max()) == pytest.approx((-3.0, 7.0), abs=1e-6)

@@ -8,7 +8,9 @@ from tests.prescriptions.samples import require_refused
 
 LAST = "S -50 40\n CIR 5"
 REFUSED = {
-    "S 50 4 517.642\n STO\n SPS ODD": "an odd asphere is not held (SPS ODD)",
+    "S 50 4 517.642\n STO\n SPS QCN": "a Forbes asphere (Q_con) is not held (SPS QCN)",
+    "S 50 4 517.642\n STO\n SPS ODD 5.0": "an odd asphere with a radius of normalisation",
+    "S 50 4 517.642\n STO\n SPS ODD; SCO C32 1e-9": "SCO C32 of SPS ODD is not held",
     "S 50 4 517.642\n STO\n XTO": "a toroid is not held",
     "S 50 4 517.642\n DIF HOE": "a diffractive surface of this kind is not held (DIF HOE R",
     "S 50 4 517.642\n SPS XYP; SCO C4 1": "a polynomial in x and y on a curved surface",

@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from dolens import load_lens, save_lens
 from dolens.prescriptions.json_lenses import json_of, read_json
 from tests.prescriptions.samples import SINGLET, require_refused
 
@@ -209,3 +210,46 @@ def test_what_is_not_held_is_refused_by_name(content, said, tmp_path):
 )
 def test_hostile_json_ends_in_one_line(text, said, tmp_path):
     require_refused(tmp_path / "lens.json", text, said)
+
+
+def test_what_a_source_publishes_and_draws_comes_back(tmp_path):
+    """Published numbers and obscurations are kept in JSON as in YAML."""
+    lens = load_lens("published/ritchey_chretien_hst")
+    for suffix in (".json", ".yaml"):
+        save_lens(lens, tmp_path / f"lens{suffix}")
+        again = load_lens(tmp_path / f"lens{suffix}")
+        assert again.published == lens.published
+        assert again.surfaces["1"].aperture.obscuration.semi_diameter == 396.0
+        assert again.source == lens.source
+
+
+CIRCLE = {"type": "RadialAperture", "r_max": 10.0, "r_min": 0.0}
+RECTANGLE = {"type": "RectangularAperture", "x_min": -1.0, "x_max": 1.0, "y_min": 2.0, "y_max": 5.0}
+ELLIPSE = {"type": "EllipticalAperture", "a": 3.0, "b": 2.0, "offset_x": 0.5, "offset_y": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("aperture", "row"),
+    [
+        (CIRCLE | {"r_min": 2.0}, {"semi_diameter": 10.0, "obscuration": {"semi_diameter": 2.0}}),
+        (RECTANGLE, {"aperture": {"half_width_x": 1.0, "half_width_y": 1.5, "decenter_y": 3.5}}),
+        (ELLIPSE, {"aperture": {"semi_axis_x": 3.0, "semi_axis_y": 2.0, "decenter_x": 0.5}}),
+        (
+            {"type": "PolygonAperture", "x": [-4.0, 4.0, 0.0], "y": [-3.0, -3.0, 5.0]},
+            {"aperture": {"polygons": [[[-4.0, -3.0], [4.0, -3.0], [0.0, 5.0]]]}},
+        ),
+        (
+            {"type": "DifferenceAperture", "a": CIRCLE, "b": ELLIPSE},
+            {
+                "semi_diameter": 10.0,
+                "obscuration": {"semi_axis_x": 3.0, "semi_axis_y": 2.0, "decenter_x": 0.5},
+            },
+        ),
+    ],
+)
+def test_apertures_of_optiland(aperture, row):
+    """The keys that its classes write, and the points that they contain (version 0.6.3)."""
+    content = copy.deepcopy(OPTILAND)
+    content["surface_group"]["surfaces"][3]["aperture"] = aperture
+    found = read_json(json.dumps(content), "lens").prescription["surfaces"]["3"]
+    assert {key: found.get(key) for key in row} == row

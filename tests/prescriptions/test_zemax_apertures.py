@@ -22,6 +22,15 @@ APERTURES = {
                           "obscuration": {"semi_diameter": 1.0, "decenter_x": 2.0}},
     "elliptical hole": {"semi_diameter": 5.0, "clips": False,
                         "obscuration": {"semi_axis_x": 1.0, "semi_axis_y": 2.0}},
+    "blocking ring": {"semi_diameter": 5.0, "clips": False,
+                      "obscuration": {"inner_semi_diameter": 1.5, "semi_diameter": 2.0}},
+    "spider": {"semi_diameter": 5.0, "clips": False,
+               "obscuration": {"width": 0.5, "arms": 3, "decenter_y": 1.0}},
+    "drawn by hand": {"aperture": {"polygons": [[[-4.0, -3.0], [4.0, -3.0], [0.0, 0.1]]],
+                                   "decenter_x": 0.5}},
+    "two drawn by hand": {"semi_diameter": 5.0, "clips": False,
+                          "obscuration": {"polygons": [[[-4.0, -3.0], [-3.0, -3.0], [-3.5, 4.0]],
+                                                       [[3.0, -3.0], [4.0, -3.0], [3.5, 4.0]]]}},
     "no edge": {"semi_diameter": 5.0, "clips": False},
     "left to the fields": {"semi_diameter": "auto"},
 }  # fmt: skip
@@ -35,6 +44,10 @@ WRITTEN = {
     "ring off the axis": "CLAP 1.0 4.0 0\n  OBDC -3.0 0",
     "hole off the axis": "OBSC 0 1.0 0\n  OBDC 2.0 0",
     "elliptical hole": "ELOB 1.0 2.0",
+    "blocking ring": "OBSC 1.5 2.0 0",
+    "spider": "SPID 0.5 3.0 0\n  OBDC 0 1.0",
+    "drawn by hand": "UDAD 1 -4.0 -3.0 0",
+    "two drawn by hand": "UDAD 4 0 0 0\n  UDAD 5 3.0 -3.0 0",
     "no edge": "DIAM 5.0 1 0 0 1",
     "left to the fields": "DIAM 0 0 0 0 1",
 }
@@ -64,3 +77,56 @@ def test_an_aperture_is_in_the_file_s_units():
     text = singlet("CURV 0.1", "DIAM 5", "SQAP 0.5 0.25", GLASS, head="UNIT IN\nFLOA\n")
     row = prescription_from_zemax(text)["surfaces"]["1"]
     assert row["aperture"] == {"half_width_x": 12.7, "half_width_y": 6.35}
+
+
+def with_aperture(*lines, head="UNIT MM\nFLOA\n"):
+    """The row of the first surface of a singlet with lines of an aperture."""
+    text = singlet("CURV 0.01", "DIAM 5 1", *lines, GLASS, head=head)
+    return prescription_from_zemax(text)["surfaces"]["1"]
+
+
+def test_outlines_drawn_by_a_user_end_at_0_0_and_are_in_the_file_s_units():
+    """As `sc_slit.ZMX` of Zemax's short course has them: slits, one after the other."""
+    corners = ["-5 -6", "-5 6", "-4 6", "-4 -6", "0 0", "-3 -6", "-3 6", "-2 6", "-2 -6", "0 0"]
+    lines = [f"UDAD {n} {xy} 0.0" for n, xy in enumerate(corners, 1)]
+    row = with_aperture("USAP 0 0 0", 'UDAD 0 "SLITS.UDA" 1.0', *lines, head="UNIT CM\nFLOA\n")
+    first = [[-50.0, -60.0], [-50.0, 60.0], [-40.0, 60.0], [-40.0, -60.0]]
+    second = [[-30.0, -60.0], [-30.0, 60.0], [-20.0, 60.0], [-20.0, -60.0]]
+    assert row["aperture"] == {"polygons": [first, second]}
+
+
+def test_a_floating_aperture_with_a_hole_is_a_ring_of_the_semi_diameter():
+    row = with_aperture("FLAP 2 7 0")
+    assert row["semi_diameter"] == 5.0
+    assert row["obscuration"] == {"semi_diameter": 2.0}
+
+
+def test_a_circle_of_1e10_has_no_edge_but_its_hole():
+    """As the primary mirror of Zemax's own Schmidt-Cassegrain sample has it."""
+    text = singlet("CURV 0.01", "DIAM 5", GLASS, last="DIAM 6 0\n  CLAP 2 1.0E+10 0")
+    row = prescription_from_zemax(text)["surfaces"]["2"]
+    assert (row["semi_diameter"], row["clips"]) == (6.0, False)
+    assert row["obscuration"] == {"semi_diameter": 2.0}
+
+
+@pytest.mark.parametrize(
+    "lines, message",
+    [
+        (["USAP 0 0 0", 'UDAD 0 "MY OWN.UDA" 1.0'], "stands in MY OWN.UDA, not here"),
+        (["USAP 0 0 0", "UDAD 1 1 1 0", "UDAD 2 2 1 90", "UDAD 3 2 2 0"], "with arcs"),
+        (["USAP 0 0 0", "UDAD 0 A.UDA 2.0", "UDAD 1 1 1 0"], "another scale"),
+        (["USAP 0 0 0", "UDAD 1 1 1 0", "UDAD 2 2 1 0"], "three corners"),
+        (
+            [
+                "USOB 0 0 0",
+                *(f"UDAD {n} {xy} 0" for n, xy in enumerate(["-4 -4", "4 -4", "1 4", "0 0"], 1)),
+                *(f"UDAD {n} {xy} 0" for n, xy in enumerate(["-1 -1", "1 -1", "1 1"], 5)),
+            ],
+            "outlines that lie in one another",
+        ),
+        (["SPID 0.5 2.5 0"], "number of arms must be whole"),
+    ],
+)
+def test_outlines_that_are_not_held_say_why(lines, message):
+    with pytest.raises(InputError, match=message):
+        with_aperture(*lines)

@@ -166,3 +166,44 @@ def test_what_no_break_can_be_is_refused(change, said):
     )  # fmt: skip
     with pytest.raises(InputError, match=said):
         lens_of(text)
+
+
+@pytest.mark.parametrize(
+    "own, before, after",
+    [
+        # A fold mirror whose axes follow the light, as "Fold Mirror Using Surface Tilts" has it.
+        (("SCBD 1 0 0 0 0 45 0 0", "SCBD 2 0 1 0 0 45 0 0"), (0, 0, 45), (0, 0, 45)),
+        # What is undone behind the surface.
+        (
+            ("SCBD 1 0 0 1 -2 3 4 5", "SCBD 2 1 2 -1 2 -3 -4 -5"),
+            (1, -2, 3, 4, 5, 0),
+            (-1, 2, -3, -4, -5, 1),
+        ),
+        # Tilts that stay.
+        (("SCBD 1 1 0 0 0.5 -3 0 0",), (0, 0.5, -3, 0, 0, 1), None),
+    ],
+)
+def test_a_surface_s_own_axes_are_breaks_around_it(own, before, after):
+    """Zemax's manual: as a coordinate break, the surface, and another coordinate break."""
+    gap = 0 if after else -40
+    around = broken(2, *before) + mirror(3, -0.01, gap, "STOP")
+    if after:
+        around += broken(4, *after, gap=-40)
+    last = 5 if after else 4
+    plane = surf(1, "CURV 0.001 0 0 0 0", "DISZ 30", "DIAM 30 1 0 0 1", "GLAS N-BK7 0 0 1.5 40")
+    expected = prescription_from_zemax(HEAD + OBJECT + plane + around + image(last))
+    found = prescription_from_zemax(
+        HEAD + OBJECT + plane + mirror(2, -0.01, -40, "STOP", *own) + image(3)
+    )
+    assert found["stop"] == expected["stop"] == 3
+    rows = [prescription_of(lens_from_prescription(p))["surfaces"] for p in (found, expected)]
+    assert rows[0] == rows[1]
+    assert found["sensor"] == expected["sensor"]
+
+
+def test_decenters_of_a_surface_s_own_are_in_the_file_s_units():
+    text = (HEAD + OBJECT).replace("UNIT MM", "UNIT IN")
+    plane = surf(1, "CURV 0.01 0 0 0 0", "DISZ 1", "DIAM 1 1 0 0 1", "GLAS N-BK7 0 0 1.5 40")
+    own = mirror(2, -0.01, -4, "STOP", "SCBD 1 0 0 0.5 0 0 0 0")
+    row = prescription_from_zemax(text + plane + own + image(3))["surfaces"]["2"]
+    assert row == {"type": "coordinate_break", "decenter_x": 12.7, "thickness": 0.0}

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from numba import carray, types
 
 from dolens.kernels.cpu.arithmetic import arithmetic
+from dolens.kernels.cpu.compiler import shifted
+from dolens.kernels.cpu.figures import stopped_by_figures
 from dolens.kernels.cpu.functions import StepFunctions
 from dolens.kernels.cpu.layout import (
     BLOCK,
@@ -35,6 +37,7 @@ from dolens.kernels.cpu.records import (
     CODE_ROW,
     EDGE,
     ELLIPSE,
+    FIGURES,
     HALF_X,
     HALF_Y,
     HOLE,
@@ -119,19 +122,23 @@ def plane_adjoint(real: types.Type) -> Callable[..., None]:
 
 def clip(real: types.Type) -> Callable[..., None]:
     """Vignette where the clear aperture is no full circle; the circle is tested on the way."""
-    zero, one, stopped = real(0.0), real(1.0), real(STOPPED)
+    zero, one, vignetted = real(0.0), real(1.0), real(STOPPED)
+    stopped = stopped_by_figures(real)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         dst, p, q = carray(after, STATE), carray(record, SHORT_RECORD), carray(codes, CODE_ROW)
         half_x, half_y, hole_x, hole_y, tag = p[HALF_X], p[HALF_Y], p[HOLE_X], p[HOLE_Y], p[TAG]
         center_x, center_y, outline, hole = p[CENTER_X], p[CENTER_Y], q[OUTLINE], q[HOLE]
+        figures = q[FIGURES]
         for i in range(BLOCK):
             x, y = math.fabs(dst[X + i] - center_x), math.fabs(dst[Y + i] - center_y)
             passes = True
+            if figures != 0:
+                passes = not stopped(shifted(record, figures), dst[X + i], dst[Y + i])
             if outline == RECTANGLE:
-                passes = x < half_x and y < half_y
+                passes = passes and x < half_x and y < half_y
             elif outline == ELLIPSE:
-                passes = half_x * x * x + half_y * y * y < one
+                passes = passes and half_x * x * x + half_y * y * y < one
             if hole == CIRCLE:
                 passes = passes and x * x + y * y > hole_x
             elif hole == RECTANGLE:
@@ -139,7 +146,7 @@ def clip(real: types.Type) -> Callable[..., None]:
             elif hole == ELLIPSE:
                 passes = passes and hole_x * x * x + hole_y * y * y > one
             if not passes and not dst[VIGNETTED + i] > zero:
-                dst[VIGNETTED + i] = tag + stopped
+                dst[VIGNETTED + i] = tag + vignetted
 
     return kernel
 

@@ -22,7 +22,7 @@ KIND, OFFSET, LENGTH = Code.KIND, Code.OFFSET, Code.LENGTH
 BEFORE, AFTER, REFRACTS = Code.BEFORE, Code.AFTER, Code.REFRACTS
 OUTLINE, HOLE = Code.EDGE, Code.HOLE
 COUNT, COLUMNS, DEGREE = Code.COUNT, Code.COLUMNS, Code.DEGREE
-WAVE, NUMBERS = Code.WAVE, Code.NUMBERS
+WAVE, NUMBERS, FIGURES = Code.WAVE, Code.NUMBERS, Code.FIGURES
 # The CPU's rows go on with addresses: of the step's compiled functions, and of its extras.
 FORWARD, ADJOINT, SAG_AND_SLOPES, SAG_HESSIAN, PARAMETERS, EXTRAS_ADDRESS = range(
     Code.ROW, Code.ROW + 6

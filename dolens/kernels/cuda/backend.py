@@ -2,7 +2,7 @@
 
 import logging
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache, lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +11,12 @@ import triton
 from torch import Tensor
 from triton.runtime.interpreter import InterpretedFunction
 
+from dolens.cached_tensors import cached_tensors
 from dolens.errors import InputError
 from dolens.kernels.cuda.adjoint import adjoint_kernel
 from dolens.kernels.cuda.forward import forward_kernel
 from dolens.kernels.cuda.functions import LawShape, SagFunctions, Shape, law_of, shape_of
-from dolens.kernels.cuda.layout import STATE
+from dolens.kernels.cuda.layout import STATE, WITH_FIGURES
 from dolens.kernels.law_kernel import law_kernels_of
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Code, Kind, SurfaceTable
@@ -43,7 +44,7 @@ class DeviceCodes(NamedTuple):
         extras: int32; the table's, and behind them what shapes have made of them.
         before: (steps,), int64, rows of the indices; and after.
         after: and behind.
-        kinds: bit k is set where there is a step of kind k.
+        kinds: bit k is set where there is a step of kind k, and one where there are figures.
         forms: of the surfaces given by their sag; see `functions.shape_of`.
         waves: (steps,), int64, the row of the indices that holds λ/2π; 0 where a step needs none.
         laws: of deflection; see `functions.law_of`.
@@ -59,7 +60,7 @@ class DeviceCodes(NamedTuple):
     laws: tuple[LawShape, ...]
 
 
-@lru_cache(maxsize=128)
+@cached_tensors(maxsize=128)
 def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCodes:
     """Copy a lens's codes once, from int64: an optimization changes its numbers, not its codes."""
     rows = np.frombuffer(codes, dtype=np.int64).reshape(-1, Code.ROW).tolist()
@@ -69,6 +70,8 @@ def _device_codes(codes: bytes, extras: bytes, device: torch.device) -> DeviceCo
         kind = row[Code.KIND]
         if kind < Kind.BY_SAG:
             kinds |= 1 << kind
+        if row[Code.FIGURES]:
+            kinds |= WITH_FIGURES
         if kind == Kind.DEFLECT:
             laws.add(law_of(row[Code.LAW], law_kernels_of(row[Code.LAW], "cuda")))
             kind = row[Code.BASE]

@@ -2,7 +2,7 @@
 
 import triton.language as tl
 
-from dolens.kernels.table import NEWTON_STEPS, Code, Failure, Kind, Outline, Slot
+from dolens.kernels.table import NEWTON_STEPS, Code, Failure, Figure, Kind, Outline, Slot
 
 SHIFT = tl.constexpr(int(Slot.SHIFT))
 STEP_X, STEP_Y, STEP_Z = (tl.constexpr(Slot.STEP + k) for k in range(3))
@@ -38,6 +38,7 @@ LAW = tl.constexpr(int(Code.LAW))
 BASE = tl.constexpr(int(Code.BASE))
 NUMBERS = tl.constexpr(int(Code.NUMBERS))
 LENGTH = tl.constexpr(int(Code.LENGTH))
+FIGURES = tl.constexpr(int(Code.FIGURES))
 ROW = tl.constexpr(int(Code.ROW))
 
 PLANE = tl.constexpr(int(Kind.PLANE))
@@ -55,10 +56,14 @@ HAS_CHANGE_AXES = tl.constexpr(1 << int(Kind.CHANGE_AXES))
 HAS_LENS_AXES = tl.constexpr(1 << int(Kind.LENS_AXES))
 HAS_SENSOR = tl.constexpr(1 << int(Kind.SENSOR))
 HAS_DEFLECT = tl.constexpr(1 << int(Kind.DEFLECT))
+# And a bit for apertures made of figures.
+WITH_FIGURES = 1 << int(Kind.BY_SAG)
+HAS_FIGURES = tl.constexpr(WITH_FIGURES)
 
 CIRCLE = tl.constexpr(int(Outline.CIRCLE))
 RECTANGLE = tl.constexpr(int(Outline.RECTANGLE))
 ELLIPSE = tl.constexpr(int(Outline.ELLIPSE))
+ELLIPTIC, ARM = tl.constexpr(int(Figure.ELLIPTIC)), tl.constexpr(int(Figure.ARM))
 
 # Added to a surface's tag where a ray fails; `dolens.optics.rays.Status`.
 VIGNETTED = tl.constexpr(int(Failure.VIGNETTED))

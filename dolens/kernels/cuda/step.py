@@ -7,6 +7,7 @@ from dolens.kernels.cuda.arithmetic import clamp, distance_to_plane, refract
 from dolens.kernels.cuda.axes import change_axes, lens_axes
 from dolens.kernels.cuda.conic import conic_intersect, sphere_intersect
 from dolens.kernels.cuda.explicit import explicit_intersect
+from dolens.kernels.cuda.figures import clear_of_figures
 from dolens.kernels.cuda.functions import CODE, LAW_CODE, LAW_FORWARD
 from dolens.kernels.cuda.gradient import surface_gradient
 from dolens.kernels.cuda.layout import (
@@ -19,11 +20,13 @@ from dolens.kernels.cuda.layout import (
     DEFLECT,
     EDGE,
     ELLIPSE,
+    FIGURES,
     HALF_X,
     HALF_Y,
     HAS_CHANGE_AXES,
     HAS_CONIC,
     HAS_DEFLECT,
+    HAS_FIGURES,
     HAS_LENS_AXES,
     HAS_SENSOR,
     HAS_SPHERE,
@@ -79,9 +82,13 @@ def intersect(
 
 
 @triton.jit
-def passes(record, codes, x, y):
+def passes(record, codes, x, y, KINDS: tl.constexpr):
     """Return whether a point is strictly inside the clear aperture."""
     inside = tl.load(record + EDGE) - (x * x + y * y) > 0.0
+    if HAS_FIGURES & KINDS:
+        figures = tl.load(codes + FIGURES)
+        if figures != 0:
+            inside &= clear_of_figures(record + figures, x, y)
     outline, hole = tl.load(codes + OUTLINE), tl.load(codes + HOLE)
     x, y = x - tl.load(record + CENTER_X), y - tl.load(record + CENTER_Y)
     if outline == RECTANGLE:
@@ -118,7 +125,8 @@ def step(
         path: optical path so far, mm.
         ended: tag and status of a miss or a total reflection, else 0; int32.
         vignetted: of the first aperture that stopped the ray, else 0.
-        KINDS: bit k is set where the lens has steps of kind k; code for no others is made.
+        KINDS: bit k is set where the lens has steps of kind k, and one where apertures are made of
+            figures; code for no others is made.
         FORMS: of the surfaces given by their sag that the lens has; see `functions.shape_of`.
         LAWS: of deflection that the lens has; see `functions.law_of`.
 
@@ -142,7 +150,7 @@ def step(
         travelled = t0 + t
         ended = tl.where((ended > 0) | (met & towards), ended, tag + MISSED)
         vignetted = tl.where(
-            (vignetted > 0) | passes(record, codes, x, y), vignetted, tag + VIGNETTED
+            (vignetted > 0) | passes(record, codes, x, y, KINDS), vignetted, tag + VIGNETTED
         )
         if tl.load(codes + REFRACTS) != 0:
             behind = tl.load(record + SENSE_BEHIND)

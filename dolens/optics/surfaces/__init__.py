@@ -18,6 +18,7 @@ from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.surfaces.toroid import Toroid
 from dolens.optics.surfaces.xy_polynomial import XYPolynomial
 from dolens.optics.surfaces.zernike import ZernikeFringe, ZernikeStandard
+from dolens.optics.surfaces.zernike_phase import ZernikeFringePhase, ZernikeStandardPhase
 
 __all__ = [
     "BREAKS",
@@ -49,7 +50,9 @@ __all__ = [
     "XYPhase",
     "XYPolynomial",
     "ZernikeFringe",
+    "ZernikeFringePhase",
     "ZernikeStandard",
+    "ZernikeStandardPhase",
     "register_surface",
     "unregister_surface",
 ]

@@ -1,4 +1,4 @@
-"""A clear aperture passes light: circles, rectangles and ellipses, with obscurations."""
+"""A clear aperture passes light: circles, rectangles, ellipses and polygons, with obscurations."""
 
 import math
 from collections.abc import Callable
@@ -9,11 +9,14 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.table import Figure
 from dolens.kernels.table import Outline as OutlineKind
+from dolens.optics.surfaces.obscurations import Ring, Spider, Together
+from dolens.optics.surfaces.outlines import CENTRE, Figures, Polygons, Simple
 
 
 @dataclass(frozen=True)
-class Circle:
+class Circle(Simple):
     """The outline is a circle about the vertex; lengths in mm."""
 
     rotational: ClassVar[bool] = True  # it looks the same from every azimuth
@@ -39,9 +42,13 @@ class Circle:
         """Return its kind and two numbers for the kernels; here r² (mm²) and nothing."""
         return OutlineKind.CIRCLE, self.semi_diameter**2, 0.0
 
+    def figures(self) -> Figures:
+        """Return an ellipse of equal axes, and the bounds of its x² + y², mm²."""
+        return [(Figure.ELLIPTIC, CENTRE, (1.0, 1.0, -1.0, self.semi_diameter**2))]
+
 
 @dataclass(frozen=True)
-class Rectangle:
+class Rectangle(Simple):
     """The outline is a rectangle about the vertex, its sides along the surface's x and y; lengths
     in mm.
     """
@@ -72,9 +79,14 @@ class Rectangle:
         """Return its kind and its half widths (mm) for the kernels."""
         return OutlineKind.RECTANGLE, self.half_width_x, self.half_width_y
 
+    def figures(self) -> Figures:
+        """Return its sides as those of a polygon."""
+        a, b = self.half_width_x, self.half_width_y
+        return Polygons((((a, b), (-a, b), (-a, -b), (a, -b)),)).figures()
+
 
 @dataclass(frozen=True)
-class Ellipse:
+class Ellipse(Simple):
     """The outline is an ellipse about the vertex, its axes along the surface's x and y; lengths in
     mm.
     """
@@ -113,9 +125,13 @@ class Ellipse:
         """Return its kind and 1/a², 1/b² (mm^-2) for the kernels."""
         return OutlineKind.ELLIPSE, self.semi_axis_x**-2, self.semi_axis_y**-2
 
+    def figures(self) -> Figures:
+        """Return its 1/a² and 1/b² (mm^-2), and the bounds of (x/a)² + (y/b)²."""
+        return [(Figure.ELLIPTIC, CENTRE, (*self.packed()[1:], -1.0, 1.0))]
+
 
 @dataclass(frozen=True)
-class Unlimited:
+class Unlimited(Simple):
     """The outline has no edge: light passes wherever the surface is.  A prescription says so
     (`clips: false`), and a search for a better lens needs it.
 
@@ -140,12 +156,17 @@ class Unlimited:
         """Return how far light is expected along x and along y, mm."""
         return self.semi_diameter, self.semi_diameter
 
+    @property
+    def drawn(self) -> Circle:
+        """Return the circle that light is expected in."""
+        return Circle(self.semi_diameter)
+
     def packed(self) -> tuple[OutlineKind, float, float]:
         """Return its kind for the kernels, and no numbers."""
         return OutlineKind.NONE, 0.0, 0.0
 
 
-Outline = Circle | Rectangle | Ellipse | Unlimited
+Outline = Circle | Rectangle | Ellipse | Polygons | Ring | Spider | Together | Unlimited
 
 
 @dataclass(frozen=True)
@@ -154,9 +175,10 @@ class ClearAperture:
 
     Attributes:
         edge: the outer limit.
-        obscuration: what is blocked in the middle, as in a telescope; or None.
-        window: a second limit, a rectangle or an ellipse that light must also pass: that of a stop
-            whose edge, a circle, is the pupil's; or None.
+        obscuration: what is blocked, as by a telescope's secondary mirror and the spider that
+            holds it; or None.
+        window: a second limit, no circle, that light must also pass: that of a stop whose edge, a
+            circle, is the pupil's; or None.
         center: x and y (mm) of the window, the obscuration, and an edge that is no circle; that of
             an off-axis part is beside the vertex.
     """
@@ -170,18 +192,17 @@ class ClearAperture:
         if self.window is not None and not isinstance(self.edge, Circle):
             raise InputError("a second outline goes with a circular edge")
         for outline in (self.edge, self.obscuration, self.window):
-            for name, value in vars(outline).items() if outline else ():
+            for name, value in outline.lengths.items() if outline else ():
                 if not 0.0 < value < math.inf:
                     raise InputError(f"{name} must be positive and finite, not {value}")
-        if (
-            self.obscuration is not None
-            and not isinstance(self.edge, Unlimited)
-            and self.obscuration.semi_diameter >= self.semi_diameter
-        ):
-            raise InputError(
-                f"the obscuration reaches {self.obscuration.semi_diameter:g} mm from the vertex, "
-                f"the aperture only {self.semi_diameter:g}"
-            )
+        if self.obscuration is not None and not isinstance(self.edge, Unlimited):
+            # A disc about the vertex that is blocked for certain.
+            reach = self.obscuration.inscribed - math.hypot(*self.center)
+            if reach >= self.semi_diameter:
+                raise InputError(
+                    f"the obscuration reaches {reach:g} mm from the vertex, the aperture only "
+                    f"{self.semi_diameter:g}"
+                )
 
     @property
     def semi_diameter(self) -> float:
@@ -202,6 +223,18 @@ class ClearAperture:
         if self.window is not None or (obscured and any(self.center)):
             return False
         return self.edge.rotational and (not obscured or self.obscuration.rotational)
+
+    def figures(self) -> list[tuple[bool, Figures]]:
+        """Return the figures of outlines that have no numbers of their own for the kernels: with
+        each list whether it blocks light.
+        """
+        limits = (self.window or self.edge, False), (self.obscuration, True)
+        cx, cy = self.center
+        return [
+            (blocks, [(kind, (x + cx, y + cy), own) for kind, (x, y), own in outline.figures()])
+            for outline, blocks in limits
+            if outline is not None and outline.packed()[0] == OutlineKind.FIGURES
+        ]
 
     def opened(self) -> "ClearAperture":
         """Return the same size with no edge and no obscuration: it clips nothing."""

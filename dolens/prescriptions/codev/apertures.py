@@ -60,6 +60,10 @@ def aperture_lines(row: Mapping[str, Any], place: str) -> list[str]:
     """Return the lines of a surface that `read_apertures` reads back."""
     lines = []
     edge, hole, size = row.get("aperture"), row.get("obscuration"), row.get("semi_diameter")
+    if isinstance(hole, list | tuple):
+        if len(hole) != 1:
+            raise InputError(f"{place}: several obscurations of a surface are not written")
+        hole = hole[0]
     if size is not None and size != "auto":
         use = "" if row.get("clips", True) else "EDG "
         lines.append(f"  CIR {use}{_text(size, place)}")

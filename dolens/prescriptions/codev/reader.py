@@ -154,9 +154,7 @@ def _with_sensor(
     semi_diameter = read_apertures(image, factor, place).get("semi_diameter")
     if isinstance(semi_diameter, float):
         sensor["diameter"] = 2.0 * semi_diameter
-    size = curvature_row(image, factor, place)
-    if size:
-        sensor["radius"] = size.get("radius") or 1.0 / size["curvature"]
+    sensor |= curvature_row(image, factor, place)
     if shape_is_given(image) and conic_constant(image, place):
         sensor["conic"] = conic_constant(image, place)
     surfaces = {str(n): row for n, row in enumerate(rows.rows, 1)}

@@ -1,8 +1,12 @@
 """Special surfaces and diffractive phases of CODE V surfaces.
 
-`SPS XYP` adds a polynomial in x and y, `SPS QBF` is Forbes's Q_bfs; `SCO C4 0.1` gives their
-coefficient 4.  `DIF DOE` with `HCT R` is a radial phase: the path is Σ C_i·r^2i at the wavelength
-HWL, in order HOR, and φ = 2π·path/HWL.
+`SPS XYP` adds a polynomial in x and y, `SPS ODD` all powers of r, `SPS QBF` is Forbes's Q_bfs;
+`SCO C4 0.1` gives their coefficient 4.  Of `SPS ODD` coefficient 1 is the conic constant (`SCO K`)
+and n + 1 that of rⁿ (`SCO ARn`), from r to r³⁰; 33 is a radius of normalisation, and 0 means none
+(Lens System Setup Reference Manual).
+
+`DIF DOE` with `HCT R` is a radial phase: the path is Σ C_i·r^2i at the wavelength HWL, in order
+HOR, and φ = 2π·path/HWL.
 """
 
 import math
@@ -17,13 +21,16 @@ from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.codev.file import Block
 from dolens.prescriptions.decimals import number_in_text, scaled
 
+_POWER = re.compile(r"a[1-9]\d*")
 _FORBES = re.compile(r"q[0-9]+")
 _NUMBER = re.compile(r"C([1-9]\d?)")
 # Coefficients of x, y, x², ..., y¹⁰: number 1 is the conic constant.
 _XY_DEGREE = 10
-_HELD = ("XYP", "QBF")
+_HELD = ("XYP", "QBF", "ODD")
+_ODD_POWERS = 30
+_ODD_NORM = 33
+_ODD_NAME = re.compile(r"AR([1-9]\d?)")
 _NAMES = {
-    "ODD": "an odd asphere",
     "QCN": "a Forbes asphere (Q_con)",
     "ZRN": "a Zernike surface",
     "ZFR": "a Zernike surface (Fringe)",
@@ -56,6 +63,8 @@ def special_shape(
         what = _NAMES.get(kind, "a special surface")
         raise InputError(f"{place}: {what} is not held (SPS {kind})".rstrip())
     texts = _coefficients(block, "SCO", f"{place}: SCO")
+    if kind == "ODD":
+        return _odd(texts, words[1:], size, factor, place)
     if kind == "QBF":
         return _forbes(texts, size, factor, place)
     if size:
@@ -123,6 +132,15 @@ def special_lines(row: Mapping[str, Any], place: str) -> list[str]:
         numbers = {1: row.get("normalization_radius")}
         numbers |= {int(key[1:]) + 3: row[key] for key in row if _FORBES.fullmatch(key)}
         return ["  SPS QBF", *_lines(numbers, place)]
+    if row["type"] == "odd_asphere":
+        powers = {int(key[1:]): row[key] for key in row if _POWER.fullmatch(key)}
+        if max(powers, default=0) > _ODD_POWERS:
+            raise InputError(
+                f"{place}: a .seq file cannot hold 'a{max(powers)}' of an odd asphere (allowed: a1 "
+                f"to a{_ODD_POWERS})"
+            )
+        numbers = {1: row.get("conic", 0.0)} | {n + 1: value for n, value in powers.items()}
+        return ["  SPS ODD", *_lines(numbers, place)]
     known = {_monomial(*powers): n for n in range(2, 67) if (powers := xy_powers(n))}
     numbers = {}
     for key in row:
@@ -155,14 +173,48 @@ def _forbes(
     return row | {"normalization_radius": radius}
 
 
+def _odd(
+    texts: dict[int, str], words: list[str], size: dict[str, float], factor: Fraction, place: str
+) -> dict[str, Any]:
+    """Return the odd asphere: coefficient 1 is the conic constant, n + 1 that of rⁿ."""
+    for word in (*words, texts.get(_ODD_NORM, "0")):
+        if number_in_text(word, f"{place}: SPS ODD") not in (0.0, 1.0):
+            raise InputError(
+                f"{place}: an odd asphere with a radius of normalisation is not held (SPS ODD "
+                f"{word})"
+            )
+    row: dict[str, Any] = {"type": "odd_asphere", **(size or {"radius": math.inf})}
+    row["conic"] = number_in_text(texts.get(1, "0"), f"{place}: SCO C1")
+    for number, text in sorted(texts.items()):
+        power = number - 1
+        if number in (1, _ODD_NORM):
+            continue
+        if power > _ODD_POWERS:
+            raise InputError(f"{place}: SCO C{number} of SPS ODD is not held")
+        value = scaled(text, factor ** (1 - power), f"{place}: SCO C{number}")
+        row |= {f"a{power}": value} if value or text == "0" else {}
+    return row
+
+
+def _number(name: str) -> int | None:
+    """Return the number of a coefficient, which an odd asphere's may have a name for."""
+    if name == "K":
+        return 1
+    match = _NUMBER.fullmatch(name)
+    if match is not None:
+        return int(match[1])
+    match = _ODD_NAME.fullmatch(name)
+    return None if match is None else int(match[1]) + 1
+
+
 def _coefficients(block: Block, key: str, place: str) -> dict[int, str]:
     """Return the texts of numbered coefficients."""
     found: dict[int, str] = {}
     for command in block.commands.get(key, []):
-        match = _NUMBER.fullmatch(command.words[0].upper()) if command.words else None
-        if match is None or len(command.words) != 2:
+        number = _number(command.words[0].upper()) if command.words else None
+        if number is None or len(command.words) != 2:
             raise InputError(f"{place} (line {command.at}): expected a coefficient, as C4 0.1")
-        found[int(match[1])] = command.words[1]
+        found[number] = command.words[1]
     return found
 
 

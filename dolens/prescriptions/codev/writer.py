@@ -20,6 +20,7 @@ from dolens.prescriptions.system_data import PUPIL_KEYS
 
 _TYPES = (
     *("plane", "aperture", "sphere", "conic", "even_asphere", "xy_polynomial", "q_bfs"),
+    "odd_asphere",
     "coordinate_break",
 )
 _D_LINE = 587.5618
@@ -195,7 +196,7 @@ def _surface(row: Mapping[str, Any], gap: str, stop: bool, place: str) -> list[s
         asphere = ["  ASP"] if kind == "even_asphere" else []
         lines += [*asphere, f"  K {_text(row.get('conic', 0.0), place)}"]
         lines += _coefficients(row, place)
-    if kind in ("xy_polynomial", "q_bfs"):
+    if kind in ("xy_polynomial", "q_bfs", "odd_asphere"):
         lines += special_lines(row, place)
     return lines + aperture_lines(row, place)
 
@@ -218,6 +219,8 @@ def _image(sensor: Mapping[str, Any], where: str) -> list[str]:
     place = f"{where}: sensor"
     radius = sensor.get("radius")
     lines = [f"SI    {_text(radius, place) if radius and math.isfinite(radius) else '0.0'} 0.0"]
+    if sensor.get("curvature") is not None:
+        lines.append(f"  CUY {_text(sensor['curvature'], place)}")
     if sensor.get("conic"):
         lines += ["  CON", f"  K {_text(sensor['conic'], place)}"]
     if sensor.get("diameter"):

@@ -178,9 +178,7 @@ def _curved(image: Block, factor: Fraction, place: str) -> dict[str, float]:
     shape = _shape(image, factor, place)
     if shape["type"] == "even_asphere":
         raise InputError(f"{place}: an aspheric image is not held")
-    if "curvature" in shape:
-        shape["radius"] = 1.0 / shape["curvature"]
-    return {key: shape[key] for key in ("radius", "conic") if key in shape}
+    return {key: shape[key] for key in ("radius", "curvature", "conic") if key in shape}
 
 
 def _medium(block: Block, place: str) -> str:

@@ -11,7 +11,7 @@ from dolens.errors import InputError
 from dolens.optics.paraxial_numbers import ParaxialNumbers
 from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
-from dolens.optics.straight import require_refracting
+from dolens.optics.straight import require_plane_sensor, require_refracting
 from dolens.optics.system import OpticalSystem
 from dolens.rendering.pupil.limiting_aperture import limiting_aperture, limiting_pupil_radius
 from dolens.rendering.pupil.rays_to_exit_pupil import rays_to_exit_pupil
@@ -63,9 +63,10 @@ def paraxial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> 
     Enough for chief rays, which are aimed at its centre.
 
     Raises:
-        InputError: the lens has mirrors or coordinate breaks.
+        InputError: the lens has mirrors, coordinate breaks or a curved sensor.
     """
     require_refracting(system, "rendering")
+    require_plane_sensor(system, "rendering")
     first_order = ParaxialNumbers.of(system)
     z, _ = first_order.exit_pupil(wavelengths[len(wavelengths) // 2])
     radius = min(first_order.exit_pupil(w)[1] for w in wavelengths) / 2.0

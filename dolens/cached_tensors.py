@@ -1,0 +1,33 @@
+"""Tensors that a process keeps serve every later call, with and without gradients."""
+
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from typing import ParamSpec, TypeVar
+
+import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def cached_tensors(maxsize: int | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Return a decorator as `functools.lru_cache` is, for functions that make tensors.
+
+    A tensor that is made under `torch.inference_mode` can never be saved for a backward pass.  A
+    lens that is evaluated in that mode, and then trained by the same process, would fail on one
+    that was kept; so the function runs outside of that mode, and without a graph.
+
+    Args:
+        maxsize: how many results are kept; None keeps all.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        @lru_cache(maxsize=maxsize)
+        @wraps(function)
+        def kept(*args: P.args, **options: P.kwargs) -> R:
+            with torch.inference_mode(False), torch.no_grad():
+                return function(*args, **options)
+
+        return kept
+
+    return decorate

@@ -1,0 +1,50 @@
+import pytest
+import torch
+
+from dolens import Rays
+from dolens.cached_tensors import cached_tensors
+from dolens.prescriptions import lens_from_prescription
+from dolens.rendering import chief_ray_map
+
+
+def test_a_kept_tensor_that_was_made_in_inference_mode_takes_part_in_gradients():
+    @cached_tensors()
+    def factors(count):
+        return torch.arange(1.0, count + 1.0)
+
+    with torch.inference_mode():
+        factors(3)
+    x = torch.ones(3, requires_grad=True)
+    (x * factors(3)).sum().backward()
+    assert x.grad.tolist() == [1.0, 2.0, 3.0]
+    assert factors(3) is factors(3)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_lens_that_was_first_traced_in_inference_mode_has_gradients(backend):
+    # A structure of its own, so that no other test has left its records behind.
+    rows = [{"type": "sphere", "radius": 30.0 + n, "semi_diameter": 7.0 + n, "thickness": 1.0,
+             "material": "1.5" if n % 2 == 0 else "air"} for n in range(9)]  # fmt: skip
+    del rows[-1]["thickness"]
+    prescription = {
+        "surfaces": {str(n): row for n, row in enumerate(rows, 1)},
+        "sensor": {"distance": 20.0},
+    }
+    lens = lens_from_prescription(prescription, backend=backend)
+    rays = Rays(
+        torch.tensor([[0.0, 1.0, -5.0]], dtype=torch.float64),
+        torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64),
+        550.0,
+    )
+    with torch.inference_mode():
+        lens.trace(rays)
+    lens.trace(rays).position.sum().backward()
+    assert lens.surfaces["1"].curvature.grad.abs() > 0.0
+
+
+def test_chebyshev_coefficients_that_were_first_made_in_inference_mode_have_gradients():
+    values = torch.ones(7, dtype=torch.float64, requires_grad=True)
+    with torch.inference_mode():
+        chief_ray_map._to_coefficients(7)
+    (chief_ray_map._to_coefficients(7) @ values).sum().backward()
+    assert torch.isfinite(values.grad).all()
