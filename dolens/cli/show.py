@@ -49,6 +49,12 @@ def show(
         float | None,
         typer.Option(metavar="<mm>", help="Set the stop to this entrance pupil diameter."),
     ] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(
+            metavar="<name>", help="Show the lens in this state, of a lens that zooms or focuses."
+        ),
+    ] = None,
     index_model: Annotated[
         str | None, typer.Option(help="dfc, do or paper, instead of the file's own.")
     ] = None,
@@ -58,7 +64,8 @@ def show(
 ) -> None:
     """Show a lens: its prescription, first-order data, aberrations and spots.
 
-    Fields, wavelengths and aperture are the file's own where no option says otherwise.
+    Fields, wavelengths and aperture are the file's own where no option says otherwise.  States of a
+    lens that zooms or focuses are listed.
 
     Example: dolens show cooke_triplet --field 0 --field 0,14 --html page.html
     """
@@ -80,7 +87,9 @@ def show(
     path = find_lens(lens)
     prescription, passed_over = read_lens_file(path)
     shown = prepared_lens(
-        lens_from_prescription(prescription, index_model=index_model, where=str(path)),
+        lens_from_prescription(prescription, index_model=index_model, where=str(path)).in_state(
+            state
+        ),
         fields,
         wavelength or None,
         f_number,

@@ -9,6 +9,7 @@ from dolens.analysis.conditions import Conditions, conditions
 from dolens.analysis.spot_diagram import SpotDiagram, spot_diagram
 from dolens.errors import InputError
 from dolens.lens_page.published_table import published_table
+from dolens.lens_page.states_table import states_table
 from dolens.lens_page.tables import (
     Table,
     first_order_table,
@@ -47,8 +48,8 @@ class Overview:
         name: of the lens.
         summary: focal length, F-number, fields and wavelengths in one line.
         conditions: fields, wavelengths and object distance of everything.
-        sections: prescription, first-order data, what the source publishes where the prescription
-            says it, Seidel sums, spot radii.
+        sections: prescription, states of a lens that has some, first-order data, what the source
+            publishes where the prescription says it, Seidel sums, spot radii.
         spots: the spots, or None where they could not be traced.
     """
 
@@ -80,6 +81,7 @@ def lens_overview(lens: Lens) -> Overview:
 
     sections = [TableSection("Prescription", prescription_tables(lens))]
     for title, make in (
+        *([("States", lambda: states_table(lens))] if lens.states else []),
         ("First-order data", lambda: first_order_table(lens, where)),
         *([("Published numbers", lambda: published_table(lens, where))] if lens.published else []),
         ("Seidel sums", lambda: seidel_table(lens, where)),

@@ -90,8 +90,9 @@ def write_page(
         blocks.append(_block(section, path is not None, figures, written))
     said("done", len(listed), len(listed))
     # The section and the view in space come first, before the tables.
+    first = 1 + next(n for n, section in enumerate(listed) if section.name == "space")
     tables, drawings = blocks[: len(overview.sections)], blocks[len(overview.sections) :]
-    blocks = [*drawings[:2], *tables, *drawings[2:]]
+    blocks = [*drawings[:first], *tables, *drawings[first:]]
     if path is not None:
         _write(Path(path), page_html(overview.name, _facts(lens, overview), command, blocks))
     written.sections = len(blocks)

@@ -54,6 +54,7 @@ from dolens.plotting.point_spread import point_spread_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
 from dolens.plotting.spots import spots_figure
+from dolens.plotting.states import states_layout_figure
 from dolens.plotting.wavefront_maps import wavefront_maps_figure
 
 # Of each field and wavelength.
@@ -85,6 +86,7 @@ class PageSections:
         )
         return [
             Section("layout", "Section", self.layout),
+            *([Section("states", "States", self.states)] if self.lens.states else []),
             Section("space", "In space", self.space),
             Section("spots", "Spot diagram", self.spots),
             Section("fans", "Ray fans", self.fans),
@@ -127,6 +129,11 @@ class PageSections:
         if beside:
             note += " Fields beside the y-z plane are drawn in space only."
         return Content({"section": figure}, note=note)
+
+    def states(self) -> Content:
+        """Draw the section of the lens in every state."""
+        found = {name: self.lens.in_state(name) for name in self.lens.state_names}
+        return Content({"states": states_layout_figure(found)})
 
     def space(self) -> Content:
         """Describe the lens in space."""

@@ -15,6 +15,7 @@ from dolens.optics.elements import Element, ElementState, check_elements
 from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
 from dolens.optics.lens_rays import LensRays
+from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.mirrors import MIRROR, media_of
@@ -25,15 +26,14 @@ from dolens.optics.rays import Rays, TracedRays
 from dolens.optics.surfaces.base import Surface
 from dolens.optics.surfaces.state import LawState, SurfaceState
 from dolens.optics.system import OpticalSystem
-from dolens.optics.thermal_lens import lens_at
 from dolens.optics.vergence import ideal_lenses, with_vergences
 
 
-class Lens(LensRays, LensViews, nn.Module):
+class Lens(LensRays, LensViews, InStates, nn.Module):
     """Surfaces, gaps, media and a sensor, plane or curved.
 
     Parameters are named as users write them: `surfaces.1.curvature`, `surfaces.5.x2y`,
-    `thicknesses.3`, `sensor_distance`.
+    `thicknesses.3`, `sensor_distance`, and `states.wide.thicknesses.3` of a state (`in_state`).
 
     Fields are angles in degrees, (x, y) for a ray along (tan x, tan y, 1), when the object is at
     infinity (`object_distance` None or `inf`); with a finite `object_distance`, mm in front of the
@@ -145,6 +145,7 @@ class Lens(LensRays, LensViews, nn.Module):
             raise InputError(f"lens '{name}': {error}") from None
         self.elements = nn.ModuleDict(dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
+        self.states, self.state_name = LensStates(), None
         register_image_surface(self, sensor_curvature, sensor_conic)
         self.to(dtype)
         self.reversals: tuple[int, ...] = ()
@@ -253,7 +254,7 @@ class Lens(LensRays, LensViews, nn.Module):
 
     def at(self, temperature: float, pressure: float | None = None) -> "Lens":
         """Return this lens at another temperature (°C) and pressure (atm); see `lens_at`."""
-        return lens_at(self, temperature, pressure)
+        return at_temperature(self, temperature, pressure)
 
     def forward(self, rays: Rays) -> TracedRays:
         """The same as `trace`."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.elements import DISPLACEMENTS, TILTS
+from dolens.optics.state_names import split_state
 
 Value = TypeVar("Value", float, Tensor)
 
@@ -53,8 +54,10 @@ def unit_of(name: str) -> Unit:
     """Return the unit of a parameter in files and configuration.
 
     Args:
-        name: as `surfaces.1.curvature`, `elements.front.tilt_x` or `sources.1.z`.
+        name: as `surfaces.1.curvature`, `elements.front.tilt_x`, `sources.1.z` or
+            `states.wide.thicknesses.5`.
     """
+    _, name = split_state(name)
     first, _, _ = name.partition(".")
     group, _, last = name.rpartition(".")
     others = UNNAMED

@@ -11,7 +11,7 @@ with the sags s at the edges of the surfaces before and behind it.
 import copy
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -71,33 +71,96 @@ def lens_at(lens: Any, temperature: float, pressure: float | None = None) -> Any
         InputError: the temperature or pressure is impossible, or a surface has parameters that are
             not known to expand.
     """
-    before = STANDARD_TEMPERATURE if lens.temperature is None else lens.temperature
     if pressure is None:
         pressure = STANDARD_PRESSURE if lens.pressure is None else lens.pressure
     environment = Environment(float(temperature), float(pressure))
-    change = environment.temperature - before
     found = copy.deepcopy(lens)
     found.temperature, found.pressure = environment.temperature, environment.pressure
     found.materials = tuple(medium_at(medium, environment) for medium in lens.materials)
+    _log_unknown(lens, media_of(lens.materials).materials)
+    for name, value in expanded_values(lens, temperature).items():
+        found.get_parameter(name).copy_(value)
+    change = temperature - _temperature(lens)
+    for surface, factor in zip(found.surfaces.values(), _factors(lens, change), strict=True):
+        _expand_unvaried(surface, factor)
+    return found
+
+
+def expanded_values(
+    lens: Any, temperature: float, values: Mapping[str, Tensor] | None = None
+) -> dict[str, Tensor]:
+    """Return the parameters of surfaces and gaps of a lens at another temperature, by name.
+
+    They are differentiable with respect to the lens's parameters, or to the values in their place.
+
+    Args:
+        lens: a `Lens`, which stays as it is.
+        temperature: °C.
+        values: parameter name → tensor used instead of the stored one.
+
+    Raises:
+        InputError: a surface has parameters that are not known to expand.
+    """
+    values = dict(values or {})
+    change = temperature - _temperature(lens)
     media = media_of(lens.materials).materials
-    _log_unknown(lens, media)
-    surfaces = list(found.surfaces.values())
-    mounts = [0.0 if rate is None else rate * _PER_KELVIN for rate in lens.thermal_expansions]
-    # Of the media before surface 1 and behind each surface.
+    mounts = _mounts(lens)
     rates = [_expansion(medium, given) for medium, given in zip(media, [0.0, *mounts], strict=True)]
-    sags = [*map(_edge_sag, surfaces), 0.0]
-    for n, surface in enumerate(surfaces):
-        solid = (rate for rate in (rates[n + 1], rates[n]) if rate is not None)
-        place = f"lens '{lens.name}': surface {n + 1}"
-        _expand(surface, 1.0 + next(solid, mounts[n]) * change, place)
-    expanded = [*map(_edge_sag, surfaces), 0.0]
-    gaps = [*found.thicknesses.values(), found.sensor_distance]
-    for n, (gap, rate) in enumerate(zip(gaps, rates[1:], strict=True)):
+    found: dict[str, Tensor] = {}
+    sags: list[Tensor | float] = []
+    expanded: list[Tensor | float] = []
+    for (n, surface), factor in zip(lens.surfaces.items(), _factors(lens, change), strict=True):
+        place = f"lens '{lens.name}': surface {n}"
+        cold = {
+            name: values.get(f"surfaces.{n}.{name}", value)
+            for name, value in surface.named_parameters()
+        }
+        hot = dict(cold)
+        still = dict(surface.named_buffers())
+        moved = still
+        if factor != 1.0 and not surface.changes_axes:
+            hot = {name: value * factor ** _power(name, place) for name, value in cold.items()}
+            moved = {name: value * factor ** _power(name, place) for name, value in still.items()}
+        found |= {f"surfaces.{n}.{name}": value for name, value in hot.items()}
+        reach = surface.aperture.edge.extent[1]
+        sags.append(_edge_sag(surface, {**cold, **still}, reach))
+        expanded.append(_edge_sag(surface, {**hot, **moved}, factor * reach))
+    sags, expanded = [*sags, 0.0], [*expanded, 0.0]
+    gaps = {f"thicknesses.{n}": gap for n, gap in lens.thicknesses.items()}
+    gaps["sensor_distance"] = lens.sensor_distance
+    for n, ((name, stored), rate) in enumerate(zip(gaps.items(), rates[1:], strict=True)):
+        gap = values.get(name, stored)
         if rate is not None:
-            gap.mul_(1.0 + rate * change)
+            found[name] = gap * (1.0 + rate * change)
         elif change != 0.0:
             edge = (gap - sags[n] + sags[n + 1]) * (1.0 + mounts[n] * change)
-            gap.copy_(edge + expanded[n] - expanded[n + 1])
+            found[name] = edge + expanded[n] - expanded[n + 1]
+        else:
+            found[name] = gap
+    return found
+
+
+def _temperature(lens: Any) -> float:
+    """Return the temperature that a lens's sizes hold for, °C."""
+    return STANDARD_TEMPERATURE if lens.temperature is None else lens.temperature
+
+
+def _mounts(lens: Any) -> list[float]:
+    """Return the expansion of the mount of the gap behind each surface, 1/K."""
+    return [0.0 if rate is None else rate * _PER_KELVIN for rate in lens.thermal_expansions]
+
+
+def _factors(lens: Any, change: float) -> list[float]:
+    """Return by what factor each surface grows: with the glass behind it, or in front of it, or its
+    mount.
+    """
+    media, mounts = media_of(lens.materials).materials, _mounts(lens)
+    # Of the media before surface 1 and behind each surface.
+    rates = [_expansion(medium, given) for medium, given in zip(media, [0.0, *mounts], strict=True)]
+    found = []
+    for n, mount in enumerate(mounts):
+        solid = (rate for rate in (rates[n + 1], rates[n]) if rate is not None)
+        found.append(1.0 + next(solid, mount) * change)
     return found
 
 
@@ -109,10 +172,15 @@ def _expansion(medium: Medium, given: float) -> float | None:
     return given if own is None else own
 
 
-def _edge_sag(surface: Surface) -> Tensor | float:
-    """Return the sag at the edge of a surface along y, mm; 0 where it has no edge."""
-    reach = surface.aperture.edge.extent[1]
-    values = {**surface._parameters, **surface._buffers}
+def _edge_sag(surface: Surface, values: Mapping[str, Tensor], reach: float) -> Tensor | float:
+    """Return the sag at the edge of a surface along y, mm; 0 where it has no edge.
+
+    Args:
+        surface: its shape.
+        values: its parameters and buffers.
+        reach: height of the edge, mm.
+    """
+    values = {name: value for name, value in values.items() if not name.startswith(_PHASE)}
     if surface.changes_axes or not values:
         return 0.0
     like = next(iter(values.values()))
@@ -120,12 +188,12 @@ def _edge_sag(surface: Surface) -> Tensor | float:
     return type(surface).sag_and_gradient(values, x, y)[0][0]
 
 
-def _expand(surface: Surface, factor: float, place: str) -> None:
-    """Make a surface larger in all directions by a factor."""
+def _expand_unvaried(surface: Surface, factor: float) -> None:
+    """Make what is no parameter of a surface larger in all directions by a factor."""
     if factor == 1.0 or surface.changes_axes:
         return
-    for name, value in (*surface.named_parameters(), *surface.named_buffers()):
-        value.mul_(factor ** _power(name, place))
+    for name, value in surface.named_buffers():
+        value.mul_(factor ** _power(name, type(surface).__name__))
     aperture = surface.aperture
     outlines = {name: getattr(aperture, name) for name in ("edge", "obscuration", "window")}
     surface.aperture = replace(

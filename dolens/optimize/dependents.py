@@ -4,18 +4,23 @@ A pickup copies another parameter; a solve holds a first-order property at its v
 functions of the values that are varied, differentiable, so that a search knows of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.lens_states import values_there
 from dolens.optics.parameter_units import to_lens_units
 from dolens.optics.paraxial import first_order, surface_matrix
+from dolens.optics.state_names import STATES, split_state
 
 SOLVES = ("efl", "paraxial_focus", "best_focus")
+_FOLLOWING = ("pickup", "solve")
+_EVERY = f"{STATES}.*."
 
 
 class Dependent(Protocol):
@@ -32,26 +37,28 @@ class Dependent(Protocol):
 
 @dataclass(frozen=True)
 class Pickup:
-    """Copies another parameter: factor · parameter + offset, as two radii that must be equal.
+    """Copies other parameters: factor · Σ parameters + offset, as two radii that must be equal, or
+    the last of some gaps whose sum stays the same while a group moves.
 
     Attributes:
         name: the parameter that follows.
-        source: the one that it follows, of the same shape.
+        sources: those that it follows, of the same shape.
         factor: without a unit.
         offset: in the lens's own unit of the parameter.
     """
 
     name: str
-    source: str
+    sources: tuple[str, ...]
     factor: float = 1.0
     offset: float = 0.0
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
-        """Return the value that follows from the source's."""
-        source = values.get(self.source)
-        if source is None:
-            source = lens.variables([self.source])[self.source].detach()
-        return self.factor * source + self.offset
+        """Return the value that follows from the sources'."""
+        total = torch.zeros(())
+        for source in self.sources:
+            value = values.get(source)
+            total = total + (lens.get_parameter(source).detach() if value is None else value)
+        return self.factor * total + self.offset
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ class FocalLength:
     enters one matrix of the product; so two evaluations solve for it.
 
     Attributes:
-        name: `surfaces.<n>.curvature`.
+        name: `surfaces.<n>.curvature`, or that of a state.
         efl: mm.
         wavelength: nm.
     """
@@ -73,11 +80,13 @@ class FocalLength:
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
         """Return the curvature c for which P(c) = 1/EFL, 1/mm."""
-        stored = lens.variables([self.name])[self.name].detach()
+        stored = lens.get_parameter(self.name).detach()
+        state, _ = split_state(self.name)
+        there = lens.in_state(state)
 
         def power(curvature: float) -> Tensor:
             trial = {**values, self.name: stored.new_tensor(curvature)}
-            system = lens.system(trial)
+            system = there.system(values_there(lens, state, trial))
             return -surface_matrix(system, self.wavelength, 1, len(system.surfaces))[1, 0]
 
         flat = power(0.0)
@@ -101,7 +110,9 @@ class ParaxialFocus:
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
         """Return the distance of the sensor from the last vertex, mm."""
-        system = lens.system({n: v for n, v in values.items() if n != self.name})
+        state, _ = split_state(self.name)
+        given = {n: v for n, v in values.items() if n != self.name}
+        system = lens.in_state(state).system(values_there(lens, state, given))
         image = first_order(system, self.wavelength, self.object_distance).image
         return image - system.vertices[len(system.surfaces) - 1] + self.defocus
 
@@ -121,18 +132,23 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
     Raises:
         InputError: unknown or missing settings, or a solve for a parameter that it cannot move.
     """
-    wavelength, where = lens.primary_wavelength, f"variable '{name}'"
+    there = lens.in_state(split_state(name)[0])
+    wavelength, where = there.primary_wavelength, f"variable '{name}'"
     if "pickup" in settings:
         check_keys(settings, ("pickup", "factor", "offset"), where)
-        source = str(settings["pickup"])
-        pair = {**lens.variables([name]), **lens.variables([source])}
-        if source == name or set(pair) != {name, source}:
-            raise InputError(f"variable '{name}': pickup must name one other parameter")
-        if pair[name].shape != pair[source].shape:
-            raise InputError(f"variable '{name}': pickup '{source}' has another shape")
+        given = settings["pickup"]
+        sources = tuple(map(str, given)) if isinstance(given, list | tuple) else (str(given),)
+        for source in sources:
+            pair = {**lens.variables([name]), **lens.variables([source])}
+            if source == name or set(pair) != {name, source}:
+                raise InputError(
+                    f"variable '{name}': pickup must name one other parameter, or a list of others"
+                )
+            if pair[name].shape != pair[source].shape:
+                raise InputError(f"variable '{name}': pickup '{source}' has another shape")
         return Pickup(
             name,
-            source,
+            sources,
             _number(name, settings, "factor", 1.0),
             to_lens_units(name, _number(name, settings, "offset", 0.0)),
         )
@@ -143,13 +159,37 @@ def dependent(name: str, settings: Mapping[str, Any], lens: Lens) -> Dependent |
             raise InputError(f"variable '{name}': solve 'efl' moves a curvature, to a target in mm")
         return FocalLength(name, _number(name, settings, "target", 0.0), wavelength)
     check_choice(solve, SOLVES, f"{where}: solve")
-    if name != "sensor_distance":
+    if split_state(name)[1] != "sensor_distance":
         raise InputError(f"variable '{name}': solve '{solve}' moves sensor_distance only")
     if solve == "best_focus":
         check_keys(settings, ("solve",), where)
         return None
     check_keys(settings, ("solve", "defocus"), where)
-    return ParaxialFocus(wavelength, lens.object_distance, _number(name, settings, "defocus", 0.0))
+    defocus = _number(name, settings, "defocus", 0.0)
+    return ParaxialFocus(wavelength, there.object_distance, defocus, name)
+
+
+def of_each_state(
+    settings: Mapping[str, Mapping[str, Any] | None], states: Sequence[str]
+) -> dict[str, Mapping[str, Any] | None]:
+    """Return settings of variables with `states.*` written out, of pickups and solves: each state's
+    follows from its own.
+    """
+    found: dict[str, Mapping[str, Any] | None] = {}
+    for name, entry in settings.items():
+        if not entry or not name.startswith(_EVERY) or entry.keys().isdisjoint(_FOLLOWING):
+            found[name] = entry
+            continue
+        for state in states:
+            here = f"{STATES}.{state}."
+            own = dict(entry)
+            sources = own.get("pickup")
+            if isinstance(sources, str):
+                own["pickup"] = sources.replace(_EVERY, here)
+            elif sources is not None:
+                own["pickup"] = [str(source).replace(_EVERY, here) for source in sources]
+            found[name.replace(_EVERY, here)] = own
+    return found
 
 
 def _number(name: str, settings: Mapping[str, Any], key: str, default: float) -> float:

@@ -60,6 +60,12 @@ class LinearModel:
         )
 
     @staticmethod
+    def constant(sum_of_squares: float, variables: int) -> "LinearModel":
+        """Return the model of residuals that no variable changes."""
+        zero = torch.zeros(0, variables, dtype=torch.float64)
+        return LinearModel(sum_of_squares, zero, torch.zeros(0, dtype=torch.float64))
+
+    @staticmethod
     def join(models: Sequence["LinearModel"]) -> "LinearModel":
         """Return the model of all residuals together, of several parts over the same variables."""
         if len(models) == 1:

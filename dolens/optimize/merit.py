@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +17,29 @@ from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.operand_model import OperandModel
 from dolens.optimize.operand_values import OperandValue, OperandValues, evaluate_operands
 from dolens.optimize.operands import Operand, UnreachableField
-from dolens.optimize.variables import DesignVariables
+
+
+class Variables(Protocol):
+    """Gives parameters of a lens as functions of the variables u; see `DesignVariables`."""
+
+    best_focus: bool
+
+    @property
+    def scaled(self) -> Tensor:
+        """Return u (P,)."""
+        ...
+
+    def __call__(self) -> dict[str, Tensor]:
+        """Return the parameters by name."""
+        ...
+
+    def derivatives(self) -> tuple[list[str], Tensor]:
+        """Return names of the parameters in the lens's order, and ∂θ/∂u (Q, P)."""
+        ...
+
+    def write_to(self, lens: Lens) -> None:
+        """Store the parameters in a lens."""
+        ...
 
 
 class MeritFunction:
@@ -37,7 +60,7 @@ class MeritFunction:
     def __init__(
         self,
         lens: Lens,
-        variables: DesignVariables,
+        variables: Variables,
         quality: ImageQuality | None,
         operands: Sequence[Operand] = (),
     ) -> None:
@@ -54,6 +77,11 @@ class MeritFunction:
             require_plane_sensor(lens.system(), "variable 'sensor_distance': solve 'best_focus'")
         self.crossings: dict[tuple[float, float], Tensor] = {}
         self._last: tuple[Tensor, MeritValue] | None = None
+
+    @property
+    def qualities(self) -> dict[str | None, ImageQuality]:
+        """Return the rays' term under the name None, as a merit of states has one by state."""
+        return {} if self.quality is None else {None: self.quality}
 
     def __call__(self) -> "MeritValue":
         """Return the merit at the variables' values; `DampedLeastSquares` takes it as closure."""
@@ -96,11 +124,20 @@ class MeritValue:
         if self._found is not None:
             self.operands = self._found.numbers()
 
+    @property
+    def qualities(self) -> dict[str | None, QualityValues]:
+        """Return the values of the rays under the name None."""
+        return {} if self.quality is None else {None: self.quality}
+
     @torch.no_grad()
     def write_to(self, lens: Lens) -> None:
         """Store the variables, what follows from them, and the focus in a lens."""
         self._merit.variables.write_to(lens)
         lens.sensor_distance.fill_(self.sensor_distance)
+
+    def foci(self) -> dict[str, float]:
+        """Return the sensor's distance (mm) by the name of its parameter."""
+        return {"sensor_distance": self.sensor_distance}
 
     def sum_of_squares(self) -> float:
         """Return the merit; `inf` where rays fail or a chief ray cannot be found."""
@@ -136,9 +173,12 @@ class MeritValue:
         merit, models = self._merit, []
         if merit.quality is not None:
             names, matrix = merit.variables.derivatives()
-            model, of_lens = merit.quality.linear_model(merit.opened, names, self._slopes)
-            models.append(model.of_variables(matrix))
-            self._focus = None if of_lens is None else of_lens @ matrix
+            if names:
+                model, of_lens = merit.quality.linear_model(merit.opened, names, self._slopes)
+                models.append(model.of_variables(matrix))
+                self._focus = None if of_lens is None else of_lens @ matrix
+            else:
+                models.append(LinearModel.constant(self.quality.merit, matrix.shape[1]))
         if self.operands:
             model = OperandModel.of(self._found, self.operand_derivatives())
             models.append(model.near(model.values.new_zeros(model.derivatives.shape[1])))

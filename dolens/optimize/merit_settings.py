@@ -1,7 +1,7 @@
 """A configuration describes a merit function by these settings."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -15,12 +15,14 @@ from dolens.analysis.pupil_quadrature import (
 )
 from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.optics.lens import Lens
+from dolens.optics.lens_states import check_state
 from dolens.optimize.image_quality import ImageQuality
 from dolens.optimize.loss_residuals import LossResiduals, RayInterceptLoss
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import Operand, operand
 from dolens.optimize.ray_intercept_losses import EncircledEnergy, Modulation, SpotSize
 from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
+from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
 
@@ -58,7 +60,9 @@ class MeritSettings:
             `polychromatic`: one for all wavelengths of a field.
         max_vignetting: share of a spot that apertures may clip; see `ImageQuality`.
         operands: each by its settings, as `dolens.optimize.operands.operand` takes them, or as an
-            object.
+            object; one of a state has its name under `state`.
+        states: of a lens that has some, those that count, together one problem; None: all.
+        state_weights: one for each of them, of its rays' term; None: all equal.
     """
 
     fields: Sequence[Sequence[float]] | None = None
@@ -73,6 +77,8 @@ class MeritSettings:
     reference_spectrum: str = "monochromatic"
     max_vignetting: float = 0.2
     operands: Sequence[Mapping[str, Any] | Operand] = ()
+    states: Sequence[str] | None = None
+    state_weights: Sequence[float] | None = None
 
     def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
         """Return (x, y) of every field that counts, degrees or mm.
@@ -133,7 +139,23 @@ class MeritSettings:
         weights = (of_fields[:, None] * of_waves).reshape(-1)
         return weights / weights.sum()
 
-    def build(self, lens: Lens, variables: DesignVariables) -> MeritFunction:
+    def states_of(self, lens: Lens) -> dict[str, float]:
+        """Return the states of a lens that count, with weights that sum to one; none of a lens
+        without states.
+
+        Raises:
+            InputError: a state that the lens does not have, or weights that do not fit.
+        """
+        states = lens.state_names if self.states is None else tuple(self.states)
+        for state in states:
+            check_state(lens, state)
+        if not states:
+            if self.state_weights is not None:
+                raise InputError(f"merit.state_weights: lens '{lens.name}' has no states")
+            return {}
+        return weights_of_states(states, self.state_weights)
+
+    def build(self, lens: Lens, variables: DesignVariables) -> MeritFunction | StatesMerit:
         """Return the merit function, over rays that pass the lens as it is now.
 
         Raises:
@@ -142,7 +164,19 @@ class MeritSettings:
         operands = [operand(settings, lens) for settings in self.operands]
         if self.quality is None and not operands:
             raise InputError("merit: there are neither a quality nor operands")
-        return MeritFunction(lens, variables, self.image_quality(lens), operands)
+        states = self.states_of(lens)
+        if not states:
+            return MeritFunction(lens, variables, self.image_quality(lens), operands)
+        parts = {}
+        for name, weight in states.items():
+            there = lens.in_state(name)
+            quality = self.image_quality(there)
+            if quality is not None:
+                quality = replace(quality, weights=quality.weights * weight)
+            own = [o for o in operands if o.states is None or name in o.states]
+            inside = VariablesInState(variables, lens, name)
+            parts[name] = MeritFunction(there, inside, quality, own)
+        return StatesMerit(lens, variables, parts)
 
     def image_quality(self, lens: Lens) -> ImageQuality | None:
         """Return the rays' term over rays that pass the lens as it is now; None without one."""

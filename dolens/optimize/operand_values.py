@@ -1,7 +1,7 @@
 """Operands of a lens are evaluated together, for a merit function, a loss and a step alike."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -26,6 +26,10 @@ class OperandValue:
     value: float
     deviation: float
     weight: float
+
+    def in_state(self, name: str) -> "OperandValue":
+        """Return the same with the name of a state before its label, as `wide/efl`."""
+        return replace(self, label=f"{name}/{self.label}")
 
 
 @dataclass(frozen=True)

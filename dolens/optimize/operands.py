@@ -18,12 +18,13 @@ from torch import Tensor
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.aiming import aim
 from dolens.optics.lens import Lens
+from dolens.optics.lens_states import check_state
 from dolens.optics.paraxial import FirstOrder, first_order
 from dolens.optics.rays import Components
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_sensor
 
-_KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps")
+_KEYS = ("kind", "target", "min", "max", "weight", "field", "gaps", "state")
 
 
 class UnreachableField(ArithmeticError):
@@ -113,6 +114,7 @@ class Operand:
         weight: factor of the residual: merit counts (weight·deviation)².
         field: (x, y) of the chief ray, degrees or mm, of operands that have one.
         gaps: numbers of the gaps, of operands that have them; None for all of their kind.
+        states: of a lens with states, those that it is of; None for all.
 
     Raises:
         InputError: no target and no limit, or both; limits that exclude each other; a weight that
@@ -126,6 +128,7 @@ class Operand:
     weight: float = 1.0
     field: tuple[float, float] = (0.0, 0.0)
     gaps: tuple[int, ...] | None = None
+    states: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         where = f"operand '{self.kind}'"
@@ -156,13 +159,13 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     """Return the operand that a configuration describes.
 
     Args:
-        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`; or an operand,
-            which is returned as it is.
+        settings: `kind`, `target` or `min` and `max`, `weight`, `field`, `gaps`, `state` (one
+            or a list); or an operand, which is returned as it is.
         lens: that it is meant for.
 
     Raises:
-        InputError: an unknown key or kind, a value that `Operand` refuses, or a gap that the lens
-            does not have.
+        InputError: an unknown key or kind, a value that `Operand` refuses, or a gap or a state that
+            the lens does not have.
     """
     if isinstance(settings, Operand):
         return settings
@@ -181,7 +184,12 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
         for gap in gaps:
             if not 1 <= gap <= count:
                 raise InputError(f"operand '{kind}': the lens has gaps 1 to {count}, not {gap}")
-    return Operand(kind, target, low, high, weight, field, gaps)
+    states = settings.get("state")
+    if states is not None:
+        states = (states,) if isinstance(states, str) else tuple(map(str, states))
+        for state in states:
+            check_state(lens, state)
+    return Operand(kind, target, low, high, weight, field, gaps, states)
 
 
 def _number(value: object, what: str) -> float:

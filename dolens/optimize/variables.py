@@ -11,7 +11,7 @@ from dolens.errors import InputError, check_keys
 from dolens.optics.lens import Lens
 from dolens.optics.parameter_units import to_file_units, unit_factors, unit_of
 from dolens.optics.row_jacobian import jacobian_of
-from dolens.optimize.dependents import Dependent, dependent
+from dolens.optimize.dependents import Dependent, dependent, of_each_state
 
 _KEYS = ("scale", "initial", "lower", "upper")
 
@@ -44,7 +44,8 @@ class DesignVariables(nn.Module):
         scale: (P,), θ/u, in the lens's own units.
         units: (P,), the lens's own unit in one of files: radians in a degree, or 1.
         dependents: the parameters that follow from others, in the order of their settings.
-        best_focus: whether a merit function is to keep the sensor at the best focus.
+        focused: names of the distances of the sensor, the lens's or a state's, which a merit
+            function is to keep at the best focus.
 
     Raises:
         InputError: an unknown parameter or setting, a scale that is not positive, or an initial
@@ -63,10 +64,9 @@ class DesignVariables(nn.Module):
         self._of = (lens,)
         self._others = frozenset(others or ())
         self._shapes: list[torch.Size] = []
-        self.dependents, self.best_focus = _dependents(lens, variables)
-        following = {parameter.name for parameter in self.dependents}
-        if self.best_focus:
-            following.add("sensor_distance")
+        variables = of_each_state(variables, lens.state_names)
+        self.dependents, self.focused = _dependents(lens, variables)
+        following = {parameter.name for parameter in self.dependents} | self.focused
         scaled, scale, lower, upper = [], [], [], []
         for pattern, settings in variables.items():
             settings = dict(settings or {})
@@ -113,6 +113,11 @@ class DesignVariables(nn.Module):
         )
         # It follows from the names, so that checkpoints need not hold it.
         self.register_buffer("units", units.to(**options), persistent=False)
+
+    @property
+    def best_focus(self) -> bool:
+        """Return whether a merit function is to keep the lens's sensor at the best focus."""
+        return "sensor_distance" in self.focused
 
     def __len__(self) -> int:
         """Return the number of parameters; an array is one."""
@@ -211,17 +216,17 @@ class DesignVariables(nn.Module):
 
 def _dependents(
     lens: Lens, variables: Mapping[str, Mapping[str, Any] | None]
-) -> tuple[list[Dependent], bool]:
-    found, best_focus = [], False
+) -> tuple[list[Dependent], frozenset[str]]:
+    found, focused = [], []
     for name, settings in variables.items():
         if settings and ("pickup" in settings or "solve" in settings):
             lens.variables([name])
             made = dependent(name, settings, lens)
             if made is None:
-                best_focus = True
+                focused.append(name)
             else:
                 found.append(made)
-    return found, best_focus
+    return found, frozenset(focused)
 
 
 def _setting(settings: Mapping[str, Any], key: str, default: float, pattern: str) -> float:

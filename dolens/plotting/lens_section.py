@@ -41,12 +41,7 @@ def lens_section_figure(
     waves = torch.as_tensor(wavelengths, dtype=torch.float64)
     wave = float(waves[int((waves - lens.primary_wavelength).abs().argmin())])
     heights = list(dict.fromkeys(y for x, y in fields.tolist() if x == 0.0)) or [0.0]
-    angles = heights
-    if object_distance is not None:
-        pupil = entrance_pupil(lens.system().double(), wave)
-        away = object_distance + float(pupil.z)
-        # Chief rays of a near object come down from a point above the axis.
-        angles = [-math.degrees(math.atan(height / away)) + 0.0 for height in heights]
+    angles = section_angles(lens, heights, wave, object_distance)
     if title is None:
         title = caption("Section", lens, [wave], object_distance)
     figure = layout_figure(lens, wave, angles, rays, object_distance, title)
@@ -56,3 +51,22 @@ def lens_section_figure(
             dark = " (no ray passes)" if "no ray" in text.get_text() else ""
             text.set_text(field_label((0.0, height), field_unit) + dark)
     return figure
+
+
+def section_angles(
+    lens: Lens, heights: Sequence[float], wavelength: float, object_distance: float | None
+) -> list[float]:
+    """Return the angles (degrees) of the chief rays of fields along y, as `layout_figure` takes
+    them.
+
+    Args:
+        lens: the lens.
+        heights: degrees, or mm on a near object.
+        wavelength: nm.
+        object_distance: mm in front of the first vertex; None for an object at infinity.
+    """
+    if object_distance is None:
+        return list(heights)
+    away = object_distance + float(entrance_pupil(lens.system().double(), wavelength).z)
+    # Chief rays of a near object come down from a point above the axis.
+    return [-math.degrees(math.atan(height / away)) + 0.0 for height in heights]

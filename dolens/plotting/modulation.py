@@ -1,7 +1,7 @@
 """The modulation transfer function is plotted against frequency."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from matplotlib.axes import Axes
@@ -17,10 +17,14 @@ from dolens.plotting.titles import draw_title
 _TANGENTIAL, _SAGITTAL = "-", (0, (1, 1.2))
 # Curves that differ by less are one on paper.
 _SAME = 2e-3
+# More panels than these have no room for a label each.
+_FEW = 3
 
 
 def modulation_figure(
-    mtf: Modulation | Mapping[str, Modulation], title: str | None = "Geometric MTF"
+    mtf: Modulation | Mapping[str, Modulation],
+    title: str | None = "Geometric MTF",
+    labels: Sequence[str] | None = None,
 ) -> Figure:
     """Plot contrast against frequency: tangential solid, sagittal dotted, the diffraction limit
     dashed.
@@ -31,6 +35,7 @@ def modulation_figure(
     Args:
         mtf: the data, or name → data, the names written above.
         title: above the axes.
+        labels: one a field, where its place differs between the panels; None: its place.
 
     Returns:
         A figure; fields that no light reaches are named so in the legend.
@@ -40,9 +45,13 @@ def modulation_figure(
     grid = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
     names = {}
     for axes, (name, found) in zip(grid, panels.items(), strict=True):
-        names[name] = _draw(axes, found)
+        names[name] = _draw(axes, found, labels)
         if name:
             axes.set_title(name, fontsize=SMALL + 1)
+    if len(panels) > _FEW:
+        # Labels side by side would run into each other.
+        for axes in [a for n, a in enumerate(grid) if n != len(panels) // 2]:
+            axes.set_xlabel("")
     grid[0].set_ylabel("modulation (contrast)", fontsize=SMALL + 1)
     first = next(iter(panels.values()))
     shades = ordered_colours(len(first.fields))
@@ -59,7 +68,7 @@ def modulation_figure(
     return figure
 
 
-def _draw(axes: Axes, mtf: Modulation) -> dict[int, str]:
+def _draw(axes: Axes, mtf: Modulation, names: Sequence[str] | None = None) -> dict[int, str]:
     """Draw one lens; return labels of the legend, by the number of the field that is drawn."""
     frequency = mtf.frequencies.numpy()
     limit = {"color": "black", "linewidth": 1.1, "linestyle": "--", "label": "diffraction limit"}
@@ -67,7 +76,7 @@ def _draw(axes: Axes, mtf: Modulation) -> dict[int, str]:
     labels: dict[int, list[str]] = {}
     shades = ordered_colours(len(mtf.fields))
     for number, (field, colour) in enumerate(zip(mtf.fields, shades, strict=True)):
-        label = field_label(field, mtf.field_unit)
+        label = names[number] if names else field_label(field, mtf.field_unit)
         if math.isnan(float(mtf.tangential[number, 0])):
             labels[number] = [f"{label} (no light passes)"]
             continue

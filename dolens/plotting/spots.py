@@ -34,6 +34,8 @@ _CHIEF_REACH = 1.3
 # The last of the compared columns gets a magnified copy where its light reaches less than this
 # share of the common scale.
 _LOST = 0.4
+# Beside more columns than these a heading has room for one number alone.
+_FEW = 3
 
 
 def spots_figure(
@@ -91,7 +93,9 @@ def spots_figure(
 
 
 def spots_comparison_figure(
-    compared: Mapping[str, SpotDiagram], title: str | None = "Spot diagrams"
+    compared: Mapping[str, SpotDiagram],
+    title: str | None = "Spot diagrams",
+    labels: Sequence[str] | None = None,
 ) -> Figure:
     """Plot the spots of several lenses, or of one before and after, on one scale.
 
@@ -102,9 +106,10 @@ def spots_comparison_figure(
     Args:
         compared: name → spots; of the same fields.
         title: above all panels.
+        labels: one a field, where its place differs between the lenses; None: its place.
 
     Raises:
-        InputError: nothing to compare, or fields that differ.
+        InputError: nothing to compare, or numbers of fields that differ.
     """
     diagrams = list(compared.values())
     if not diagrams or any(d.fields.shape != diagrams[0].fields.shape for d in diagrams):
@@ -131,10 +136,11 @@ def spots_comparison_figure(
             axes = grid[field, column]
             one.field(axes, field)
             heading = f"{name}\n" if field == 0 else ""
-            axes.set_title(heading + one.numbers(field), fontsize=SMALL)
+            numbers = one.numbers(field, short=len(columns) > _FEW)
+            axes.set_title(heading + numbers, fontsize=SMALL)
         _label(grid[:, [column]], fields, half, False)
     for row, field in enumerate(diagrams[0].fields):
-        label = field_label(field, diagrams[0].field_unit)
+        label = labels[row] if labels else field_label(field, diagrams[0].field_unit)
         grid[row, 0].set_ylabel(f"{label}\ny (µm)", fontsize=SMALL + 1)
         for axes, (_, _, half) in zip(grid[row, 1:], columns[1:], strict=True):
             axes.tick_params(labelleft=half != reach)
@@ -171,8 +177,10 @@ class _Drawn:
         self._points(axes, field, wave)
         self._marks(axes, self.chief[field], self.middles[field, wave], self.airy[wave])
 
-    def numbers(self, field: int, wave: int | None = None) -> str:
-        """Return the RMS radius and the largest distance from the centroid, for a heading."""
+    def numbers(self, field: int, wave: int | None = None, short: bool = False) -> str:
+        """Return the RMS radius and, unless `short`, the largest distance from the centroid, for a
+        heading.
+        """
         if wave is None:
             rms = float(self.spots.polychromatic_rms[field])
             far = _largest(np.linalg.norm(self.points[field], axis=-1))
@@ -181,6 +189,8 @@ class _Drawn:
             far = 1e3 * float(self.spots.geo[field, wave])
         if math.isnan(rms):
             return "no light passes"
+        if short:
+            return f"RMS {number_text(1e3 * rms)} µm"
         return f"RMS {number_text(1e3 * rms)}, max {number_text(far)} µm"
 
     def _points(self, axes: Axes, field: int, wave: int) -> None:

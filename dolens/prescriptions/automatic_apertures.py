@@ -8,7 +8,7 @@ stop instead.  Where no ray gets through at all, the height is the paraxial one.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -56,6 +56,19 @@ def set_automatic_semi_diameters(lens: Lens, prescription: Mapping[str, Any]) ->
         if not surface.aperture.clips and surface.semi_diameter > surface.reach:
             _resize(lens, n, surface.reach)
     return lens
+
+
+def set_common_semi_diameters(lenses: Sequence[Lens], numbers: Iterable[str]) -> None:
+    """Give automatic semi-diameters of states of one lens the largest value of all.
+
+    Args:
+        lenses: the lens as each of its states has it.
+        numbers: of the surfaces.
+    """
+    for n in numbers:
+        largest = max(lens.surfaces[n].semi_diameter for lens in lenses)
+        for lens in lenses:
+            _resize(lens, n, largest)
 
 
 def _too_small(lens: Lens, numbers: Sequence[str]) -> list[str]:

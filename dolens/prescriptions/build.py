@@ -24,7 +24,8 @@ lens (see deflections.py).
 Some shapes have lists of numbers (the coefficients and knots of a `b_spline`).
 What the lens is used with is optional: `wavelengths`, `fields`, `object_distance`, and a pupil
 that the stop is closed to (see `dolens.prescriptions.system_data`).
-So are the numbers that its source publishes (see `dolens.prescriptions.published`).
+So are the numbers that its source publishes (see `dolens.prescriptions.published`), and the states
+of a lens that zooms, focuses or gets warm (see `dolens.prescriptions.states`).
 It is data: nothing in it names code, and unknown keys are errors.
 """
 
@@ -62,6 +63,7 @@ from dolens.prescriptions.media import EXPANSION_KEY, environment_of, expansion_
 from dolens.prescriptions.poses import element_rows, elements_from
 from dolens.prescriptions.published import PUBLISHED_KEY, published_from, published_rows
 from dolens.prescriptions.sensor_data import sensor_from, sensor_row
+from dolens.prescriptions.states import STATES_KEY, state_rows, with_states
 from dolens.prescriptions.system_data import (
     SYSTEM_DATA_KEYS,
     set_stop_semi_diameter,
@@ -80,6 +82,7 @@ _LENS_KEYS = (
     "surfaces",
     "elements",
     "sensor",
+    STATES_KEY,
     *SYSTEM_DATA_KEYS,
 )
 _SURFACE_KEYS = (
@@ -157,7 +160,15 @@ def lens_from_prescription(
             **data,
         )
         lens = set_object_fields(set_stop_semi_diameter(lens, prescription))
-        return set_automatic_semi_diameters(lens, prescription)
+        lens = set_automatic_semi_diameters(lens, prescription)
+        if not prescription.get(STATES_KEY):
+            return lens
+
+        def build(other: Mapping[str, Any], place: str) -> Lens:
+            named = {"name": name, **other}
+            return lens_from_prescription(named, dtype, index_model, place, backend)
+
+        return with_states(lens, prescription, build, where)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(where) else f"{where}: {message}") from None
@@ -169,6 +180,11 @@ def prescription_of(lens: Lens) -> dict[str, Any]:
 
     Reading it back gives a lens with the same parameters to the last bit.
     """
+    return {**_rows_of(lens), **state_rows(lens, _rows_of)}
+
+
+def _rows_of(lens: Lens) -> dict[str, Any]:
+    """Return the prescription of a lens without its states."""
     rows: dict[str, dict[str, Any]] = {}
     for (number, surface), material in zip(lens.surfaces.items(), lens.materials[1:], strict=True):
         if surface.changes_axes:

@@ -115,6 +115,7 @@ def _told(difference: Difference, said: list[str]) -> bool:
         "note": "remark",
         "source": "lost: source",
         "published": "lost: the published numbers",
+        "states": "lost: the states",
         "elements": "lost: the names",
         "index_model": "the index model",
         "material": "the glass",

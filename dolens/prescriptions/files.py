@@ -15,6 +15,7 @@ from dolens.prescriptions.build import lens_from_prescription, prescription_of
 from dolens.prescriptions.lens_formats import MOST_BYTES, SUFFIXES, encode_lens, read_lens
 from dolens.prescriptions.published import PUBLISHED_KEY
 from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.yaml_text import plain_values
 
 __all__ = [
@@ -203,7 +204,8 @@ def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None
     path = Path(path)
     prescription = prescription_of(lens)
     if path.suffix.lower() not in _WHOLE:
-        prescription.pop(PUBLISHED_KEY, None)
+        for part in (prescription, *prescription.get(STATES_KEY, {}).values()):
+            part.pop(PUBLISHED_KEY, None)
     if path.suffix.lower() in _WITHOUT_SOURCE:
         prescription.pop("source", None)
     with glass_folders(glass_catalogues):

@@ -125,8 +125,15 @@ def _without_source(prescription: Prescription, new: str) -> list[str]:
 
 def _without_published(prescription: Prescription, new: str) -> list[str]:
     """Drop the numbers that the source publishes."""
-    found = prescription.pop("published", None)
-    return ["lost: the published numbers"] if found else []
+    states = prescription.get("states") or {}
+    found = [part.pop("published", None) for part in (prescription, *states.values()) if part]
+    return ["lost: the published numbers"] if any(found) else []
+
+
+def _without_states(prescription: Prescription, new: str) -> list[str]:
+    """Drop the states: the lens itself stays."""
+    found = prescription.pop("states", None)
+    return [f"lost: the states {', '.join(map(str, found))}"] if found else []
 
 
 def _one_line_name(prescription: Prescription, new: str) -> list[str]:
@@ -148,6 +155,7 @@ SIMPLIFICATIONS: tuple[Callable[[Prescription, str], list[str]], ...] = (
     _aperture_planes,
     _glass_by_numbers,
     _dfc_indices,
+    _without_states,
 )
 
 

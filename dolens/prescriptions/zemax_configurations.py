@@ -1,19 +1,42 @@
-"""Configurations of a Zemax `.zmx` file are states of one lens: zoom, focus, temperature.
+"""Configurations of a Zemax `.zmx` file are states of one lens: zoom, focus.
 
 `MNUM count current` begins the list behind the surfaces, and each line of it says what one operand
 is in one configuration: `THIC 5 2 12.5` is a gap of 12.5 behind surface 5 in configuration 2.  The
-surfaces are written as they are in the current one, and that is the lens which is read.
+surfaces are written as they are in the current one, and that is the lens itself; every
+configuration that can be held becomes a state of it, under its title (LTTL) or as `c2`.
+
+A configuration is read as the file would be, were it the current one: its numbers take the place of
+those of the surfaces and the system.  One that cannot be held is passed over, and listed: where it
+changes a glass, a type or the stop, where a solve would change the lens with it (its result is
+written for the current configuration alone), or where its temperature differs (the numbers of such
+a file are those at that temperature).
 """
 
-from dolens.errors import InputError
-from dolens.prescriptions.decimals import number_in_text
-from dolens.prescriptions.zemax import Line, ZemaxFile
-from dolens.prescriptions.zemax_fields import last
+import copy
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
 
-# Temperature and pressure, and what a file without ENVD means by them.
-_AIR = {"TEMP": 20.0, "PRES": 1.0}
-# Lines round what ENVD says to a dozen digits.
-_SAME_AIR = 1e-6
+from dolens.errors import InputError
+from dolens.prescriptions.build import lens_from_prescription
+from dolens.prescriptions.decimals import number_in_text
+from dolens.prescriptions.system_data import PUPIL_KEYS
+from dolens.prescriptions.zemax import Line, ZemaxFile
+from dolens.prescriptions.zemax_settings import apply_setting
+
+Read = Callable[[ZemaxFile], dict[str, Any]]
+
+TITLE = "LTTL"
+# What bends no ray: remarks, weights, mechanical sizes.
+_SILENT = ("MOFF", "MCOM", TITLE, "CWGT", "CHZN", "MCSD", "CSUM", "HOLD")
+# Solves of a surface, whose results hold for the current configuration.
+_SOLVES = (
+    *("MAZH", "MAZA", "CHZH", "CHZA", "EDGE", "EDGV", "OPDS", "PZUP", "PKUP", "PPAR", "PCON"),
+    *("PXDT", "PIKC", "PIKT", "PIKD", "PIKG", "PIKK", "TOLE", "TCOM"),
+)
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
+# Keys of a prescription that a state may have for itself.
+_KEYS = ("fields", "object_distance", "wavelengths", "reference_wavelength", *PUPIL_KEYS)
 
 
 def configuration_lines(file: ZemaxFile) -> list[Line]:
@@ -24,75 +47,195 @@ def configuration_lines(file: ZemaxFile) -> list[Line]:
     return [line for line in file.tail if line.at > begin[-1].at and line.operand != "MOFF"]
 
 
-def refuse_own_air(file: ZemaxFile, where: str) -> None:
-    """Refuse media at a temperature or pressure that is not the system's.
+def read_configurations(
+    file: ZemaxFile, lens: dict[str, Any], read: Read, where: str
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the states of a file's lens, as a prescription writes them, and sentences about the
+    configurations that are passed over.
 
-    TEMP and PRES hold for the GLSS behind them, in the same configuration: so a lens may stand in a
-    vacuum between windows.  Where MNUM does not say which configuration is the current one, one
-    must be as the system is.
-
-    Raises:
-        InputError: a GLSS of the current configuration stands behind another temperature or
-            pressure than ENVD has.
-    """
-    begin = file.system.get("MNUM")
-    if not begin or not begin[-1].arguments:
-        return
-    place = f"{where}: line {begin[-1].at}: MNUM"
-    count, *current = (number_in_text(word, place) for word in begin[-1].arguments[:2])
-    # Older files give no current one.
-    candidates = [current[0] or 1.0] if current else range(1, int(count) + 1)
-    found = [_own_air(file, where, number) for number in candidates]
-    if found and all(found):
-        raise InputError(f"{where}: {found[0]}")
-
-
-def _own_air(file: ZemaxFile, where: str, configuration: float) -> str:
-    """Return which medium has a temperature or pressure of its own, nothing where none has."""
-    line = last(file, "ENVD")
-    given = [number_in_text(word, f"{where}: ENVD") for word in line.arguments[:2]] if line else []
-    air = _AIR | dict(zip(_AIR, given, strict=False))
-    here = air
-    for line in configuration_lines(file):
-        place = f"{where}: line {line.at}: {line.operand}"
-        if line.operand not in (*_AIR, "GLSS") or len(line.arguments) < 3:
-            continue
-        if number_in_text(line.arguments[1], place) != configuration:
-            continue
-        if line.operand in _AIR:
-            here = {**here, line.operand: number_in_text(line.arguments[2], place)}
-        elif any(abs(here[key] - air[key]) > _SAME_AIR for key in _AIR):
-            return (
-                f"surface {line.arguments[0]}: a medium at a temperature or pressure of its own is "
-                f"not held (GLSS behind TEMP {here['TEMP']:g} and PRES {here['PRES']:g}, line "
-                f"{line.at})"
-            )
-    return ""
-
-
-def other_configurations(file: ZemaxFile, where: str) -> list[str]:
-    """Return a sentence about the configurations that are not read, none where there is one.
+    Args:
+        file: the lines.
+        lens: the prescription of the current configuration.
+        read: returns the prescription of a file's current configuration.
+        where: name in messages.
 
     Raises:
         InputError: MNUM has no whole number.
     """
     begin = file.system.get("MNUM")
     if not begin or not begin[-1].arguments:
-        return []
+        return {}, []
     place = f"{where}: line {begin[-1].at}: MNUM"
-    count, current = (number_in_text(word, place) for word in (*begin[-1].arguments, "1")[:2])
+    words = (number_in_text(word, place) for word in (*begin[-1].arguments, "1")[:2])
+    count, current = words
     if count != int(count) or current != int(current):
         raise InputError(f"{place} must have whole numbers, not '{begin[-1].text}'")
-    if count < 2:
-        return []
+    count, current = int(count), int(current) or 1
+    differ = _differing(file)
+    if count < 2 or not differ:
+        return {}, []
+    held: dict[int, dict[str, Any]] = {}
+    problems: dict[int, str] = {}
+    for number in range(1, count + 1):
+        try:
+            held[number] = _of_configuration(file, number, lens, read, where)
+        except InputError as problem:
+            problems[number] = str(problem).removeprefix(f"{where}: ")
+    states = _states(file, lens, held, current, where)
+    for number in _unbuilt(lens, states, problems, where):
+        del states[number]
+    others = [number for number in range(1, count + 1) if number != current]
+    lost = [number for number in others if number not in states]
+    said = f"which set {', '.join(differ)} (read: the current one, {current})"
+    names = _names(file, states, lens)
+    found = {names[number]: state for number, state in states.items() if names[number]}
+    if not lost:
+        return found, []
+    why = problems.get(lost[0])
+    why = f": {why}" if why else ""
+    if len(lost) == len(others):
+        return {}, [f"the other {len(lost)} of {count} configurations, {said}{why}"]
+    numbers = ", ".join(map(str, lost))
+    return found, [f"configurations {numbers} of {count}, {said}{why}"]
+
+
+def _differing(file: ZemaxFile) -> list[str]:
+    """Return the operands whose values differ between configurations, with their surfaces."""
     values: dict[str, set[str]] = {}
     for line in configuration_lines(file):
-        if len(line.arguments) > 2:
+        if len(line.arguments) > 2 and line.operand not in _SILENT:
             values.setdefault(f"{line.operand} {line.arguments[0]}", set()).add(line.arguments[2])
-    differ = [name for name, words in values.items() if len(words) > 1]
-    if not differ:
-        return []
-    return [
-        f"the other {int(count) - 1} of {int(count)} configurations, which set "
-        f"{', '.join(differ)} (read: the current one, {int(current) or 1})"
-    ]
+    return [name for name, words in values.items() if len(words) > 1]
+
+
+def _of_configuration(
+    file: ZemaxFile, number: int, lens: dict[str, Any], read: Read, where: str
+) -> dict[str, Any]:
+    """Return the prescription of a configuration.
+
+    Raises:
+        InputError: it cannot be held; the message says why.
+    """
+    differ = _differing(file)
+    if file.skipped:
+        raise InputError("the file leaves out numbers of surfaces")
+    for solve in _SOLVES:
+        for line in file.passed_over.get(solve, []):
+            raise InputError(f"a solve holds for the current one ({solve} in line {line.at})")
+    for n, lines in enumerate(file.surfaces):
+        if "CURV" in lines and lines["CURV"][-1].arguments[1:2] not in ([], ["0"], ["1"]):
+            raise InputError(f"a solve of surface {n} holds for the current one (CURV)")
+    there = copy.deepcopy(file)
+    for line in configuration_lines(file):
+        if line.operand in _SILENT or len(line.arguments) < 3:
+            continue
+        if number_in_text(line.arguments[1], f"{where}: line {line.at}") != number:
+            continue
+        if f"{line.operand} {line.arguments[0]}" in differ:
+            apply_setting(there, line)
+    found = read(there)
+    _refuse_other_structure(lens, found)
+    return found
+
+
+def _refuse_other_structure(lens: dict[str, Any], there: dict[str, Any]) -> None:
+    for key in (lens.keys() | there.keys()) - {"surfaces", "sensor", *_KEYS}:
+        if lens.get(key) != there.get(key):
+            raise InputError(f"it changes '{key}'")
+    if lens["surfaces"].keys() != there["surfaces"].keys():
+        raise InputError("it changes the number of surfaces")
+    for n, row in lens["surfaces"].items():
+        for key in ("type", "material", "phase"):
+            if row.get(key) != there["surfaces"][n].get(key):
+                raise InputError(f"surface {n}: it changes '{key}'")
+    for key in (lens["sensor"].keys() | there["sensor"].keys()) - {"distance"}:
+        if lens["sensor"].get(key) != there["sensor"].get(key):
+            raise InputError(f"the image: it changes '{key}'")
+
+
+def _states(
+    file: ZemaxFile,
+    lens: dict[str, Any],
+    held: dict[int, dict[str, Any]],
+    current: int,
+    where: str,
+) -> dict[int, dict[str, Any]]:
+    """Return the states: each says every number that differs in any of them."""
+    varied = {
+        (n, _canonical(key))
+        for there in held.values()
+        for n, row in lens["surfaces"].items()
+        for key in row.keys() | there["surfaces"][n].keys()
+        if row.get(key) != there["surfaces"][n].get(key)
+    }
+    moved = any(there["sensor"] != lens["sensor"] for there in held.values())
+    system = [key for key in _KEYS if any(t.get(key) != lens.get(key) for t in held.values())]
+    found = {}
+    for number, there in held.items():
+        rows: dict[str, dict[str, Any]] = {}
+        for n, key in sorted(varied, key=lambda pair: (int(pair[0]), pair[1])):
+            row = there["surfaces"][n]
+            said = {k: value for k, value in row.items() if _canonical(k) == key}
+            rows.setdefault(n, {}).update(said or {key: 0.0})
+        state: dict[str, Any] = {"surfaces": rows} if rows else {}
+        if moved:
+            state["sensor"] = {"distance": there["sensor"]["distance"]}
+        for key in system:
+            if key in there:
+                state[key] = there[key]
+            elif key == "object_distance":
+                state[key] = float("inf")
+        found[number] = state
+    return found
+
+
+def _canonical(key: str) -> str:
+    return key.replace("curvature", "radius")
+
+
+def _unbuilt(
+    lens: dict[str, Any], states: dict[int, dict[str, Any]], problems: dict[int, str], where: str
+) -> list[int]:
+    """Return the states that make no lens, and write down why."""
+
+    def build(some: dict[int, dict[str, Any]]) -> None:
+        named = {f"c{number}": state for number, state in some.items()}
+        lens_from_prescription({**lens, "states": named}, where=where)
+
+    try:
+        build(states)
+    except InputError:
+        found = []
+        for number, state in states.items():
+            try:
+                build({number: state})
+            except InputError as problem:
+                problems[number] = str(problem).removeprefix(f"{where}: ")
+                found.append(number)
+        return found
+    return []
+
+
+def _names(
+    file: ZemaxFile, states: dict[int, dict[str, Any]], lens: dict[str, Any]
+) -> dict[int, str]:
+    """Return the names of the states: their titles where these can be names, else `c2`; nothing of
+    one whose title is the lens's own.
+    """
+    titles = {}
+    for line in configuration_lines(file):
+        if line.operand == TITLE and len(line.arguments) > 2:
+            titles[int(number_in_text(line.arguments[1], ""))] = line.text.split('"')[1:2]
+    names = {}
+    for number in states:
+        (title,) = titles.get(number) or [""]
+        own = bool(_NAME.fullmatch(title)) and title not in names.values()
+        names[number] = title if own else f"c{number}"
+        if title == own_title(lens):
+            names[number] = ""
+    return names
+
+
+def own_title(lens: Mapping[str, Any]) -> str:
+    """Return the title of a configuration that is the lens itself and none of its states."""
+    return f"the lens itself: {lens.get('name', '')}".strip()

@@ -27,13 +27,15 @@ from dolens.errors import InputError
 from dolens.optics.mirrors import MIRROR
 from dolens.prescriptions.apertures import AUTOMATIC
 from dolens.prescriptions.read_file import ReadPrescription
+from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import Line, ZemaxFile, parse_zemax
 from dolens.prescriptions.zemax_apertures import is_fixed, read_apertures
 from dolens.prescriptions.zemax_block import SurfaceBlock, curvature_row
-from dolens.prescriptions.zemax_configurations import other_configurations, refuse_own_air
+from dolens.prescriptions.zemax_configurations import read_configurations
 from dolens.prescriptions.zemax_fields import is_axial
 from dolens.prescriptions.zemax_glass import read_glass
+from dolens.prescriptions.zemax_own_air import refuse_own_air
 from dolens.prescriptions.zemax_own_axes import own_axes
 from dolens.prescriptions.zemax_passed_over import passed_over
 from dolens.prescriptions.zemax_shape import Row
@@ -69,8 +71,17 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     file = parse_zemax(text, where)
     if len(file.surfaces) < 3:
         raise InputError(f"{where}: needs an object, a surface and an image as SURF blocks")
+    read = partial(_current, glass=_glass_reader(file), where=where)
+    found = read(file)
+    states, lost = read_configurations(file, found, read, where)
+    if states:
+        found[STATES_KEY] = states
+    return ReadPrescription(found, [*passed_over(file), *lost])
+
+
+def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
+    """Return the prescription of the current configuration."""
     factor = factor_to_mm(file, where)
-    glass = _glass_reader(file)
     medium, distance = _object(file, glass, factor, where)
     prescription = read_system(file, factor, distance is not None, where)
     refuse_own_air(file, where)
@@ -107,15 +118,26 @@ def read_zemax(text: str, where: str = "lens") -> ReadPrescription:
     prescription["stop"] = stops[0]
     if distance is not None:
         prescription["object_distance"] = _in_front(distance, prescription, rows, hard)
-    found = _with_sensor(prescription, rows, hard, file.surfaces[-1], factor, where)
-    return ReadPrescription(found, [*passed_over(file), *other_configurations(file, where)])
+    return _with_sensor(prescription, rows, hard, file.surfaces[-1], factor, where)
 
 
 def _glass_reader(file: ZemaxFile) -> GlassReader:
-    """Return what reads a surface's glass, given the words of its GLAS and its name in messages."""
+    """Return what reads a surface's glass, given the words of its GLAS and its name in messages.
+
+    What it has read it knows, so that other configurations say nothing of it once more.
+    """
     catalogues = [word for line in file.system.get("GCAT", []) for word in line.arguments]
     words = [lines["GLAS"][-1].arguments if "GLAS" in lines else [] for lines in file.surfaces]
-    return partial(read_glass, catalogues=catalogues or None, surfaces=words)
+    read = partial(read_glass, catalogues=catalogues or None, surfaces=words)
+    known: dict[tuple[str, ...], str] = {}
+
+    def glass(words: list[str], place: str) -> str:
+        key = (place, *words)
+        if key not in known:
+            known[key] = read(words, place=place)
+        return known[key]
+
+    return glass
 
 
 def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, bool]:

@@ -1,6 +1,7 @@
 """A prescription is written as the text of a Zemax `.zmx` file."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from dolens.errors import InputError
@@ -8,12 +9,14 @@ from dolens.prescriptions.checks import as_integer, as_number
 from dolens.prescriptions.compare import require_same
 from dolens.prescriptions.decimals import shifted
 from dolens.prescriptions.media import canonical
+from dolens.prescriptions.states import STATES_KEY, merged_prescription
 from dolens.prescriptions.zemax_apertures import aperture_lines
 from dolens.prescriptions.zemax_fields import FIELD_KINDS, PUPIL_ANGLES, VIGNETTING_OPERANDS
 from dolens.prescriptions.zemax_glass import catalogue_line, glass_line
 from dolens.prescriptions.zemax_reader import prescription_from_zemax
 from dolens.prescriptions.zemax_shapes import shape_of_row
 from dolens.prescriptions.zemax_standard import conic_line, curvature_line
+from dolens.prescriptions.zemax_states import configurations_of
 
 _D_LINE = 587.5618
 # Fields in the lists; further ones have lines of their own.
@@ -28,11 +31,40 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
     a wavelength and a field: where the prescription has none, the d line and the axis are written.
     A glass's maker goes into GCAT, its nd and Vd beside its name; a constant index is a model glass
     whose Vd is 0.  `occluder` is written as air, which it is in the index models that a file can
-    hold.
+    hold.  States are written as configurations (see `zemax_states`).
 
     Raises:
         InputError: one line that names the surface and key which the format cannot hold.
     """
+    if not prescription.get(STATES_KEY):
+        return _without_states(prescription, where)
+    alone = {key: value for key, value in prescription.items() if key != STATES_KEY}
+    text = _without_states(alone, where)
+    lines = configurations_of(prescription, partial(_written, where=where), where)
+    text += "\n".join((*lines, ""))
+    found = prescription_from_zemax(text, where)
+    for name, state in prescription[STATES_KEY].items():
+        place = f"{where}: state '{name}'"
+        back = found.get(STATES_KEY, {}).get(name)
+        if back is None:
+            raise InputError(f"{place}: a .zmx file cannot hold it")
+        both = (
+            merged_prescription(prescription, state, place),
+            merged_prescription(found, back, place),
+        )
+        require_same(*both, ".zmx", place, canonical, _ALWAYS)
+    return text
+
+
+def _without_states(prescription: Mapping[str, Any], where: str) -> str:
+    text = _written(prescription, where)
+    found = prescription_from_zemax(text, where)
+    require_same(prescription, found, ".zmx", where, canonical, _ALWAYS)
+    return text
+
+
+def _written(prescription: Mapping[str, Any], where: str) -> str:
+    """Write a prescription without its states; nothing is read back."""
     model = str(prescription.get("index_model", "dfc"))
     if model != "dfc":
         raise InputError(
@@ -66,10 +98,7 @@ def zemax_of(prescription: Mapping[str, Any], where: str = "lens") -> str:
         "  DISZ 0",
         f'  DIAM {diameter / 2.0!r} {int(diameter > 0.0)} 0 0 1 ""',
     ]
-    text = "\n".join((*lines, ""))
-    found = prescription_from_zemax(text, where)
-    require_same(prescription, found, ".zmx", where, canonical, _ALWAYS)
-    return text
+    return "\n".join((*lines, ""))
 
 
 def _image_shape(sensor: Mapping[str, Any], where: str) -> list[str]:

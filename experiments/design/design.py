@@ -13,19 +13,28 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice
-from dolens.experiments.design.figures import design_figures
+from dolens.experiments.design.figures import design_figures, history_figures
 from dolens.experiments.design.iteration import (
     Progress,
     gradient_iteration,
     least_squares_iteration,
 )
 from dolens.experiments.design.light import fit_edges, refuse_lost_light
+from dolens.experiments.design.state_figures import state_figures
+from dolens.experiments.design.states import (
+    entrance_pupils,
+    foci,
+    set_entrance_pupils,
+    set_foci,
+    state_metrics,
+)
 from dolens.experiments.design.tables import iteration_row, spot_metrics
 from dolens.experiments.experiment import Experiment, Figures
 from dolens.optics.lens import Lens
 from dolens.optimize import DesignVariables, MeritFunction, MeritSettings
 from dolens.optimize.merit import MeritValue
 from dolens.optimize.start import start_values
+from dolens.optimize.states import StatesMerit, StatesValue
 from dolens.prescriptions import lens_from_prescription
 from dolens.stages import stage
 
@@ -57,10 +66,13 @@ class DesignModule(Experiment):
         evaluation: what RMS spot radii are reported of; None: the merit's own rays.
         semi_diameters: `fixed`: light passes where the prescription lets it; or `automatic`: the
             rays that pass the lens where the search begins are kept, and in the end every edge, and
-            the stop's, is put where they pass.
+            the stop's, is put where they pass; with `keep_pupils` each round's own rays are, and
+            every round begins with its edges.
         round_tolerance: a round that lowers the merit by a smaller part is the last.
         seed: of the errors in `start`.
         mtf_max_frequency: the end of the MTF curves in figures, cycles/mm; see `design_figures`.
+        keep_pupils: whether the stop opens or closes to the entrance pupils of the prescription,
+            where the search begins and with every round; in every state to its own.
 
     Attributes:
         initial: the lens where the search began.
@@ -85,11 +97,13 @@ class DesignModule(Experiment):
         round_tolerance: float,
         seed: int,
         mtf_max_frequency: float | None,
+        keep_pupils: bool = False,
     ) -> None:
         super().__init__(lens, experiment)
         self.automatic_optimization = False
         generator = torch.Generator().manual_seed(seed)
         values = start_values(lens, start or {}, generator)
+        self._pupils = entrance_pupils(lens) if keep_pupils else {}
         with torch.no_grad():
             for name, parameter in lens.variables(list(values)).items():
                 parameter.copy_(values[name])
@@ -98,6 +112,7 @@ class DesignModule(Experiment):
             raise InputError("variables: there are none; name a parameter, as surfaces.*.curvature")
         self.variables.project()
         self.variables.write_to(self.lens)
+        set_entrance_pupils(self.lens, self._pupils)
         # In a tuple, so that checkpoints do not hold them.
         self._initial = (copy.deepcopy(self.lens),)
         self.published = None
@@ -118,19 +133,22 @@ class DesignModule(Experiment):
             self.merit_settings = replace(merit, max_vignetting=1.0)
         if not 0.0 <= round_tolerance < 1.0:
             raise InputError(f"round_tolerance: {round_tolerance}; allowed: 0 to 1")
-        self.merit: MeritFunction | None = None
+        self.merit: MeritFunction | StatesMerit | None = None
         self.history: list[dict[str, float]] = []
         self.initial_merit = math.nan
         self._stopped: str | None = None
         # Where the round began, so that a resumed one has its rays; and the best round's end.
         for name in ("round_start", "best"):
             self.register_buffer(name, self.variables.scaled.detach().clone())
+        # The sensor of the lens, or those of its states that are kept at their best focus.
+        of_states = sorted(self.variables.focused) if len(lens.states) else ["sensor_distance"]
+        self._focus_names = of_states
         for name in ("round_start_focus", "best_focus"):
-            self.register_buffer(name, self.lens.sensor_distance.detach().clone())
+            self.register_buffer(name, foci(self.lens, of_states))
         self.register_buffer("best_merit", torch.tensor(math.inf, dtype=torch.float64))
         self._fit_seconds = self._left = 0.0
         self._between: list[float] = []
-        self.initial_light: Tensor | None = None
+        self.initial_light: dict[str | None, Tensor] = {}
 
     @property
     def initial(self) -> Lens:
@@ -154,13 +172,13 @@ class DesignModule(Experiment):
             now = self.variables.scaled.clone()
             self.variables.scaled.copy_(self.round_start)
             self.variables.write_to(lens)
-            lens.sensor_distance.copy_(self.round_start_focus)
+            set_foci(lens, self._focus_names, self.round_start_focus)
             self.variables.scaled.copy_(now)
         with stage("choosing the rays"):
             self.merit = self._build(lens)
         fresh = math.isinf(float(self.best_merit))
-        quality = self.merit.quality if fresh else self.merit_settings.image_quality(self.initial)
-        self.initial_light = None if quality is None else quality.spots.light
+        begun = self.merit if fresh else self.merit_settings.build(self.initial, self.variables)
+        self.initial_light = {n: quality.spots.light for n, quality in begun.qualities.items()}
         if fresh:
             self._keep_if_better(self.merit())
             self.initial_merit = float(self.best_merit)
@@ -224,9 +242,11 @@ class DesignModule(Experiment):
         )
         with torch.no_grad():
             self.round_start.copy_(self.variables.scaled)
-            self.round_start_focus.copy_(self.lens.sensor_distance)
+            self.round_start_focus.copy_(foci(self.lens, self._focus_names))
         optimizer = self.optimizers().optimizer
-        if not before - reached > self.round_tolerance * before:
+        gained, least = before - reached, self.round_tolerance * before
+        # With pupils of its own a round begins with other edges, and may end worse than the best.
+        if abs(gained) <= least if self._pupils else not gained > least:
             self.trainer.should_stop = True
         elif hasattr(optimizer, "restart"):
             optimizer.restart()
@@ -251,41 +271,52 @@ class DesignModule(Experiment):
         with torch.no_grad():
             self.variables.scaled.copy_(self.best)
             self.variables.write_to(self.lens)
-            self.lens.sensor_distance.copy_(self.best_focus)
+            set_foci(self.lens, self._focus_names, self.best_focus)
+        set_entrance_pupils(self.lens, self._pupils)
         if self.automatic_semi_diameters:
-            fit_edges(self.lens, self.initial, self.merit_settings)
+            fit_edges(self.lens, None if self._pupils else self.initial, self.merit_settings)
 
-    def _build(self, lens: Lens) -> MeritFunction:
-        if not self.automatic_semi_diameters:
+    def _build(self, lens: Lens) -> MeritFunction | StatesMerit:
+        if self._pupils:
+            # The rays of each round are those of its pupils.
+            set_entrance_pupils(lens, self._pupils)
+            if self.automatic_semi_diameters:
+                fit_edges(lens, None, self.merit_settings)
+        if self._pupils or not self.automatic_semi_diameters:
             return self.merit_settings.build(lens, self.variables)
         # The rays of the start serve every round.
         return self.merit or self.merit_settings.build(self.initial, self.variables)
 
     def _refuse_lost_light(self) -> None:
-        if self.merit.quality is not None and not self.automatic_semi_diameters:
-            refuse_lost_light(self.merit.quality, self.initial_light)
+        for state, quality in self.merit.qualities.items():
+            if not self.automatic_semi_diameters:
+                refuse_lost_light(quality, self.initial_light[state])
 
-    def _keep_if_better(self, value: MeritValue) -> None:
+    def _keep_if_better(self, value: MeritValue | StatesValue) -> None:
         merit = value.sum_of_squares()
         if merit < float(self.best_merit):
             with torch.no_grad():
                 self.best_merit.fill_(merit)
                 self.best.copy_(self.variables.scaled)
-                self.best_focus.fill_(value.sensor_distance)
+                found = value.foci()
+                distances = [found[name] for name in self._focus_names]
+                self.best_focus.copy_(
+                    self.best_focus.new_tensor(distances).view_as(self.best_focus)
+                )
 
     # ---------------------------------------------------------------- what is logged
 
     @property
     def rays(self) -> int:
         """Return the number of rays of one evaluation of the merit."""
-        quality = None if self.merit is None else self.merit.quality
-        return 0 if quality is None else len(quality.spots.weight)
+        qualities = {} if self.merit is None else self.merit.qualities
+        return sum(len(quality.spots.weight) for quality in qualities.values())
 
     @property
     def rays_launched(self) -> int:
         """Return the number of rays that were launched to find those that pass."""
-        quality = None if self.merit is None else self.merit.quality
-        return 0 if quality is None else quality.spots.launched
+        qualities = {} if self.merit is None else self.merit.qualities
+        return sum(quality.spots.launched for quality in qualities.values())
 
     def _record(self, progress: Progress, seconds: float) -> None:
         row = iteration_row(progress, self.merit, seconds)
@@ -304,7 +335,8 @@ class DesignModule(Experiment):
         others = {"initial": self.initial}
         if self.published is not None:
             others["published"] = self.published
-        self.log_dict(spot_metrics(self.lens, others, self.evaluation))
+        metrics = state_metrics if self.evaluation.states_of(self.lens) else spot_metrics
+        self.log_dict(metrics(self.lens, others, self.evaluation))
 
     def summary(self) -> dict[str, float]:
         """Return the merit of the best round, and costs."""
@@ -327,15 +359,22 @@ class DesignModule(Experiment):
         merit = self.merit_settings
         # Weights of operands have units of their own, and so has the sum.
         unit = _MERIT_UNITS.get(merit.quality, "") if isinstance(merit.quality, str) else ""
-        return design_figures(
-            self.lens,
-            self.initial,
-            self.evaluation,
-            self.history,
-            self.mtf_max_frequency,
-            "" if merit.operands else unit,
-            self.initial_merit,
-        )
+        unit = "" if merit.operands else unit
+        if not self.evaluation.states_of(self.lens):
+            return design_figures(
+                self.lens,
+                self.initial,
+                self.evaluation,
+                self.history,
+                self.mtf_max_frequency,
+                unit,
+                self.initial_merit,
+            )
+        others = {"initial": self.initial}
+        if self.published is not None:
+            others["published"] = self.published
+        found = state_figures(self.lens, others, self.evaluation, self.mtf_max_frequency)
+        return {**found, **history_figures(self.lens, self.history, self.initial_merit, unit)}
 
     # ---------------------------------------------------------------- checkpoints
 

@@ -154,15 +154,27 @@ def design_figures(
         "modulation": transfer,
         "rms_curves": curves,
     }
-    if history:
-        damping = [row.get("train/damping", float("nan")) for row in history]
-        figures["history"] = lambda: history_figure(
+    return figures | history_figures(lens, history, initial_merit, merit_unit)
+
+
+def history_figures(
+    lens: Lens, history: Sequence[Mapping[str, float]], initial_merit: float, merit_unit: str
+) -> Figures:
+    """Return the figure of a design's history; none where nothing was trained.
+
+    Arguments are those of `design_figures`.
+    """
+    if not history:
+        return {}
+    damping = [row.get("train/damping", float("nan")) for row in history]
+    return {
+        "history": lambda: history_figure(
             [initial_merit, *(row["train/merit"] for row in history)],
             [math.nan, *damping] if any(value == value for value in damping) else None,
             title=": ".join(filter(None, [shown_name(lens), "history of the design"])),
             merit_label=f"merit ({merit_unit})" if merit_unit else "merit",
         )
-    return figures
+    }
 
 
 def titled(lens: Lens, stage: str | None, rest: str) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 from dolens.optimize import DampedLeastSquares, DesignVariables, MeritFunction
 from dolens.optimize.linear_model import LinearModel
 from dolens.optimize.merit import MeritValue
+from dolens.optimize.states import StatesMerit, StatesValue
 
 # How often a step of a gradient that makes rays fail is halved before it is taken back.
 _HALVINGS = 30
@@ -43,7 +44,7 @@ class Progress:
         stopped: why nothing more can be gained, or None.
     """
 
-    value: MeritValue
+    value: MeritValue | StatesValue
     numbers: dict[str, float]
     cost: Cost
     stopped: str | None = None
@@ -53,7 +54,7 @@ class Progress:
 class _CountedValue:
     """Evaluates a merit, and writes down what its Jacobian costs."""
 
-    value: MeritValue
+    value: MeritValue | StatesValue
     rays: int
     cost: Cost
 
@@ -72,14 +73,14 @@ class _CountedValue:
 class CountedMerit:
     """Evaluates a merit function, and counts its evaluations."""
 
-    merit: MeritFunction
+    merit: MeritFunction | StatesMerit
     cost: Cost = field(default_factory=Cost)
-    _last: MeritValue | None = None
+    _last: MeritValue | StatesValue | None = None
 
     @property
     def rays(self) -> int:
         """Return the number of rays of one evaluation."""
-        return 0 if self.merit.quality is None else len(self.merit.quality.spots.weight)
+        return sum(len(quality.spots.weight) for quality in self.merit.qualities.values())
 
     def __call__(self) -> _CountedValue:
         """Return the value at the variables."""
@@ -92,7 +93,7 @@ class CountedMerit:
 
 
 def least_squares_iteration(
-    optimizer: DampedLeastSquares, step: Callable[..., Any], merit: MeritFunction
+    optimizer: DampedLeastSquares, step: Callable[..., Any], merit: MeritFunction | StatesMerit
 ) -> Progress:
     """Make a step of an optimizer that takes residuals.
 
@@ -120,7 +121,7 @@ def least_squares_iteration(
 def gradient_iteration(
     optimizer: torch.optim.Optimizer,
     step: Callable[..., Any],
-    merit: MeritFunction,
+    merit: MeritFunction | StatesMerit,
     variables: DesignVariables,
 ) -> Progress:
     """Make a step of an optimizer that takes a gradient, and project it onto the bounds (S17).

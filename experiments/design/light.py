@@ -6,23 +6,26 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.experiments.design.states import set_edges
 from dolens.experiments.design.tables import spot_labels
 from dolens.optics.lens import Lens
-from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optimize import MeritSettings
-from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters
+from dolens.optimize.automatic_semi_diameters import fitted_semi_diameters, rim_rays
 from dolens.optimize.image_quality import ImageQuality
 
 # Rings of the quadrature that tells where the edges of the beams are.
 _EDGE_RINGS = 40
+# Factor of the heights of beams that pass an edge untouched.
+_BESIDE = 1.005
 
 
-def fit_edges(lens: Lens, initial: Lens, settings: MeritSettings) -> None:
-    """Put every edge of a lens where the rays that pass another one meet it.
+def fit_edges(lens: Lens, initial: Lens | None, settings: MeritSettings) -> None:
+    """Put every edge of a lens where the light of its beams meets it.
 
     Args:
         lens: its clear apertures are replaced.
-        initial: decides which rays there are.
+        initial: decides which rays there are, those that pass it; None: those that the lens's own
+            stop lets pass, aimed at its rim, with a little room beside all others.
         settings: fields and wavelengths of the rays.
     """
     settings = replace(
@@ -30,9 +33,17 @@ def fit_edges(lens: Lens, initial: Lens, settings: MeritSettings) -> None:
         sampling="gaussian_quadrature",
         sampling_options={"rings": _EDGE_RINGS, "arms": 2 * _EDGE_RINGS, "symmetry": True},
     )
-    edges = fitted_semi_diameters(lens, settings.rays(initial))
-    for number, semi_diameter in edges.items():
-        lens.surfaces[number].aperture = ClearAperture(Circle(semi_diameter))
+    edges = {}
+    for state in settings.states_of(lens) or (None,):
+        there = lens.in_state(state)
+        if initial is not None:
+            rays = settings.rays(initial.in_state(state))
+            edges[state] = fitted_semi_diameters(there, rays)
+            continue
+        own = rim_rays(there, settings.fields_of(there), settings.wavelengths_of(there))
+        edges[state] = fitted_semi_diameters(there, own, _BESIDE)
+        edges[state].pop(str(lens.stop), None)
+    set_edges(lens, edges)
 
 
 def refuse_lost_light(quality: ImageQuality, initial_light: Tensor) -> None:

@@ -96,12 +96,13 @@ def iteration_row(progress: Progress, merit: MeritFunction, seconds: float) -> d
         "cost/iteration_rays": float(cost.rays),
         "cost/evaluations": float(cost.evaluations),
     }
-    if value.quality is not None:
-        row["train/quality"] = value.quality.merit
-        scale, unit = merit.quality.scale, merit.quality.unit
-        labels = spot_labels(merit.quality.spots)
-        for label, rms in zip(labels, value.quality.rms.tolist(), strict=True):
-            row[f"spot_{unit}/{label}"] = scale * rms
+    if value.qualities:
+        row["train/quality"] = sum(found.merit for found in value.qualities.values())
+    for state, found in value.qualities.items():
+        quality = merit.qualities[state]
+        before = f"spot_{quality.unit}/" + ("" if state is None else f"{state}/")
+        for label, rms in zip(spot_labels(quality.spots), found.rms.tolist(), strict=True):
+            row[before + label] = quality.scale * rms
     if value.operands:
         slopes = value.operand_derivatives().norm(dim=1).tolist()
         for item, slope in zip(value.operands, slopes, strict=True):

@@ -206,9 +206,10 @@ def _loaded(
 
 
 def _lens(prescription: Mapping[str, Any], settings: RunSettings) -> Lens:
-    return lens_from_prescription(
+    lens = lens_from_prescription(
         prescription, settings.dtype, where="lens", backend=settings.backend
     )
+    return lens.in_state(settings.state)
 
 
 def _made(key: str, config: DictConfig) -> Any:

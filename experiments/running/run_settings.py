@@ -1,6 +1,6 @@
 """The settings that a run reads, as one typed object."""
 
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any
 
 import torch
@@ -36,6 +36,7 @@ class RunSettings:
         test: whether to test.
         ckpt_path: a checkpoint to resume from, or None.
         objective: the name of the metric that the run returns.
+        state: of a lens that zooms or focuses, the state to work with; None: the lens itself.
 
     Raises:
         InputError: a value that is not allowed.
@@ -57,6 +58,8 @@ class RunSettings:
     test: bool
     ckpt_path: str | None
     objective: str
+    # Run folders of old lack it.
+    state: str | None = None
 
     def __post_init__(self) -> None:
         check_choice(self.lens_dtype, DTYPES, "lens_dtype")
@@ -83,10 +86,11 @@ class RunSettings:
         Raises:
             InputError: a key is missing, or a value is not allowed.
         """
-        missing = [name for name in cls.names() if name not in cfg]
+        needed = [field.name for field in fields(cls) if field.default is MISSING]
+        missing = [name for name in needed if name not in cfg]
         if missing:
             raise InputError(f"{missing[0]}: is missing from the configuration")
-        return cls(**{name: cfg[name] for name in cls.names()})
+        return cls(**{name: cfg[name] for name in cls.names() if name in cfg})
 
     @property
     def dtype(self) -> torch.dtype:

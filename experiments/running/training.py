@@ -134,9 +134,10 @@ def run(cfg: DictConfig) -> float:
 def build_lens(settings: RunSettings) -> Lens:
     """Return the lens of a run; prescriptions are plain data and instantiate nothing."""
     where = f"lens={HydraConfig.get().runtime.choices.get('lens')}"
-    return lens_from_prescription(
+    lens = lens_from_prescription(
         settings.prescription(), settings.dtype, where=where, backend=settings.backend
     )
+    return lens.in_state(settings.state)
 
 
 def refuse_untrained(settings: RunSettings, module: Experiment) -> None:

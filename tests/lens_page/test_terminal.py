@@ -6,8 +6,9 @@ import re
 import pytest
 from typer.testing import CliRunner
 
-from dolens import InputError
+from dolens import InputError, load_lens
 from dolens.cli.app import app
+from dolens.lens_page.states_table import states_table
 
 
 def show(*arguments):
@@ -37,6 +38,19 @@ def test_published_numbers_stand_beside_computed_ones():
     assert "US 2,838,978" in text
 
 
+def test_states_are_listed_and_shown():
+    """US 9,784,950 B2 prints EFL 15.5 to 44.04 mm for its three positions."""
+    found = show("published/zoom_us9784950_ex1", "--state", "f44")
+    assert found.exit_code == 0, found.output
+    assert "f = 44.043 mm" in found.output and "Zoom 15.5-44.0 mm f/2.9, f44" in found.output
+    assert "Published numbers" in found.output and "44.04" in found.output
+    table = states_table(load_lens("published/zoom_us9784950_ex1"))
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert table.heads == ("state", "f15", "f21", "f44")
+    assert rows["published"] == ("15.5", "21.49", "44.04")
+    assert rows["thicknesses.5"] == ("1.65", "9.04", "18.89")
+
+
 def test_long_lists_of_coefficients_stay_within_the_terminal():
     """An odd asphere of eight coefficients is a list that goes on in further lines."""
     found = show("published/mobile_us7535658_odd")
@@ -48,6 +62,7 @@ def test_long_lists_of_coefficients_stay_within_the_terminal():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["--state", "wide"], "has no state 'wide' (allowed: none, as the lens has no states)"),
         (["--field", "1,2,3"], "--field: must be a number (y) or two (x,y), not '1,2,3'"),
         (["--field", "95"], "fields must be within ±90 degrees"),
         (["--tolerances", "default"], "--tolerances needs --html or --figures"),

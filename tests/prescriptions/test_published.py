@@ -86,6 +86,41 @@ def test_numbers_are_those_that_the_source_prints(name):
         assert largest == pytest.approx(published.half_field, rel=1e-9)
 
 
+WITH_STATES = [
+    (name, state) for name in NAMES for state in load_prescription(name).get("states", {})
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "state"), WITH_STATES, ids=[f"{short(name)}-{state}" for name, state in WITH_STATES]
+)
+def test_every_position_of_a_zoom_has_its_focal_length_and_its_image(name, state):
+    lens = built(name).in_state(state)
+    published = lens.published
+    with torch.no_grad():
+        first = lens.first_order(lens.primary_wavelength, lens.object_distance)
+        # The gaps put the paraxial image on the sensor, but for their rounding.
+        image = float(first.image - lens.system().vertices[len(lens.surfaces) - 1])
+    if published.efl is not None:
+        assert 0.0 < published.efl_tolerance <= 0.01 * published.efl
+        assert float(first.efl) == pytest.approx(published.efl, abs=published.efl_tolerance)
+    if published.f_number is not None:
+        assert float(first.f_number) == pytest.approx(published.f_number, rel=1e-9)
+    depth = 2.0 * abs(float(first.working_f_number))
+    assert image == pytest.approx(float(lens.sensor_distance), abs=0.05 * depth)
+
+
+def test_a_focused_telephoto_has_its_image_where_its_patent_has_it():
+    """Printed gaps at 2.5 m: the image stays within a thousandth of a millimetre."""
+    lens = built("published/internal_focus_jph04294310_ex1")
+    images = []
+    for state in ("far", "near"):
+        there = lens.in_state(state)
+        with torch.no_grad():
+            images.append(float(there.first_order(object_distance=there.object_distance).image))
+    assert images[0] == pytest.approx(images[1], abs=1e-3)
+
+
 @pytest.mark.parametrize("name", NAMES, ids=short)
 def test_light_of_the_axis_and_of_the_edge_of_the_field_arrives(name):
     lens = built(name)

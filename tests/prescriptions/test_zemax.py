@@ -243,14 +243,14 @@ def test_what_bends_no_ray_is_passed_over_and_listed():
         assert words in said
 
 
-def test_configurations_are_listed_and_the_current_one_is_read():
+def test_the_current_configuration_is_the_lens_itself():
+    """Others are its states; see tests/prescriptions/test_states.py."""
     text = singlet("CURV 0.02", "DISZ 4", GLASS, "DIAM 5")
     more = "MNUM 2 1\nTHIC 1 1 4.0 0\nTHIC 1 2 5.0 0\nCRVT 2 1 -0.02\nCRVT 2 2 -0.02\n"
-    found = read_zemax(text + more)
-    assert found.prescription["surfaces"]["1"]["thickness"] == 4.0
-    assert found.passed_over[-1] == (
-        "the other 1 of 2 configurations, which set THIC 1 (read: the current one, 1)"
-    )
+    found = read_zemax(text + more).prescription
+    assert found["surfaces"]["1"]["thickness"] == 4.0
+    gaps = {n: state["surfaces"]["1"]["thickness"] for n, state in found["states"].items()}
+    assert gaps == {"c1": 4.0, "c2": 5.0}
 
 
 def test_files_that_indent_nothing(tmp_path):

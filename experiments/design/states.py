@@ -1,0 +1,165 @@
+"""A design of a lens with states: the lens in each of them, its pupils, edges and spots."""
+
+import logging
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from dolens.experiments.design.tables import SpotTable, spot_metrics, spot_table
+from dolens.optics.aperture_setting import with_aperture
+from dolens.optics.lens import Lens
+from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
+from dolens.optimize import MeritSettings
+
+logger = logging.getLogger(__name__)
+
+
+def views(lens: Lens, settings: MeritSettings) -> dict[str, Lens]:
+    """Return the lens in each state that counts, in the order of the merit; empty without states.
+
+    They share the lens's parameters: what the design changes is seen in all.
+    """
+    return {name: lens.in_state(name) for name in settings.states_of(lens)}
+
+
+def entrance_pupils(lens: Lens) -> dict[str | None, float]:
+    """Return the diameter (mm) of the entrance pupil of a lens in each of its states, or, under
+    None, of a lens without states.
+    """
+    found = {}
+    for name in lens.state_names or (None,):
+        there = lens.in_state(name)
+        with torch.no_grad():
+            first = there.first_order(there.primary_wavelength, there.object_distance)
+        found[name] = float(first.entrance_pupil.diameter)
+    return found
+
+
+def set_entrance_pupils(lens: Lens, diameters: Mapping[str | None, float]) -> None:
+    """Open or close the stop of a lens, in each of its states, to entrance pupils (mm)."""
+    number = str(lens.stop)
+    for name, diameter in diameters.items():
+        closed = with_aperture(lens.in_state(name), entrance_pupil_diameter=diameter)
+        set_aperture(lens, name, number, closed.surfaces[number].aperture)
+
+
+def set_aperture(lens: Lens, state: str | None, number: str, aperture: ClearAperture) -> None:
+    """Replace the clear aperture of a surface, in the lens or in one of its states."""
+    if state is None:
+        lens.surfaces[number].aperture = aperture
+    else:
+        lens.states[state].data.apertures[number] = aperture
+
+
+def set_edges(lens: Lens, edges: Mapping[str | None, Mapping[str, float]]) -> None:
+    """Put the edges of a lens where the light of its states needs them.
+
+    The stop opens in each state as that state needs it, or stays; every other edge lets the light
+    of all states pass.
+
+    Args:
+        lens: its clear apertures are replaced.
+        edges: state, or None for a lens without states → number of a surface → mm.
+    """
+    numbers = dict.fromkeys(n for found in edges.values() for n in found)
+    for number in numbers:
+        sizes = {state: found[number] for state, found in edges.items() if number in found}
+        largest = ClearAperture(Circle(max(sizes.values())))
+        lens.surfaces[number].aperture = largest
+        for state in lens.state_names:
+            own = number == str(lens.stop) and state in sizes
+            set_aperture(
+                lens, state, number, ClearAperture(Circle(sizes[state])) if own else largest
+            )
+
+
+def state_metrics(
+    lens: Lens, others: Mapping[str, Lens], settings: MeritSettings
+) -> dict[str, float]:
+    """Return mean RMS spot radii and light by state of a design and others, and over all states.
+
+    The published lens has them once more with the sensor at the best focus of each state: its
+    printed gaps are rounded.
+
+    Args:
+        lens: the design, `final` in the names of metrics, as `rms_spot_um/final/wide`.
+        others: lenses to compare with, by their names there.
+        settings: of a merit of spots; a lens that lacks its states is left out.
+    """
+    weights = settings.states_of(lens)
+    numbers: dict[str, float] = {}
+    text = {}
+    for kind, other in {**others, "final": lens}.items():
+        if not set(weights) <= set(other.state_names):
+            continue
+        tables = {
+            name: spot_table(there, settings) for name, there in views(other, settings).items()
+        }
+        numbers[f"rms_spot_um/{kind}"] = _mean(tables, weights, "mean")
+        numbers[f"light/{kind}"] = _mean(tables, weights, "light")
+        for name, table in tables.items():
+            numbers[f"rms_spot_um/{kind}/{name}"] = table.mean
+        text[kind] = ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items())
+        if kind == "published":
+            own = {
+                name: _refocused(there, settings) for name, there in views(other, settings).items()
+            }
+            numbers[f"rms_spot_um/{kind}_refocused"] = sum(weights[n] * own[n] for n in own)
+            numbers |= {f"rms_spot_um/{kind}_refocused/{name}": rms for name, rms in own.items()}
+    error = 0.0
+    for name, there in views(lens, settings).items():
+        of_state = spot_metrics(there, {}, settings)
+        for label, value in of_state.items():
+            prefix = "rms_spot_um/final/"
+            if label.startswith(prefix):
+                numbers[f"{prefix}{name}/{label.removeprefix(prefix)}"] = value
+        error += weights[name] * of_state["error/sampling_um"]
+        numbers |= first_order_numbers(there, name)
+    numbers["error/sampling_um"] = error
+    for kind, row in text.items():
+        logger.info("RMS spot radius by state, %s: %s µm", kind, row)
+    return numbers
+
+
+def _refocused(lens: Lens, settings: MeritSettings) -> float:
+    """Return the mean RMS radius (µm) of a lens with the sensor where that is best."""
+    quality = settings.image_quality(lens)
+    values = quality.values(lens)
+    slopes = quality.slopes(values)
+    there = quality.refocused(values, slopes, quality.best_focus(values, slopes))
+    return 1e3 * float((quality.weights.to(there.rms) * there.rms).sum())
+
+
+@torch.no_grad()
+def first_order_numbers(lens: Lens, name: str) -> dict[str, float]:
+    """Return focal length (mm) and F-number of a lens in a state, and what it misses of the
+    published focal length, as metrics.
+    """
+    first = lens.first_order(lens.primary_wavelength, lens.object_distance)
+    numbers = {f"efl_mm/{name}": float(first.efl)}
+    near = lens.object_distance is not None
+    number = first.working_f_number if near else first.f_number
+    numbers[f"{'working_' if near else ''}f_number/{name}"] = abs(float(number))
+    if near:
+        numbers[f"magnification/{name}"] = float(first.magnification)
+    return numbers
+
+
+def _mean(tables: Mapping[str, SpotTable], weights: Mapping[str, float], what: str) -> float:
+    return sum(weights[name] * getattr(table, what) for name, table in tables.items())
+
+
+def foci(lens: Lens, names: list[str]) -> Tensor:
+    """Return distances of the sensor by the names of their parameters, (k,) or, of one, ()."""
+    found = [lens.get_parameter(name).detach().clone() for name in names]
+    if names == ["sensor_distance"]:
+        return found[0]
+    return torch.stack(found) if found else torch.zeros(0, dtype=lens.dtype)
+
+
+@torch.no_grad()
+def set_foci(lens: Lens, names: list[str], distances: Tensor) -> None:
+    """Store distances of the sensor that `foci` has returned."""
+    for name, distance in zip(names, distances.reshape(-1), strict=True):
+        lens.get_parameter(name).copy_(distance)

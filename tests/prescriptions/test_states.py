@@ -1,0 +1,184 @@
+"""States in prescriptions: read, written, and refused in one line; and in Zemax's files."""
+
+import pytest
+import torch
+
+from dolens import InputError, load_lens, save_lens
+from dolens.prescriptions import lens_from_prescription, prescription_of
+from dolens.prescriptions.zemax_reader import read_zemax
+from tests.prescriptions.samples import SINGLET
+from tests.prescriptions.zemax_samples import triplet
+
+ZOOM = "published/zoom_us7106520_ex8"
+
+
+def with_states(**states):
+    return SINGLET | {"states": states}
+
+
+def same(one, other):
+    assert one.state_names == other.state_names
+    before, after = dict(one.named_parameters()), dict(other.named_parameters())
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    for name in one.state_names:
+        a, b = one.in_state(name), other.in_state(name)
+        assert (a.fields, a.wavelengths, a.object_distance) == (
+            b.fields, b.wavelengths, b.object_distance
+        )  # fmt: skip
+        assert [s.aperture for s in a.surfaces.values()] == [
+            s.aperture for s in b.surfaces.values()
+        ]
+
+
+def test_a_prescription_comes_back_to_the_last_bit():
+    lens = lens_from_prescription(
+        with_states(
+            half={"surfaces": {"1": {"radius": 21.7, "a4": 2e-6}}, "sensor": {"distance": 29.1}},
+            near={"object_distance": 400.0, "fields": {"heights": [[0, 0], [0, 5]]}, "f_number": 4},
+            hot={"temperature": 40.0, "pressure": 0.9},
+            blue={"wavelengths": [450.0, 486.0]},
+        )
+    )
+    again = lens_from_prescription(prescription_of(lens))
+    same(lens, again)
+    assert prescription_of(again) == prescription_of(lens)
+    assert again.in_state("blue").primary_wavelength == 450.0
+    assert again.in_state("hot").pressure == 0.9
+
+
+def test_the_f_number_holds_in_a_state_unless_its_stop_is_the_lens_s():
+    stop = SINGLET["surfaces"]["1"] | {"semi_diameter": "auto"}
+    singlet = SINGLET | {"f_number": 5.0, "surfaces": SINGLET["surfaces"] | {"1": stop}}
+    changed = {"surfaces": {"1": {"radius": 30.0}}}
+    lens = lens_from_prescription(
+        singlet | {"states": {"again": changed, "same_stop": changed | {"f_number": None}}}
+    )
+    again, same_stop = lens.in_state("again"), lens.in_state("same_stop")
+    assert float(again.first_order().f_number) == pytest.approx(5.0, rel=1e-12)
+    sizes = [one.surfaces["1"].semi_diameter for one in (lens, same_stop, again)]
+    assert sizes[0] == sizes[1] < sizes[2]
+
+
+def test_an_automatic_semi_diameter_is_the_largest_that_any_state_needs():
+    """Light of ±10 degrees meets the second surface where a wider field alone would."""
+    back = SINGLET["surfaces"]["2"] | {"semi_diameter": "auto"}
+    narrow, wide = {"angles": [[0, 0], [0, 1]]}, {"angles": [[0, 0], [0, 10]]}
+    surfaces = SINGLET["surfaces"] | {"2": back}
+    singlet = SINGLET | {"surfaces": surfaces, "fields": narrow}
+    lens = lens_from_prescription(singlet | {"states": {"wide": {"fields": wide}}})
+    alone = lens_from_prescription(singlet | {"fields": wide}).surfaces["2"].semi_diameter
+    assert alone > lens_from_prescription(singlet).surfaces["2"].semi_diameter
+    for there in (lens, lens.in_state("wide")):
+        assert there.surfaces["2"].semi_diameter == alone
+
+
+@pytest.mark.parametrize(
+    ("states", "said"),
+    [
+        ([1], "states: expected a mapping"),
+        ({"a.b": {}}, "state 'a.b': its name has letters"),
+        ({"a": {"stop": 2}}, "state 'a': unknown key 'stop'"),
+        ({"a": {"surfaces": {"1": {"type": "plane"}}}}, "a state cannot change 'type'"),
+        ({"a": {"surfaces": {"1": {"material": "air"}}}}, "a state cannot change 'material'"),
+        ({"a": {"surfaces": {"1": {"a6": 1.0}}}}, "a state cannot change 'a6'"),
+        ({"a": {"surfaces": {"9": {"radius": 1.0}}}}, "state 'a': surface 9 is not in the lens"),
+        ({"a": {"surfaces": {"1": {"radius": 0}}}}, "state 'a': surface 1: 'radius' is 0"),
+        ({"a": {"sensor": {"diameter": 3}}}, "state 'a': sensor: unknown key 'diameter'"),
+        ({"a": {"temperature": -300}}, "state 'a': temperature -300"),
+        ({"a": {"surfaces": {"2": {"thickness": 3}}}}, "the last surface has no 'thickness'"),
+    ],
+)
+def test_a_mistake_takes_one_line(states, said):
+    with pytest.raises(InputError) as refusal:
+        lens_from_prescription(SINGLET | {"states": states})
+    assert said in str(refusal.value)
+    assert str(refusal.value).startswith("lens: ") and "\n" not in str(refusal.value)
+
+
+# ---------------------------------------------------------------- Zemax's configurations
+
+
+def test_a_zemax_file_holds_the_states_as_configurations(tmp_path):
+    lens = load_lens(ZOOM)
+    save_lens(lens, tmp_path / "zoom.zmx")
+    again = load_lens(tmp_path / "zoom.zmx")
+    for state in lens.state_names:
+        a, b = lens.in_state(state), again.in_state(state)
+        pairs = zip(a.parameters(), b.parameters(), strict=True)
+        assert all(torch.equal(one, other) for one, other in pairs)
+        assert (a.fields, a.object_distance) == (b.fields, b.object_distance)
+        number = str(a.stop)
+        assert a.surfaces[number].aperture == b.surfaces[number].aperture
+
+
+def test_a_lens_that_is_none_of_its_states_stays_the_lens_itself(tmp_path):
+    lens = lens_from_prescription(with_states(longer={"surfaces": {"1": {"thickness": 6.0}}}))
+    save_lens(lens, tmp_path / "lens.zmx")
+    again = load_lens(tmp_path / "lens.zmx")
+    assert again.state_names == ("longer",)
+    gaps = [float(one.thicknesses["1"]) for one in (again, again.in_state("longer"))]
+    assert gaps == [5.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [
+        ({"temperature": 40.0}, "state 'a': a .zmx file cannot hold 'temperature' of a state"),
+        (
+            {"wavelengths": [500.0, 600.0]},
+            "state 'a': a .zmx file has as many fields and wavelengths",
+        ),
+        (
+            {"object_distance": 100.0, "fields": {"heights": [[0, 0]]}},
+            "state 'a': a .zmx file has fields of one kind in all its states",
+        ),
+    ],
+)
+def test_what_no_configuration_holds_is_refused(state, said, tmp_path):
+    lens = lens_from_prescription(with_states(a=state))
+    with pytest.raises(InputError, match=said):
+        save_lens(lens, tmp_path / "lens.zmx")
+
+
+def test_configurations_of_a_file_are_its_states():
+    more = (
+        "MNUM 2 2\nMOFF 0 1\n"
+        "THIC 2 1 7.5 0 0 0 1 1 1 0 0\nTHIC 2 2 6.008 0 0 0 1 1 1 0 0\n"
+        "CRVT 3 1 -0.05 0 0 0 1 1 1 0 0\nCRVT 3 2 -0.045018683 0 0 0 1 1 1 0 0\n"
+        "YFIE 3 1 18 0 0 0 1 1 1 0 0\nYFIE 3 2 20 0 0 0 1 1 1 0 0\n"
+        'LTTL 0 1 "close" 0 0 0 1 1 0 0.0 ""\n'
+    )
+    found = read_zemax(triplet() + more)
+    plain = read_zemax(triplet()).prescription
+    assert {k: v for k, v in found.prescription.items() if k != "states"} == plain
+    close = found.prescription["states"]["close"]
+    assert close["surfaces"]["2"]["thickness"] == 7.5
+    assert close["surfaces"]["3"] == {"radius": -20.0}
+    assert close["fields"]["angles"][2] == [0.0, 18.0]
+    assert list(found.prescription["states"]) == ["close", "c2"]
+    assert not any("configuration" in said for said in found.passed_over)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ("THIC 2 1 6.008\nTHIC 2 2 7\nGLSS 1 1 BK7\nGLSS 1 2 SF6\n", "GLSS 1 is not held"),
+        ("STPS 0 1 3\nSTPS 0 2 4\n", "STPS 0 is not held"),
+        ("PRAM 2 1 1.0 0 0\nPRAM 2 2 2.0 0 0\n", "does not say which parameter it is"),
+        ("APER 0 1 5\nAPER 0 2 6\n", "APER sets an aperture that the file does not have"),
+    ],
+)
+def test_a_configuration_that_cannot_be_held_is_passed_over_and_listed(lines, said):
+    found = read_zemax(triplet() + "MNUM 2 1\n" + lines)
+    assert "states" not in found.prescription
+    assert found.passed_over[-1].startswith("the other 1 of 2 configurations, which set")
+    assert said in found.passed_over[-1]
+
+
+def test_a_solve_is_not_repeated_in_other_configurations():
+    """What a solve gave holds for the configuration that the file was saved in."""
+    text = triplet().replace("SURF 6\n", "SURF 6\n  MAZH 0 0\n")
+    found = read_zemax(text + "MNUM 2 1\nTHIC 2 1 6.008\nTHIC 2 2 7.0\n")
+    assert "states" not in found.prescription
+    assert "a solve holds for the current one (MAZH" in found.passed_over[-1]
