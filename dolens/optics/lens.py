@@ -11,14 +11,15 @@ from dolens.errors import InputError
 from dolens.optics.axial_ray import reversals
 from dolens.optics.backend import check_backend, is_few
 from dolens.optics.broken_axes import GlobalAxes
-from dolens.optics.elements import Element, ElementState, check_elements
+from dolens.optics.elements import Element, ElementState
 from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
+from dolens.optics.lens_checks import check_lens
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
-from dolens.optics.mirrors import MIRROR, media_of
+from dolens.optics.mirrors import media_of
 from dolens.optics.paraxial import vergence
 from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
@@ -96,14 +97,10 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         sensor_conic: float | None = None,
     ) -> None:
         super().__init__()
-        count = len(surfaces)
-        if count == 0 or len(thicknesses) != count - 1 or len(materials) != count + 1:
-            raise InputError(
-                f"lens '{name}': {count} surfaces need {count - 1} thicknesses and {count + 1} "
-                f"materials, not {len(thicknesses)} and {len(materials)}"
-            )
-        if not 1 <= stop <= count:
-            raise InputError(f"lens '{name}': stop must be a surface from 1 to {count}, not {stop}")
+        try:
+            check_lens(surfaces, thicknesses, materials, stop, elements or {})
+        except InputError as error:
+            raise InputError(f"lens '{name}': {error}") from None
         self.name = name
         self.source = source
         self.published = published
@@ -116,22 +113,13 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.reference_wavelength = reference_wavelength
         self.fields = fields
         self.object_distance = object_distance
-        self.thermal_expansions = tuple(thermal_expansions or (None,) * count)
+        self.thermal_expansions = tuple(thermal_expansions or (None,) * len(surfaces))
         self.wavelength_weights = None if wavelength_weights is None else tuple(wavelength_weights)
         self.temperature = temperature
         self.pressure = pressure
         self.telecentric_object = telecentric_object
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
-        try:
-            media_of(self.materials)
-        except InputError as error:
-            raise InputError(f"lens '{name}': {error}") from None
-        for number, (surface, medium) in enumerate(zip(surfaces, materials[1:], strict=True), 1):
-            if surface.law is not None and medium is MIRROR:
-                raise InputError(
-                    f"lens '{name}': surface {number}: a {surface.law.kind} cannot be a mirror"
-                )
         self.surfaces = nn.ModuleDict(
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
         )
@@ -139,17 +127,12 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.thicknesses = nn.ParameterDict()
         for number, gap in enumerate(thicknesses, 1):
             self.thicknesses[str(number)] = nn.Parameter(torch.tensor(float(gap), dtype=dtype))
-        try:
-            check_elements(elements or {}, count)
-        except InputError as error:
-            raise InputError(f"lens '{name}': {error}") from None
         self.elements = nn.ModuleDict(dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.states, self.state_name = LensStates(), None
         register_image_surface(self, sensor_curvature, sensor_conic)
         self.to(dtype)
         self.reversals: tuple[int, ...] = ()
-        self._check_breaks()
         self.reversals = reversals(self.system(), self.primary_wavelength)
 
     @property
@@ -198,25 +181,14 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         values = dict(values or {})
         surfaces = []
         for number, surface in self.surfaces.items():
-            # Their own tables: `named_parameters` searches submodules, and takes ten times as long.
-            parameters = {**surface._parameters, **surface._buffers}
-            if values:
-                parameters = {
-                    name: values.pop(f"surfaces.{number}.{name}", value)
-                    for name, value in parameters.items()
-                }
+            parameters = _stored_or_given(surface, values, f"surfaces.{number}.")
             edge = values.pop(f"surfaces.{number}.semi_diameter", None) if values else None
             aperture = surface.aperture
             if edge is not None:
                 aperture = aperture.resized(float(edge.detach()))
             law = surface.law and LawState(surface.law, parameters)
             if surface.phase is not None:
-                own = {**surface.phase._parameters, **surface.phase._buffers}
-                if values:
-                    own = {
-                        name: values.pop(f"surfaces.{number}.phase.{name}", value)
-                        for name, value in own.items()
-                    }
+                own = _stored_or_given(surface.phase, values, f"surfaces.{number}.phase.")
                 law = LawState(type(surface.phase), own)
             surfaces.append(SurfaceState(type(surface), parameters, aperture, edge, law))
         thicknesses = [
@@ -312,25 +284,23 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         """
         return self.system().global_axes()
 
-    def _check_breaks(self) -> None:
-        """Raise `InputError` where breaks are all there is, the stop, or have a medium."""
-        media = media_of(self.materials).materials
-        breaks = [int(n) for n, surface in self.surfaces.items() if surface.changes_axes]
-        if len(breaks) == len(self.surfaces):
-            raise InputError(f"lens '{self.name}': there is no surface but coordinate breaks")
-        for number in breaks:
-            place = f"lens '{self.name}': surface {number} is a coordinate break"
-            if number == self.stop:
-                raise InputError(f"{place}, and cannot be the stop")
-            if media[number] != media[number - 1]:
-                raise InputError(f"{place}; the medium behind it is the one in front of it")
-
     def _check_range(self, first: int, last: int | None) -> None:
         count = len(self.surfaces)
         if not 1 <= first <= (count if last is None else last) <= count:
             raise InputError(
                 f"lens '{self.name}': surfaces {first} to {last} are no range of 1 to {count}"
             )
+
+
+def _stored_or_given(
+    module: nn.Module, values: dict[str, Tensor], prefix: str
+) -> dict[str, Tensor]:
+    """Return what a module itself holds, or what `values` has instead, which is taken out there."""
+    # Its own tables: `named_parameters` searches submodules, and takes ten times as long.
+    stored = {**module._parameters, **module._buffers}
+    if not values:
+        return stored
+    return {name: values.pop(prefix + name, value) for name, value in stored.items()}
 
 
 def _named_parameters(module: nn.Module, prefix: str = "") -> Iterator[tuple[str, nn.Parameter]]:
