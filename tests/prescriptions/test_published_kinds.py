@@ -185,3 +185,33 @@ def test_the_axicon_focuses_into_a_ring():
     assert radii == pytest.approx([40 * 0.01] * len(radii), rel=0.005)
     # The image's semi-diameter that the file gives, by OpticStudio.
     assert radii == pytest.approx([0.4010458306812] * len(radii), rel=2e-6)
+
+
+# Real rays that CODE V's listing prints: field (degrees), y 300 mm in front of the lens, and y on
+# the image, mm, of the chief ray and of the rays at ±50 mm from it.
+CODE_V = (
+    (2.0, 112.848743, 14.075077, {50: 0.000408, -50: 0.001669}),
+    (0.0, 144.927530, 0.0, {50: 0.004296, -50: -0.000681}),
+    (-2.0, 177.959658, -14.309040, {50: 0.002791, -50: -0.001003}),
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    # The Q coefficients are printed with five digits.
+    [("three_mirror_compact", 2e-6), ("three_mirror_compact_q", 2e-4)],
+)
+@pytest.mark.parametrize(("field", "start", "end", "aberrations"), CODE_V)
+def test_rays_of_the_three_mirror_compact_are_those_of_code_v(
+    name, tolerance, field, start, end, aberrations
+):
+    lens = built(name)
+    y = torch.tensor([start, *(start + height for height in aberrations)], dtype=torch.float64)
+    position = torch.stack((torch.zeros_like(y), y, torch.full_like(y, -300.0)), -1)
+    angle = math.radians(field)
+    direction = torch.tensor([0.0, math.sin(angle), math.cos(angle)], dtype=torch.float64)
+    with torch.no_grad():
+        # The outermost rays pass the edge of the stop, which is that of paraxial rays.
+        hit = trace_rays(lens.system().opened(), Rays(position, direction.expand_as(position), 500))
+    expected = [end, *(end + error for error in aberrations.values())]
+    assert hit.position[:, 1].tolist() == pytest.approx(expected, abs=tolerance)
