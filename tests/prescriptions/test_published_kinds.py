@@ -198,8 +198,8 @@ CODE_V = (
 
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    # The Q coefficients are printed with five digits.
-    [("three_mirror_compact", 2e-6), ("three_mirror_compact_q", 2e-4)],
+    # The listing's focal distance has four decimals, and the coefficients of Q five digits.
+    [("three_mirror_compact", 1e-5), ("three_mirror_compact_q", 5e-4)],
 )
 @pytest.mark.parametrize(("field", "start", "end", "aberrations"), CODE_V)
 def test_rays_of_the_three_mirror_compact_are_those_of_code_v(
