@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dolens.analysis.conditions import conditions
+from dolens.optics.elements import to_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.rays import Rays
 from dolens.optics.surfaces.clear_aperture import Unlimited
@@ -87,7 +88,8 @@ def _draw(axes: Axes, name: str, lens: Lens) -> None:
 def _paths(lens: Lens, field: float, heights: tuple[float, ...]) -> np.ndarray:
     """Return points (rays, points, 3), mm, of real rays that cross the stop at these heights.
 
-    The first point lies on the first surface's side of the object, 1 mm in front of it.
+    They are in the lens's axes, and on surfaces alone, not on coordinate breaks.  The first point
+    lies on the first surface's side of the object, 1 mm in front of it.
     """
     where = conditions(lens)
     wave, distance = where.reference_wavelength, where.object_distance
@@ -96,8 +98,13 @@ def _paths(lens: Lens, field: float, heights: tuple[float, ...]) -> np.ndarray:
     rays = Rays(aimed.position, aimed.direction, wave)
     traced = lens.trace(rays, record=True)
     ok = aimed.converged & traced.valid
-    surfaces = traced.points.unbind(0)
-    points = torch.stack([surfaces[0] - rays.direction, *surfaces, traced.position], -2)
+    system = lens.system()
+    surfaces = [traced.points[number - 1] for number in system.met]
+    # A traced ray is in the sensor's axes, with the z of an unfolded lens.
+    end = traced.components()
+    end = to_lens_axes(end._replace(z=end.z - system.vertices[-1]), system.all_axes[-1])
+    sensor = torch.stack(end[:3], -1)
+    points = torch.stack([surfaces[0] - rays.direction, *surfaces, sensor], -2)
     return points[ok].double().cpu().numpy()
 
 
@@ -141,7 +148,9 @@ def _numbers(lens: Lens) -> str:
     first = lens.first_order(where.reference_wavelength, where.object_distance)
     efl, f_number = abs(float(first.efl)), abs(float(first.working_f_number))
     field = float(where.fields.norm(dim=-1).max())
-    parts = [f"f = {number_text(efl, 4)} mm" if efl < 1e9 else "afocal"]
+    parts = []
+    if not math.isnan(efl):  # A cone has none.
+        parts.append(f"f = {number_text(efl, 4)} mm" if efl < 1e9 else "afocal")
     if math.isfinite(f_number) and f_number < 1e6:
         parts.append(f"f/{number_text(f_number, 3)}")
     if field:
