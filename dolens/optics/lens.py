@@ -246,6 +246,7 @@ class Lens(LensRays, LensViews, nn.Module):
             mirrors,
             self.reversals,
             image,
+            self.fields is not None and self.fields.from_the_side,
         )
         if not ideal_lenses(system):
             return system

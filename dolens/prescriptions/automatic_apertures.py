@@ -92,8 +92,13 @@ def _points(lens: Lens) -> Tensor:
 
 
 def _paraxial_heights(lens: Lens) -> dict[str, float]:
-    """Return |y| + |ȳ| of the marginal and the chief ray at every surface."""
-    field = float(_points(lens).norm(dim=-1).max())
+    """Return |y| + |ȳ| of the marginal and the chief ray at every surface; of fields from the side,
+    which have no paraxial chief ray, the marginal ray's alone.
+    """
+    points = _points(lens)
+    if _fields(lens).from_the_side:
+        points = torch.where(points.abs() < 90.0, points, 0.0)
+    field = float(points.norm(dim=-1).max())
     rays = lens.paraxial_rays(field, lens.primary_wavelength, lens.object_distance)
     heights = (rays.marginal.height.abs() + rays.chief.height.abs()).tolist()
     return dict(zip(lens.surfaces, heights, strict=True))
@@ -102,16 +107,22 @@ def _paraxial_heights(lens: Lens) -> dict[str, float]:
 def _real_heights(lens: Lens) -> dict[str, float]:
     """Return the largest height of real rays at every surface: from every field to the rim of the
     paraxial entrance pupil, or of what vignetting factors leave of it.
+
+    Light from the side never crosses that pupil: its rays are aimed at the rim of the stop.
     """
     points, fields = _points(lens), _fields(lens)
     pupil = lens.first_order(lens.primary_wavelength).entrance_pupil
-    if not math.isfinite(float(pupil.z)):
+    if not (fields.from_the_side or math.isfinite(float(pupil.z))):
         return {}
     angle = torch.arange(_RIM, dtype=lens.dtype) * (2.0 * math.pi / _RIM)
     rim = torch.stack((angle.sin(), angle.cos()), -1).expand(len(points), _RIM, 2)
     if fields.vignetting is not None:
         rim = torch.stack([of.on_stop(one) for of, one in zip(fields.vignetting, rim, strict=True)])
         rim = rim / rim.norm(dim=-1, keepdim=True).clamp(min=1.0)
+    waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
+    if fields.from_the_side:
+        rays = lens.aim(points[:, None, None], rim[:, :, None], waves, lens.object_distance)
+        return _heights_of(lens, rays, rays.converged)
     # An inverted pupil has the rim of an upright one.
     at = torch.cat([0.5 * pupil.diameter * rim, pupil.z.expand(*rim.shape[:-1], 1)], -1)
     if vergence(lens.object_distance) == 0.0:
@@ -122,15 +133,21 @@ def _real_heights(lens: Lens) -> dict[str, float]:
         towards = at - torch.cat([points, start], -1)[:, None]
         towards = torch.where(towards[..., 2:] < 0.0, -towards, towards)
     towards = towards / towards.norm(dim=-1, keepdim=True)
-    waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
-    rays = Rays(at[:, :, None], towards[:, :, None], waves)
+    return _heights_of(lens, Rays(at[:, :, None], towards[:, :, None], waves))
+
+
+def _heights_of(
+    lens: Lens, rays: Rays, converged: Tensor | bool = True
+) -> dict[str, float]:
+    """Return the largest height of rays at every surface; nothing where none gets through."""
     system = lens.system().opened().traced_by("reference")
     hit = trace_rays(system, rays, 1.0, True)
-    if not bool(hit.valid.any()):
+    passed = hit.valid & converged
+    if not bool(passed.any()):
         return {}
     found = {}
     for number, axes, point in zip(lens.surfaces, system.axes, hit.points, strict=True):
-        x, y, z = point[hit.valid].unbind(-1)
+        x, y, z = point[passed].unbind(-1)
         local = from_lens_axes(Components(x, y, z, x, y, z), axes)
         found[number] = float(torch.hypot(local.x, local.y).max())
     return found
