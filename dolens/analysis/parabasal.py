@@ -30,7 +30,7 @@ class ParabasalRays:
         position: (F, W, 2), mm, of the chief rays on the sensor.
         slope: (F, W, 2), dx/dz and dy/dz behind the last surface.
         position_rate: (F, W, 2, 2), ∂position/∂q, with q (mm) across the beam in the plane
-            through the first vertex that faces the field (see `dolens.optics.launching.launch`).  Of a
+            through the first vertex that faces the field (see `dolens.optics.launching`).  Of a
             curved sensor on the plane z = const. through the chief ray's point.
         slope_rate: (F, W, 2, 2), ∂slope/∂q, 1/mm.
         image_rate: (F, W, 2, 2), mm, ∂position/∂(tan x, tan y) for an object at infinity, else

@@ -1,9 +1,9 @@
 """The rays of an object point that pass a lens, as seen from its front.
 
 A ray of a given object point is fixed by where it crosses the plane through the first vertex that
-faces the point (see `dolens.optics.launching`).  Tracing costs so little that the part of this plane
-whose rays pass is found by trying all that meet the first surface: unlike aiming at the stop, this
-asks nothing of the pupil's shape and place.
+faces the point (see `dolens.optics.launching`).  Tracing costs so little that the part of this
+plane whose rays pass is found by trying all that meet the first surface: unlike aiming at the stop,
+this asks nothing of the pupil's shape and place.
 """
 
 import math
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from dolens.diffraction.object_points import ObjectPoints
-from dolens.optics.launching import launch, line_of_slopes
 from dolens.optics.elements import to_lens_axes
+from dolens.optics.launching import launch, line_of_slopes
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status, TracedRays

@@ -1,8 +1,8 @@
 """Real rays aimed at the stop.
 
 A ray of a given field is fixed by where it crosses the plane that faces the field
-(`dolens.optics.launching`).  Aiming asks for the point q of that plane whose ray meets the stop at p·R, with p
-the relative stop coordinates and R the stop's semi-diameter: F(q) = 0, two equations.
+(`dolens.optics.launching`).  Aiming asks for the point q of that plane whose ray meets the stop at
+p·R, with p the relative stop coordinates and R the stop's semi-diameter: F(q) = 0, two equations.
 
 It follows the solution along a homotopy: at t the field angle is t times the one asked for, and so
 is the point on the stop.  At t = 0 the axis is the solution, or nearly.  Each step is predicted

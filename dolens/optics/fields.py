@@ -9,6 +9,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 
+# Light so near 90° to the axis, degrees, is traced as light from the side is: it crosses a vertex
+# plane hundreds of semi-diameters away.
+_STEEP = 89.0
 # Fields this near to each other, in their own unit, are the same.
 _SAME = 1e-9
 
@@ -74,18 +77,14 @@ class Fields(NamedTuple):
 
     @property
     def from_the_side(self) -> bool:
-        """Return whether light comes at 90° to the axis and more."""
-        return self.kind == "angles" and any(is_from_the_side(point) for point in self.points)
+        """Return whether light comes at 90° to the axis, or nearly, and more."""
+        steep = (abs(angle) >= _STEEP for point in self.points for angle in point)
+        return self.kind == "angles" and any(steep)
 
 
-def is_from_the_side(angles: Sequence[float] | Tensor) -> bool:
-    """Return whether any of these angles (degrees) is of light at 90° to the axis and more."""
-    return bool((torch.as_tensor(angles).detach().abs() >= 90.0).any())
-
-
-def require_from_the_front(angles: Sequence[float] | Tensor, what: str) -> None:
+def require_from_the_front(angles: float | Sequence[float] | Tensor, what: str) -> None:
     """Raise `InputError` where an angle (degrees) has no tangent, of which `what` is made."""
-    if is_from_the_side(angles):
+    if bool((torch.as_tensor(angles).detach().abs() >= 90.0).any()):
         raise InputError(f"{what} needs fields below 90 degrees to the axis")
 
 

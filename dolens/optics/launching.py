@@ -76,4 +76,6 @@ def polar_angles(line: Tensor) -> tuple[Tensor, Tensor]:
     """
     across, along = line[..., :2], line[..., 2]
     sine = across.norm(dim=-1)
-    return torch.atan2(sine, along), across / sine.clamp(min=torch.finfo(line.dtype).tiny)[..., None]
+    return torch.atan2(sine, along), across / sine.clamp(min=torch.finfo(line.dtype).tiny)[
+        ..., None
+    ]

@@ -136,9 +136,7 @@ def _real_heights(lens: Lens) -> dict[str, float]:
     return _heights_of(lens, Rays(at[:, :, None], towards[:, :, None], waves))
 
 
-def _heights_of(
-    lens: Lens, rays: Rays, converged: Tensor | bool = True
-) -> dict[str, float]:
+def _heights_of(lens: Lens, rays: Rays, converged: Tensor | bool = True) -> dict[str, float]:
     """Return the largest height of rays at every surface; nothing where none gets through."""
     system = lens.system().opened().traced_by("reference")
     hit = trace_rays(system, rays, 1.0, True)
