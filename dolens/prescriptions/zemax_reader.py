@@ -173,7 +173,7 @@ def _stop_behind(row: Row, place: str, medium: str, pupil: bool) -> Row:
         )
     if not pupil:
         raise InputError(f"{place}: the stop, a coordinate break, has no size (ENPD, FNUM, OBNA)")
-    stop = {"type": "plane", "material": medium, "thickness": row["thickness"]}
+    stop = {"type": "aperture", "material": medium, "thickness": row["thickness"]}
     row["thickness"] = 0.0
     return stop
 

@@ -173,6 +173,8 @@ def test_a_stop_on_a_break_about_the_axis_is_a_plane_there(tmp_path):
     assert z[lens.stop - 1] == 0.0 and z[lens.stop] == 2.0
     pupil = lens.first_order(550.0).entrance_pupil
     assert float(pupil.z) == 0.0 and float(pupil.diameter) == pytest.approx(16.0, rel=1e-15)
+    found = prescription_from_zemax(turned_stop("PARM 5 45"))
+    assert prescription_from_zemax(zemax_of(found))["surfaces"] == found["surfaces"]
 
 
 @pytest.mark.parametrize(
