@@ -10,6 +10,7 @@ from dolens import InputError, Rays, Status
 from dolens.analysis.parabasal import parabasal_rays
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.optics.launching import field_line
+from dolens.plotting.drawing import layout_drawing
 from dolens.prescriptions.build import lens_from_prescription
 
 RADIUS, INDEX = 10.0, 1.5
@@ -188,3 +189,14 @@ def test_what_needs_a_tangent_refuses_fields_from_the_side():
     lens.backend = "cpu"
     with pytest.raises(InputError, match="kernels trace no light at 90 degrees"):
         lens.trace(lens.chief_ray((0.0, 95.0)))
+
+
+def test_a_drawing_shows_light_that_comes_from_behind_the_front():
+    """The chief ray of 90.5° is drawn straight to the first surface, falling towards -z, and
+    through the centre of the stop.
+    """
+    (fan,) = layout_drawing(fisheye().requires_grad_(False), WAVE, [90.5], 1).fans
+    (path,) = fan.paths
+    along = path[1] - path[0]
+    assert math.degrees(math.atan2(along[1], along[2])) == pytest.approx(90.5, abs=1e-9)
+    assert path[5] == pytest.approx([0.0, 0.0, 33.5], abs=1e-9)
