@@ -19,6 +19,7 @@ from dolens.analysis.full_field import full_field, three_digits
 from dolens.analysis.ray_intercepts import field_unit
 from dolens.analysis.spot_diagram import spectral_shares
 from dolens.errors import InputError
+from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 
@@ -168,6 +169,8 @@ def own_fields(lens: Lens, object_distance: float | None) -> Tensor:
     points = torch.tensor(lens.fields.points, dtype=torch.float64)
     if (lens.fields.kind == "heights") == (object_distance is not None):
         return points
+    if lens.fields.kind == "angles":
+        require_from_the_front(points, "an object at a finite distance")
     if lens.fields.kind == "heights":
         return torch.rad2deg((-points * vergence(lens.object_distance)).atan())
     return -torch.deg2rad(points).tan() * object_distance

@@ -21,7 +21,7 @@ from dolens.analysis.ray_intercepts import (
 )
 from dolens.analysis.spot_diagram import AIRY, spectral_shares, spot_diagram, working_f_numbers
 from dolens.errors import InputError
-from dolens.optics.aiming import field_tangents
+from dolens.optics.launching import field_line
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 
@@ -208,6 +208,7 @@ def field_directions(field: Tensor, object_distance: float | None) -> Tensor:
         object_distance: mm in front of the first vertex; None for an object at infinity.
     """
     angles = torch.deg2rad(field) if vergence(object_distance) == 0.0 else field
-    slopes, _ = field_tangents(angles, object_distance)
-    length = slopes.norm(dim=-1, keepdim=True)
-    return torch.where(length > 0.0, slopes / length, slopes.new_tensor([0.0, 1.0]))
+    line, _ = field_line(angles, object_distance)
+    across = line[..., :2]
+    length = across.norm(dim=-1, keepdim=True)
+    return torch.where(length > 0.0, across / length, across.new_tensor([0.0, 1.0]))

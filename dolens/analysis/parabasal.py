@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.ray_intercepts import in_double_precision
-from dolens.optics.aiming import field_tangents, launch
+from dolens.optics.fields import require_from_the_front
+from dolens.optics.launching import field_line, launch
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.rays import Rays, Status
@@ -29,7 +30,7 @@ class ParabasalRays:
         position: (F, W, 2), mm, of the chief rays on the sensor.
         slope: (F, W, 2), dx/dz and dy/dz behind the last surface.
         position_rate: (F, W, 2, 2), ∂position/∂q, with q (mm) across the beam in the plane
-            through the first vertex that faces the field (see `dolens.optics.aiming.launch`).  Of a
+            through the first vertex that faces the field (see `dolens.optics.launching`).  Of a
             curved sensor on the plane z = const. through the chief ray's point.
         slope_rate: (F, W, 2, 2), ∂slope/∂q, 1/mm.
         image_rate: (F, W, 2, 2), mm, ∂position/∂(tan x, tan y) for an object at infinity, else
@@ -64,6 +65,8 @@ def parabasal_rays(
     field = torch.as_tensor(fields, **options).reshape(-1, 2)
     waves = torch.as_tensor(wavelengths, **options).reshape(-1)
     near = vergence(object_distance)
+    if near == 0.0:
+        require_from_the_front(field, "a map of chief rays against the tangent of the field")
     with torch.enable_grad():
         # The coordinate in which an ideal lens's image is linear.
         linear = torch.deg2rad(field).tan() if near == 0.0 else field
@@ -76,8 +79,8 @@ def parabasal_rays(
 
         q = aimed.crossing.clone().requires_grad_()
         angles = torch.deg2rad(field) if near == 0.0 else field
-        tangents, _ = field_tangents(angles, object_distance)
-        ray = launch(tangents[:, None], near, q)
+        line, _ = field_line(angles, object_distance)
+        ray = launch(line[:, None], near, q)
         hit = lens.trace(Rays.from_components(ray, waves))
         reached = reached & _arrives(hit.status)
         position = hit.position[..., :2]

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dolens.analysis.vignetting import VignettedPupils
 from dolens.errors import InputError
+from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays
@@ -85,6 +86,7 @@ def square_grid(
     unit = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
 
     def launch(field: tuple[float, float]) -> Launched:
+        require_from_the_front(field, "a grid of rays in the plane of the first vertex")
         tangents = [math.tan(math.radians(angle)) for angle in field]
         tangent = torch.tensor(tangents, dtype=torch.float64)
         width = half_width

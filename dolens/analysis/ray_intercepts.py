@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.aiming import AimedRays, field_tangents, launch
+from dolens.optics.aiming import AimedRays
 from dolens.optics.fields import vignetting_margin
 from dolens.optics.image_surface import TangentPlanes
+from dolens.optics.launching import field_line, launch
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.ray_tracing import trace_rays
@@ -236,10 +237,8 @@ def _fitted(
     W).
     """
     near = vergence(object_distance)
-    tangents, _ = field_tangents(torch.deg2rad(field) if near == 0.0 else field, object_distance)
-    tangents = tangents[:, None, None]
-    line = torch.cat([tangents, torch.ones_like(tangents[..., :1])], -1)
-    line = line / line.norm(dim=-1, keepdim=True)
+    line, _ = field_line(torch.deg2rad(field) if near == 0.0 else field, object_distance)
+    line = line[:, None, None]
     # Where the rays cross the plane that faces the field, in its axes: the inverse of `launch`.
     tilt = line[..., :2] / (1.0 + line[..., 2:])
     start = aimed.position[..., :2] - tilt * aimed.position[..., 2:]
@@ -253,7 +252,7 @@ def _fitted(
         part = basis * ok[..., None]
         coefficients = torch.linalg.pinv(part, rtol=1e-10) @ torch.where(ok[..., None], start, 0.0)
     found = ok.sum(-1) > 0
-    ray = launch(tangents, near, wanted @ coefficients)
+    ray = launch(line, near, wanted @ coefficients)
     return Rays.from_components(ray, aimed.wavelength), found
 
 

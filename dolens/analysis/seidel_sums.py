@@ -9,7 +9,9 @@ from torch import Tensor
 from dolens.analysis.conditions import Conditions, wavelength_interval
 from dolens.analysis.full_field import full_field
 from dolens.analysis.ray_intercepts import in_double_precision
+from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
+from dolens.optics.paraxial import vergence
 from dolens.optics.seidel import Seidel
 
 
@@ -74,6 +76,8 @@ def seidel_sums(lens: Lens, where: Conditions) -> SeidelSums:
     exact = in_double_precision(lens)
     wavelength, distance = where.reference_wavelength, where.object_distance
     edge = float(where.fields.norm(dim=-1).max()) or full_field(exact, distance)
+    if vergence(distance) == 0.0:
+        require_from_the_front(edge, "a paraxial chief ray")
     low, high = float(where.wavelengths.min()), float(where.wavelengths.max())
     colours = (low, high) if low < high else wavelength_interval(lens)
     found = exact.seidel(edge, wavelength, distance, colours)

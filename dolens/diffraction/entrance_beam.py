@@ -1,9 +1,9 @@
 """The rays of an object point that pass a lens, as seen from its front.
 
 A ray of a given object point is fixed by where it crosses the plane through the first vertex that
-faces the point (see `dolens.optics.aiming`).  Tracing costs so little that the part of this plane
-whose rays pass is found by trying all that meet the first surface: unlike aiming at the stop, this
-asks nothing of the pupil's shape and place.
+faces the point (see `dolens.optics.launching`).  Tracing costs so little that the part of this
+plane whose rays pass is found by trying all that meet the first surface: unlike aiming at the stop,
+this asks nothing of the pupil's shape and place.
 """
 
 import math
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from dolens.diffraction.object_points import ObjectPoints
-from dolens.optics.aiming import launch
 from dolens.optics.elements import to_lens_axes
+from dolens.optics.launching import launch, line_of_slopes
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Components, Rays, Status, TracedRays
@@ -103,7 +103,8 @@ def box_grid(centre: Tensor, half_width: Tensor, side: int, rim: int = 0) -> Ten
 
 def launched(points: ObjectPoints, q: Tensor) -> Components:
     """Rays (N, S, S) of N points through points (N, S, S, 2), mm, of the planes that face them."""
-    return launch(points.slopes[:, None, None], points.vergence[:, None, None], q)
+    line = line_of_slopes(points.slopes)
+    return launch(line[:, None, None], points.vergence[:, None, None], q)
 
 
 class _Edge(NamedTuple):
@@ -161,7 +162,8 @@ class _PupilSearch:
         return tuple(hit.surface[clipped].unique().tolist()), ended
 
     def _rays(self, q: Tensor, owner: Tensor) -> Components:
-        return launch(self.points.slopes[owner], self.points.vergence[owner], q)
+        line = line_of_slopes(self.points.slopes)
+        return launch(line[owner], self.points.vergence[owner], q)
 
     def _pass(self, ray: Components, wavelength: Tensor) -> Tensor:
         return self._trace(ray, wavelength).valid

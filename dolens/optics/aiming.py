@@ -1,10 +1,8 @@
 """Real rays aimed at the stop.
 
-A ray of a given field is fixed by where it crosses the plane through the first vertex that is
-perpendicular to the line from the object point to that vertex.  This plane faces a wide field as
-squarely as a narrow one, however far the entrance pupil wanders, and for an object at infinity it
-is a wavefront.  Aiming asks for the point q of that plane whose ray meets the stop at p·R, with p
-the relative stop coordinates and R the stop's semi-diameter: F(q) = 0, two equations.
+A ray of a given field is fixed by where it crosses the plane that faces the field
+(`dolens.optics.launching`).  Aiming asks for the point q of that plane whose ray meets the stop at
+p·R, with p the relative stop coordinates and R the stop's semi-diameter: F(q) = 0, two equations.
 
 It follows the solution along a homotopy: at t the field angle is t times the one asked for, and so
 is the point on the stop.  At t = 0 the axis is the solution, or nearly.  Each step is predicted
@@ -25,7 +23,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.elements import from_lens_axes, to_lens_axes
-from dolens.optics.paraxial import vergence
+from dolens.optics.launching import field_line, launch, polar_angles
 from dolens.optics.rays import Components, Rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import Trace, stop_gradient_where_invalid, trace_surfaces
@@ -62,47 +60,6 @@ class AimedRays(Rays):
     crossing: Tensor
 
 
-def field_tangents(
-    field: Tensor, object_distance: float | Tensor | None = None
-) -> tuple[Tensor, float | Tensor]:
-    """Slopes (tan x, tan y) of the line from the object point to the first vertex.
-
-    Args:
-        field: (..., 2), angles in radians for an object at infinity; else the object point's x and
-            y in mm.
-        object_distance: mm in front of the first vertex; None or `inf` for an object at infinity.
-
-    Returns:
-        The slopes (..., 2), and 1/object_distance (1/mm).
-    """
-    near = vergence(object_distance)
-    if isinstance(near, Tensor):
-        near = near.to(field)
-        return torch.where(near[..., None] == 0.0, field.tan(), -field * near[..., None]), near
-    return (field.tan() if near == 0.0 else -field * near), near
-
-
-def launch(tangents: Tensor, near: float | Tensor, q: Tensor) -> Components:
-    """Rays of a field through points of the plane that faces it.
-
-    Args:
-        tangents: (..., 2), slopes of the line from the object point to the first vertex.
-        near: 1/object distance, 1/mm; 0 for an object at infinity.
-        q: (..., 2), mm, in the plane through the first vertex perpendicular to that line; its axes
-            are the lens's x and y, turned with z the shortest way into the line.
-    """
-    (tx, ty), (qx, qy) = tangents.unbind(-1), q.unbind(-1)
-    n = torch.rsqrt(1.0 + tx * tx + ty * ty)
-    l, m = tx * n, ty * n  # noqa: E741
-    along = (l * qx + m * qy) / (1.0 + n)
-    x, y, z = qx - l * along, qy - m * along, -(l * qx + m * qy)
-    # The object point lies a distance n·near before the plane, so far ones lose no digits.
-    w = n * near
-    inverse = torch.rsqrt(1.0 + w * w * (qx * qx + qy * qy))
-    direction = ((l + w * x) * inverse, (m + w * y) * inverse, (n + w * z) * inverse)
-    return Components(*torch.broadcast_tensors(x, y, z, *direction))
-
-
 def aim(
     system: OpticalSystem,
     field: Tensor,
@@ -116,7 +73,8 @@ def aim(
     Args:
         system: the lens.
         field: (..., 2): angles (x, y) in radians for an object at infinity, whose rays have
-            direction (tan x, tan y, 1) normalised; else the object point's x and y in mm.
+            direction (tan x, tan y, 1) normalised, see `field_line`; else the object point's x
+            and y in mm.
         pupil: (..., 2), where the rays cross the stop surface, x and y in its own axes over its
             semi-diameter; in the unit disc.
         wavelength: nm, a number or (...).
@@ -130,25 +88,25 @@ def aim(
         the lens, the field and the pupil point, in forward and in reverse mode; the search ends
         when every ray has ended, so that it cannot be mapped over lenses by `vmap`.
     """
-    tangents, near = field_tangents(field, object_distance)
+    line, near = field_line(field, object_distance)
     target = pupil * system.surfaces[system.stop - 1].semi_diameter
     # Not torch.broadcast_shapes, whose first call imports SymPy: half a second.
-    tangents, target = torch.broadcast_tensors(tangents, target)
+    like = torch.broadcast_tensors(line[..., 0], target[..., 0])[0]
     if isinstance(wavelength, Tensor):
-        every = torch.broadcast_tensors(tangents, wavelength[..., None])[0]
-        tangents, target = every, target.expand(every.shape)
-    problem = _Problem(system, wavelength, near, tangents.detach(), target.detach())
+        like = torch.broadcast_tensors(like, wavelength)[0]
+    line, target = line.expand(*like.shape, 3), target.expand(*like.shape, 2)
+    problem = _Problem(system, wavelength, near, line.detach(), target.detach())
     with torch.no_grad():
         found_near = None if guess is None else _corrected(problem, guess.expand(target.shape))
         q, slopes, found = found_near or _follow(problem)
-    residual, reached = _miss(system, wavelength, near, tangents, target, q)
+    residual, reached = _miss(system, wavelength, near, line, target, q)
     with torch.no_grad():
         first = system.surfaces[system.met[0] - 1]
         front = slopes.abs().amax((-2, -1)) * first.semi_diameter
         rounding = torch.finfo(system.dtype).eps * (front + problem.scale)
         converged = found & reached & (residual.abs().amax(-1) <= ROUNDING * rounding)
     q = q - _solve(slopes, residual)
-    ray = launch(tangents, near, q)
+    ray = launch(line, near, q)
     position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
     kept = converged[..., None]
     backwards = direction.new_tensor((0.0, 0.0, -1.0))
@@ -167,7 +125,7 @@ class _Problem(NamedTuple):
     system: OpticalSystem
     wavelength: float | Tensor
     near: float | Tensor
-    tangents: Tensor
+    line: Tensor
     target: Tensor
 
     @property
@@ -208,10 +166,9 @@ def _follow(problem: _Problem) -> tuple[Tensor, Tensor, Tensor]:
         q and ∂F/∂q there, and whether the last correction was so small that the next is below
         rounding.  q is zero and ∂F/∂q the identity where it was not.
     """
-    tangents = problem.tangents
-    q = torch.zeros_like(tangents) + _start(problem)
-    t = torch.zeros_like(tangents[..., 0])
-    angle = torch.atan(tangents.norm(dim=-1))
+    q = torch.zeros_like(problem.target) + _start(problem)
+    t = torch.zeros_like(q[..., 0])
+    angle, _ = polar_angles(problem.line)
     longest = (MAX_TURN / angle.clamp(min=MAX_TURN)).clamp(max=1.0)
     step, start, start_t, rate = longest, q, t, torch.zeros_like(q)
     # Newton's corrections must halve F; the first F after a prediction, within the stop.
@@ -260,7 +217,7 @@ def _start(problem: _Problem) -> Tensor:
     sent back from the stop's vertex, along its axis, says where the beam comes in.
     """
     system = problem.system
-    zero = problem.tangents.new_zeros(())
+    zero = problem.target.new_zeros(())
     origin = torch.stack((zero, zero))
     if not system.breaks or system.stop == system.met[0]:
         return origin
@@ -279,13 +236,12 @@ def _start(problem: _Problem) -> Tensor:
 
 def _evaluate(problem: _Problem, q: Tensor, t: Tensor) -> _Evaluation:
     """F and its derivatives: a trace of two copies of the rays, swept back once, x and y apart."""
-    system, wavelength, near, tangents, target = problem
-    tangent = tangents.norm(dim=-1)
-    angle = torch.atan(tangent)
-    azimuth = tangents / tangent.clamp(min=torch.finfo(q.dtype).tiny)[..., None]
+    system, wavelength, near, line, target = problem
+    angle, azimuth = polar_angles(line)
 
     def miss(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        turned = torch.tan(t * angle)[..., None] * azimuth
+        part = (t * angle)[..., None]
+        turned = torch.cat((part.sin() * azimuth, part.cos()), -1)
         return _miss(system, wavelength, near, turned, t[..., None] * target, q)
 
     copies = (q.expand(2, *q.shape).contiguous(), t.expand(2, *t.shape).contiguous())
@@ -305,12 +261,12 @@ def _miss(
     system: OpticalSystem,
     wavelength: float | Tensor,
     near: float | Tensor,
-    tangents: Tensor,
+    line: Tensor,
     target: Tensor,
     q: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return by how much (mm) rays miss their points on the stop, and whether they reach it."""
-    ray = launch(tangents, near, q)
+    ray = launch(line, near, q)
     traced = trace_surfaces(system, ray, wavelength, 1.0, first=1, last=system.stop)
     landed = from_lens_axes(traced.ray, system.axes[system.stop - 1])
     return torch.stack((landed.x, landed.y), -1) - target, _reaches(traced)

@@ -51,6 +51,8 @@ def choose_backend(
         return "reference"
     device = system.device.type
     reason = unsupported(system)
+    if system.from_the_side:
+        reason = "kernels trace no light at 90 degrees to the axis and more"
     if device not in ("cpu", "cuda"):
         reason = f"there are no kernels for {device}"
     elif system.dtype not in _KERNEL_DTYPES:

@@ -7,6 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
+
+# Light so near 90° to the axis, degrees, is traced as light from the side is: it crosses a vertex
+# plane hundreds of semi-diameters away.
+_STEEP = 89.0
 # Fields this near to each other, in their own unit, are the same.
 _SAME = 1e-9
 
@@ -57,7 +62,8 @@ class Fields(NamedTuple):
 
     Attributes:
         kind: `angles`, in degrees, of an object at any distance: a ray from field (x, y) has
-            direction (tan x, tan y, 1) normalised; or `heights`, in mm, of points of an object
+            direction (tan x, tan y, 1) normalised, along one axis continued by (0, sin y, cos y)
+            and (sin x, 0, cos x) to 90° and beyond; or `heights`, in mm, of points of an object
             plane at a finite distance.
         points: (x, y) of each.
         weights: how much each counts, of any sum; None: all the same.
@@ -68,6 +74,18 @@ class Fields(NamedTuple):
     points: tuple[tuple[float, float], ...]
     weights: tuple[float, ...] | None = None
     vignetting: tuple[Vignetting, ...] | None = None
+
+    @property
+    def from_the_side(self) -> bool:
+        """Return whether light comes at 90° to the axis, or nearly, and more."""
+        steep = (abs(angle) >= _STEEP for point in self.points for angle in point)
+        return self.kind == "angles" and any(steep)
+
+
+def require_from_the_front(angles: float | Sequence[float] | Tensor, what: str) -> None:
+    """Raise `InputError` where an angle (degrees) has no tangent, of which `what` is made."""
+    if bool((torch.as_tensor(angles).detach().abs() >= 90.0).any()):
+        raise InputError(f"{what} needs fields below 90 degrees to the axis")
 
 
 def vignetting_margin(own: Fields | None, fields: Tensor, pupil: Tensor) -> Tensor:

@@ -91,6 +91,8 @@ def _of_real_rays(lens: Lens, heights: Tensor) -> Tensor:
         if not bool(_arrives(back.status).all()):
             raise InputError("a chief ray of a real image height does not come from the object")
         ray = Rays(back.position, back.direction, ray.wavelength)
+        if bool((ray.direction[..., 2] >= 0.0).any()):
+            raise InputError("a chief ray of a real image height comes at 90 degrees to the axis")
     _, y, z = ray.position.unbind(-1)
     tangent = ray.direction[..., 1] / ray.direction[..., 2]
     near = vergence(lens.object_distance)

@@ -219,6 +219,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
             mirrors,
             self.reversals,
             image,
+            self.fields is not None and self.fields.from_the_side,
         )
         if not ideal_lenses(system):
             return system

@@ -39,6 +39,8 @@ class OpticalSystem:
         reversals: numbers of the coordinate breaks that turn the axes so far that light travels the
             other way along z behind them.
         image: the curved surface that rays end on, its vertex at the sensor; None: a plane.
+        from_the_side: whether light comes at 90° to the axis and more; its rays meet spheres and
+            conics along their vertex plane and from behind it, and are traced by the reference.
         backend: the implementation that traces rays through it: `reference`, `cpu`, `cuda`, or
             `auto`; see `dolens.optics.backend.choose_backend`.
     """
@@ -53,6 +55,7 @@ class OpticalSystem:
     mirrors: tuple[int, ...] = ()
     reversals: tuple[int, ...] = ()
     image: SurfaceState | None = None
+    from_the_side: bool = False
 
     @cached_property
     def senses(self) -> tuple[float, ...]:

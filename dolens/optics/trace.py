@@ -66,12 +66,18 @@ def distance_to_plane(ray: Components, z: Tensor | float, sense: float) -> tuple
     return sense * (z - ray.z) / cosine, cosine.detach() - GRAZING
 
 
+def distance_to_nearest(ray: Components) -> Tensor:
+    """Return the distance (mm) along rays to the point that is nearest to the vertex."""
+    x, y, z, l, m, n = ray  # noqa: E741
+    return -torch.addcmul(torch.addcmul(x * l, y, m), z, n)
+
+
 class Meeting(NamedTuple):
     """Rays meet a surface.
 
     Attributes:
         ray: on the surface, in its axes.
-        to_plane: distance (mm) to the vertex plane.
+        to_plane: distance (mm) to the vertex plane, or to the point nearest to the vertex.
         t: distance (mm) from there to the surface.
         met: a margin that is positive where they meet it.
     """
@@ -82,9 +88,27 @@ class Meeting(NamedTuple):
     met: Tensor
 
 
-def meet(surface: SurfaceState, ray: Components, sense: float) -> Meeting:
-    """Find where rays, in a surface's axes, meet it, coming towards +z (sense +1) or -z."""
+def meet(
+    surface: SurfaceState, ray: Components, sense: float, from_the_side: bool = False
+) -> Meeting:
+    """Find where rays, in a surface's axes, meet it, coming towards +z (sense +1) or -z.
+
+    Args:
+        surface: the surface.
+        ray: in its axes.
+        sense: of the light.
+        from_the_side: whether rays may come along the vertex plane or from behind it.
+    """
     shape = surface.shape
+    if from_the_side:
+        nearest = distance_to_nearest(ray)
+        moved = transfer(ray, nearest)
+        found = shape.intersect_from(surface.parameters, moved, sense)
+        if found is not None:
+            limit = FAR * surface.semi_diameter
+            t, met = found[0].clamp(-limit, limit), found[1]
+            met = torch.minimum(met, limit - torch.maximum(t, -t).detach())
+            return Meeting(transfer(moved, t), nearest, t, met)
     to_plane, towards = distance_to_plane(ray, 0.0, sense)
     limit = FAR * surface.semi_diameter
     l, m, n = ray[3:]  # noqa: E741
@@ -123,6 +147,8 @@ def enter_lens(
     axes = system.axes[number - 1]
     if axes.segment:
         distance, _ = distance_to_plane(from_lens_axes(ray, axes), 0.0, towards)
+    elif system.from_the_side:
+        distance = distance_to_nearest(ray._replace(z=ray.z - system.vertices[number - 1]))
     else:
         distance, _ = distance_to_plane(ray, system.vertices[number - 1].to(finer), towards)
     index = system.indices(rays.wavelength)[front]
@@ -177,7 +203,9 @@ def trace_surfaces(
         arriving, leaving = sense * senses[front], sense * senses[back]
         here, carried = change_axes(ray, axes, places[i])
         axes = places[i]
-        (x, y, z, l, m, n), to_plane, t, met = meet(surface, here, arriving)  # noqa: E741
+        (x, y, z, l, m, n), to_plane, t, met = meet(  # noqa: E741
+            surface, here, arriving, system.from_the_side
+        )
         inside = surface.aperture.margin(x, y)
         if path is not None:
             path = path + before * (to_plane + t if carried is None else carried + to_plane + t)

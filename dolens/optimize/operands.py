@@ -17,6 +17,7 @@ from torch import Tensor
 
 from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.aiming import aim
+from dolens.optics.fields import require_from_the_front
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
 from dolens.optics.paraxial import FirstOrder, first_order
@@ -294,6 +295,7 @@ def _distortion(operand: Operand, lens: LensProperties) -> dict[str, Tensor]:
     ray = lens.chief_ray(operand.field)
     field = torch.tensor(operand.field, dtype=lens.system.dtype, device=lens.system.device)
     if lens.object_distance is None:
+        require_from_the_front(operand.field, "distortion")
         ideal = lens.first_order.efl * torch.tan(torch.deg2rad(field))
     else:
         ideal = lens.first_order.magnification * field

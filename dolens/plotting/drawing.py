@@ -81,8 +81,8 @@ def layout_drawing(
     """Section a lens and trace its rays; arguments and errors are those of `layout_figure`."""
     sensor = sensor or lens.sensor_diameter
     lines = [wavelength] if isinstance(wavelength, int | float) else list(wavelength)
-    _check(fields_deg, rays, lines)
     system = lens.system(values)
+    _check(fields_deg, rays, lines, 180.0 if system.from_the_side else 90.0)
     profiles = [surface_profile(system, number) for number in range(1, len(system.surfaces) + 1)]
     # The sensor's middle, and the sections of all surfaces.
     back = float(np.concatenate([sensor_line(system, 0.0)[:, 0], *(z for z, _ in profiles)]).max())
@@ -149,14 +149,14 @@ def draw_layout(
     open_axes(axes)
 
 
-def _check(fields_deg: Sequence[float], rays: int, lines: Sequence[float]) -> None:
+def _check(fields_deg: Sequence[float], rays: int, lines: Sequence[float], limit: float) -> None:
     if not lines:
         raise InputError("layout: at least one wavelength, not none")
     if rays < 1 or not fields_deg:
         raise InputError(f"layout: at least one field and one ray, not {len(fields_deg)}, {rays}")
     for field in fields_deg:
-        if not abs(field) < 90.0:
-            raise InputError(f"layout: fields must be within ±90 degrees, not {field:g}")
+        if not abs(field) < limit:
+            raise InputError(f"layout: fields must be within ±{limit:g} degrees, not {field:g}")
 
 
 def _draw_axis(axes: Axes, points: np.ndarray) -> None:

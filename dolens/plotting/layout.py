@@ -63,8 +63,9 @@ def layout_figure(
         A figure of equal scale in y and z, in mm.
 
     Raises:
-        InputError: there are no fields or rays, a field is not within ±90°, or the object is not
-            in front of the entrance pupil and the first vertex.
+        InputError: there are no fields or rays, a field is not within ±90° (±180° of a lens with
+            fields from the side), or the object is not in front of the entrance pupil and the first
+            vertex.
     """
     drawing = layout_drawing(lens, wavelength, fields_deg, rays, object_distance, values, sensor)
     system = drawing.system

@@ -12,6 +12,7 @@ from dolens.optics.elements import to_lens_axes
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.outlines import Polygons
+from dolens.optics.surfaces.refraction import GRAZING
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces, trace_to_sensor, transfer
 from dolens.plotting.surface_cut import BISECTIONS, Profile, SurfaceCut, place_of, runs
@@ -144,13 +145,14 @@ def trace_fan(
         field_deg: the angle of the chief ray in object space, degrees.
         rays: how many; one alone is the chief ray.
         object_distance: mm in front of the first vertex, or None for infinity.
-        start: z in mm where the first point of every ray lies, or at the object if that is nearer.
+        start: z in mm where the first point of every ray lies, or at the object if that is nearer;
+            with light from the side not farther out than a little beyond the first surface.
 
     Returns:
         (valid rays, surfaces + 2, 3), mm, in the lens's axes: start, every surface that light
         meets, sensor.
     """
-    if system.breaks:
+    if system.breaks or system.from_the_side:
         return _aimed_fan(system, wavelength, field_deg, rays, object_distance, start)
     pupil = entrance_pupil(system, wavelength)
     if object_distance is not None:
@@ -221,7 +223,12 @@ def _aimed_fan(
         pupil = torch.stack([torch.zeros_like(heights), heights], -1)
         aimed = aim(system, field, pupil, wavelength, object_distance)
         ray = aimed.components()
-        ray = transfer(ray, (start - ray.z) / ray.n)
+        if system.from_the_side:
+            longest = 1.2 * system.surfaces[system.met[0] - 1].semi_diameter
+            lead = (ray.z - start) / ray.n.clamp(min=GRAZING)
+            ray = transfer(ray, -lead.clamp(0.0, longest))
+        else:
+            ray = transfer(ray, (start - ray.z) / ray.n)
         points, valid = _paths(system, ray, wavelength)
         return points, valid & aimed.converged
 

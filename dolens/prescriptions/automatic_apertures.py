@@ -21,8 +21,9 @@ from dolens.optics.fields import Fields
 from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.ray_tracing import trace_rays
-from dolens.optics.rays import Components, Rays
+from dolens.optics.rays import Components, Rays, TracedRays
 from dolens.optics.surfaces.clear_aperture import Unlimited
+from dolens.optics.system import OpticalSystem
 from dolens.prescriptions.apertures import is_automatic
 
 # Points of the pupil's rim.
@@ -108,8 +109,13 @@ def _points(lens: Lens) -> Tensor:
 
 
 def _paraxial_heights(lens: Lens) -> dict[str, float]:
-    """Return |y| + |ȳ| of the marginal and the chief ray at every surface."""
-    field = float(_points(lens).norm(dim=-1).max())
+    """Return |y| + |ȳ| of the marginal and the chief ray at every surface; of fields from the side,
+    which have no paraxial chief ray, the marginal ray's alone.
+    """
+    points = _points(lens)
+    if _fields(lens).from_the_side:
+        points = torch.where(points.abs() < 90.0, points, 0.0)
+    field = float(points.norm(dim=-1).max())
     rays = lens.paraxial_rays(field, lens.primary_wavelength, lens.object_distance)
     heights = (rays.marginal.height.abs() + rays.chief.height.abs()).tolist()
     return dict(zip(lens.surfaces, heights, strict=True))
@@ -118,16 +124,23 @@ def _paraxial_heights(lens: Lens) -> dict[str, float]:
 def _real_heights(lens: Lens) -> dict[str, float]:
     """Return the largest height of real rays at every surface: from every field to the rim of the
     paraxial entrance pupil, or of what vignetting factors leave of it.
+
+    Light from the side never crosses that pupil, and of a wide field half the rays may miss: such
+    rays are aimed at the rim of the stop.
     """
     points, fields = _points(lens), _fields(lens)
     pupil = lens.first_order(lens.primary_wavelength).entrance_pupil
-    if not math.isfinite(float(pupil.z)):
+    if not (fields.from_the_side or math.isfinite(float(pupil.z))):
         return {}
     angle = torch.arange(_RIM, dtype=lens.dtype) * (2.0 * math.pi / _RIM)
     rim = torch.stack((angle.sin(), angle.cos()), -1).expand(len(points), _RIM, 2)
     if fields.vignetting is not None:
         rim = torch.stack([of.on_stop(one) for of, one in zip(fields.vignetting, rim, strict=True)])
         rim = rim / rim.norm(dim=-1, keepdim=True).clamp(min=1.0)
+    waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
+    system = lens.system().opened().traced_by("reference")
+    if fields.from_the_side:
+        return _heights_of(system, [_aimed(lens, system, points, rim, waves)])
     # An inverted pupil has the rim of an upright one.
     at = torch.cat([0.5 * pupil.diameter * rim, pupil.z.expand(*rim.shape[:-1], 1)], -1)
     if vergence(lens.object_distance) == 0.0:
@@ -138,29 +151,33 @@ def _real_heights(lens: Lens) -> dict[str, float]:
         towards = at - torch.cat([points, start], -1)[:, None]
         towards = torch.where(towards[..., 2:] < 0.0, -towards, towards)
     towards = towards / towards.norm(dim=-1, keepdim=True)
-    waves = torch.tensor(lens.wavelengths or (lens.primary_wavelength,), dtype=torch.float64)
-    system = lens.system().opened().traced_by("reference")
     traced = [trace_rays(system, Rays(at[:, :, None], towards[:, :, None], waves), 1.0, True)]
     missing = traced[0].valid.double().mean((1, 2)) < 0.5
     if bool(missing.any()):
-        aimed = aim(
-            system,
-            _radians(lens, points[missing])[:, None, None],
-            rim[missing][:, :, None],
-            waves,
-            lens.object_distance,
-        )
-        hit = trace_rays(system, aimed, 1.0, True)
-        traced.append(replace(hit, valid=hit.valid & aimed.converged))
-    passed = [hit.points[:, hit.valid] for hit in traced]
-    points = torch.cat(passed, 1)
-    if not points.shape[1]:
+        traced.append(_aimed(lens, system, points[missing], rim[missing], waves))
+    return _heights_of(system, traced)
+
+
+def _aimed(
+    lens: Lens, system: OpticalSystem, points: Tensor, rim: Tensor, waves: Tensor
+) -> TracedRays:
+    """Trace rays of field points (F, 2) that are aimed at points (F, N, 2) of the stop."""
+    field = _radians(lens, points)[:, None, None]
+    rays = aim(system, field, rim[:, :, None], waves, lens.object_distance)
+    hit = trace_rays(system, rays, 1.0, True)
+    return replace(hit, valid=hit.valid & rays.converged)
+
+
+def _heights_of(system: OpticalSystem, traced: Sequence[TracedRays]) -> dict[str, float]:
+    """Return the largest height of rays at every surface; nothing where none gets through."""
+    passed = torch.cat([hit.points[:, hit.valid] for hit in traced], 1)
+    if not passed.shape[1]:
         return {}
     found = {}
-    for number, axes, point in zip(lens.surfaces, system.axes, points, strict=True):
+    for number, (axes, point) in enumerate(zip(system.axes, passed, strict=True), 1):
         x, y, z = point.unbind(-1)
         local = from_lens_axes(Components(x, y, z, x, y, z), axes)
-        found[number] = float(torch.hypot(local.x, local.y).max())
+        found[str(number)] = float(torch.hypot(local.x, local.y).max())
     return found
 
 

@@ -42,8 +42,11 @@ def fields_from(value: Any, place: str) -> Fields | None:
         if not isinstance(point, list | tuple) or len(point) != 2:
             raise InputError(f"{shape}, not {point!r}")
         x, y = (as_number(entry, f"{place}: '{kind}'") for entry in point)
-        if kind in _ANGLES and max(abs(x), abs(y)) >= 90.0:
-            raise InputError(f"{place}: '{kind}' must be below 90 degrees, not {point!r}")
+        # Beyond 90° in x and y at once there is no convention of which direction is meant.
+        limit = 180.0 if kind == "angles" and 0.0 in (x, y) else 90.0
+        if kind in _ANGLES and max(abs(x), abs(y)) >= limit:
+            along = "" if kind == "pupil_angles" else " (180 along x or y alone)"
+            raise InputError(f"{place}: '{kind}' must be below 90 degrees{along}, not {point!r}")
         found.append((x, y))
     weights, vignetting = value.get("weights"), value.get("vignetting")
     if weights is not None:

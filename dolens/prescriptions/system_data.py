@@ -40,10 +40,11 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.optics.fields import require_from_the_front
 from dolens.optics.image_heights import in_double_precision
 from dolens.optics.lens import Lens
 from dolens.optics.marginal_ray import real_marginal_height
-from dolens.optics.paraxial import matrix_to_stop
+from dolens.optics.paraxial import matrix_to_stop, vergence
 from dolens.optics.surfaces.clear_aperture import Circle, Unlimited
 from dolens.prescriptions.apertures import is_automatic
 from dolens.prescriptions.checks import as_number, as_positive
@@ -112,6 +113,8 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
     fields = fields_from(prescription.get("fields"), f"{where}: fields")
     if fields is not None and fields.kind == "heights" and distance is None:
         raise InputError(f"{where}: 'fields.heights' need an 'object_distance' (mm)")
+    if fields is not None and fields.kind == "angles" and vergence(distance) != 0.0:
+        require_from_the_front(fields.points, f"{where}: an object at a finite distance")
     for key, needs in (("object_na", True), ("telecentric_object", telecentric)):
         if needs and prescription.get(key) and distance is None:
             raise InputError(f"{where}: '{key}' needs an 'object_distance' (mm)")

@@ -25,7 +25,9 @@ from typing import Any
 
 from dolens.errors import InputError
 from dolens.optics.mirrors import MIRROR
+from dolens.optics.surfaces.coordinate_break import BREAK as BREAK_KEYS
 from dolens.prescriptions.apertures import AUTOMATIC
+from dolens.prescriptions.breaks import KIND as BREAK
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.system_data import PUPIL_KEYS
@@ -103,6 +105,9 @@ def _current(file: ZemaxFile, glass: GlassReader, where: str) -> dict[str, Any]:
             hard.append(False)
         rows.append(row)
         hard.append(clips)
+        if block.stop and row["type"] == BREAK:
+            rows.append(_stop_behind(row, block.place, medium, pupil))
+            hard.append(False)
         if block.stop:
             stops.append(len(rows))
         if after is not None:
@@ -172,6 +177,27 @@ def _row(block: SurfaceBlock, glass: GlassReader, pupil: bool) -> tuple[Row, boo
     if comment:
         row["note"] = comment
     return row | aperture | {"thickness": block.length("DISZ")}, clips
+
+
+def _stop_behind(row: Row, place: str, medium: str, pupil: bool) -> Row:
+    """Return the plane of a stop that stands on a coordinate break.
+
+    A break that only turns about z leaves the plane of the stop, and its circle, where they are.
+
+    Raises:
+        InputError: the break does more, or the stop has no size.
+    """
+    moves = [name for name in BREAK_KEYS if name != "tilt_z" and row.get(name)]
+    if moves:
+        raise InputError(
+            f"{place}: a stop on a coordinate break that decentres or tilts the axis is not held "
+            f"({', '.join(moves)}; allowed: a turn about z)"
+        )
+    if not pupil:
+        raise InputError(f"{place}: the stop, a coordinate break, has no size (ENPD, FNUM, OBNA)")
+    stop = {"type": "aperture", "material": medium, "thickness": row["thickness"]}
+    row["thickness"] = 0.0
+    return stop
 
 
 def _in_front(

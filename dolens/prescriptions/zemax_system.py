@@ -8,7 +8,13 @@ from dolens.errors import InputError
 from dolens.prescriptions.decimals import number_in_text, scaled
 from dolens.prescriptions.system_data import PUPIL_KEYS
 from dolens.prescriptions.zemax import ZemaxFile
-from dolens.prescriptions.zemax_fields import is_telecentric, last, read_fields, read_wavelengths
+from dolens.prescriptions.zemax_fields import (
+    is_axial,
+    is_telecentric,
+    last,
+    read_fields,
+    read_wavelengths,
+)
 
 _UNITS = {"MM": Fraction(1), "CM": Fraction(10), "IN": Fraction(127, 5), "METER": Fraction(1000)}
 
@@ -49,7 +55,9 @@ def read_system(
     if is_telecentric(file, where):
         if not finite_object:
             raise InputError(f"{where}: FTYP: a telecentric object space needs a finite object")
-        found["telecentric_object"] = True
+        # On the axis the chief ray is the axis, wherever the stop is.
+        if not is_axial(file, where):
+            found["telecentric_object"] = True
     elif _aims_real_rays(file) and not found.keys().isdisjoint(PUPIL_KEYS):
         found["real_pupil"] = True
     return found | _air(file, where)

@@ -7,7 +7,8 @@ import torch
 import yaml
 
 from dolens import InputError, Status, load_lens
-from dolens.optics.aiming import aim, launch
+from dolens.optics.aiming import aim
+from dolens.optics.launching import field_line, launch
 from dolens.optics.trace import trace_surfaces
 from dolens.prescriptions import lens_from_prescription
 
@@ -216,8 +217,8 @@ def test_fields_out_of_reach_are_flagged(root, name, degrees):
     # Indeed no ray of a fine grid, far wider than the lens, comes through to the stop.
     side = torch.linspace(-30.0, 30.0, 301, dtype=torch.float64)
     grid = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1)
-    tangents = torch.deg2rad(fields[1]).tan()
-    traced = trace_surfaces(lens.system(), launch(tangents, 0.0, grid), D_LINE, last=lens.stop)
+    line, _ = field_line(torch.deg2rad(fields[1]))
+    traced = trace_surfaces(lens.system(), launch(line, 0.0, grid), D_LINE, last=lens.stop)
     lost = [margin > 0.0 for row in traced.margins for margin in (row.met, row.transmitted)
             if margin is not None]  # fmt: skip
     through = torch.stack(lost).all(0)

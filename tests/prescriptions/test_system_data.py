@@ -110,8 +110,8 @@ BAD = {
         "fields: 'angles' must be a list of points [x, y], not 0",
     ),
     "a field beside the lens": (
-        {"fields": {"angles": [[0, 90]]}},
-        "fields: 'angles' must be below 90 degrees, not [0, 90]",
+        {"fields": {"angles": [[5, 90]]}},
+        "fields: 'angles' must be below 90 degrees (180 along x or y alone), not [5, 90]",
     ),
     "heights at infinity": (
         {"fields": {"heights": [[0, 1]]}},

@@ -155,7 +155,7 @@ def test_a_folded_lens_is_written_and_read_back_to_the_last_bit(name):
 @pytest.mark.parametrize(
     "change, said",
     [
-        (("STOP",), "surface 2 is a coordinate break, and cannot be the stop"),
+        (("STOP",), "surface 2: a stop on a coordinate break that decentres or tilts the axis"),
         (("GLAS ___BLANK 1 0 1.5 60",), "surface 2: a coordinate break with a medium"),
     ],
 )

@@ -150,3 +150,76 @@ def test_a_curved_object_is_a_plane_to_fields_on_the_axis(field, held):
     else:
         with pytest.raises(InputError, match="the object: must be a plane"):
             prescription_from_zemax(text)
+
+
+def turned_stop(*stop, head=HEAD):
+    """A cylinder behind a coordinate break that is the stop."""
+    return head + "".join(
+        (
+            surface(0, "DISZ INFINITY"),
+            surface(1, "STOP", "TYPE COORDBRK", *stop, "DISZ 2"),
+            surface(2, "TYPE TOROIDAL", f"CURV {1 / RADIUS}", "PARM 1 1E20", "DISZ 5"),
+            surface(3, ""),
+        )
+    )
+
+
+def test_a_stop_on_a_break_about_the_axis_is_a_plane_there(tmp_path):
+    """The pupil of 16 mm lies in the plane where the axes turn, 2 mm before the next surface."""
+    lens = lens_of(turned_stop("PARM 5 45"), tmp_path)
+    stop = lens.surfaces[str(lens.stop)]
+    assert not stop.changes_axes and stop.semi_diameter == pytest.approx(8.0, rel=1e-15)
+    z = [float(v) for v in lens.system().vertices]
+    assert z[lens.stop - 1] == 0.0 and z[lens.stop] == 2.0
+    pupil = lens.first_order(550.0).entrance_pupil
+    assert float(pupil.z) == 0.0 and float(pupil.diameter) == pytest.approx(16.0, rel=1e-15)
+    found = prescription_from_zemax(turned_stop("PARM 5 45"))
+    assert prescription_from_zemax(zemax_of(found))["surfaces"] == found["surfaces"]
+
+
+@pytest.mark.parametrize(
+    "stop, head, said",
+    [
+        ("PARM 3 5", HEAD, "a stop on a coordinate break that decentres or tilts the axis"),
+        ("PARM 2 1", HEAD, r"is not held \(decenter_y; allowed: a turn about z\)"),
+        ("PARM 5 45", HEAD.replace("ENPD 16", "FLOA"), "the stop, a coordinate break, has no size"),
+    ],
+)
+def test_other_stops_on_breaks_are_refused(stop, head, said, tmp_path):
+    with pytest.raises(InputError, match=said):
+        lens_of(turned_stop(stop, head=head), tmp_path)
+
+
+def test_on_the_axis_a_telecentric_object_asks_nothing_of_the_stop(tmp_path):
+    """The chief ray is the axis; the edge ray has the numerical aperture of the file.  Off the axis
+    a stop that does not make chief rays parallel is refused.
+    """
+    system = "OBNA 0.1 0\nFTYP 1 1 1 1\nYFLN 0\nWAVM 1 0.55 1\n"
+    text = system + BEHIND_A_SPHERE.replace("DISZ INFINITY", "DISZ 60")
+    lens = lens_of(text, tmp_path)
+    rays = lens.paraxial_rays(0.0, 550.0, 60.0)
+    assert float(rays.marginal.slope_before[0]) == pytest.approx(
+        math.tan(math.asin(0.1)), rel=1e-12
+    )
+    with pytest.raises(InputError, match="'telecentric_object'"):
+        lens_of(text.replace("YFLN 0", "YFLN 1"), tmp_path)
+
+
+def test_a_field_beyond_90_degrees_is_read_and_written(tmp_path):
+    """Light of 100° meets a dome from the side, and the law of sines bends it there."""
+    text = HEAD.replace("YFLN 0", "YFLN 100").replace("ENPD 16", "ENPD 1") + BEHIND_A_SPHERE
+    lens = lens_of(text, tmp_path)
+    assert lens.fields.points == ((0.0, 100.0),)
+    again = prescription_from_zemax(zemax_of(prescription_from_zemax(text)))
+    assert again["fields"]["angles"] == [[0.0, 100.0]]
+    # It is met where the normal has turned by 70° from the axis, 30° from the ray.
+    angle = math.radians(70.0)
+    exact = {"dtype": torch.float64}
+    point = RADIUS * torch.tensor([0.0, -math.sin(angle), 1.0 - math.cos(angle)], **exact)
+    angle = math.radians(100.0)
+    line = torch.tensor([0.0, math.sin(angle), math.cos(angle)], **exact)
+    hit = lens.trace(Rays(point - 50.0 * line, line, 550.0), last=1)
+    angle = math.radians(70.0) + math.asin(math.sin(math.radians(30.0)) / INDEX)
+    expected = torch.tensor([0.0, math.sin(angle), math.cos(angle)], **exact)
+    torch.testing.assert_close(hit.position, point, rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(hit.direction, expected, rtol=0.0, atol=1e-14)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
+from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay, Refraction, snell
@@ -277,6 +278,22 @@ class Surface(nn.Module):
             step = _newton_step(cls, p, ray, t).clamp(-scale, scale)
             t = t - (step - step.detach())
         return t, margin.masked_fill(lost | far, -1.0)
+
+    @classmethod
+    def intersect_from(
+        cls, p: Parameters, ray: Components, sense: float
+    ) -> tuple[Tensor, Tensor] | None:
+        """Find where rays from any point meet the surface, as `intersect` does from the vertex
+        plane; so do rays that come along that plane or from behind it.
+
+        Here: None, the surface is met from the vertex plane only.
+
+        Args:
+            p: parameters.
+            ray: in the surface's own axes, at a point near the vertex.
+            sense: as in `intersect`.
+        """
+        return None
 
     @classmethod
     def normal(

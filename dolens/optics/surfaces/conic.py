@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
+from dolens.optics.rays import Components
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
 from dolens.optics.surfaces.refraction import GRAZING, PlaneRay, safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
@@ -54,6 +55,11 @@ def conic_distance(c: Tensor, a: Tensor, ray: PlaneRay, sense: float) -> tuple[T
     x, y, l, m, n = ray  # noqa: E741
     f = c * torch.addcmul(x * x, y, y)
     g = n - c * torch.addcmul(l * x, m, y)
+    return _root(f, g, a, sense)
+
+
+def _root(f: Tensor, g: Tensor, a: Tensor, sense: float) -> tuple[Tensor, Tensor]:
+    """Return the root t of A·t² - 2G·t + F = 0 and the margin D; see `conic_distance`."""
     discriminant = g * g - a * f
     root = safe_sqrt(discriminant)
     along = g if sense > 0.0 else -g
@@ -127,6 +133,25 @@ class Conic(Surface):
         c, k = p["curvature"], p["conic"]
         t, met = conic_distance(c, c + (c * k) * (ray.n * ray.n), ray, sense)
         branch = 1.0 - ((1.0 + k) * c).detach() * (ray.n * t).detach()
+        return t, torch.minimum(met, branch)
+
+    @classmethod
+    def intersect_from(
+        cls, p: Parameters, ray: Components, sense: float
+    ) -> tuple[Tensor, Tensor] | None:
+        """Find the ray intercept in closed form from any point (x, y, z): in the quadratic equation
+        of `conic_distance` F = c(x² + y² + (1+k)z²) - 2z and G = n - c(lx + my + (1+k)nz).
+
+        A shape that adds terms to the conic is met from the vertex plane only.
+        """
+        if not cls.closed_form:
+            return None
+        c, k = p["curvature"], cls.conic_constant(p)
+        x, y, z, l, m, n = ray  # noqa: E741
+        f = c * (x * x + y * y + (1.0 + k) * (z * z)) - 2.0 * z
+        g = n - c * (l * x + m * y + (1.0 + k) * (n * z))
+        t, met = _root(f, g, c * (1.0 + k * (n * n)), sense)
+        branch = 1.0 - ((1.0 + k) * c * (z + n * t)).detach()
         return t, torch.minimum(met, branch)
 
     @classmethod
