@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -82,7 +83,7 @@ class Measurement:
 
     def centroid_of(self, share: Tensor) -> Tensor:
         """Return the centroid (2,), x and y, mm, of an image (height, width) of sum 1."""
-        options = {"dtype": share.dtype, "device": share.device}
+        options: dict[str, Any] = {"dtype": share.dtype, "device": share.device}
         rows = torch.arange(self.sensor.height, **options)
         columns = torch.arange(self.sensor.width, **options)
         x, y = self.sensor.positions(rows, columns)

@@ -51,7 +51,7 @@ class Pose(DesignVariables):
         shift: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         require_plane_sensor(lens.system(), "poses")
-        options = {"dtype": torch.float64, "device": lens.device}
+        options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
         places = torch.tensor(sources, **options).reshape(-1, 3)
         offset = torch.tensor(shift, **options)
         others = {f"sources.*.{c}": offset[axis] for axis, c in enumerate(_COORDINATES)}

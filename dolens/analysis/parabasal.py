@@ -8,6 +8,7 @@ Aberrations of Optical Systems, section 9.2); these derivatives take any surface
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -61,7 +62,7 @@ def parabasal_rays(
         object_distance: mm in front of the first vertex; None for an object at infinity.
     """
     lens = in_double_precision(lens)
-    options = {"dtype": torch.float64, "device": lens.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
     field = torch.as_tensor(fields, **options).reshape(-1, 2)
     waves = torch.as_tensor(wavelengths, **options).reshape(-1)
     near = vergence(object_distance)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -212,7 +212,7 @@ def _passing(
     symmetric: bool = False,
 ) -> SpotRays:
     """Keep the rays that pass, of every field and wavelength, in the lens's precision."""
-    options = {"dtype": lens.dtype, "device": lens.device}
+    options: dict[str, Any] = {"dtype": lens.dtype, "device": lens.device}
     pieces, launched, launches, light = [], 0, {}, []
     for spot, (field, wavelength) in enumerate(product(map(tuple, fields), wavelengths)):
         if field not in launches:

@@ -10,6 +10,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -171,7 +172,7 @@ def launch_through_stop(
         InputError: no fields or wavelengths, or fields that are not pairs.
     """
     lens = in_double_precision(lens)
-    options = {"dtype": torch.float64, "device": lens.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
     field = torch.as_tensor(fields, **options)
     if field.ndim != 2 or field.shape[-1] != 2 or len(field) == 0:
         raise InputError(f"fields must be pairs (x, y), at least one, not {fields}")

@@ -8,7 +8,7 @@ this asks nothing of the pupil's shape and place.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -212,7 +212,7 @@ def _first_surface(system: OpticalSystem, points: ObjectPoints) -> tuple[Tensor,
     first = system.met[0]
     surface, axes = system.surfaces[first - 1], system.axes[first - 1]
     like = system.sensor_distance.detach()
-    options = {"dtype": like.dtype, "device": like.device}
+    options: dict[str, Any] = {"dtype": like.dtype, "device": like.device}
     azimuth = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)
     # A dome seen from the side has its outline inside the rim.
     radius = torch.arange(1, _RADII + 1, **options)[:, None] * (surface.semi_diameter / _RADII)

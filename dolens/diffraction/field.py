@@ -10,6 +10,8 @@ Wolf, section 8.2).  |U|² is the flux per area of the sensor.  Where D - R = α
 part of a wavelength this is a Fourier transform, whose total flux is the pupil's (Parseval).
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -74,7 +76,7 @@ def direct_field(
     """
     if x.shape != y.shape or x.ndim != 1:
         raise InputError(f"points are x and y (M,), not {tuple(x.shape)} and {tuple(y.shape)}")
-    options = {"dtype": wavefront.opd.dtype, "device": wavefront.opd.device}
+    options: dict[str, Any] = {"dtype": wavefront.opd.dtype, "device": wavefront.opd.device}
     x, y = x.to(**options), y.to(**options)
     fields = [_added(wavefront, n, x, y, dtype) for n in range(len(wavefront.wavelength))]
     return torch.stack(fields)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -150,7 +151,7 @@ def pupil_wavefront(
     if samples < _FEWEST:
         raise InputError(f"a wavefront needs at least {_FEWEST} samples a side, not {samples}")
     system = system.double()
-    options = {"dtype": torch.float64, "device": system.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
     points = points.to(**options)
     waves = _one_each("wavelengths", wavelength, len(points), options)
     near = points.vergence

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -104,7 +105,7 @@ def wavefront_maps(
         InputError: no fields or wavelengths, or a sphere that cannot be placed.
     """
     system = lens.system().double()
-    options = {"dtype": torch.float64, "device": system.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
     field = torch.as_tensor(fields, **options)
     waves = torch.as_tensor(wavelengths, **options).reshape(-1)
     if field.ndim != 2 or field.shape[-1] != 2 or not len(field) or not len(waves):

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -186,7 +187,7 @@ def normal_equations(
     parameters = lens.variables(variables)
     columns = _columns(parameters)
     shape = rays.components().x.shape
-    options = {"dtype": lens.dtype, "device": lens.device}
+    options: dict[str, Any] = {"dtype": lens.dtype, "device": lens.device}
     target = _broadcast("target", torch.as_tensor(target, **options), (*shape, len(outputs)))
     target = target.detach().reshape(-1, len(outputs))
     if weight is not None:

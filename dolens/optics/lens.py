@@ -20,6 +20,7 @@ from dolens.optics.lens_states import InStates, LensStates, at_temperature
 from dolens.optics.lens_views import LensViews
 from dolens.optics.materials import Medium
 from dolens.optics.mirrors import media_of
+from dolens.optics.module_table import ModuleTable
 from dolens.optics.paraxial import vergence
 from dolens.optics.published import Published
 from dolens.optics.ray_tracing import trace_rays
@@ -120,14 +121,14 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.telecentric_object = telecentric_object
         self.backend = check_backend(backend)
         self.materials = tuple(materials)
-        self.surfaces = nn.ModuleDict(
+        self.surfaces = ModuleTable[Surface](
             {str(number): surface for number, surface in enumerate(surfaces, 1)}
         )
         # Assigned one by one: given a dict, ParameterDict sorts its keys as text (1, 10, 2, ...).
         self.thicknesses = nn.ParameterDict()
         for number, gap in enumerate(thicknesses, 1):
             self.thicknesses[str(number)] = nn.Parameter(torch.tensor(float(gap), dtype=dtype))
-        self.elements = nn.ModuleDict(dict(elements or {}))
+        self.elements = ModuleTable[Element](dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.states, self.state_name = LensStates(), None
         register_image_surface(self, sensor_curvature, sensor_conic)

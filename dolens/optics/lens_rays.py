@@ -1,6 +1,7 @@
 """The rays of a lens's fields, paraxial and real, and what follows from the paraxial ones."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -78,7 +79,7 @@ class LensRays:
             wavelength: nm, a number or (...).
             object_distance: mm, or None for infinity.
         """
-        options = {"dtype": self.dtype, "device": self.device}
+        options: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
         field = self._field(field, object_distance)
         pupil = torch.as_tensor(pupil, **options)
         for what, values in (("field", field), ("pupil", pupil)):

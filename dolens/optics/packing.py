@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 import torch
@@ -155,7 +156,7 @@ def _lay_out(
 def _values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
     """Return the records as one tensor."""
     numbers = torch.stack(tuple(scalars))
-    options = {"dtype": numbers.dtype, "device": numbers.device}
+    options: dict[str, Any] = {"dtype": numbers.dtype, "device": numbers.device}
     if arrays:
         numbers = torch.cat([numbers, *(array.to(**options).reshape(-1) for array in arrays)])
     constants, signs = layout.constants.to(**options), layout.signs.to(**options)

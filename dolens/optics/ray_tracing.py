@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -125,7 +126,8 @@ def _joined(
         position, direction, shape = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1), ray.x.shape
     else:
         # As the user gave them: views of (..., 3), which a kernel reads in place.
-        options, shape = {"device": system.device, "dtype": system.dtype}, _shape(rays)
+        options: dict[str, Any] = {"device": system.device, "dtype": system.dtype}
+        shape = _shape(rays)
         position = rays.position.to(**options).expand(*shape, 3)
         direction = rays.direction.to(**options).expand(*shape, 3)
     return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(shape)

@@ -4,6 +4,7 @@ The reference that the kernels must equal.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,7 +88,7 @@ def reference_sums(
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.expand(rays.components().x.shape).reshape(-1)
     p, k = sum(t.numel() for t in parameters.values()), len(outputs)
-    options = {"dtype": torch.float64, "device": lens.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
     head, jtr = torch.zeros(2, **options), torch.zeros(p, **options)
     jtj = torch.zeros((p, p), **options)
     by_group = torch.zeros((groups, 2 + k + k * p), **options)

@@ -35,7 +35,7 @@ average over azimuth; a cubic plate, for one, adds aberrations that no Seidel su
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -182,5 +182,5 @@ def _refraction_invariant(ray: ParaxialRay, n: Tensor, c: Tensor) -> Tensor:
 
 
 def _vector(values: Iterable[float | Tensor], system: OpticalSystem) -> Tensor:
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     return torch.stack([torch.as_tensor(value, **options) for value in values])

@@ -86,7 +86,7 @@ class LensProperties:
 
     def _traced_chief_ray(self, field: tuple[float, float]) -> Components:
         system = self.system
-        options = {"dtype": system.dtype, "device": system.device}
+        options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
         angles = torch.tensor(field, **options)
         if self.object_distance is None:
             angles = torch.deg2rad(angles)

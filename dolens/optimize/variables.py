@@ -101,7 +101,7 @@ class DesignVariables(nn.Module):
                 scale += [unit_of(name).factor * s] * len(starts)
                 lower += [low / s] * len(starts)
                 upper += [high / s] * len(starts)
-        options = {"dtype": lens.dtype, "device": lens.device}
+        options: dict[str, Any] = {"dtype": lens.dtype, "device": lens.device}
         self.scaled = nn.Parameter(torch.tensor(scaled, **options))
         self.register_buffer("scale", torch.tensor(scale, **options))
         self.register_buffer("lower", torch.tensor(lower, **options))

@@ -5,7 +5,7 @@ pixel is unknown one filter serves all depths; where it is known each depth has 
 that guesses depths from what it sees lies in between.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,7 +41,7 @@ def natural_spectrum(
     Returns:
         (rows, columns // 2 + 1), zero at the origin.
     """
-    options = {"dtype": like.dtype, "device": like.device}
+    options: dict[str, Any] = {"dtype": like.dtype, "device": like.device}
     down = torch.fft.fftfreq(rows, **options)[:, None]
     across = torch.fft.rfftfreq(columns, **options)[None]
     power = 1.0 / (down.square() + across.square() + outer_scale**-2)

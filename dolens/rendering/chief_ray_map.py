@@ -1,7 +1,7 @@
 """Chief-ray maps: distortion and lateral colour of a sensor's pixels, as smooth functions."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -106,7 +106,7 @@ def _by_itself(imaging: ImagingSystem, window: Sensor) -> tuple[Tensor, Tensor]:
     """The map of a window for whose sensor there are no polynomials."""
     if window != imaging.sensor:
         return chief_ray_maps(imaging.on(window), [window])[0]
-    options = {"dtype": torch.float64, "device": imaging.system.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": imaging.system.device}
     row, column = torch.meshgrid(
         torch.arange(window.height, **options),
         torch.arange(window.width, **options),

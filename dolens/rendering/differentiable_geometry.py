@@ -1,7 +1,7 @@
 """The pupil and the magnifications of a render, with gradients, and the weight of its samples."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,7 +42,7 @@ class DifferentiableGeometry(NamedTuple):
 
 
 def _stacked(values: Sequence[float | Tensor], system: OpticalSystem) -> Tensor:
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     return torch.stack([torch.as_tensor(v, **options) for v in values])
 
 

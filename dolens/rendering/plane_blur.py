@@ -1,6 +1,7 @@
 """A lens's blur of planes, one kernel a plane and field."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -81,7 +82,7 @@ def places_in_texture(
     left = column - (0.5 * (sensor.width - 1) - sensor.centre_column)
     if top.is_integer() and left.is_integer():
         return (int(top), int(left)), None
-    options = {"dtype": torch.float64, "device": imaging.system.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": imaging.system.device}
     rows, columns = torch.meshgrid(
         torch.arange(sensor.height, **options),
         torch.arange(sensor.width, **options),

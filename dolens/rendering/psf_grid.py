@@ -1,6 +1,6 @@
 """Point spread functions all over a sensor, as its pixels see the scene."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -146,7 +146,7 @@ def _object_points(
     system, scene, pitch = imaging.system, imaging.scene, imaging.sensor.pixel_pitch
     planes, channels = len(scene.depths), len(scene.wavelengths)
     rows, columns = (chief_ray_points if distortion else pinhole_points)(imaging, points)
-    options = {"dtype": torch.float64, "device": system.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
     depth = torch.tensor(scene.depths, **options)[:, None]
     magnifications = scene.differentiable_magnifications(system)
     scale = pitch / torch.stack([torch.as_tensor(m, **options) for m in magnifications])[:, None]

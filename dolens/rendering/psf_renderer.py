@@ -154,7 +154,7 @@ class PsfRenderer(Renderer):
         """Images (B, images, C, height, width) of windows of the sensor and textures that are shown
         to each, all rays traced at once.
         """
-        options = {"device": lens.device, "dtype": lens.dtype}
+        options: dict[str, Any] = {"device": lens.device, "dtype": lens.dtype}
         textures = [texture.to(**options) for _, texture in shown]
         windows = [window.sensor for window, _ in shown]
         system = with_chosen_backend(lens.system(values), textures)

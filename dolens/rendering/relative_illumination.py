@@ -1,5 +1,7 @@
 """Relative illumination: how bright a white scene is over the sensor."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -31,7 +33,7 @@ def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
         (C, height, width); differentiable in the lens.
     """
     system, sensor = imaging.system, imaging.sensor
-    options = {"dtype": torch.float64, "device": system.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
     height, width = sensor.height, sensor.width
     grid = torch.meshgrid(
         torch.arange(height, **options), torch.arange(width, **options), indexing="ij"

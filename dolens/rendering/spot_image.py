@@ -6,7 +6,7 @@ lens moves its light moves with it, smoothly.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -105,7 +105,7 @@ class SpotImager:
         """
         require_refracting(system, "images of point sources")
         require_plane_sensor(system, "images of point sources")
-        options = {"dtype": system.dtype, "device": system.device}
+        options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
         grid = torch.zeros(self.sensor.height, self.sensor.width, **options)
         sums = torch.zeros(3, **options)
         for first in range(0, self.rays, self.rays_at_a_time):

@@ -5,6 +5,7 @@ colour of a texel that is not there.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,7 +34,7 @@ def layer_opacities(depth: Tensor, depths: Sequence[float]) -> tuple[Tensor, Ten
         Opacities (..., L, H, W), which sum to one, and where the surface is in front of what the
         plane has a share in, (..., L, H, W), bool.
     """
-    options = {"dtype": torch.float64, "device": depth.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": depth.device}
     planes = 1.0 / torch.tensor(depths, **options)
     surface = (1.0 / depth.double()).clamp(float(planes[-1]), float(planes[0]))[..., None, :, :]
     near, far = planes[:-1, None, None], planes[1:, None, None]

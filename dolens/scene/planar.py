@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -103,7 +103,7 @@ def pinhole_image(
     if inside and top.is_integer() and left.is_integer():
         top, left = int(top), int(left)
         return textures[..., top : top + sensor.height, left : left + sensor.width]
-    options = {"dtype": textures.dtype, "device": textures.device}
+    options: dict[str, Any] = {"dtype": textures.dtype, "device": textures.device}
     rows = torch.arange(sensor.height, **options) + top
     columns = torch.arange(sensor.width, **options) + left
     grid = torch.meshgrid(rows, columns, indexing="ij")

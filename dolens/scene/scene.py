@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -191,7 +191,7 @@ class Scene(ABC):
             moving = ParaxialNumbers.differentiable(system)
         if moving is None:
             return list(numbers)
-        options = {"dtype": system.dtype, "device": system.device}
+        options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
         return [
             torch.tensor(number, **options) + (tensor - tensor.detach()).to(**options)
             for number, tensor in zip(

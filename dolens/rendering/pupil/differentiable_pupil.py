@@ -1,6 +1,7 @@
 """The exit pupil's derivative with respect to the lens, of the disc that renderers sample."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -50,7 +51,7 @@ def differentiable_exit_pupil(
     pupil = pupil.numbers()
     if not depends_on_parameters(system):
         return pupil
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     z, ratio = _pupil_plane(system, wavelengths, pupil)
     axial = torch.tensor(pupil.axial_radius, **options)
     limit = limiting_aperture(system, wavelengths, pupil.z, pupil.axial_radius)

@@ -12,7 +12,7 @@ gradient is f's factor R ∂R/∂θ.  What collects rays by their weights needs 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -71,7 +71,7 @@ def edge_rays(
     middle, arms, radius, surface = edge
     if not bool((surface > 0).any()):
         return None
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     every = torch.tensor(wavelengths, dtype=torch.float64, device=system.device)[:, None]
     shape = (len(wavelengths), *surface.shape)
     weight = torch.zeros(shape, **options)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -96,7 +96,7 @@ def sampled_exit_pupil(
         InputError: no ray from the sensor's centre gets through.
     """
     axial = axial or axial_exit_pupil(system, wavelengths)
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     places = torch.tensor([0.0, 0.25, 0.75, 1.0], **options)
     rows = torch.stack((places, places)).flatten() * sensor.height - 0.5
     columns = torch.stack((places, 1.0 - places)).flatten() * sensor.width - 0.5
@@ -137,7 +137,7 @@ def axial_exit_pupil(system: OpticalSystem, wavelengths: Sequence[float]) -> Exi
         InputError: no ray from the sensor's centre gets through.
     """
     z, paraxial, _ = paraxial_exit_pupil(system, wavelengths)
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     sensor_z = system.vertices[-1]
     distance = abs(z - float(sensor_z))
     angle = torch.arange(_AZIMUTHS, **options) * (2.0 * math.pi / _AZIMUTHS)

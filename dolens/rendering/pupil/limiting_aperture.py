@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,7 +40,7 @@ def limiting_aperture(
         z: of the disc, mm from the first vertex.
         radius: of the disc, mm, that axial rays fill.
     """
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     count = 1 if system.rotationally_symmetric else _AZIMUTHS
     angle = torch.arange(count, **options) * (2.0 * math.pi / _AZIMUTHS)
     origin, sensor_z = torch.zeros((), **options), system.vertices[-1]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,7 +59,7 @@ def pupil_boundary(
         pupil: the disc, numbers.
     """
     probe = _Probe(system, wavelength, points, pupil)
-    options = {"dtype": system.dtype, "device": system.device}
+    options: dict[str, Any] = {"dtype": system.dtype, "device": system.device}
     angle = torch.arange(AZIMUTHS, **options) * (2.0 * math.pi / AZIMUTHS)
     arms = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
     if bool(probe.passes((UNCUT * arms).expand(len(points[0]), -1, 2))[0].all()):
@@ -110,7 +111,7 @@ class _Probe:
 
     def middles(self) -> Tensor:
         """(F, 2): the mean of the places that pass; the disc's centre where all do."""
-        options = {"dtype": self.system.dtype, "device": self.system.device}
+        options: dict[str, Any] = {"dtype": self.system.dtype, "device": self.system.device}
         axis = (torch.arange(_SIDE, **options) + 0.5) * (2.0 / _SIDE) - 1.0
         places = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
         places = places[places.norm(dim=-1) < 1.0]
@@ -208,7 +209,7 @@ def pupil_boundary_map(imaging: ImagingSystem) -> PupilBoundaryMap | None:
             middle one's edges start the search for the others'.
     """
     system, sensor, wavelengths = imaging.system, imaging.sensor, imaging.scene.wavelengths
-    options = {"dtype": torch.float64, "device": system.device}
+    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
     ends = torch.tensor([0.0, 1.0], **options)
     rows, columns = (
         (ends * side - 0.5).repeat_interleave(n).repeat(2 // n)
