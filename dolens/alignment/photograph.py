@@ -93,7 +93,7 @@ def read_measurement(
         # Pillow gives 16 bits as int32.
         saturation = 255.0 if values.dtype.itemsize == 1 else 65535.0
     counts = torch.from_numpy(values.astype(np.float64))
-    whole = Sensor(*counts.shape, pixel_pitch)
+    whole = Sensor(counts.shape[0], counts.shape[1], pixel_pitch)
     top, left, height, width = region or (0, 0, whole.height, whole.width)
     height, width = height - height % downsample, width - width % downsample
     window = whole.window(top, left, height, width)

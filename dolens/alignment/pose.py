@@ -42,6 +42,9 @@ class Pose(DesignVariables):
             focus, or no plane.
     """
 
+    sources: Tensor
+    shift: Tensor
+
     def __init__(
         self,
         lens: Lens,

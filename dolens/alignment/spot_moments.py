@@ -136,7 +136,7 @@ class MomentModel:
         def on_sensor(at: Tensor) -> Tensor:
             return weighted_sums(at, self.shares, origin, self.size, POWERS)
 
-        _, along = jvp(on_sensor, (points,), (slopes,))
+        along = jvp(on_sensor, (points,), (slopes,))[1]
         other = torch.cat([shift_derivatives(found, self.size), along[..., None]], -1)
         return found, torch.cat([traced, other @ self.sensor.mT], -1)
 

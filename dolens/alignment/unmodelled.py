@@ -78,8 +78,9 @@ class Unmodelled:
         own, melts = shares[: len(found.surfaces)], shares[len(found.surfaces) :]
         with torch.no_grad():
             for surface, share in zip(found.surfaces.values(), own.tolist(), strict=True):
-                if hasattr(surface, "curvature"):
-                    surface.curvature.div_(1.0 + self.radius * share)
+                curvature = getattr(surface, "curvature", None)
+                if curvature is not None:
+                    curvature.div_(1.0 + self.radius * share)
         shifted = {
             glass: ShiftedMedium(glass, self.index * share)
             for glass, share in zip(glasses, melts.tolist(), strict=True)

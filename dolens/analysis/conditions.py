@@ -124,7 +124,7 @@ def own_distance(lens: Lens, object_distance: float | None = None) -> float | No
         InputError: the distance is not positive.
     """
     distance = lens.object_distance if object_distance is None else object_distance
-    return None if vergence(distance) == 0.0 else float(distance)
+    return None if distance is None or vergence(distance) == 0.0 else float(distance)
 
 
 def field_points(fields: FieldPoints) -> Tensor:
@@ -167,12 +167,11 @@ def own_fields(lens: Lens, object_distance: float | None) -> Tensor:
             return along_y
         return torch.cat([along_y, along_y[1:].flip(-1)])
     points = torch.tensor(lens.fields.points, dtype=torch.float64)
-    if (lens.fields.kind == "heights") == (object_distance is not None):
+    if lens.fields.kind == ("angles" if object_distance is None else "heights"):
         return points
-    if lens.fields.kind == "angles":
-        require_from_the_front(points, "an object at a finite distance")
-    if lens.fields.kind == "heights":
+    if object_distance is None:
         return torch.rad2deg((-points * vergence(lens.object_distance)).atan())
+    require_from_the_front(points, "an object at a finite distance")
     return -torch.deg2rad(points).tan() * object_distance
 
 
@@ -195,8 +194,9 @@ def spectral_lines(lens: Lens) -> tuple[float, ...]:
     """Return the wavelengths (nm) of chromatic aberrations: those of the lens, or, for a lens with
     a single one, that one between the ends of `wavelength_interval`.
     """
-    if len(set(lens.wavelengths or ())) > 1:
-        return lens.wavelengths
+    waves = lens.wavelengths or ()
+    if len(set(waves)) > 1:
+        return waves
     low, high = wavelength_interval(lens)
     return tuple(sorted({low, lens.primary_wavelength, high}, reverse=True))
 

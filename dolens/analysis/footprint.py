@@ -82,6 +82,7 @@ def footprint(
     numbers = tuple(int(n) for n, s in lens.surfaces.items() if not s.changes_axes)
     ended = torch.where(hit.valid, len(lens.surfaces) + 1, hit.surface)[:, 0]
     met = (hit.status == Status.OK) | (hit.status == Status.VIGNETTED)
+    assert hit.points is not None  # they were recorded
     points, clipped = [], []
     for number in numbers:
         x, y, z = hit.points[number - 1][:, 0].unbind(-1)

@@ -150,13 +150,13 @@ def gaussian_quadrature(
     """
     if rings < 1 or arms < 2 or arms % 2:
         raise InputError(f"rings must be at least 1 and arms even, not {rings} and {arms}")
-    nodes, shares = np.polynomial.legendre.leggauss(rings)
+    nodes, half_shares = np.polynomial.legendre.leggauss(rings)
     # Gauss and Legendre's nodes in ρ², on which an area's element is even.
     radii = torch.from_numpy(np.sqrt(0.5 * (nodes + 1.0)))
-    shares = torch.from_numpy(0.5 * shares)
+    shares = torch.from_numpy(0.5 * half_shares)
     symmetric = symmetry and lens.system().rotationally_symmetric
 
-    distinct = list(dict.fromkeys(map(tuple, fields)))
+    distinct = list(dict.fromkeys((float(x), float(y)) for x, y in fields))
     points = torch.tensor(distinct, dtype=torch.float64).reshape(-1, 2)
     azimuths = [_azimuths(field, arms, symmetric) for field in distinct]
     count = max(map(len, azimuths), default=0)
@@ -213,24 +213,26 @@ def _passing(
 ) -> SpotRays:
     """Keep the rays that pass, of every field and wavelength, in the lens's precision."""
     options: dict[str, Any] = {"dtype": lens.dtype, "device": lens.device}
-    pieces, launched, launches, light = [], 0, {}, []
-    for spot, (field, wavelength) in enumerate(product(map(tuple, fields), wavelengths)):
+    pieces, launched, light = [], 0, []
+    launches: dict[tuple[float, float], Launched] = {}
+    spots = product([(float(x), float(y)) for x, y in fields], wavelengths)
+    for number, (field, nm) in enumerate(spots):
         if field not in launches:
             launches[field] = launch(field)
         position, direction, weight, whole = launches[field]
         position, direction = position.to(**options), direction.to(**options)
-        valid = trace_rays(lens.system(), Rays(position, direction, wavelength)).valid
+        valid = trace_rays(lens.system(), Rays(position, direction, nm)).valid
         launched += valid.numel()
         if not bool(valid.any()):
-            raise InputError(f"no ray of field {field} and {wavelength:g} nm passes the lens")
+            raise InputError(f"no ray of field {field} and {nm:g} nm passes the lens")
         weight = weight.to(valid.device)[valid]
         light.append(float(weight.sum()) / whole)
         pieces.append(
             (
                 position[valid],
                 direction[valid],
-                torch.full((len(weight),), wavelength, dtype=torch.float64, device=valid.device),
-                torch.full((len(weight),), spot, device=valid.device),
+                torch.full((len(weight),), nm, dtype=torch.float64, device=valid.device),
+                torch.full((len(weight),), number, device=valid.device),
                 weight / weight.sum(),
             )
         )
@@ -274,7 +276,7 @@ def with_chief_rays(lens: Lens, spots: SpotRays, object_distance: float | None =
         rays=Rays(
             torch.cat([rays.position, chief.position]),
             torch.cat([rays.direction, chief.direction]),
-            torch.cat([rays.wavelength, spots.wavelengths.to(device)]),
+            torch.cat([torch.as_tensor(rays.wavelength), spots.wavelengths.to(device)]),
         ),
         spot=torch.cat([spots.spot, torch.arange(spots.count, device=device)]),
         weight=torch.cat([spots.weight, spots.weight.new_zeros(spots.count)]),

@@ -10,11 +10,11 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
 from dolens.errors import InputError
 from dolens.optics.aiming import AimedRays
 from dolens.optics.fields import vignetting_margin
@@ -24,6 +24,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.paraxial import vergence
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import Rays, Status
+from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem
 
 _DEGREE = 8
@@ -124,7 +125,7 @@ def trace_ray_intercepts(
     reached = reached & launched.chief_started
     points = hit.position[..., :2]
     if system.image is not None:
-        points = _along_surface(system, hit.position, chief.position, reached)
+        points = _along_surface(system, system.image, hit.position, chief.position, reached)
     return RayIntercepts(
         launched.fields.cpu(),
         field_unit(object_distance),
@@ -172,14 +173,8 @@ def launch_through_stop(
         InputError: no fields or wavelengths, or fields that are not pairs.
     """
     lens = in_double_precision(lens)
-    options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
-    field = torch.as_tensor(fields, **options)
-    if field.ndim != 2 or field.shape[-1] != 2 or len(field) == 0:
-        raise InputError(f"fields must be pairs (x, y), at least one, not {fields}")
-    waves = torch.as_tensor(wavelengths, **options)
-    if waves.ndim != 1 or len(waves) == 0:
-        raise InputError(f"wavelengths must be numbers (nm), at least one, not {wavelengths}")
-    pupil = pupil.to(**options)
+    field, waves = as_fields_and_wavelengths(fields, wavelengths, lens.device)
+    pupil = pupil.to(field)
     count = len(waves)
     # The chief ray of the reference wavelength is always one of the rays.
     reference = torch.nonzero(waves == lens.primary_wavelength).flatten()
@@ -188,7 +183,7 @@ def launch_through_stop(
         waves = torch.cat([waves, waves.new_tensor([lens.primary_wavelength])])
 
     centre = pupil.new_zeros(1, 2)
-    nodes = torch.cat([centre, pupil]) if exact else _nodes().to(**options)
+    nodes = torch.cat([centre, pupil]) if exact else _nodes().to(field)
     aimed = lens.aim(field[:, None, None], nodes, waves[:, None], object_distance)
     chief_rays = Rays(aimed.position[:, at, 0], aimed.direction[:, at, 0], waves[at])
     if exact:
@@ -206,12 +201,14 @@ def launch_through_stop(
     )
 
 
-def _along_surface(system: OpticalSystem, points: Tensor, chief: Tensor, reached: Tensor) -> Tensor:
+def _along_surface(
+    system: OpticalSystem, image: SurfaceState, points: Tensor, chief: Tensor, reached: Tensor
+) -> Tensor:
     """Return points (F, W, N, 3) of a curved sensor as x and y in the plane that touches it where
     the chief ray (F, 3) lands, from that point's own x and y on.
     """
     there = torch.where(reached[:, None], chief, 0.0)[..., :2]
-    planes = TangentPlanes.at(system.image, there).unsqueeze(1).unsqueeze(1)
+    planes = TangentPlanes.at(image, there).unsqueeze(1).unsqueeze(1)
     away = points - system.vertices[-1] * points.new_tensor([0.0, 0.0, 1.0]) - planes.point
     return planes.turned(away)[..., :2] + planes.point[..., :2]
 

@@ -87,7 +87,7 @@ def zernike_polynomials(x: Tensor, y: Tensor, terms: Sequence[ZernikeTerm]) -> T
     """
     q = x * x + y * y
     cosine, sine = torch.ones_like(q), torch.zeros_like(q)
-    found: list[Tensor | None] = [None] * len(terms)
+    found = [q] * len(terms)  # each is replaced below
     for m in range(max(term.m for term in terms) + 1):
         orders = [(term.n - m) // 2 for term in terms if term.m == m]
         radial = [value for value, _ in jacobi(q, m, max(orders, default=-1) + 1)]

@@ -63,8 +63,8 @@ def _show(title: str, own: Mapping[str, float], metrics: Mapping[str, float]) ->
     from rich.table import Table
 
     table = Table(title=title, caption="in parentheses: difference to the run's own test")
-    rows = {name: _judge_and_view(name) for name in metrics}
-    rows = {name: place for name, place in rows.items() if place is not None}
+    places = {name: _judge_and_view(name) for name in metrics}
+    rows = {name: place for name, place in places.items() if place is not None}
     if rows:
         table.add_column("view")
         for headline in _HEADLINES.values():

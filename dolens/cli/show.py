@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from dolens.lens_page.tables import Table
+    from dolens.optics.lens import Lens
 
 
 def show(
@@ -177,7 +178,7 @@ def _print_table(console: "Console", table: "Table") -> None:
 
 def _write(
     console: "Console",
-    shown: object,
+    shown: "Lens",
     html: Path | None,
     figures: Path | None,
     tolerances: str | None,

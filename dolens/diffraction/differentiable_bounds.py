@@ -64,18 +64,18 @@ def _ends(fit: PupilFit) -> tuple[Tensor, Tensor, Tensor]:
         last = rank >= rank.amax(1, keepdim=True) - 0.5 / _SIDE
         starts.append(torch.where(last, depth, -torch.inf).argmax(1))
     place = grid.gather(1, torch.stack(starts, 1)[..., None].expand(-1, -1, 2))
-    axis = torch.tensor([0, 1, 0, 1], device=place.device)
-    along = torch.nn.functional.one_hot(axis, 2).to(place)
-    reach = (width[:, axis] * _STEP)[..., None] * along
+    axes = torch.tensor([0, 1, 0, 1], device=place.device)
+    along = torch.nn.functional.one_hot(axes, 2).to(place)
+    reach = (width[:, axes] * _STEP)[..., None] * along
     for _ in range(_ITERATIONS):
         distance, slope, which = _along(fit, place, reach)
         shift = torch.where(slope.abs() > _TINY, -distance / slope, 0.0)
-        limit = width[:, axis] / _SIDE
+        limit = width[:, axes] / _SIDE
         place = place + torch.clamp(shift, -limit, limit)[..., None] * along
     _, slope, which = _along(fit, place, reach)
     bounds = torch.cat((fit.low, fit.high), 1)
-    at = place.gather(2, axis[:, None].expand(len(place), -1, 1))[..., 0]
-    near = (at - bounds).abs() <= _NEAR * width[:, axis]
+    at = place.gather(2, axes[:, None].expand(len(place), -1, 1))[..., 0]
+    near = (at - bounds).abs() <= _NEAR * width[:, axes]
     outwards = torch.tensor([1.0, 1.0, -1.0, -1.0], device=place.device) * slope > 0.0
     lit = (depth > 0.0).any(1, keepdim=True)
     return place, which, torch.where(near & outwards & lit, slope, 0.0)

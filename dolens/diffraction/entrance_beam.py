@@ -146,8 +146,7 @@ class _PupilSearch:
             # The last point before the first whose ray does not pass.
             last = passes.long().cumprod(0).sum(0)[None, :, None].expand(1, -1, 2)
             ladder = torch.cat([edge.inside[None], tried, edge.outside[None]])
-            inside, outside = ladder.gather(0, last)[0], ladder.gather(0, last + 1)[0]
-            edge = _Edge(inside, outside, edge.owner)
+            edge = _Edge(ladder.gather(0, last)[0], ladder.gather(0, last + 1)[0], edge.owner)
         return edge
 
     def stops(self, edge: _Edge) -> tuple[tuple[int, ...], Tensor]:

@@ -159,13 +159,13 @@ class FieldPupil:
         if self.fit is None:
             return self._transfer_of_rays(frequencies, direction, share)
         pupil = self._on_grid(round(share * self.samples(0.0, 2.0)), direction)
-        share = self.weights * pupil.flux
-        share = (share / share.sum())[:, None]
+        light = self.weights * pupil.flux
+        shares = (light / light.sum())[:, None]
         found, limit = [], []
         for axis in range(2):
             aberrated, perfect = transfer_functions(pupil, axis, frequencies)
-            found.append((share * aberrated).sum(0))
-            limit.append((share * perfect).sum(0).abs())
+            found.append((shares * aberrated).sum(0))
+            limit.append((shares * perfect).sum(0).abs())
         return torch.stack(found), torch.stack(limit)
 
     def _transfer_of_rays(
@@ -207,11 +207,17 @@ class FieldPupil:
             half_window: mm.
             spots: how many times the spot's own extent must fit beside it.
         """
+        fit = self._fitted()
         wave = MM_PER_NM * self.front.wavelength / self.front.index
-        width = (self.fit.high - self.fit.low).amax(-1)
+        width = (fit.high - fit.low).amax(-1)
         reach = spots * self._farthest() + half_window
         needed = _OVERSAMPLING * float((width * reach / wave).amax())
         return max(_FEWEST, 4 * math.ceil(needed / 4.0))
+
+    def _fitted(self) -> PupilFit:
+        """Return the fit of a pupil that diffracts."""
+        assert self.fit is not None
+        return self.fit
 
     def _farthest(self) -> float:
         lit = self.front.coverage >= 0.5
@@ -225,8 +231,8 @@ class FieldPupil:
         if needed > most_samples:
             return f"the wavefront needs {needed} samples across the pupil"
         # Edges are smooth in `coverage`: few samples give the flux to far less than its limit.
-        pupil = regular_pupil(self.fit, _FEWEST)
-        chosen = choose_propagation(self.fit, pupil.flux, half)
+        pupil = regular_pupil(self._fitted(), _FEWEST)
+        chosen = choose_propagation(self._fitted(), pupil.flux, half)
         reasons = zip(chosen.fourier.tolist(), chosen.reasons, strict=True)
         return next((reason.removeprefix("direct: ") for good, reason in reasons if not good), "")
 
@@ -257,7 +263,7 @@ class FieldPupil:
         """Evaluate the pupil on a grid whose last dimension runs along a direction, and the other
         across it; `cosines` are along and across, from the middle.
         """
-        fit, front = self.fit, self.front
+        fit, front = self._fitted(), self.front
         along = direction.to(fit.low)
         if float(along[0]) == 0.0 or float(along[1]) == 0.0:
             pupil = regular_pupil(fit, samples)

@@ -3,17 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
 from dolens.analysis.ray_intercepts import field_unit
 from dolens.analysis.spot_diagram import spectral_shares
 from dolens.diffraction.entrance_beam import EntranceBeam, find_beam
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.wavefront import Wavefront, pupil_wavefront
-from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.system import OpticalSystem
 
@@ -71,12 +70,8 @@ def field_wavefronts(
             placed.
     """
     system = lens.system().double()
-    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
-    field = torch.as_tensor(fields, **options)
-    waves = torch.as_tensor(wavelengths, **options).reshape(-1)
-    if field.ndim != 2 or field.shape[-1] != 2 or not len(field) or not len(waves):
-        raise InputError("fields must be pairs (x, y) and wavelengths numbers, at least one each")
-    spectrum = spectral_shares(wavelength_weights, len(waves)).to(**options)
+    field, waves = as_fields_and_wavelengths(fields, wavelengths, system.device)
+    spectrum = spectral_shares(wavelength_weights, len(waves)).to(field)
     shape = (len(field), len(waves))
     every = field.repeat_interleave(len(waves), 0)
     points = object_points(every, object_distance)
@@ -123,7 +118,7 @@ def _coarse(
 
 def object_points(fields: Tensor, object_distance: float | None) -> ObjectPoints:
     """Return the object points of fields (N, 2), degrees for an object at infinity, else mm."""
-    if field_unit(object_distance) == "°":
+    if object_distance is None or field_unit(object_distance) == "°":
         return ObjectPoints.at_infinity(fields)
     away = torch.full_like(fields[:, :1], -float(object_distance))
     return ObjectPoints.at(torch.cat([fields, away], -1))

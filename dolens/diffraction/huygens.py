@@ -21,7 +21,13 @@ from torch import Tensor
 from dolens.diffraction.field import direct_field
 from dolens.diffraction.field_pupil import COARSER, FieldPupil
 from dolens.diffraction.field_wavefronts import field_wavefronts, object_points
-from dolens.diffraction.point_spread import PointSpread, airy_radius_um, window_half_width
+from dolens.diffraction.point_spread import (
+    FieldPointSpread,
+    PointSpread,
+    airy_radius_um,
+    of_all_fields,
+    window_half_width,
+)
 from dolens.diffraction.prepared_pupils import part_of
 from dolens.diffraction.propagation import turns_across
 from dolens.diffraction.wavefront import MM_PER_NM, Wavefront, pupil_wavefront
@@ -94,11 +100,10 @@ def huygens_point_spread(
         raise InputError(f"a window needs two cells and a positive width, not {cells}")
     found = field_wavefronts(lens, fields, wavelengths, object_distance, wavelength_weights)
     weights = found.weights.to(lens.device)
-    dark = torch.full((cells, cells), math.nan, dtype=torch.float64)
     rows = []
     for number, lit in enumerate(found.lit.any(1).tolist()):
         if not lit:
-            rows.append((math.nan, dark, math.nan, math.nan, math.nan, False, "no light passes"))
+            rows.append(FieldPointSpread.dark(cells))
             continue
         which = number * len(weights) + torch.arange(len(weights), device=lens.device)
         front = part_of(found.wavefront, which)
@@ -109,26 +114,13 @@ def huygens_point_spread(
         irradiance, perfect = sums.added(finer, grid, grid)
         coarser = sums.added(max(8, round(COARSER * finer)), grid, grid)[0]
         highest = sums.highest(finer, grid, irradiance)
-        error = (irradiance - coarser).abs().amax() / irradiance.amax()
+        error = float((irradiance - coarser).abs().amax() / irradiance.amax())
         held = float(irradiance.sum()) * (2.0 * half / cells) ** 2
         reason = f"{_REASON}, {finer} × {finer} rays"
         strehl = highest / float(perfect)
-        rows.append((1e3 * half, 1e-6 * irradiance.cpu(), held, strehl, float(error), True, reason))
-    half_widths, windows, held, strehl, errors, diffraction, reasons = zip(*rows, strict=True)
-    return PointSpread(
-        found.fields,
-        found.field_unit,
-        found.wavelengths,
-        found.centre,
-        torch.tensor(half_widths, dtype=torch.float64),
-        torch.stack(windows),
-        torch.tensor(held, dtype=torch.float64),
-        torch.tensor(strehl, dtype=torch.float64),
-        airy_radius_um(lens, found, object_distance),
-        diffraction,
-        reasons,
-        torch.tensor(errors, dtype=torch.float64),
-    )
+        window = 1e-6 * irradiance
+        rows.append(FieldPointSpread(1e3 * half, window, held, strehl, True, reason, error))
+    return of_all_fields(found, airy_radius_um(lens, found, object_distance), rows)
 
 
 @torch.no_grad()

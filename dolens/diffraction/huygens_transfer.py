@@ -52,7 +52,10 @@ def huygens_modulation(
     arguments = wavelengths, object_distance, wavelength_weights
     along = field_directions(points, object_distance)
     unknown = torch.full_like(frequency, math.nan)
-    curves, errors, diffraction, reasons = [], [], [], []
+    curves: list[Tensor] = []
+    errors: list[float] = []
+    diffraction: list[bool] = []
+    reasons: list[str] = []
     for field, way in zip(points, along, strict=True):
         half, airy = huygens_window(lens, field, *arguments)
         half += _AIRY_RADII * airy

@@ -1,8 +1,9 @@
 """Point spread functions and encircled energy of a lens's fields, with diffraction."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -58,6 +59,54 @@ class PointSpread:
     sampling_error: Tensor
 
 
+class FieldPointSpread(NamedTuple):
+    """A field has these entries in a `PointSpread`; the irradiance is (M, M), per µm²."""
+
+    half_width_um: float
+    irradiance: Tensor
+    held: float
+    strehl_ratio: float
+    diffraction: bool
+    reason: str
+    sampling_error: float
+
+    @classmethod
+    def dark(cls, cells: int) -> "FieldPointSpread":
+        """Return the entries of a field without light."""
+        unknown = torch.full((cells, cells), math.nan, dtype=torch.float64)
+        return cls(math.nan, unknown, math.nan, math.nan, False, "no light passes", math.nan)
+
+
+def of_all_fields(
+    found: FieldWavefronts, airy_radius_um: float, rows: Sequence[FieldPointSpread]
+) -> PointSpread:
+    """Return the point spread functions of all fields.
+
+    Args:
+        found: the wavefronts that they were computed from.
+        airy_radius_um: µm.
+        rows: one for each field.
+    """
+
+    def numbers(values: Iterable[float]) -> Tensor:
+        return torch.tensor(list(values), dtype=torch.float64)
+
+    return PointSpread(
+        found.fields,
+        found.field_unit,
+        found.wavelengths,
+        found.centre,
+        numbers(row.half_width_um for row in rows),
+        torch.stack([row.irradiance.cpu() for row in rows]),
+        numbers(row.held for row in rows),
+        numbers(row.strehl_ratio for row in rows),
+        airy_radius_um,
+        tuple(row.diffraction for row in rows),
+        tuple(row.reason for row in rows),
+        numbers(row.sampling_error for row in rows),
+    )
+
+
 @torch.no_grad()
 def point_spread(
     lens: Lens,
@@ -94,33 +143,19 @@ def point_spread(
     prepared = prepared or prepare_pupils(
         lens, fields, wavelengths, object_distance, wavelength_weights
     )
-    found = prepared.wavefronts
-    dark = torch.full((cells, cells), math.nan, dtype=torch.float64)
     rows = []
     for pupil in prepared.pupils:
         if pupil is None:
-            rows.append((math.nan, dark, math.nan, math.nan, False, "no light passes", math.nan))
+            rows.append(FieldPointSpread.dark(cells))
             continue
         half = window_half_width(pupil) if half_width_um is None else 1e-3 * half_width_um
         irradiance, peak, perfect = _mean_irradiance(pupil, half, cells)
         held = float(irradiance.sum()) * (2.0 * half / cells) ** 2
         how = pupil.diffraction, pupil.reason, _sampling_error(pupil, half, cells)
-        rows.append((1e3 * half, 1e-6 * irradiance, held, peak / perfect, *how))
-    half_widths, windows, held, strehl, diffraction, reasons, errors = zip(*rows, strict=True)
-    return PointSpread(
-        found.fields,
-        found.field_unit,
-        found.wavelengths,
-        found.centre,
-        torch.tensor(half_widths, dtype=torch.float64),
-        torch.stack([window.cpu() for window in windows]),
-        torch.tensor(held, dtype=torch.float64),
-        torch.tensor(strehl, dtype=torch.float64),
-        airy_radius_um(lens, found, object_distance),
-        diffraction,
-        reasons,
-        torch.tensor(errors, dtype=torch.float64),
-    )
+        row = FieldPointSpread(1e3 * half, 1e-6 * irradiance, held, peak / perfect, *how)
+        rows.append(row)
+    airy = airy_radius_um(lens, prepared.wavefronts, object_distance)
+    return of_all_fields(prepared.wavefronts, airy, rows)
 
 
 @torch.no_grad()

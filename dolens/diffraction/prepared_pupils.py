@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -60,7 +61,7 @@ def _field_pupils(
     system = lens.system().double()
     count = len(found.wavelengths)
     weights = found.weights.to(system.device)
-    pupils = []
+    pupils: list[FieldPupil | None] = []
     for number, lit in enumerate(found.lit.any(1).tolist()):
         if not lit:
             pupils.append(None)
@@ -75,7 +76,7 @@ def _field_pupils(
 
 def part_of(front: Wavefront, which: Tensor) -> Wavefront:
     """Return some of the wavefronts, with the apertures that clip these."""
-    values = {
+    values: dict[str, Any] = {
         name: value[which] if isinstance(value, Tensor) else value
         for name, value in vars(front).items()
     }

@@ -118,14 +118,18 @@ class _Prepared:
     points: ObjectPoints
     fit: PupilFit
     samples: int
-    chosen: Propagation | None = None
+    chosen: Propagation
     # Of all pupils, where they are one piece of work.
     pupil: RegularPupil | None = None
 
-    def pieces(self, beside: int = 0) -> Sequence[Tensor]:
+    def pieces(self, beside: int) -> Sequence[Tensor]:
         """Numbers of the pupils, as many at a time as memory is meant for, beside a window."""
-        size = _FUNCTIONS * self.samples**2 + (self.samples + beside) ** 2
-        return torch.arange(len(self.fit.low)).split(max(1, _PIECE // size))
+        return _pieces(self.fit, self.samples, beside)
+
+
+def _pieces(fit: PupilFit, samples: int, beside: int = 0) -> Sequence[Tensor]:
+    size = _FUNCTIONS * samples**2 + (samples + beside) ** 2
+    return torch.arange(len(fit.low)).split(max(1, _PIECE // size))
 
 
 @dataclass(frozen=True)
@@ -160,16 +164,16 @@ def _prepare(
     rays = pupil_wavefront(system, points, wavelength, centres, settings.rays)
     fit = with_differentiable_bounds(_fitted(rays, settings))
     points = points.to(rays.opd.dtype, rays.opd.device)
-    found = _Prepared(points, fit, fourier_samples(fit, window.half_width, settings))
-    parts = found.pieces()
-    if len(parts) == 1:
-        found = replace(found, pupil=regular_pupil(fit, found.samples))
-        flux = found.pupil.flux
+    samples = fourier_samples(fit, window.half_width, settings)
+    parts = _pieces(fit, samples)
+    pupil = regular_pupil(fit, samples) if len(parts) == 1 else None
+    if pupil is not None:
+        flux = pupil.flux
     else:
         with torch.no_grad():
-            flux = torch.cat([regular_pupil(fit, found.samples, part).flux for part in parts])
+            flux = torch.cat([regular_pupil(fit, samples, part).flux for part in parts])
     chosen = choose_propagation(fit, flux, window.half_width, settings)
-    return replace(found, chosen=replace(chosen, samples=found.samples))
+    return _Prepared(points, fit, samples, replace(chosen, samples=samples), pupil)
 
 
 def _fitted(wavefront: Wavefront, settings: DiffractionSettings) -> PupilFit:
@@ -192,7 +196,7 @@ def _by_fourier(found: _Prepared, pixels: _Subpixels) -> Tensor:
         return kernels(found.pupil)
 
     clipping = found.fit.wavefront.clipping
-    moving = [number for number, surface in clipping.items() if surface.edge is not None]
+    moving = {n: surface.edge for n, surface in clipping.items() if surface.edge is not None}
 
     def piece(i: int, coefficients: Tensor, low: Tensor, high: Tensor, *edges: Tensor) -> Tensor:
         moved = {n: replace(clipping[n], edge=e) for n, e in zip(moving, edges, strict=True)}
@@ -201,7 +205,7 @@ def _by_fourier(found: _Prepared, pixels: _Subpixels) -> Tensor:
         return kernels(regular_pupil(fit, found.samples, parts[i])).movedim(0, -1)
 
     fit = found.fit
-    tensors = (fit.coefficients, fit.low, fit.high, *(clipping[number].edge for number in moving))
+    tensors = (fit.coefficients, fit.low, fit.high, *moving.values())
     return replay(piece, [len(part) for part in parts], tensors).movedim(-1, 0)
 
 

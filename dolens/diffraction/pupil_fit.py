@@ -139,20 +139,20 @@ def regular_pupil(fit: PupilFit, samples: int, which: Tensor | None = None) -> R
         samples: G.
         which: their numbers; None: all.
     """
-    which = slice(None) if which is None else which.to(fit.low.device)
-    wavefront, coefficients = fit.wavefront, fit.coefficients[which]
-    low, high = fit.low[which], fit.high[which]
+    chosen = slice(None) if which is None else which.to(fit.low.device)
+    wavefront, coefficients = fit.wavefront, fit.coefficients[chosen]
+    low, high = fit.low[chosen], fit.high[chosen]
     degree = coefficients.shape[-1] - 1
     step = torch.arange(samples, dtype=low.dtype, device=low.device)
     share = (step + 0.5) / samples
     cosines = low[..., None] + (high - low)[..., None] * share
-    unit = (cosines - fit.centre[which][..., None]) / fit.half_width[which][..., None]
+    unit = (cosines - fit.centre[chosen][..., None]) / fit.half_width[chosen][..., None]
     unit = unit.clamp(-1.0, 1.0)
     x, y = (chebyshev(unit[:, axis], degree)[0][:, None] for axis in (0, 1))
     opd, whole, *crossings = (y.mT @ coefficients @ x).unbind(1)
-    lit = (wavefront.coverage[which] > 0.0).flatten(1).any(-1)
+    lit = (wavefront.coverage[chosen] > 0.0).flatten(1).any(-1)
     square = unit.detach().square()
-    near = square[:, 1, :, None] + square[:, 0, None] <= fit.radius[which, None, None].square()
+    near = square[:, 1, :, None] + square[:, 0, None] <= fit.radius[chosen][:, None, None].square()
     passed = (lit[:, None, None] & near).to(opd.dtype)
     surfaces = wavefront.clipping.values()
     for surface, x, y in zip(surfaces, crossings[::2], crossings[1::2], strict=True):
@@ -162,7 +162,7 @@ def regular_pupil(fit: PupilFit, samples: int, which: Tensor | None = None) -> R
     # A cell that passes a share c has amplitude c, but flux c and not c².
     flux = (whole * amplitude).sum((-2, -1)) * cell
     return RegularPupil(
-        amplitude, opd, cosines, flux, wavefront.wavelength[which], wavefront.index[which]
+        amplitude, opd, cosines, flux, wavefront.wavelength[chosen], wavefront.index[chosen]
     )
 
 

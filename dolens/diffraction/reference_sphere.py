@@ -62,6 +62,7 @@ def on_tangent_planes(
         x and y (N, ..., 2), mm, from the centre, and directions (N, ..., 3), both in the planes'
         axes (see `TangentPlanes`); and the distance that rays were carried, mm.
     """
+    assert system.image is not None
     planes = TangentPlanes.at(system.image, centre)
     for _ in range(hit.position.ndim - 2):
         planes = planes.unsqueeze(1)

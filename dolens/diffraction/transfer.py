@@ -88,22 +88,25 @@ def diffraction_modulation(
     dark = torch.full_like(frequency, math.nan).expand(4, -1)
     along = field_directions(found.fields, object_distance).to(lens.device)
     rows, errors = [], []
-    for pupil, tangential in zip(pupils, along, strict=True):
+    for pupil, way in zip(pupils, along, strict=True):
         if pupil is None:
             rows.append(dark)
             errors.append(math.nan)
             continue
-        found_here, limit = pupil.transfer(frequency, tangential)
-        coarser, _ = pupil.transfer(frequency, tangential, COARSER)
+        found_here, limit = pupil.transfer(frequency, way)
+        coarser, _ = pupil.transfer(frequency, way, COARSER)
         rows.append(torch.cat([found_here.abs(), limit]))
         errors.append(float((found_here.abs() - coarser.abs()).abs().amax()))
-    curves = torch.stack(rows, 1).cpu()
+    tangential, sagittal, *limits = torch.stack(rows, 1).cpu()
     return DiffractionModulation(
         found.fields,
         found.field_unit,
         found.wavelengths,
         frequency.cpu(),
-        *curves,
+        tangential,
+        sagittal,
+        limits[0],
+        limits[1],
         tuple(pupil is not None and pupil.diffraction for pupil in pupils),
         tuple("no light passes" if pupil is None else pupil.reason for pupil in pupils),
         torch.tensor(errors, dtype=torch.float64),

@@ -175,7 +175,8 @@ def pupil_wavefront(
     ray, every, opened = launched(points, q), waves[:, None, None], system.opened()
     rays = Rays.from_components(ray, every)
     hit = trace_rays(opened, rays)
-    away, arriving, path = hit.position[..., :2] - centre[:, None, None], hit.direction, 0.0
+    away, arriving = hit.position[..., :2] - centre[:, None, None], hit.direction
+    path: Tensor | float = 0.0
     if system.image is not None:
         away, arriving, path = on_tangent_planes(system, hit, centre)
     excess, direction, meets = to_sphere(away, arriving, curvature[:, None, None])
@@ -264,7 +265,7 @@ def _one_each(
     what: str,
     values: float | Sequence[float] | Tensor,
     count: int,
-    options: Mapping[str, torch.dtype | torch.device],
+    options: Mapping[str, Any],
 ) -> Tensor:
     tensor = torch.as_tensor(values, **options).detach()
     if tensor.ndim > 1 or (tensor.ndim == 1 and len(tensor) not in (1, count)):

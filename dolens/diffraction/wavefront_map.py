@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from dolens.analysis.fields_and_wavelengths import as_fields_and_wavelengths
 from dolens.analysis.ray_intercepts import field_unit
 from dolens.analysis.zernike_fit import TERMS, ZernikeFit, zernike_fit
 from dolens.diffraction.entrance_beam import EntranceBeam, box_grid, find_beam, launched
@@ -14,7 +14,6 @@ from dolens.diffraction.field_wavefronts import light_centroids, object_points
 from dolens.diffraction.object_points import ObjectPoints
 from dolens.diffraction.reference_sphere import find_chief_rays
 from dolens.diffraction.wavefront import MM_PER_NM, RIM, cell_areas, pupil_wavefront
-from dolens.errors import InputError
 from dolens.optics.elements import from_lens_axes
 from dolens.optics.lens import Lens
 from dolens.optics.ray_tracing import trace_rays
@@ -105,11 +104,7 @@ def wavefront_maps(
         InputError: no fields or wavelengths, or a sphere that cannot be placed.
     """
     system = lens.system().double()
-    options: dict[str, Any] = {"dtype": torch.float64, "device": system.device}
-    field = torch.as_tensor(fields, **options)
-    waves = torch.as_tensor(wavelengths, **options).reshape(-1)
-    if field.ndim != 2 or field.shape[-1] != 2 or not len(field) or not len(waves):
-        raise InputError("fields must be pairs (x, y) and wavelengths numbers, at least one each")
+    field, waves = as_fields_and_wavelengths(fields, wavelengths, system.device)
     shape = (len(field), len(waves))
     points = object_points(field.repeat_interleave(len(waves), 0), object_distance)
     wave = waves.repeat(len(field))

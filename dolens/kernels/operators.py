@@ -4,6 +4,7 @@
 programs hold no Python objects of ours.  First derivatives only: a second one says so.
 """
 
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -21,13 +22,10 @@ from dolens.kernels.table import SurfaceTable
 
 def _backend(position: Tensor) -> Any:
     """Return the module that runs kernels where the rays are; it is imported when first needed."""
-    if position.device.type == "cpu":
-        from dolens.kernels.cpu import backend
-    elif position.device.type == "cuda":
-        from dolens.kernels.cuda import backend
-    else:
+    kind = position.device.type
+    if kind not in ("cpu", "cuda"):
         raise InputError(f"no kernels for rays on {position.device}; use backend 'reference'")
-    return backend
+    return import_module(f"dolens.kernels.{kind}.backend")
 
 
 @operator

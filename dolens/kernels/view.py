@@ -81,7 +81,9 @@ class View:
     def from_lists(integers: list[int], numbers: list[float]) -> "View":
         """Return the view of `integers` and `numbers`."""
         height, width, pupil_samples, pixel_area, low, high = integers
-        pixel_pitch, *places, pupil_z, pupil_radius, axial_radius = numbers[:8]
+        pixel_pitch, row, column, of_row, of_column, pupil_z, pupil_radius, axial_radius = numbers[
+            :8
+        ]
         planes = numbers[8:]
         depths = len(planes) // 2
         return View(
@@ -91,7 +93,10 @@ class View:
             pupil_samples,
             bool(pixel_area),
             low + (high << 32),
-            *places,
+            row,
+            column,
+            of_row,
+            of_column,
             pupil_z,
             pupil_radius,
             axial_radius,

@@ -28,8 +28,8 @@ def with_aperture(
         InputError: both are given, one is not positive, the stop is no circle, or no stop on its
             surface makes this pupil.
     """
-    given = {"f_number": f_number, "entrance_pupil_diameter": entrance_pupil_diameter}
-    given = {name: value for name, value in given.items() if value is not None}
+    either = {"f_number": f_number, "entrance_pupil_diameter": entrance_pupil_diameter}
+    given = {name: value for name, value in either.items() if value is not None}
     if not given:
         return lens
     if len(given) > 1:

@@ -8,13 +8,12 @@ wavelength.  Wavelengths are those in air, as of the spectral lines that makers 
 """
 
 from collections.abc import Callable
-from typing import TypeVar
 
 from torch import Tensor
 
-Wavelength = TypeVar("Wavelength", float, Tensor)
+Wavelength = float | Tensor
 Terms = tuple[tuple[float, float], ...]
-Formula = Callable[[float | Tensor, float, Terms], float | Tensor]
+Formula = Callable[[Wavelength, float, Terms], Wavelength]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028

@@ -22,13 +22,16 @@ CURVATURE, CONIC = "sensor_curvature", "sensor_conic"
 WITHOUT_EDGE = ClearAperture(Unlimited(1e6))
 
 
-def register_image_surface(lens: nn.Module, curvature: float | None, conic: float | None) -> None:
+def register_image_surface(
+    lens: nn.Module, curvature: float | None, conic: float | None, dtype: torch.dtype
+) -> None:
     """Give a lens the parameters of its curved sensor; a plane has none.
 
     Args:
-        lens: with `sensor_distance`.
+        lens: with a name.
         curvature: 1/mm, its sign as any surface's; None: a plane.
         conic: the conic constant; None: a sphere.
+        dtype: precision of the parameters.
 
     Raises:
         InputError: a conic constant without a curvature.
@@ -36,9 +39,8 @@ def register_image_surface(lens: nn.Module, curvature: float | None, conic: floa
     if curvature is None and conic is not None:
         raise InputError(f"lens '{lens.name}': a sensor with a conic constant needs a curvature")
     for name, value in ((CURVATURE, curvature), (CONIC, conic)):
-        if value is not None:
-            value = nn.Parameter(lens.sensor_distance.detach().new_tensor(float(value)))
-        lens.register_parameter(name, value)
+        given = None if value is None else torch.tensor(float(value), dtype=dtype)
+        lens.register_parameter(name, None if given is None else nn.Parameter(given))
 
 
 def image_surface(lens: nn.Module, values: dict[str, Tensor]) -> SurfaceState | None:

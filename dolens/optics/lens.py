@@ -131,7 +131,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.elements = ModuleTable[Element](dict(elements or {}))
         self.sensor_distance = nn.Parameter(torch.tensor(float(sensor_distance), dtype=dtype))
         self.states, self.state_name = LensStates(), None
-        register_image_surface(self, sensor_curvature, sensor_conic)
+        register_image_surface(self, sensor_curvature, sensor_conic, dtype)
         self.to(dtype)
         self.reversals: tuple[int, ...] = ()
         self.reversals = reversals(self.system(), self.primary_wavelength)

@@ -15,6 +15,8 @@ class ModuleTable(nn.ModuleDict, Generic[Kind]):
 
         def __getitem__(self, key: str) -> Kind: ...
 
-        def values(self) -> ValuesView[Kind]: ...
+        def values(self) -> ValuesView[Kind]:
+            """Return the modules."""
 
-        def items(self) -> ItemsView[str, Kind]: ...
+        def items(self) -> ItemsView[str, Kind]:
+            """Return names and modules."""

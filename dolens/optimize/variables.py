@@ -52,6 +52,11 @@ class DesignVariables(nn.Module):
             value outside its bounds.
     """
 
+    scale: Tensor
+    lower: Tensor
+    upper: Tensor
+    units: Tensor
+
     def __init__(
         self,
         lens: Lens,

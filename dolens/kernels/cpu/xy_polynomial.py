@@ -40,7 +40,7 @@ from dolens.kernels.cpu.layout import (
 from dolens.kernels.cpu.records import CODE_ROW, COLUMNS, COUNT, DEGREE, EXTRAS_ADDRESS, SHAPE
 
 # Work rows: W, P_x and P_y; then the powers of x from the zeroth to the degree, and those of y.
-*_, ROOT, P_X, P_Y, _ = OWN
+ROOT, P_X, P_Y = OWN[-4:-1]
 POWERS = FURTHER
 COEFFICIENTS, OF_COEFFICIENTS = SHAPE + 1, OF_SECOND  # behind b
 

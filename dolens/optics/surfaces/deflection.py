@@ -103,7 +103,7 @@ class Law(nn.Module):
         raise NotImplementedError
 
     @classmethod
-    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor, ...]:
+    def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
         """Return the numbers that `kernel` takes, in its order.
 
         Args:
