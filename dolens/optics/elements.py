@@ -189,9 +189,10 @@ def relative_axes(now: Axes, then: Axes) -> tuple[Tensor, Tensor]:
         front of one of the two.
     """
     like = then.rotation if now.rotation is None else now.rotation
+    assert like is not None  # at least one is carried
     step = _origin(then, like) - _origin(now, like)
     if now.rotation is None:
-        return step, then.rotation.mT
+        return step, like.mT
     step = now.rotation.mT @ step
     return step, now.rotation if then.rotation is None else then.rotation.mT @ now.rotation
 
@@ -230,12 +231,10 @@ def to_lens_axes(ray: Components, axes: Axes) -> Components:
     x, y, z, l, m, n = ray  # noqa: E741
     if axes.rotation is None:
         return Components(x, y, z + axes.z, l, m, n)
-    rotation, origin = axes.rotation.to(n.dtype), axes.origin.to(n.dtype)
-    position = _turn(rotation, x, y, z)
-    return Components(
-        *(p + o for p, o in zip(position, origin.unbind(), strict=True)),
-        *_turn(rotation, l, m, n),
-    )
+    assert axes.origin is not None  # as there is a rotation
+    rotation, (ox, oy, oz) = axes.rotation.to(n.dtype), axes.origin.to(n.dtype).unbind()
+    px, py, pz = _turn(rotation, x, y, z)
+    return Components(px + ox, py + oy, pz + oz, *_turn(rotation, l, m, n))
 
 
 def from_lens_axes(ray: Components, axes: Axes) -> Components:
@@ -243,6 +242,7 @@ def from_lens_axes(ray: Components, axes: Axes) -> Components:
     x, y, z, l, m, n = ray  # noqa: E741
     if axes.rotation is None:
         return Components(x, y, z - axes.z, l, m, n)
+    assert axes.origin is not None  # as there is a rotation
     turn = axes.rotation.to(n.dtype).mT
     ox, oy, oz = axes.origin.to(n.dtype).unbind()
     return Components(*_turn(turn, x - ox, y - oy, z - oz), *_turn(turn, l, m, n))

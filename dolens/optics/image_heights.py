@@ -65,7 +65,8 @@ def heights_of_pupil_angles(lens: Lens, angles: Tensor) -> Tensor:
     """
     with torch.no_grad():
         first = in_double_precision(lens).first_order(lens.primary_wavelength)
-    distance = float(lens.object_distance) + float(first.entrance_pupil.z)
+    away = math.inf if lens.object_distance is None else float(lens.object_distance)
+    distance = away + float(first.entrance_pupil.z)
     if not math.isfinite(distance):
         raise InputError("fields by angles need an entrance pupil that is not at infinity")
     return -torch.deg2rad(angles).tan() * distance
@@ -95,11 +96,12 @@ def _of_real_rays(lens: Lens, heights: Tensor) -> Tensor:
             raise InputError("a chief ray of a real image height comes at 90 degrees to the axis")
     _, y, z = ray.position.unbind(-1)
     tangent = ray.direction[..., 1] / ray.direction[..., 2]
-    near = vergence(lens.object_distance)
-    if near == 0.0:
+    distance = lens.object_distance
+    near = vergence(distance)
+    if distance is None or near == 0.0:
         height = torch.rad2deg(tangent.atan())
     else:
-        height = y + tangent * (-float(lens.object_distance) - z)
+        height = y + tangent * (-float(distance) - z)
     towards = heights / torch.where(radius > 0.0, radius, 1.0)[:, None]
     if near == 0.0:
         # An angle of a field is one of each component of its tangent.

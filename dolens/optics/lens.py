@@ -187,7 +187,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
             aperture = surface.aperture
             if edge is not None:
                 aperture = aperture.resized(float(edge.detach()))
-            law = surface.law and LawState(surface.law, parameters)
+            law = None if surface.law is None else LawState(surface.law, parameters)
             if surface.phase is not None:
                 own = _stored_or_given(surface.phase, values, f"surfaces.{number}.phase.")
                 law = LawState(type(surface.phase), own)
@@ -299,7 +299,8 @@ def _stored_or_given(
 ) -> dict[str, Tensor]:
     """Return what a module itself holds, or what `values` has instead, which is taken out there."""
     # Its own tables: `named_parameters` searches submodules, and takes ten times as long.
-    stored = {**module._parameters, **module._buffers}
+    tables = (module._parameters, module._buffers)
+    stored = {n: value for table in tables for n, value in table.items() if value is not None}
     if not values:
         return stored
     return {name: values.pop(prefix + name, value) for name, value in stored.items()}
@@ -311,4 +312,5 @@ def _named_parameters(module: nn.Module, prefix: str = "") -> Iterator[tuple[str
         if parameter is not None:
             yield prefix + name, parameter
     for name, child in module._modules.items():
-        yield from _named_parameters(child, f"{prefix}{name}.")
+        if child is not None:
+            yield from _named_parameters(child, f"{prefix}{name}.")

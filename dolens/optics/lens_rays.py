@@ -107,7 +107,7 @@ class LensRays:
         They cross it at +y, -y and +x; `wavelength` broadcasts with (..., 3).
         """
         field = torch.as_tensor(field, dtype=self.dtype, device=self.device)[..., None, :]
-        edge = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0))
+        edge = field.new_tensor([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0]])
         return self.aim(field, edge, wavelength, object_distance)
 
     def _field(

@@ -63,7 +63,10 @@ class LensState(_Branch):
             branch: nn.Module = self
             for part in path:
                 # Straight into the tables: the names of surfaces and gaps are numbers.
-                branch = branch._modules.setdefault(part, _Branch())
+                inner = branch._modules.get(part)
+                if inner is None:
+                    inner = branch._modules[part] = _Branch()
+                branch = inner
             branch._parameters[last] = parameter
         self.data = data
 
@@ -86,7 +89,9 @@ class LensStates(nn.Module):
 
     def __getitem__(self, name: str) -> LensState:
         """Return a state by its name."""
-        return self._modules[name]
+        state = self._modules[name]
+        assert isinstance(state, LensState)  # nothing else is put there
+        return state
 
 
 class InStates:

@@ -36,7 +36,7 @@ def real_marginal_height(lens: Lens, paraxial: float) -> float:
     wavelength = lens.primary_wavelength
     # The height at the stop is a·y + b·n·u of a ray that meets the first vertex at y with slope u.
     (a, b), _ = matrix_to_stop(system, wavelength).tolist()
-    if vergence(lens.object_distance) == 0.0:
+    if lens.object_distance is None or vergence(lens.object_distance) == 0.0:
         start, slope = [0.0, paraxial / abs(a), 0.0], 0.0
     else:
         distance = float(lens.object_distance)
@@ -50,6 +50,7 @@ def real_marginal_height(lens: Lens, paraxial: float) -> float:
         raise InputError(
             "the real marginal ray, which gives the stop its size ('real_pupil'), does not reach it"
         )
+    assert hit.points is not None  # they were recorded
     at = hit.points[-1][0]
     local = from_lens_axes(Components(*at, *direction[0].to(at)), system.axes[lens.stop - 1])
     return float(torch.hypot(local.x, local.y))

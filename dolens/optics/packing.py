@@ -5,7 +5,7 @@ gradients flow back through ordinary tensor operations, and derivatives by param
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from itertools import accumulate
 from typing import Any
@@ -23,6 +23,7 @@ from dolens.optics.materials import Medium
 from dolens.optics.record_structure import BREAK, Form, LawForm, Structure
 from dolens.optics.records import Records, records, tensor
 from dolens.optics.row_jacobian import jacobian_of
+from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.system import OpticalSystem, per_radian
 
 Wavelength = float | Sequence[float] | Tensor
@@ -98,35 +99,38 @@ def _lay_out(
     scalars: list[Tensor] = []
     arrays: list[Tensor] = []
     of_laws: list[Tensor] = []
-    forms, apertures, laws = [], [], []
+    forms: list[Form] = []
+    apertures: list[ClearAperture] = []
+    laws: list[LawForm | None] = []
     for number, surface in enumerate(system.surfaces, 1):
         shape = surface.shape
         if shape.kernel is None:
             raise InputError(f"surface {number} ({shape.kind}) has no kernel")
         code = BREAK if shape.changes_axes else shape.kernel.code
         numbers, count, columns, degree, extras, data = shape.packed(surface.parameters)
-        sizes = []
         for value in numbers:
-            sizes.append(None if value is None else value.shape)
             if value is not None:
                 (arrays if value.ndim else scalars).append(value)
-        forms.append(Form(code, count, columns, degree, extras, tuple(sizes), data))
+        forms.append(Form(code, count, columns, degree, extras, _sizes(numbers), data))
         apertures.append(surface.aperture)
         law = surface.deflection
         if law is None:
             laws.append(None)
         else:
             own = law.law.packed(law.parameters, sense > 0.0)
-            sizes = tuple(None if value is None else value.shape for value in own)
-            laws.append(LawForm(law.law.kernel.code, sizes))
+            if law.law.kernel is None:
+                raise InputError(f"surface {number}: a {law.law.kind} has no kernel")
+            laws.append(LawForm(law.law.kernel.code, _sizes(own)))
             of_laws += [value for value in own if value is not None]
     scalars += (*of_laws, *system.thicknesses, system.sensor_distance)
     image = None
     if to_sensor and system.image is not None:
         shape = system.image.shape
+        if shape.kernel is None:
+            raise InputError(f"the sensor ({shape.kind}) has no kernel")
         own = shape.packed(system.image.parameters).numbers
-        image = Form(shape.kernel.code, 0, 0, 0, (), tuple(value.shape for value in own))
-        scalars += own
+        image = Form(shape.kernel.code, 0, 0, 0, (), _sizes(own))
+        scalars += [value for value in own if value is not None]
     layout = records(
         Structure(
             tuple(forms),
@@ -149,8 +153,14 @@ def _lay_out(
             if then:
                 arrays += relative_axes(axes[now], axes[then])
             else:
-                arrays += (axes[now].origin, axes[now].rotation)
+                origin, rotation = axes[now].origin, axes[now].rotation
+                assert origin is not None and rotation is not None  # they turn
+                arrays += (origin, rotation)
     return layout, scalars, arrays
+
+
+def _sizes(numbers: Iterable[Tensor | None]) -> tuple[torch.Size | None, ...]:
+    return tuple(None if value is None else value.shape for value in numbers)
 
 
 def _values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
@@ -247,7 +257,7 @@ def _indices(
         one = torch.ones_like(wavelength)
         found = {medium: medium.index(wavelength) * one for medium in set(used)}
         last = [per_radian(wavelength, wavelength)] if waves else []
-        return torch.stack([found[medium] for medium in used] + last)
+        return torch.stack([*(found[medium] for medium in used), *last])
     several = (wavelength,) if isinstance(wavelength, (int, float)) else tuple(wavelength)
     return tensor(_index_rows(used, several, waves), np.float64).to(device)
 

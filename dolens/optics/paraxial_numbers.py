@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from dolens.optics.paraxial_recurrence import TwoRays, behind_surfaces
 from dolens.optics.paraxial_surfaces import curvatures_of, deflects
 from dolens.optics.system import OpticalSystem
 
-Number = TypeVar("Number", float, Tensor)
+Number = Any  # of Python's, or a tensor
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ What adds to a surface's power (n' - n)c, a diffractive phase or an ideal lens, 
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-Number = TypeVar("Number")  # of Python's, or a tensor
+Number = Any  # of Python's, or a tensor
 
 
 class TwoRays(NamedTuple):

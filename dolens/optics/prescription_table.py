@@ -2,9 +2,9 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from torch import nn
 
 from dolens.optics.elements import TILTS, Element
 from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
@@ -164,7 +164,7 @@ class PrescriptionTable:
 
 
 @torch.no_grad()
-def prescription_table(lens: nn.Module) -> PrescriptionTable:
+def prescription_table(lens: Any) -> PrescriptionTable:
     """Return the prescription of a `Lens` in its present state as plain values."""
     carrier = {
         number: name
@@ -217,7 +217,7 @@ def prescription_table(lens: nn.Module) -> PrescriptionTable:
     )
 
 
-def _sensor_shape(lens: nn.Module) -> tuple[float, float]:
+def _sensor_shape(lens: Any) -> tuple[float, float]:
     """Return radius (mm) and conic constant of the sensor."""
     curvature, conic = lens.sensor_curvature, lens.sensor_conic
     radius = math.inf if curvature is None or float(curvature) == 0.0 else 1.0 / float(curvature)

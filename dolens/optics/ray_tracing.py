@@ -50,6 +50,7 @@ def trace_rays(
     if reference or torch.promote_types(finer, system.dtype) != system.dtype:
         ray, before = enter_lens(system, rays, first if sense > 0.0 else end, sense)
     if reference:
+        assert ray is not None  # it entered above
         traced = trace_surfaces(
             system, ray, rays.wavelength, sense, True, record, first=first, last=last
         )
@@ -123,14 +124,15 @@ def _joined(
 ) -> tuple[Tensor, Tensor, tuple[int, ...]]:
     """Positions and directions (N, 3), and the leading shape; of `ray` where it was moved."""
     if ray is not None and before is not None:
-        position, direction, shape = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1), ray.x.shape
+        position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
+        shape = tuple(ray.x.shape)
     else:
         # As the user gave them: views of (..., 3), which a kernel reads in place.
         options: dict[str, Any] = {"device": system.device, "dtype": system.dtype}
         shape = _shape(rays)
         position = rays.position.to(**options).expand(*shape, 3)
         direction = rays.direction.to(**options).expand(*shape, 3)
-    return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(shape)
+    return position.reshape(-1, 3), direction.reshape(-1, 3), shape
 
 
 @dataclass(frozen=True)

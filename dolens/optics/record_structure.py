@@ -28,7 +28,7 @@ class Form(NamedTuple):
     """
 
     kind: int
-    count: int
+    count: int  # type: ignore[assignment]  # a tuple has a method of that name
     columns: int
     degree: int
     extras: tuple[int, ...]

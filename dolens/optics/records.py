@@ -52,7 +52,7 @@ class Records:
     turns: tuple[tuple[int, int], ...]
 
 
-def tensor(numbers: Sequence, dtype: type) -> Tensor:
+def tensor(numbers: Sequence | np.ndarray, dtype: type) -> Tensor:
     """A tensor on the CPU; by way of NumPy, which reads lists several times faster."""
     return torch.from_numpy(np.array(numbers, dtype=dtype))
 
@@ -246,18 +246,20 @@ class _Writer:
     def image(self, line: tuple[int, tuple[int, ...]], now: int, at: int, medium: int) -> None:
         """From the last surface to a curved sensor, which refracts nothing."""
         s = self.structure
+        form = s.image
+        assert form is not None
         sensor = len(s.forms) + 1
         turned = line != self.line(sensor)
         if turned:
             self.turn(self.step(Kind.CHANGE_AXES, medium, medium, sensor), now, sensor)
-        row = self.step(s.image.kind, medium, medium, sensor)
+        row = self.step(form.kind, medium, medium, sensor)
         if not turned:
             self.shift(row, at, sensor)
         begin = row[Code.OFFSET]
         self.constants[begin + Slot.SENSE_BEHIND] = self.constants[begin + Slot.SENSE]
         self.aperture(row, WITHOUT_EDGE)
-        self.add(len(self.constants), self.of_image, len(s.image.sizes))
-        self.constants += [0.0] * len(s.image.sizes)
+        self.add(len(self.constants), self.of_image, len(form.sizes))
+        self.constants += [0.0] * len(form.sizes)
         row[Code.LENGTH] = len(self.constants) - begin
 
     def figures(self, row: list[int], aperture: ClearAperture) -> None:

@@ -70,5 +70,6 @@ class _Replay(torch.autograd.Function):
             )
             for j, g in zip(needed, found, strict=True):
                 if g is not None:
-                    totals[j] = g if totals[j] is None else totals[j] + g
+                    before = totals[j]
+                    totals[j] = g if before is None else before + g
         return (None, None, None, *totals)

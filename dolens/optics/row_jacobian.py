@@ -98,9 +98,11 @@ def forward_columns(
         return value, value.new_zeros(*value.shape, len(point))
 
     def sweep(direction: Tensor) -> tuple[Tensor, Tensor]:
-        return jvp(function, (point,), (direction,))
+        value, columns = jvp(function, (point,), (direction,))
+        return value, columns
 
-    together = vmap(sweep, out_dims=(None, 0))
+    # The value is the same for all directions.
+    together: Callable[[Tensor], tuple[Tensor, Tensor]] = vmap(sweep, out_dims=(None, 0))  # type: ignore[arg-type]
     found = [together(some) for some in directions.split(_TOGETHER)]
     value, columns = found[-1][0], torch.cat([part for _, part in found])
     if chosen is None or bool(chosen.all()):

@@ -144,6 +144,7 @@ class OpticalSystem:
                 origin = torch.stack([like, like, torch.as_tensor(axes.z).to(like)])
                 rotation = torch.eye(3, dtype=torch.float64, device=self.device)
             else:
+                assert axes.origin is not None  # as there is a rotation
                 origin, rotation = axes.origin.double(), axes.rotation.double()
             origins.append(origin)
             rotations.append(rotation)

@@ -110,6 +110,6 @@ def absolute_change(
     """
     t = temperature - thermal.reference
     square = wavelength * wavelength - thermal.resonance * abs(thermal.resonance)
-    bracket = t * (thermal.d0 + t * (thermal.d1 + t * thermal.d2))
+    bracket: Wavelength = t * (thermal.d0 + t * (thermal.d1 + t * thermal.d2))
     bracket = bracket + t * (thermal.e0 + t * thermal.e1) / square
     return (index * index - 1.0) / (2.0 * index) * bracket

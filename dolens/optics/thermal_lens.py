@@ -222,7 +222,9 @@ def _power(name: str, place: str) -> int:
 
 def _log_unknown(lens: Any, media: Sequence[Medium]) -> None:
     """Say in one line which glasses have no dn/dT or no expansion."""
-    still, rigid = {}, {}
+    # Names in the order of the lens.
+    still: dict[str, None] = {}
+    rigid: dict[str, None] = {}
     for medium, given in zip(media[1:], lens.thermal_expansions, strict=True):
         glass = medium if isinstance(medium, Glass) else None
         if medium.name not in _EMPTY and (glass is None or glass.thermal is None):

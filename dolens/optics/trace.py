@@ -115,8 +115,8 @@ def meet(
     x = torch.addcmul(ray.x, to_plane, l).clamp(-limit, limit)
     y = torch.addcmul(ray.y, to_plane, m).clamp(-limit, limit)
     at_plane = PlaneRay(x, y, l, m, n)
-    t, met = shape.intersect(surface.parameters, at_plane, sense, surface.semi_diameter)
-    met = towards if met is None else torch.minimum(towards, met)
+    t, branch = shape.intersect(surface.parameters, at_plane, sense, surface.semi_diameter)
+    met = towards if branch is None else torch.minimum(towards, branch)
     t = t.clamp(-limit, limit)
     # What was held at the limit is not where the ray goes.
     across = torch.maximum(x.detach().abs(), y.detach().abs())
@@ -311,7 +311,10 @@ def traced_rays(traced: Trace, path_before: Tensor | None) -> TracedRays:
         traced: with path lengths.
         path_before: optical path (mm) before the trace began, or None.
     """
-    path = traced.path_length if path_before is None else traced.path_length + path_before
+    path = traced.path_length
+    assert path is not None  # as the argument says
+    if path_before is not None:
+        path = path + path_before
     status, surface = first_failure(traced)
     kept = [stop_gradient_where_invalid(c, traced.valid) for c in traced.ray]
     points = None

@@ -36,7 +36,6 @@ def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tenso
     lenses = ideal_lenses(system)
     if not lenses:
         return system
-    laws = [surface.deflection for surface in system.surfaces]
     index = system.signed_indices(wavelength)
     near = torch.as_tensor(near, dtype=system.dtype, device=system.device)
     one = torch.ones_like(near)
@@ -53,9 +52,9 @@ def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tenso
         focused = height == 0.0
         arriving = (reduced / torch.where(focused, one, height)).clamp(-_LARGEST, _LARGEST)
         arriving = torch.where(focused, torch.full_like(one, _LARGEST), arriving)
-        law = replace(
-            laws[i], parameters={**laws[i].parameters, "vergence": arriving.to(system.dtype)}
-        )
-        surfaces[i] = replace(surfaces[i], deflection=law)
+        law = surfaces[i].deflection
+        assert law is not None  # an ideal lens is a law
+        own = {**law.parameters, "vergence": arriving.to(system.dtype)}
+        surfaces[i] = replace(surfaces[i], deflection=replace(law, parameters=own))
     found = replace(system, surfaces=surfaces)
     return found.traced_by("reference") if near.numel() > 1 else found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dolens.optics.lens_views.conditions import looked_at, shown, title_of
+from dolens.optics.lens_views.conditions import as_lens, looked_at, shown, title_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ class OverFieldViews:
         from dolens.analysis.lateral_colour import chromatic_focal_shift, lateral_colour
         from dolens.plotting.lateral_colour import lateral_colour_figure
 
-        lines = spectral_lines(self) if wavelengths is None else wavelengths
+        lines = spectral_lines(as_lens(self)) if wavelengths is None else wavelengths
         lens, given = looked_at(self, 0.0, lines, object_distance, aperture)
         distance, waves = given.object_distance, given.wavelengths
         colour = [
@@ -137,7 +137,7 @@ class OverFieldViews:
         from dolens.diffraction.illumination import relative_illumination
         from dolens.plotting.illumination import illumination_figure
 
-        wavelength = wavelength or self.primary_wavelength
+        wavelength = wavelength or as_lens(self).primary_wavelength
         lens, given = looked_at(self, 0.0, wavelength, object_distance, aperture)
         distance = given.object_distance
         curves = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dolens.optics.lens_views.conditions import looked_at, shown, title_of
+from dolens.optics.lens_views.conditions import as_lens, looked_at, shown, title_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +37,7 @@ class WavefrontViews:
         from dolens.diffraction.wavefront_map import wavefront_maps
         from dolens.plotting.wavefront_maps import wavefront_maps_figure
 
-        waves = self.primary_wavelength if wavelengths is None else wavelengths
+        waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
         lens, given = looked_at(self, fields, waves, object_distance, aperture)
         maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
         return shown(wavefront_maps_figure(maps, title_of("Wavefront error", lens, given)))
@@ -66,7 +66,7 @@ class WavefrontViews:
         from dolens.diffraction.wavefront_map import wavefront_maps
         from dolens.plotting.wavefront_maps import zernike_figure
 
-        wavelength = wavelength or self.primary_wavelength
+        wavelength = wavelength or as_lens(self).primary_wavelength
         lens, given = looked_at(self, fields, wavelength, object_distance, aperture)
         maps = wavefront_maps(lens, given.fields, given.wavelengths, given.object_distance)
         title = title_of("Zernike coefficients", lens, given)
@@ -93,7 +93,7 @@ class WavefrontViews:
         from dolens.diffraction.strehl import strehl_ratios
         from dolens.plotting.strehl import strehl_figure
 
-        waves = self.primary_wavelength if wavelengths is None else wavelengths
+        waves = as_lens(self).primary_wavelength if wavelengths is None else wavelengths
         lens, given = looked_at(self, 0.0, waves, object_distance, aperture)
         distance = given.object_distance
         scans = [
@@ -122,7 +122,7 @@ class WavefrontViews:
         from dolens.analysis.footprint import footprint
         from dolens.plotting.footprint import footprint_figure
 
-        wavelength = wavelength or self.primary_wavelength
+        wavelength = wavelength or as_lens(self).primary_wavelength
         lens, given = looked_at(self, fields, wavelength, object_distance, aperture)
         found = footprint(lens, given.fields, wavelength, rays, given.object_distance)
         return shown(footprint_figure(found, title_of("Footprints", lens, given)))

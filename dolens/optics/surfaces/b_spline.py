@@ -54,7 +54,7 @@ def spline_sag(p: Parameters, x: Tensor, y: Tensor, second: bool = False) -> Spl
     row, row_x = (c * bx.value).sum(1), (c * bx.slope).sum(1)
     s = level + (row * by.value).sum(0)
     sx, sy = (row_x * by.value).sum(0), (row * by.slope).sum(0)
-    if not second:
+    if bx.second_derivative is None or by.second_derivative is None:
         return SplineSag(s, sx, sy)
     sxx = ((c * bx.second_derivative).sum(1) * by.value).sum(0)
     return SplineSag(s, sx, sy, sxx, (row_x * by.slope).sum(0), (row * by.second_derivative).sum(0))
@@ -91,7 +91,7 @@ class BSpline(Surface):
 
     def check_aperture(self) -> None:
         """Check that the knots fit the coefficients and that their rectangle holds the aperture."""
-        rows, columns = self.coefficients.shape
+        rows, columns = self.get_parameter("coefficients").shape
         extents = self.aperture.edge.extent
         for axis, count, extent in zip("xy", (columns, rows), extents, strict=True):
             knots = self.get_buffer(f"knots_{axis}").tolist()
@@ -127,8 +127,9 @@ class BSpline(Surface):
     def paraxial_curvature(cls, p: Parameters) -> Tensor | float:
         """Return (s_xx + s_yy)/2 at x = y = 0: the mean over azimuth."""
         zero = p["knots_x"].new_zeros(())
-        bent = spline_sag(p, zero, zero, second=True)
-        return 0.5 * (bent.sxx + bent.syy)
+        _, _, _, sxx, _, syy = spline_sag(p, zero, zero, second=True)
+        assert sxx is not None and syy is not None  # they were asked for
+        return 0.5 * (sxx + syy)
 
 
 def with_knots(parameters: Mapping[str, Any]) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class PackedShape(NamedTuple):
     """
 
     numbers: tuple[Tensor | None, ...]
-    count: int = 0
+    count: int = 0  # type: ignore[assignment]  # a tuple has a method of that name
     columns: int = 0
     degree: int = 0
     extras: tuple[int, ...] = ()
@@ -275,8 +275,8 @@ class Surface(nn.Module):
         ray = ray._replace(x=ray.x.masked_fill(far, 0.0), y=ray.y.masked_fill(far, 0.0))
         t = t - _newton_step(cls, p, ray, t).clamp(-scale, scale)
         if torch.is_grad_enabled():
-            step = _newton_step(cls, p, ray, t).clamp(-scale, scale)
-            t = t - (step - step.detach())
+            last = _newton_step(cls, p, ray, t).clamp(-scale, scale)
+            t = t - (last - last.detach())
         return t, margin.masked_fill(lost | far, -1.0)
 
     @classmethod

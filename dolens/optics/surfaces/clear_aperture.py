@@ -219,10 +219,10 @@ class ClearAperture:
     @property
     def rotational(self) -> bool:
         """Return whether it looks the same from every azimuth."""
-        obscured = self.obscuration is not None
-        if self.window is not None or (obscured and any(self.center)):
+        hole = self.obscuration
+        if self.window is not None or (hole is not None and any(self.center)):
             return False
-        return self.edge.rotational and (not obscured or self.obscuration.rotational)
+        return self.edge.rotational and (hole is None or hole.rotational)
 
     def figures(self) -> list[tuple[bool, Figures]]:
         """Return the figures of outlines that have no numbers of their own for the kernels: with

@@ -72,11 +72,12 @@ def _root(f: Tensor, g: Tensor, a: Tensor, sense: float) -> tuple[Tensor, Tensor
 
 def check_reach(surface: Surface) -> None:
     """Raise `InputError` where an aperture reaches beyond its surface's conic, (1+k)·c²·r² > 1."""
-    c = float(surface.curvature.detach())
+    curvature = surface.get_parameter("curvature")
+    c = float(curvature.detach())
     conic = getattr(surface, "conic", None)
     alpha = (1.0 + (0.0 if conic is None else float(conic.detach()))) * c * c
     # A whole hemisphere is allowed, and 1/R has rounded.
-    rounding = 4.0 * torch.finfo(surface.curvature.dtype).eps
+    rounding = 4.0 * torch.finfo(curvature.dtype).eps
     if alpha * surface.semi_diameter**2 > 1.0 + rounding:
         raise InputError(
             f"semi_diameter {surface.semi_diameter:g} mm exceeds the surface, which ends at "

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
-from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.base import PackedShape, Parameters
 from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import register_surface
@@ -88,7 +88,7 @@ class EvenAsphere(Conic):
     @classmethod
     def fourth_order_departure(cls, p: Parameters) -> Tensor | float:
         """Return k·c³/8 + a4, and (c³ - (c + 2·a2)³)/8 where there is an a2."""
-        departure = Conic.fourth_order_departure.__func__(cls, p) + p.get("a4", 0.0)
+        departure = super().fourth_order_departure(p) + p.get("a4", 0.0)
         if "a2" not in p:
             return departure
         return departure + (p["curvature"] ** 3 - cls.paraxial_curvature(p) ** 3) / 8.0
@@ -105,11 +105,11 @@ class EvenAsphere(Conic):
         cls, p: Parameters, ray: PlaneRay, sense: float, scale: float
     ) -> tuple[Tensor, Tensor | None]:
         """Find the ray intercept by Newton's iteration from the conic."""
-        return Surface.intersect.__func__(cls, p, ray, sense, scale)
+        return super(Conic, cls).intersect(p, ray, sense, scale)
 
     @classmethod
     def normal(
         cls, p: Parameters, x: Tensor, y: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the unit normal from the slopes."""
-        return Surface.normal.__func__(cls, p, x, y, z)
+        return super(Conic, cls).normal(p, x, y, z)

@@ -112,11 +112,12 @@ class Spider(Composite):
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Return how far inside an arm's sides and its end a point is, mm."""
-        found = None
+        found: Tensor | None = None
         for c, s in self.directions:
             along, across = c * x + s * y, c * y - s * x
             inside = torch.minimum(0.5 * self.width - across.abs(), along)
             found = inside if found is None else torch.maximum(found, inside)
+        assert found is not None  # there is an arm
         return found
 
     def share(self, covered: Covered, x: Tensor, y: Tensor) -> Tensor:

@@ -121,7 +121,8 @@ class Polygons(Composite):
 
     def margin(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the distance to the nearest side, mm: positive strictly inside."""
-        nearest, odd, on = None, torch.zeros_like(x, dtype=torch.bool), None
+        odd, on = torch.zeros_like(x, dtype=torch.bool), torch.zeros_like(x, dtype=torch.bool)
+        nearest = torch.full_like(x, math.inf)
         for (ax, ay), (bx, by) in self.sides:
             ex, ey = bx - ax, by - ay
             u, v = x - ax, y - ay
@@ -133,11 +134,11 @@ class Polygons(Composite):
             along = (ex * u + ey * v) / (ex * ex + ey * ey)
             within = ((x - ax) * (x - bx) <= 0.0) & ((y - ay) * (y - by) <= 0.0)
             here = (cross == 0.0) & within
-            on = here if on is None else on | here
+            on = on | here
             share = along.clamp(0.0, 1.0)
             p, q = u - share * ex, v - share * ey
             squared = torch.addcmul(p * p, q, q)
-            nearest = squared if nearest is None else torch.minimum(nearest, squared)
+            nearest = torch.minimum(nearest, squared)
         distance = nearest.clamp(min=torch.finfo(nearest.dtype).tiny).sqrt()
         return torch.where(odd, distance, -distance).masked_fill(on, 0.0)
 

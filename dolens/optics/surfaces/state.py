@@ -45,6 +45,7 @@ class SurfaceState:
         """Deflect rays at points (mm) of the surface by its law; see `Law.deflect`."""
         normal = self.shape.normal(self.parameters, *point)
         law = self.deflection
+        assert law is not None  # Snell's is not among them
         return law.law.deflect(law.parameters, point, direction, normal, media, travel)
 
     def double(self) -> "SurfaceState":

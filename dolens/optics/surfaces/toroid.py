@@ -40,7 +40,8 @@ class Toroid(Surface):
         share = torch.linspace(0.0, 1.0, 65).to(p["curvature_x"])
         x, y = (reach * share for reach in self.aperture.edge.extent)
         for along_x, along_y in ((x, torch.zeros_like(y)), (torch.zeros_like(x), y)):
-            if float(self.sag_and_gradient(p, along_x, along_y)[3].min()) < -rounding:
+            exists = self.sag_and_gradient(p, along_x, along_y)[3]
+            if exists is not None and float(exists.min()) < -rounding:
                 raise InputError(
                     f"the aperture, which reaches {self.semi_diameter:g} mm, exceeds the surface, "
                     "which ends where its curve in y does, or at the radius of rotation in x"
@@ -66,7 +67,7 @@ class Toroid(Surface):
         bent = cx * x * inverse
         sx = torch.where(on, bent, 2.0 * bent)
         across = torch.where(on, g * inverse, 1.0 + bent * bent)
-        margin = torch.minimum(exists, squared.detach())
+        margin = squared.detach() if exists is None else torch.minimum(exists, squared.detach())
         return sag, sx, df * across, torch.minimum(margin, (1.0 - cx * f).detach())
 
     @classmethod
