@@ -28,6 +28,6 @@ def cached_tensors(maxsize: int | None = None) -> Callable[[Callable[P, R]], Cal
             with torch.inference_mode(False), torch.no_grad():
                 return function(*args, **options)
 
-        return kept
+        return kept  # type: ignore[return-value]  # a wrapper takes what the function takes
 
     return decorate

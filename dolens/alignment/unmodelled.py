@@ -85,7 +85,8 @@ class Unmodelled:
             glass: ShiftedMedium(glass, self.index * share)
             for glass, share in zip(glasses, melts.tolist(), strict=True)
         }
-        found.materials = tuple(shifted.get(medium, medium) for medium in lens.materials)
+        media: list[Any] = [shifted.get(medium, medium) for medium in lens.materials]
+        found.materials = tuple(media)
         return found
 
 

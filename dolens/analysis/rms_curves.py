@@ -35,7 +35,7 @@ class RMSCurves:
 def rms_against_field(
     lens: Lens,
     wavelengths: Sequence[float] | Tensor,
-    field: Sequence[float] | None = None,
+    field: Sequence[float] | Tensor | None = None,
     count: int = 15,
     rays: int = 4000,
     object_distance: float | None = None,

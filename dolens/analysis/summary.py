@@ -1,9 +1,11 @@
 """A summary tells a lens's first-order data, Seidel sums and spot sizes at a glance."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from dolens.analysis.conditions import FieldPoints, conditions
 from dolens.analysis.first_order_numbers import FirstOrderNumbers, first_order_numbers
@@ -130,7 +132,7 @@ class LensSummary(FirstOrderNumbers):
 def lens_summary(
     lens: Lens,
     fields: FieldPoints | None = None,
-    wavelengths: list[float] | None = None,
+    wavelengths: Sequence[float] | Tensor | None = None,
     object_distance: float | None = None,
 ) -> LensSummary:
     """Summarise a lens.

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -14,7 +14,7 @@ from dolens.errors import InputError
 class PassedOn(TyperCommand):
     """A command that takes its arguments as they are: none of them is an option of its own."""
 
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Keep all arguments, in their order."""
         ctx.params["arguments"] = list(args)
         return []

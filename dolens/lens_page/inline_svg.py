@@ -4,6 +4,7 @@ import io
 import re
 from html import escape
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.collections import Collection
 from matplotlib.figure import Figure
@@ -58,9 +59,11 @@ def rasterise(figure: Figure) -> None:
         for artist in axes.get_children():
             if isinstance(artist, Line2D):
                 marked = artist.get_marker() not in (None, "None", "", " ")
-                dense = marked and len(artist.get_xdata(orig=False)) > _MANY
+                dense = marked and np.size(artist.get_xdata(orig=False)) > _MANY
             else:
-                dense = isinstance(artist, Collection) and len(artist.get_offsets()) > _MANY
+                dense = (
+                    isinstance(artist, Collection) and len(np.asarray(artist.get_offsets())) > _MANY
+                )
             if dense:
                 artist.set_rasterized(True)
 

@@ -134,6 +134,7 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
     """
     lens = copy.deepcopy(lens).requires_grad_(True)
     notes: list[str] = []
+    given: Mapping[str, Any]
     if str(source) == DEFAULT:
         _add_elements(lens)
         given, factor = _usual(lens, notes), 1.0
@@ -201,10 +202,10 @@ def _usual(lens: Lens, notes: list[str]) -> dict[str, Any]:
     for n, medium in enumerate(lens.materials[1:-1], 1):
         if is_glass(medium):
             given[f"thicknesses.{n}"] = length
-    for n, surface in lens.surfaces.items():
+    for key, surface in lens.surfaces.items():
         curvature = getattr(surface, "curvature", None)
         if curvature is not None and float(curvature.detach()) != 0.0:
-            given[f"surfaces.{n}.curvature"] = {"half_range": _CURVATURE, "relative": True}
+            given[f"surfaces.{key}.curvature"] = {"half_range": _CURVATURE, "relative": True}
     notes.append(
         f"Usual tolerances, uniform over ± the half-range: elements tilt by {_TILT:g}°, and are "
         f"decentred and shifted by {length:g} mm; glass thickness {length:g} mm; curvatures "

@@ -281,6 +281,7 @@ class PageSections:
             if dim and bool(bright.any()):
                 where = replace(where, fields=where.fields[bright])
                 problems.append(f"tolerances at {', '.join(dim)}: too little light passes")
+        assert self.tolerances is not None  # there is no such section without
         found = offenders(self.lens, where, self.tolerances)
         return Content(
             {"worst_offenders": found.figure()},

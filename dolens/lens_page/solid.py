@@ -112,6 +112,7 @@ def _turned(system: OpticalSystem, number: int, vectors: np.ndarray, moved: bool
     if axes.rotation is None:
         return vectors + (np.array([0.0, 0.0, float(axes.z)]) if moved else 0.0)
     turned = vectors @ axes.rotation.double().numpy().T
+    assert axes.origin is not None  # as there is a rotation
     return turned + axes.origin.double().numpy() if moved else turned
 
 
@@ -310,6 +311,7 @@ def _beams(lens: Lens, where: Conditions, which: Sequence[int]) -> list[list[np.
     end = hit.components()
     end = to_lens_axes(end._replace(z=end.z - system.vertices[-1]), system.all_axes[-1])
     met = [number - 1 for number in system.met]
+    assert hit.points is not None  # they were recorded
     # (fields, rays, surfaces and sensor, 3)
     points = torch.cat([hit.points[met], torch.stack(end[:3], -1)[None]]).movedim(0, 2)
     passing = hit.valid & aimed.converged

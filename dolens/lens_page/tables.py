@@ -1,6 +1,7 @@
 """The tables of a lens: its prescription, first-order data, Seidel sums and spot radii."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -39,7 +40,7 @@ class Table:
     """
 
     heads: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
     caption: str = ""
     words: frozenset[int] = frozenset({0})
     total: bool = False

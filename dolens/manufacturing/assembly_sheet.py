@@ -81,7 +81,7 @@ def surface_table(
 ) -> list[tuple[str, ...]]:
     """Return a row of text for every surface: number, element, radius, aperture, gap, medium."""
     system = lens.system().double()
-    rows = []
+    rows: list[tuple[str, ...]] = []
     count = len(lens.surfaces)
     for number in range(1, count + 1):
         face = face_of(system, number)
@@ -136,8 +136,7 @@ def _draw(
     last = -math.inf
     highest = max(*tops, _draw_stop(axes, lens, middle, unit))
     for element, outline, top in zip(elements, outlines, tops, strict=True):
-        patch = {"facecolor": "#EAF2F7", "edgecolor": INK, "lw": 0.8, "zorder": 1}
-        axes.add_patch(Polygon(outline, **patch))
+        axes.add_patch(Polygon(outline, facecolor="#EAF2F7", edgecolor=INK, lw=0.8, zorder=1))
         # Labels of neighbours that are close go up in steps, so that none covers another.
         centre = float(outline[:, 0].mean())
         raised = centre - last < 7.0 * unit
@@ -188,17 +187,21 @@ def _draw_stop(axes: Axes, lens: Lens, middle: np.ndarray, unit: float) -> float
 def _notes(figure: Figure, lens: Lens, tolerances: ShopTolerances, continues: bool) -> None:
     line = lens.primary_wavelength
     order = lens.first_order(line, lens.object_distance)
-    near = lens.object_distance is not None and math.isfinite(lens.object_distance)
+    distance = lens.object_distance
+    where = "at infinity"
+    if distance is not None and math.isfinite(distance):
+        where = f"{length(distance)} mm before S1"
     lines = [
         ("At the design wavelength", f"{line:g} nm"),
         ("Focal length", f"{length(float(order.efl.detach()), 3, 3)} mm"),
         ("Back focal distance", f"{length(float(order.bfd.detach()), 3, 3)} mm"),
         ("F-number", f"{float(order.f_number.detach()):.3f}"),
-        ("Object", f"{length(lens.object_distance)} mm before S1" if near else "at infinity"),
+        ("Object", where),
         ("Sensor behind last surface", f"{length(float(lens.sensor_distance.detach()))} mm"),
     ]
-    if lens.sensor_curvature is not None and float(lens.sensor_curvature.detach()):
-        radius = 1.0 / float(lens.sensor_curvature.detach())
+    curvature = 0.0 if lens.sensor_curvature is None else float(lens.sensor_curvature.detach())
+    if curvature != 0.0:
+        radius = 1.0 / curvature
         lines.append(("Radius of the sensor", f"{length(radius)} mm"))
     if lens.sensor_diameter:
         lines.append(("Image circle", f"Ø {length(lens.sensor_diameter)} mm"))

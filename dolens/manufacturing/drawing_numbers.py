@@ -234,7 +234,8 @@ def sag_rows(face: Face, count: int = 13) -> list[tuple[str, str, str]]:
     The distances r are round numbers, about `count` of them, and the aperture's edge.
     """
     edge = face.semi_diameter
-    steps = MaxNLocator(count - 1, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, edge)
+    ticks = MaxNLocator(count - 1, steps=[1, 2, 2.5, 5, 10]).tick_values(0.0, edge)
+    steps = np.asarray(ticks)
     steps = steps[steps >= 0.0]
     r = np.append(steps[steps < edge - 0.2 * (steps[1] - steps[0])], edge)
     sag, slope, _, _ = face.sag_and_slopes(r, np.zeros_like(r))

@@ -97,7 +97,7 @@ def drawing_axes(
     paper = [box[2] * SIZE[0] * MM_PER_INCH, box[3] * SIZE[1] * MM_PER_INCH]
     largest = min(paper[0] / width, paper[1] / height)
     scale = max(s for s in _all_scales() if s <= largest * (1.0 + 1e-9))
-    axes = figure.add_axes(tuple(box))
+    axes = figure.add_axes((box[0], box[1], box[2], box[3]))
     half = [0.5 * side / scale for side in paper]
     axes.set(xlim=(-half[0], half[0]), ylim=(-half[1], half[1]), aspect="equal")
     axes.axis("off")
@@ -154,10 +154,10 @@ def dimension(
     if small:
         low, high = sorted((first[0], last[0]))
         for tip, tail in ((low, low - 6.0 * unit), (high, high + 6.0 * unit)):
-            ends = [(tip, level), (tail, level)]
-            ends = [p if not upright else p[::-1] for p in ends]
+            tips = [(tip, level), (tail, level)]
+            head, foot = [p if not upright else p[::-1] for p in tips]
             inward = {**arrow, "arrowstyle": "-|>"}
-            axes.annotate("", ends[0], ends[1], arrowprops=inward, zorder=3)
+            axes.annotate("", head, foot, arrowprops=inward, zorder=3)
     middle = 0.5 * (first[0] + last[0])
     shift = level + (1.0 if after else -1.0) * 1.7 * unit
     place = (middle, shift) if not upright else (shift, middle)
@@ -177,7 +177,7 @@ def table(
     name_share: float = 0.27,
 ) -> None:
     """Draw columns of named rows, each under its heading, in a box of the sheet."""
-    axes = figure.add_axes(tuple(box))
+    axes = figure.add_axes((box[0], box[1], box[2], box[3]))
     axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
     axes.axis("off")
     most = max(len(rows) for _, rows in columns) + 1
@@ -228,7 +228,7 @@ def grid_table(
 
     Columns are of equal widths, or of given shares of the box.
     """
-    axes = figure.add_axes(tuple(box))
+    axes = figure.add_axes((box[0], box[1], box[2], box[3]))
     axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
     axes.axis("off")
     height = box[3] * SIZE[1] * 72.0
@@ -273,7 +273,8 @@ def draw_formula(figure: Figure, place: tuple[float, float], formula: str, size:
     outline = TextPath((0.0, 0.0), formula, size=size)
     extents = outline.get_extents()
     centred = Affine2D().translate(-extents.x0, -0.5 * (extents.y0 + extents.y1)).scale(1.0 / 72.0)
-    placed = centred + figure.dpi_scale_trans + ScaledTranslation(*place, figure.transFigure)
+    placed = centred + figure.dpi_scale_trans
+    placed += ScaledTranslation(*place, figure.transFigure)  # type: ignore[arg-type]  # any
     figure.add_artist(PathPatch(outline, transform=placed, facecolor=INK, linewidth=0.0))
 
 

@@ -154,9 +154,9 @@ def _draw_section(
     dimension(axes, (-middle[0], zero), (z, zero), low[1] - 6.0 * unit, centre, False, False)
     top = points[np.abs(points[:, 1] - edge) < 1e-9 * (1.0 + abs(edge))]
     if not element.conical_edge and len(top) > 1:
-        ends = [(float(pick(top[:, 0])), edge) for pick in (np.min, np.max)]
+        first, last = (float(top[:, 0].min()), edge), (float(top[:, 0].max()), edge)
         text = f"({length(element.edge_thickness, 3, 3)})"
-        dimension(axes, *ends, high[1] + 6.0 * unit, text, False, True)
+        dimension(axes, first, last, high[1] + 6.0 * unit, text, False, True)
 
 
 def _side_panel(figure: Figure, element: GlassElement, tolerances: ShopTolerances) -> None:
@@ -206,12 +206,12 @@ def _sag_table(
     figure: Figure, face: Face, box: tuple[float, float, float, float], small: bool
 ) -> None:
     if face.shape.rotational:
-        rows = sag_rows(face, 9 if small else 13)
+        radial = sag_rows(face, 9 if small else 13)
         heading = ("r (mm)", "sag z (mm)", "slope (°)")
-        grid_table(figure, box, f"Sag of S{face.number}, z towards the right", [heading, *rows])
+        grid_table(figure, box, f"Sag of S{face.number}, z towards the right", [heading, *radial])
         return
     x, y, sag = sag_grid(face, 5 if small else 7)
-    rows = [("y \\ x", *(number(value, 3) for value in x))]
+    rows: list[tuple[str, ...]] = [("y \\ x", *(number(value, 3) for value in x))]
     for value, line in zip(y[::-1], sag[::-1], strict=True):
         numbers = ("" if np.isnan(z) else number(z, 6) for z in line)
         rows.append((number(value, 3), *numbers))

@@ -61,8 +61,7 @@ def tensor_spline(face: Face, reach: float, used: float, tolerance: float) -> Te
         InputError: no spline of reasonable size comes within the tolerance.
     """
     if issubclass(face.shape, BSpline):
-        knots = (_own_knots(face, axis, reach) for axis in "xy")
-        return _collocated(face, *knots)
+        return _collocated(face, _own_knots(face, "x", reach), _own_knots(face, "y", reach))
     spans = _FIRST_SPANS
     while spans <= _MOST_SPANS:
         inner = np.linspace(-reach, reach, spans + 1)

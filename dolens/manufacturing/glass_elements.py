@@ -267,6 +267,7 @@ def face_of(system: OpticalSystem, number: int) -> Face:
     if axes.rotation is None:
         rotation, origin = np.eye(3), np.array([0.0, 0.0, float(torch.as_tensor(axes.z).detach())])
     else:
+        assert axes.origin is not None  # as there is a rotation
         rotation = axes.rotation.detach().double().cpu().numpy()
         origin = axes.origin.detach().double().cpu().numpy()
     parameters = {name: p.detach().double().cpu() for name, p in surface.parameters.items()}

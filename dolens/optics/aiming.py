@@ -17,7 +17,7 @@ the implicit function's derivative.
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -245,7 +245,8 @@ def _evaluate(problem: _Problem, q: Tensor, t: Tensor) -> _Evaluation:
         return _miss(system, wavelength, near, turned, t[..., None] * target, q)
 
     copies = (q.expand(2, *q.shape).contiguous(), t.expand(2, *t.shape).contiguous())
-    residual, pull_back, reached = torch.func.vjp(miss, *copies, has_aux=True)
+    found: Any = torch.func.vjp(miss, *copies, has_aux=True)
+    residual, pull_back, reached = found
     # Of the first copy the x is derived, of the second the y.
     component = torch.eye(2, dtype=q.dtype, device=q.device).reshape(2, *(1,) * t.ndim, 2)
     of_q, of_t = pull_back(component.expand(residual.shape))

@@ -19,6 +19,7 @@ from dolens.optics.elements import (
     carriers,
     rotation_matrix,
 )
+from dolens.optics.surfaces.coordinate_break import CoordinateBreak
 from dolens.optics.surfaces.state import SurfaceState
 
 
@@ -85,7 +86,7 @@ def _designed(surfaces: Sequence[SurfaceState], gaps: Sequence[Tensor]) -> list[
     rotation = torch.eye(3, dtype=torch.float64, device=like.device)
     places = []
     for surface, gap in zip(surfaces, gaps, strict=True):
-        if surface.shape.changes_axes:
+        if issubclass(surface.shape, CoordinateBreak):
             shift, turn = surface.shape.motion(surface.parameters)
             origin, rotation = origin + rotation @ shift, rotation @ turn
         places.append(_Place(origin, rotation))

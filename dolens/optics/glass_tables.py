@@ -7,6 +7,7 @@ D0 D1 D2 E0 E1 λtk and the reference temperature (see `dolens.optics.thermal`),
 """
 
 import csv
+import io
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -62,8 +63,8 @@ def table(maker: str) -> dict[str, dict[str, str]]:
     if maker not in MAKERS + FURTHER:
         raise InputError(f"no maker '{maker}' (allowed: {', '.join(MAKERS + FURTHER)})")
     file = resources.files("dolens.optics").joinpath("glass_data", f"{maker.lower()}.csv")
-    with file.open(encoding="ascii", newline="") as text:
-        return {row["name"].upper(): row for row in csv.DictReader(text)}
+    rows = csv.DictReader(io.StringIO(file.read_text(encoding="ascii"), newline=""))
+    return {row["name"].upper(): row for row in rows}
 
 
 def table_glass(maker: str, key: str) -> Glass:

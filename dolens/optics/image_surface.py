@@ -50,13 +50,13 @@ def image_surface(lens: nn.Module, values: dict[str, Tensor]) -> SurfaceState | 
         lens: holds the parameters.
         values: name → tensor used in the place of the stored one; what is used is taken out.
     """
-    stored = lens._parameters
-    if stored[CURVATURE] is None:
+    own_curvature, own_conic = lens._parameters[CURVATURE], lens._parameters[CONIC]
+    if own_curvature is None:
         return None
-    curvature = values.pop(CURVATURE, stored[CURVATURE])
-    if stored[CONIC] is None:
+    curvature = values.pop(CURVATURE, own_curvature)
+    if own_conic is None:
         return SurfaceState(Sphere, {"curvature": curvature}, WITHOUT_EDGE)
-    conic = values.pop(CONIC, stored[CONIC])
+    conic = values.pop(CONIC, own_conic)
     return SurfaceState(Conic, {"curvature": curvature, "conic": conic}, WITHOUT_EDGE)
 
 

@@ -70,6 +70,9 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         sensor_conic: conic constant of a curved sensor; None: a sphere.
     """
 
+    sensor_curvature: nn.Parameter | None
+    sensor_conic: nn.Parameter | None
+
     def __init__(
         self,
         surfaces: Sequence[Surface],
@@ -137,12 +140,12 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.reversals = reversals(self.system(), self.primary_wavelength)
 
     @property
-    def dtype(self) -> torch.dtype:
+    def dtype(self) -> torch.dtype:  # type: ignore[override]
         """The precision of the parameters and of traced rays."""
         return self.sensor_distance.dtype
 
     @property
-    def device(self) -> torch.device:
+    def device(self) -> torch.device:  # type: ignore[override]
         """The device that the parameters live on."""
         return self.sensor_distance.device
 

@@ -100,7 +100,8 @@ class InStates:
     @property
     def state_names(self) -> tuple[str, ...]:
         """Return the names of the states in their order; none of a lens without states."""
-        return tuple(self.states)
+        states: LensStates = getattr(self, "states")  # noqa: B009 - of the lens
+        return tuple(states)
 
     def in_state(self, name: str | None) -> Self:
         """Return this lens in one of its states.
@@ -135,7 +136,7 @@ def in_state(lens: Any, name: str) -> Any:
     found, data = overlaid(lens, name), lens.states[name].data
     if data.temperature is None and data.pressure is None:
         return found
-    heated = lens_at(found, state_temperature(lens, name), data.pressure)
+    heated = lens_at(found, _temperature(lens, data), data.pressure)
     return heated.requires_grad_(False)
 
 
@@ -208,7 +209,7 @@ def values_there(lens: Any, name: str | None, values: Mapping[str, Tensor]) -> d
     """
     there = values_in_state(lens, name, values)
     temperature = state_temperature(lens, name)
-    if temperature is None:
+    if name is None or temperature is None:
         return there
     cold = overlaid(lens, name)
     stored = {base: parameter.detach() for base, parameter in cold.named_parameters()}

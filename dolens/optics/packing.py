@@ -256,7 +256,7 @@ def _indices(
         wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)
         one = torch.ones_like(wavelength)
         found = {medium: medium.index(wavelength) * one for medium in set(used)}
-        last = [per_radian(wavelength, wavelength)] if waves else []
+        last = [torch.as_tensor(per_radian(wavelength, wavelength))] if waves else []
         return torch.stack([*(found[medium] for medium in used), *last])
     several = (wavelength,) if isinstance(wavelength, (int, float)) else tuple(wavelength)
     return tensor(_index_rows(used, several, waves), np.float64).to(device)

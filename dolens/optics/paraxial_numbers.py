@@ -34,14 +34,14 @@ class ParaxialNumbers:
             coefficient of the wavelength (1/(mm nm)); None where none adds any.
     """
 
-    curvatures: tuple[float | Tensor, ...]
-    thicknesses: tuple[float | Tensor, ...]
-    sensor_distance: float | Tensor
+    curvatures: tuple[Number, ...]
+    thicknesses: tuple[Number, ...]
+    sensor_distance: Number
     materials: tuple[Medium, ...]
     stop: int
-    stop_radius: float | Tensor
+    stop_radius: Number
     senses: tuple[float, ...]
-    powers: tuple[tuple[float | Tensor, float | Tensor], ...] | None = None
+    powers: tuple[tuple[Number, Number], ...] | None = None
 
     @classmethod
     @torch.no_grad()
@@ -88,11 +88,11 @@ class ParaxialNumbers:
         )
 
     @property
-    def length(self) -> float | Tensor:
+    def length(self) -> Number:
         """From the first vertex to the last, mm."""
         return sum(self.thicknesses)
 
-    def exit_pupil(self, wavelength: float) -> tuple[float | Tensor, float | Tensor]:
+    def exit_pupil(self, wavelength: float) -> tuple[Number, Number]:
         """z from the first vertex and diameter, mm; both infinite where it lies at infinity."""
         _, b, _, d = self._unit_rays_behind(wavelength, self.stop, len(self.curvatures))
         if d == 0.0:
@@ -100,7 +100,7 @@ class ParaxialNumbers:
         image_index = self._index(-1, wavelength)
         return self.length - b * image_index / d, 2.0 * self.stop_radius / abs(d)
 
-    def chief_ray_magnification(self, wavelength: float, depth: float) -> float | Tensor:
+    def chief_ray_magnification(self, wavelength: float, depth: float) -> Number:
         """Height on the sensor over height on an object at a depth in mm, by the chief ray."""
         before, behind = self._index(0, wavelength), self._index(-1, wavelength)
         a, b, _, _ = self._unit_rays_at_stop(wavelength)
@@ -136,11 +136,11 @@ class ParaxialNumbers:
         return self.senses[medium] * float(self.materials[medium].index(wavelength))
 
 
-def _powers(system: OpticalSystem) -> list[float | Tensor]:
+def _powers(system: OpticalSystem) -> list[Number]:
     """Return constant and coefficient of every surface's added power; nothing without any."""
     if not deflects(system.surfaces):
         return []
-    found: list[float | Tensor] = []
+    found: list[Number] = []
     for surface in system.surfaces:
         law = surface.deflection
         found += (0.0, 0.0) if law is None else law.law.paraxial_power(law.parameters)

@@ -98,7 +98,7 @@ def paraxial_rays(
 
 
 def _ray(
-    heights: Sequence[Tensor], reduced: Sequence[Tensor], indices: Sequence[float | Tensor]
+    heights: list[Tensor], reduced: list[Tensor], indices: Sequence[float | Tensor]
 ) -> ParaxialRay:
     """A ray from its heights and from its reduced slopes before and behind all surfaces."""
     slopes = torch.stack([nu / n for nu, n in zip(reduced, indices, strict=True)])

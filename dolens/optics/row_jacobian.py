@@ -98,7 +98,7 @@ def forward_columns(
         return value, value.new_zeros(*value.shape, len(point))
 
     def sweep(direction: Tensor) -> tuple[Tensor, Tensor]:
-        value, columns = jvp(function, (point,), (direction,))
+        value, columns, *_ = jvp(function, (point,), (direction,))
         return value, columns
 
     # The value is the same for all directions.

@@ -108,7 +108,7 @@ def seidel(
     asphere = 8.0 * departure * (n_after - n) * h
     if deflects(system.surfaces):
         power, shorter, longer = (
-            _vector(powers_of(system, nm), system) for nm in (wavelength, *color)
+            _vector(powers_of(system, nm) or (), system) for nm in (wavelength, *color)
         )
         fourth = _vector(_fourth_order_paths(system, wavelength), system)
         asphere = asphere - (8.0 * fourth + c * c * power) * h

@@ -80,7 +80,8 @@ def fitted_semi_diameters(
     """
     opened = without_edges(lens)
     rays = Rays(spots.rays.position, spots.rays.direction, spots.rays.wavelength)
-    hit = opened.trace(rays, record=True)
+    points = opened.trace(rays, record=True).points
+    assert points is not None  # they were recorded
     axes = lens.system().axes
     square = spots.fields.square().sum(-1)
     nearest = (square == square.min()).to(spots.spot.device)[spots.spot]
@@ -89,7 +90,7 @@ def fitted_semi_diameters(
         aperture = surface.aperture
         if not isinstance(aperture.edge, Circle | Unlimited) or aperture.obscuration is not None:
             continue
-        x, y, z = hit.points[place].unbind(-1)
+        x, y, z = points[place].unbind(-1)
         local = from_lens_axes(Components(x, y, z, x, y, z), axes[place])
         heights = torch.hypot(local.x, local.y)
         if place + 1 == lens.stop:

@@ -34,7 +34,7 @@ def by_number_of_variables(
     """
     if max_variables < 0:
         raise InputError(f"optimizer.max_variables: {max_variables}; allowed: 0 or more variables")
-    given = list(params)
+    given: list[Any] = list(params)
     tensors = [
         tensor
         for entry in given

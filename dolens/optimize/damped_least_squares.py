@@ -163,7 +163,9 @@ class DampedLeastSquares(torch.optim.Optimizer):
     # ---------------------------------------------------------------- one iteration
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Tensor | Residuals]) -> Tensor:
+    def step(  # type: ignore[override]  # a closure of residuals is needed
+        self, closure: Callable[[], Tensor | Residuals]
+    ) -> Tensor:
         """Make one iteration: compute a Jacobian, and try steps until one of them is better.
 
         Args:

@@ -26,7 +26,10 @@ _EVERY = f"{STATES}.*."
 class Dependent(Protocol):
     """Computes a parameter from the others."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Return the name of the parameter."""
+        ...
 
     def value(self, lens: Lens, values: Mapping[str, Tensor]) -> Tensor:
         """Return the parameter's value, from the lens and the values that are known so far, by

@@ -263,14 +263,16 @@ class ImageQuality(ABC):
         of the middle wavelength.
         """
         spots = self.spots
+        own = spots.chief
+        assert own is not None  # the reference is the chief ray
         if self.reference_spectrum == "monochromatic":
-            return spots.chief[spots.spot]
-        group_of_spot = torch.zeros_like(spots.chief)
+            return own[spots.spot]
+        group_of_spot = torch.zeros_like(own)
         group_of_spot[spots.spot] = self.group
         waves = spots.wavelengths.unique()
         middle = spots.wavelengths == waves[len(waves) // 2]
-        chief = torch.zeros_like(spots.chief)
-        chief[group_of_spot[middle]] = spots.chief[middle]
+        chief = torch.zeros_like(own)
+        chief[group_of_spot[middle]] = own[middle]
         return chief[self.group]
 
     def _mean_squares(self, deviations: Tensor) -> Tensor:

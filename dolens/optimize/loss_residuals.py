@@ -131,5 +131,6 @@ class LossResiduals(RayInterceptQuality):
         return gradient.detach(), product
 
     def _loss(self, deviations: Tensor) -> Tensor:
+        assert self.intercept_loss is not None  # it was checked
         groups = RayGroups(self.group_shares, self.group, self.group_weights)
         return self.intercept_loss(deviations, groups)

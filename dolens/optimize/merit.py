@@ -22,7 +22,10 @@ from dolens.optimize.operands import Operand, UnreachableField
 class Variables(Protocol):
     """Gives parameters of a lens as functions of the variables u; see `DesignVariables`."""
 
-    best_focus: bool
+    @property
+    def best_focus(self) -> bool:
+        """Return whether the sensor stands at the best focus of the rays."""
+        ...
 
     @property
     def scaled(self) -> Tensor:
@@ -114,7 +117,7 @@ class MeritValue:
                     self._slopes = merit.quality.slopes(self.quality)
                     shift = merit.quality.best_focus(self.quality, self._slopes)
                     self.quality = merit.quality.refocused(self.quality, self._slopes, shift)
-                    merit.lens.sensor_distance += shift
+                    merit.lens.sensor_distance.add_(shift)
             self.sensor_distance = float(merit.lens.sensor_distance)
         # With their graph at once: nearly every point that is tried is where the next step begins.
         self._sensor = merit.lens.sensor_distance.detach().clone().requires_grad_()
@@ -143,8 +146,8 @@ class MeritValue:
         """Return the merit; `inf` where rays fail or a chief ray cannot be found."""
         if self.operands is None:
             return math.inf
-        total = sum((item.weight * item.deviation) ** 2 for item in self.operands)
-        if self.quality is not None:
+        total: float = sum((item.weight * item.deviation) ** 2 for item in self.operands)
+        if self.quality is not None and self._merit.quality is not None:
             if not self._merit.quality.is_usable(self.quality):
                 return math.inf
             total += self.quality.merit
@@ -170,8 +173,9 @@ class MeritValue:
 
     def linear_model(self) -> LinearModel:
         """Return R and b in the variables u."""
-        merit, models = self._merit, []
-        if merit.quality is not None:
+        merit = self._merit
+        models: list[LinearModel] = []
+        if merit.quality is not None and self.quality is not None:
             names, matrix = merit.variables.derivatives()
             if names:
                 model, of_lens = merit.quality.linear_model(merit.opened, names, self._slopes)
@@ -179,9 +183,9 @@ class MeritValue:
                 self._focus = None if of_lens is None else of_lens @ matrix
             else:
                 models.append(LinearModel.constant(self.quality.merit, matrix.shape[1]))
-        if self.operands:
-            model = OperandModel.of(self._found, self.operand_derivatives())
-            models.append(model.near(model.values.new_zeros(model.derivatives.shape[1])))
+        if self._found is not None and self.operands:
+            rows = OperandModel.of(self._found, self.operand_derivatives())
+            models.append(rows.near(rows.values.new_zeros(rows.derivatives.shape[1])))
         return LinearModel.join(models)
 
     def operand_derivatives(self) -> Tensor:

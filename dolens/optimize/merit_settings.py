@@ -182,9 +182,10 @@ class MeritSettings:
         """Return the rays' term over rays that pass the lens as it is now; None without one."""
         if self.quality is None:
             return None
-        own_loss = self.quality if callable(self.quality) else None
+        own_loss = None if isinstance(self.quality, str) else self.quality
+        name = self.quality if isinstance(self.quality, str) else ""
         if own_loss is None:
-            check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
+            check_choice(name, (*RESIDUALS, *LOSSES), "merit.quality")
         rays = self.rays(lens)
         common = (
             rays,
@@ -194,11 +195,11 @@ class MeritSettings:
             self.max_vignetting,
         )
         options, where = _given(self.quality_options), "merit.quality_options"
-        if own_loss is None and self.quality in RESIDUALS:
-            return call_with_settings(RESIDUALS[self.quality], options, where, *common)
+        if own_loss is None and name in RESIDUALS:
+            return call_with_settings(RESIDUALS[name], options, where, *common)
         curvature = options.pop("curvature", "directions")
         if own_loss is None:
-            loss = call_with_settings(LOSSES[self.quality], options, where)
+            loss = call_with_settings(LOSSES[name], options, where)
             return LossResiduals(*common, loss, curvature)
         check_keys(options, ("curvature",), where)
         return LossResiduals(*common, own_loss, curvature)

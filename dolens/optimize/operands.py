@@ -136,7 +136,7 @@ class Operand:
         limits = self.min is not None or self.max is not None
         if limits == (self.target is not None):
             raise InputError(f"{where}: give a target, or limits (min, max), one of the two")
-        if None not in (self.min, self.max) and self.min > self.max:
+        if self.min is not None and self.max is not None and self.min > self.max:
             raise InputError(f"{where}: min exceeds max")
         if not self.weight > 0.0:
             raise InputError(f"{where}: weight must be positive, not {self.weight:g}")
@@ -153,7 +153,7 @@ class Operand:
             return value - self.target
         below = 0.0 if self.min is None else (value - self.min).clamp(max=0.0)
         above = 0.0 if self.max is None else (value - self.max).clamp(min=0.0)
-        return below + above
+        return torch.as_tensor(below + above)
 
 
 def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
@@ -170,7 +170,7 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     """
     if isinstance(settings, Operand):
         return settings
-    kind = settings.get("kind")
+    kind = str(settings.get("kind"))
     check_choice(kind, KINDS, "operand: kind")
     check_keys(settings, _KEYS, f"operand '{kind}'")
     target, low, high = (
@@ -178,7 +178,9 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
         for key in ("target", "min", "max")
     )
     weight = _number(settings.get("weight", 1.0), f"{kind}: weight")
-    field = tuple(_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0))
+    field = [_number(v, f"{kind}: field") for v in settings.get("field") or (0.0, 0.0)]
+    if len(field) != 2:
+        raise InputError(f"operand '{kind}': field is x and y, not {field}")
     gaps, count = settings.get("gaps"), len(lens.thicknesses)
     if gaps is not None:
         gaps = tuple(int(gap) for gap in gaps)
@@ -190,10 +192,10 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
         states = (states,) if isinstance(states, str) else tuple(map(str, states))
         for state in states:
             check_state(lens, state)
-    return Operand(kind, target, low, high, weight, field, gaps, states)
+    return Operand(kind, target, low, high, weight, (field[0], field[1]), gaps, states)
 
 
-def _number(value: object, what: str) -> float:
+def _number(value: Any, what: str) -> float:
     try:
         return float(value)
     except (TypeError, ValueError):

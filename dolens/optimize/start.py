@@ -53,7 +53,7 @@ def start_values(
 
 
 def _numbers(pattern: str, change: object) -> dict[str, float]:
-    given = dict(change) if isinstance(change, Mapping) else {"value": change}
+    given: dict[str, Any] = dict(change) if isinstance(change, Mapping) else {"value": change}
     if isinstance(change, Mapping):
         check_keys(change, _KEYS, f"start '{pattern}'")
     for key, value in given.items():

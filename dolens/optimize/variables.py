@@ -67,7 +67,8 @@ class DesignVariables(nn.Module):
         self.names: list[str] = []
         # In a tuple, so that the lens's parameters are not this module's too.
         self._of = (lens,)
-        self._others = frozenset(others or ())
+        further = dict(others or {})
+        self._others = frozenset(further)
         self._shapes: list[torch.Size] = []
         variables = of_each_state(variables, lens.state_names)
         self.dependents, self.focused = _dependents(lens, variables)
@@ -78,7 +79,7 @@ class DesignVariables(nn.Module):
             if pattern in following:
                 continue
             check_keys(settings, _KEYS, f"variable '{pattern}'")
-            found = {pattern: others[pattern]} if pattern in self._others else None
+            found = {pattern: further[pattern]} if pattern in further else None
             for name, parameter in (found or lens.variables([pattern])).items():
                 if name in following:
                     continue

@@ -85,7 +85,7 @@ class WavefrontResiduals(ImageQuality):
 
     def _index(self, lens: Lens) -> Tensor:
         """Return the index n' (N,) before the sensor."""
-        return lens.system().materials[-1].index(self._wavelengths)
+        return torch.as_tensor(lens.system().materials[-1].index(self._wavelengths))
 
     def _path_before(self, lens: Lens) -> Tensor:
         """Return the path (N,), mm, from the object's wavefront to where the rays begin."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -79,7 +80,7 @@ def coding_gain_figure(
         log_ticks(axes.xaxis)
         axes.set_title(f"({letter})", loc="left", fontsize=SMALL + 1, fontweight="bold")
     grid[0, 0].set_ylabel("gain at the worst depth (dB)", fontsize=SMALL)
-    handles = {}
+    handles: dict[str, Any] = {}
     for axes in grid[0]:
         handles |= {label: h for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if handles:

@@ -80,10 +80,10 @@ def comparison_figure(
         for column, (image, label) in enumerate(zip(stack, labels, strict=True)):
             axes = figure.add_subplot(grid[row, column + beside])
             _show(axes, image)
-            known = psnr is not None and name in psnr
-            quality = f": {float(psnr[name][column]):.1f} dB" if known else ""
-            heading = f"{label}\n" if row == 0 else ""
-            axes.set_title(f"{heading}{name}{quality}", fontsize=SMALL)
+            of_this = None if psnr is None else psnr.get(name)
+            said = "" if of_this is None else f": {float(of_this[column]):.1f} dB"
+            above = f"{label}\n" if row == 0 else ""
+            axes.set_title(f"{above}{name}{said}", fontsize=SMALL)
     draw_title(figure, title, TITLE - 1)
     return figure
 

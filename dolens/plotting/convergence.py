@@ -81,7 +81,7 @@ def convergence_figure(
         axes.legend(frameon=False, fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axes in grid:
         ruled_axes(axes)
-    _part(grid, stages)
+    _part(list(grid), stages)
     grid[-1].set_xlabel("iteration", fontsize=SMALL + 1)
     grid[-1].xaxis.set_major_locator(MaxNLocator(integer=True, steps=(1, 2, 5, 10), min_n_ticks=1))
     grid[-1].set_xlim(0.5, count + 0.5)

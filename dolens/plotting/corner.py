@@ -91,7 +91,7 @@ def corner_figure(
 
     cell = min(_CELL, (PAGE - _BESIDE) / count)
     figure = Figure(figsize=(cell * count + _BESIDE, cell * count + _BELOW), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
+    figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
     grid = figure.subplots(count, count, squeeze=False)
     scaled_covariance = (matrix * torch.outer(factor, factor)).numpy()
     correlations = (matrix / torch.outer(sigma, sigma)).numpy()

@@ -1,6 +1,7 @@
 """Encircled energy is plotted against the radius."""
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -46,18 +47,21 @@ def encircled_energy_figure(
                 label += " (no light passes)" if dark else " (rays alone)"
             # Rays alone are drawn once.
             if solid or not alone:
-                style = {"linestyle": "-" if solid else "--", "linewidth": 1.6 if solid else 1.1}
-                axes.plot(curves.radii_um, line, color=colour, gid="energy", zorder=3, **style)
+                own: dict[str, Any] = {
+                    "linestyle": "-" if solid else "--",
+                    "linewidth": 1.6 if solid else 1.1,
+                }
+                axes.plot(curves.radii_um, line, color=colour, gid="energy", zorder=3, **own)
             if curves is given[0]:
                 handles.append(Line2D([], [], color=colour, linewidth=1.6, label=label))
     if given and math.isfinite(given[0].airy_radius_um):
         radius = np.linspace(0.0, reach, 400)
         x = math.pi * AIRY * radius / given[0].airy_radius_um
-        style = {"color": "black", "linewidth": 0.9}
+        style: dict[str, Any] = {"color": "black", "linewidth": 0.9}
         axes.plot(radius, 1.0 - j0(x) ** 2 - j1(x) ** 2, zorder=2, gid="perfect", **style)
         handles.append(Line2D([], [], label="perfect lens, axis", **style))
     if len(given) > 1:
-        grey = {"color": "0.35"}
+        grey: dict[str, Any] = {"color": "0.35"}
         handles.append(Line2D([], [], linewidth=1.6, label="with diffraction", **grey))
         handles.append(Line2D([], [], linewidth=1.1, linestyle="--", label="rays", **grey))
     axes.set(xlim=(0.0, reach), ylim=(0.0, 1.02))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ FORMATS = ("png", "pdf", "svg")
 # Dots per inch of the figure's size: two pixels for each that a screen of 96 dpi shows.
 _DPI = 200.0
 # Text stays text in PDF, and files of one figure are the same whenever they are written.
-_SETTINGS = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "dolens"}
+_SETTINGS: Any = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "dolens"}
 _DATES = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 

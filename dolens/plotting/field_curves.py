@@ -1,6 +1,7 @@
 """Field curvature and distortion are plotted side by side."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -92,7 +93,7 @@ def _foci(axes: Axes, curves: FieldCurves) -> None:
     field = curves.scan.coordinate.numpy()
     for number, wavelength in enumerate(curves.wavelengths):
         colour = spectral_colour(float(wavelength))
-        style = {"color": colour, "linewidth": 1.4, "zorder": 3}
+        style: dict[str, Any] = {"color": colour, "linewidth": 1.4, "zorder": 3}
         axes.plot(curves.tangential[:, number], field, gid="tangential", **style)
         axes.plot(curves.sagittal[:, number], field, gid="sagittal", linestyle="--", **style)
     note_if_empty(axes, curves.tangential.numpy(), "no chief ray reaches the sensor")

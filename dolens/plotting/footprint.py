@@ -1,6 +1,7 @@
 """Footprints are drawn surface by surface, rays within the outline of the clear aperture."""
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -65,7 +66,12 @@ def _draw(axes: Axes, footprint: Footprint, number: int, shades: list[str]) -> N
     points = footprint.points[number]
     for field, colour in zip(range(len(shades)), shades, strict=True):
         x, y = points[field][footprint.passes[field]].T.numpy()
-        style = {"markersize": 1.3, "markeredgewidth": 0.0, "zorder": 2, "gid": "rays"}
+        style: dict[str, Any] = {
+            "markersize": 1.3,
+            "markeredgewidth": 0.0,
+            "zorder": 2,
+            "gid": "rays",
+        }
         axes.plot(x, y, "o", color=colour, alpha=0.6, rasterized=True, **style)
         ends = ~footprint.passes[field] & points[field].isfinite().all(-1)
         if number + 1 < len(footprint.surfaces):
@@ -97,7 +103,7 @@ def _outline(axes: Axes, aperture: ClearAperture, reach: float) -> None:
     y, x = torch.meshgrid(step, step, indexing="ij")
     if not aperture.clips:
         angle = np.linspace(0.0, 2.0 * math.pi, 181)
-        style = {"color": "0.5", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
+        style: dict[str, Any] = {"color": "0.5", "linewidth": 0.9, "linestyle": "--", "zorder": 4}
         axes.plot(*(aperture.semi_diameter * f(angle) for f in (np.cos, np.sin)), **style)
     margin = aperture.margin(x, y).numpy()
     if margin.min() < 0.0 < margin.max():

@@ -33,6 +33,7 @@ def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], si
     if not labels:
         return
     figure = axes.get_figure(root=True)
+    assert figure is not None  # axes are drawn in one
     figure.draw_without_rendering()
     scale = figure.dpi / 72.0
     frame = np.array(axes.get_window_extent().extents)
@@ -40,8 +41,9 @@ def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], si
     half = _MARKER * scale
     taken = np.concatenate([drawn - half, drawn + half], 1)
     texts = [t.get_window_extent().extents for t in axes.texts if t.get_text()]
-    if axes.get_legend() is not None:
-        texts.append(axes.get_legend().get_window_extent().extents)
+    legend = axes.get_legend()
+    if legend is not None:
+        texts.append(legend.get_window_extent().extents)
     labels_taken = np.array(texts).reshape(-1, 4)
     taken = np.concatenate([taken, labels_taken])
     for text, x, y, colour in labels:
@@ -74,6 +76,7 @@ def place_labels(axes: Axes, labels: Sequence[tuple[str, float, float, str]], si
         cost = _shared(boxes, taken).sum(1) + 2.0 * outside + far * crossed
         best = int(cost.argmin())
         note.set_position(tuple(centres[best] / scale))
+        assert note.arrow_patch is not None  # it was asked for
         note.arrow_patch.set_visible(bool(far[best]))
         labels_taken = np.concatenate([labels_taken, boxes[[best]]])
         taken = np.concatenate([taken, boxes[[best]]] + ([along[best]] if far[best] else []))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -157,9 +158,11 @@ def _draw_departure(axes: Axes, system: OpticalSystem, number: int) -> None:
     t = torch.linspace(-semi_diameter, semi_diameter, SAMPLES, dtype=torch.float64)
     zero = torch.zeros_like(t)
     # The curves of x³ + y³ coincide: a thin one is drawn over a thick one.
+    thick: dict[str, Any] = {"color": "#56B4E9", "linewidth": 3.0}
+    thin: dict[str, Any] = {"color": "#D55E00", "linewidth": 1.2, "linestyle": "--"}
     for label, x, y, style in (
-        ("along x, h(x, 0)", t, zero, {"color": "#56B4E9", "linewidth": 3.0}),
-        ("along y, h(0, y)", zero, t, {"color": "#D55E00", "linewidth": 1.2, "linestyle": "--"}),
+        ("along x, h(x, 0)", t, zero, thick),
+        ("along y, h(0, y)", zero, t, thin),
     ):
         sag, _, _, exists = sag_of(system, number, x, y)
         axes.plot(t[exists], 1e3 * sag[exists], label=label, **style)

@@ -28,7 +28,7 @@ def legend_below(
         labels: of the entries; None: the handles' own.
         marker_scale: of markers, over those in the axes.
     """
-    names = [handle.get_label() for handle in handles] if labels is None else list(labels)
+    names = [str(handle.get_label()) for handle in handles] if labels is None else list(labels)
     while True:
         legend = figure.legend(
             list(handles),

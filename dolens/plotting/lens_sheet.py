@@ -93,10 +93,11 @@ def _paths(lens: Lens, field: float, heights: tuple[float, ...]) -> np.ndarray:
     """
     where = conditions(lens)
     wave, distance = where.reference_wavelength, where.object_distance
-    pupil = [(0.0, height) for height in heights]
+    pupil = torch.tensor([(0.0, height) for height in heights], dtype=lens.dtype)
     aimed = lens.aim((0.0, field), pupil, wave, distance)
     rays = Rays(aimed.position, aimed.direction, wave)
     traced = lens.trace(rays, record=True)
+    assert traced.points is not None  # they were recorded
     ok = aimed.converged & traced.valid
     system = lens.system()
     surfaces = [traced.points[number - 1] for number in system.met]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from matplotlib.axes import Axes
@@ -14,7 +15,7 @@ from dolens.plotting.legends import legend_below
 from dolens.plotting.style import PAGE, SMALL, ordered_colours, ruled_axes
 from dolens.plotting.titles import draw_title
 
-_TANGENTIAL, _SAGITTAL = "-", (0, (1, 1.2))
+_DASHES: dict[str, Any] = {"tangential": "-", "sagittal": (0, (1, 1.2))}
 # Curves that differ by less are one on paper.
 _SAME = 2e-3
 # More panels than these have no room for a label each.
@@ -60,7 +61,7 @@ def modulation_figure(
         Line2D([], [], color=shades[number], linewidth=1.5, label=label)
         for number, label in grouped.items()
     ]
-    for label, dashes in (("tangential", _TANGENTIAL), ("sagittal", _SAGITTAL)):
+    for label, dashes in _DASHES.items():
         handles.append(Line2D([], [], color="0.3", linestyle=dashes, linewidth=1.5, label=label))
     handles.append(Line2D([], [], color="black", linestyle="--", label="diffraction limit"))
     legend_below(figure, handles, 5)
@@ -71,7 +72,12 @@ def modulation_figure(
 def _draw(axes: Axes, mtf: Modulation, names: Sequence[str] | None = None) -> dict[int, str]:
     """Draw one lens; return labels of the legend, by the number of the field that is drawn."""
     frequency = mtf.frequencies.numpy()
-    limit = {"color": "black", "linewidth": 1.1, "linestyle": "--", "label": "diffraction limit"}
+    limit: dict[str, Any] = {
+        "color": "black",
+        "linewidth": 1.1,
+        "linestyle": "--",
+        "label": "diffraction limit",
+    }
     axes.plot(frequency, mtf.diffraction_limit.numpy(), **limit)
     labels: dict[int, list[str]] = {}
     shades = ordered_colours(len(mtf.fields))
@@ -86,8 +92,8 @@ def _draw(axes: Axes, mtf: Modulation, names: Sequence[str] | None = None) -> di
             continue
         labels[number] = [label]
         curves = (
-            ("tangential", mtf.tangential, _TANGENTIAL),
-            ("sagittal", mtf.sagittal, _SAGITTAL),
+            ("tangential", mtf.tangential, _DASHES["tangential"]),
+            ("sagittal", mtf.sagittal, _DASHES["sagittal"]),
         )
         for way, curve, dashes in curves:
             axes.plot(

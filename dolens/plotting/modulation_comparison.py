@@ -1,6 +1,7 @@
 """The geometric MTF and the MTF with diffraction are plotted side by side."""
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -80,7 +81,7 @@ def _draw(axes: Axes, curves: DiffractionModulation | Modulation) -> None:
     if limit is not None:
         axes.plot(frequency, limit, color="black", linewidth=0.9, gid="limit", zorder=2)
     for number, colour in enumerate(ordered_colours(len(curves.fields))):
-        style = {"color": colour, "linewidth": 1.5, "zorder": 3}
+        style: dict[str, Any] = {"color": colour, "linewidth": 1.5, "zorder": 3}
         axes.plot(frequency, curves.tangential[number], gid="tangential", **style)
         axes.plot(frequency, curves.sagittal[number], gid="sagittal", linestyle="--", **style)
     axes.set_xlim(frequency.min(), frequency.max())

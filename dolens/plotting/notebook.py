@@ -12,7 +12,7 @@ def showing(figure: Figure) -> Figure:
     IPython's own formatter for figures exists only where pyplot was set up; where it does, it comes
     first and this is not asked, so that a figure is shown once.
     """
-    figure._repr_png_ = partial(png_of, figure)
+    figure._repr_png_ = partial(png_of, figure)  # type: ignore[attr-defined]
     return figure
 
 

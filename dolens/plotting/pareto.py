@@ -1,7 +1,7 @@
 """Error is plotted against cost, with the Pareto front."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
@@ -74,7 +74,7 @@ def pareto_figure(
         y = [max(p.error, least) for p in front]
         axes.step(x, y, where="post", color="0.6", linewidth=1.0, zorder=1, label="Pareto front")
     if floor:
-        look = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
+        look: dict[str, Any] = {"color": "0.5", "linewidth": 0.8, "linestyle": ":"}
         axes.axhline(floor, label="what the reference can tell", **look)
     axes.set(xscale="log", yscale="log")
     if everything:

@@ -107,8 +107,8 @@ def window_of_light(light: Tensor, share: float = _ENERGY) -> tuple[int, int, in
     top, bottom, left, right = box
     # One pixel of dark around, where there is room.
     side = min(max(bottom - top + 2, right - left + 2, min(size, _SMALLEST_WINDOW)), size)
-    starts = (
-        min(max((low + high - side) // 2, 0), size - side)
-        for low, high in ((top, bottom), (left, right))
-    )
-    return (*starts, side)
+
+    def start(low: int, high: int) -> int:
+        return min(max((low + high - side) // 2, 0), size - side)
+
+    return start(top, bottom), start(left, right), side

@@ -36,7 +36,7 @@ def ray_fans_figure(
     figure = Figure(figsize=(PAGE, _HEIGHT * rows + 1.3), layout="constrained")
     grid = figure.subplots(rows, 2, squeeze=False, sharex=True, sharey=True)
     # The numbers at both ends of neighbouring axes stay apart.
-    figure.get_layout_engine().set(wspace=0.06)
+    figure.set_layout_engine("constrained", wspace=0.06)
     coordinate = fans.coordinate.numpy()
     both = (fans.tangential_um.numpy(), fans.sagittal_um.numpy())
     reach = max(float(np.nanmax(np.abs(fan), initial=0.0)) for fan in both) or 1.0

@@ -1,6 +1,7 @@
 """RMS spot radii are plotted against field and against wavelength."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from matplotlib.axes import Axes
@@ -56,7 +57,7 @@ def rms_curves_figure(
     if not given:
         raise InputError("rms_curves_figure needs curves against field or against wavelength")
     figure = Figure(figsize=(PAGE if len(given) > 1 else 4.8, 3.9), layout="constrained")
-    figure.get_layout_engine().set(wspace=0.06)
+    figure.set_layout_engine("constrained", wspace=0.06)
     grid = figure.subplots(1, len(given), squeeze=False, sharey=_comparable(given))
     for axes, (curves, draw) in zip(grid[0], given, strict=True):
         draw(axes, curves)
@@ -143,7 +144,7 @@ def _distinct(curves: RMSCurves) -> dict[int, list[str]]:
     found: dict[int, list[str]] = {}
     scale = float(curves.rms.nan_to_num(0.0).abs().max())
     for number, (field, line) in enumerate(zip(curves.fields, curves.rms, strict=True)):
-        alike = {"rtol": 0.0, "atol": _SAME * scale, "equal_nan": True}
+        alike: dict[str, Any] = {"rtol": 0.0, "atol": _SAME * scale, "equal_nan": True}
         twin = next((n for n in found if torch.allclose(curves.rms[n], line, **alike)), number)
         found.setdefault(twin, []).append(field_label(field, curves.field_unit))
     return found

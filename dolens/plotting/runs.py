@@ -133,8 +133,9 @@ def _dots(axes: Axes, x: Sequence[float], y: Sequence[float], colour: str) -> No
 
 def _finish(figure: Figure, axes: Axes, points: Sequence[RunPoint], title: str | None) -> None:
     for axis in (axes.xaxis, axes.yaxis):
-        if isinstance(axis.get_major_formatter(), ScalarFormatter):
-            axis.get_major_formatter().set_useOffset(False)
+        formatter = axis.get_major_formatter()
+        if isinstance(formatter, ScalarFormatter):
+            formatter.set_useOffset(False)
     ruled_axes(axes)
     notes = []
     if any(len(point.seeds) > 1 for point in points):

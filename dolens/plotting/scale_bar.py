@@ -1,5 +1,7 @@
 """A scale bar says how large an image is."""
 
+from typing import Any
+
 from matplotlib.axes import Axes
 
 from dolens.plotting.number_text import number_text
@@ -26,7 +28,12 @@ def scale_bar(axes: Axes, pixels: int, pitch: float) -> None:
     """
     length = round_length(_LONGEST * pixels * pitch)
     share = length / (pixels * pitch)
-    look = {"color": "black", "linewidth": 2.0, "solid_capstyle": "butt", "clip_on": False}
+    look: dict[str, Any] = {
+        "color": "black",
+        "linewidth": 2.0,
+        "solid_capstyle": "butt",
+        "clip_on": False,
+    }
     axes.plot([0.0, share], [-0.05, -0.05], transform=axes.transAxes, gid="scale bar", **look)
     text = f"{number_text(length)} mm" if length >= 0.1 else f"{number_text(1e3 * length)} µm"
     count = length / pitch

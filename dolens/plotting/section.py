@@ -71,7 +71,8 @@ def surface_profile(system: OpticalSystem, number: int) -> Profile:
 def obscuration_profiles(system: OpticalSystem, number: int) -> list[Profile]:
     """Return the profiles over what the surface's obscuration blocks of its aperture."""
     aperture = system.surfaces[number - 1].aperture
-    if aperture.obscuration is None:
+    hole = aperture.obscuration
+    if hole is None:
         return []
     reach = aperture.semi_diameter
     cut = SurfaceCut(system, number)
@@ -80,7 +81,7 @@ def obscuration_profiles(system: OpticalSystem, number: int) -> list[Profile]:
         x, y, _, _ = cut.points(q)
         # Arms of a spider end at the edge.
         u, v = x - aperture.center[0], y - aperture.center[1]
-        return (aperture.obscuration.margin(u, v) >= 0.0) & (torch.hypot(x, y) <= reach)
+        return (hole.margin(u, v) >= 0.0) & (torch.hypot(x, y) <= reach)
 
     return [cut.profile(*run) for run in runs(blocked, reach)]
 
@@ -103,9 +104,13 @@ def element_edges(
     axes = system.axes
     together = axes[number - 1].together(axes[other - 1])
     angle = axis_angle(system, number) if together else 0.0
-    turned = [_turn(face, -angle) for face in (front, back)]
-    upper, lower = (_edge(*turned, end) for end in (-1, 0))
-    return tuple(np.stack(_turn(tuple(edge.T), angle), -1) for edge in (upper, lower))
+    faces = _turn(front, -angle), _turn(back, -angle)
+
+    def edge(end: int) -> np.ndarray:
+        z, y = _edge(*faces, end).T
+        return np.stack(_turn((z, y), angle), -1)
+
+    return edge(-1), edge(0)
 
 
 def _turn(profile: Profile, angle: float) -> Profile:

@@ -90,11 +90,11 @@ def _row(figure: Figure, line: Sequence[Axes], images: list[Tensor], pitch: floa
     differing = line[3].imshow(
         left_over.numpy(), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="nearest"
     )
-    for picture, owners, name in (
+    for drawn, owners, name in (
         (bright, line[:3], f"over measured peak\n(no unit{', square-root scale' * peaked})"),
         (differing, line[3], "difference (%)"),
     ):
-        bar = figure.colorbar(picture, ax=owners, fraction=0.05, pad=0.02)
+        bar = figure.colorbar(drawn, ax=owners, fraction=0.05, pad=0.02)
         bar.set_label(name, fontsize=SMALL - 1)
         bar.ax.tick_params(labelsize=SMALL - 1)
         bar.outline.set_visible(False)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -209,10 +210,15 @@ class _Drawn:
     @staticmethod
     def _marks(axes: Axes, chief: np.ndarray, middle: np.ndarray, radius: float) -> None:
         if np.isfinite(middle).all():
-            look = {"fill": False, "edgecolor": "black", "linewidth": 0.8, "zorder": 4}
+            look: dict[str, Any] = {
+                "fill": False,
+                "edgecolor": "black",
+                "linewidth": 0.8,
+                "zorder": 4,
+            }
             axes.add_patch(Circle(tuple(middle), radius, gid="airy", **look))
         if np.isfinite(chief).all():
-            style = {"markersize": 6, "markeredgewidth": 0.8, "color": "black"}
+            style: dict[str, Any] = {"markersize": 6, "markeredgewidth": 0.8, "color": "black"}
             axes.plot(*chief, marker="+", linestyle="none", gid="chief", zorder=5, **style)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import cycle, islice
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -13,7 +14,7 @@ from torch import Tensor
 # Okabe and Ito's colours, told apart by colour-blind readers too; yellow is too pale for lines.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")
 # Lines of one figure differ in these too, so that they are told apart in grey.
-DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5)))
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5)))
 MARKERS = "osD^vP*X"
 SMALL = 8
 TITLE = 10
@@ -46,7 +47,7 @@ def ordered_colours(count: int) -> list[str]:
     return [to_hex(colormaps["viridis"](share)) for share in shares]
 
 
-def line_styles(count: int) -> list[dict[str, object]]:
+def line_styles(count: int) -> list[dict[str, Any]]:
     """Return `color` and `linestyle` of that many lines; no two are alike up to 28."""
     shades = colours(count)
     return [
@@ -58,7 +59,8 @@ def line_styles(count: int) -> list[dict[str, object]]:
 def spectral_colour(wavelength: float) -> str:
     """Return a line colour for a wavelength (nm), from violet at 400 to dark red at 700."""
     nodes = np.array([to_rgb(colour) for colour in _SPECTRUM.values()])
-    return to_hex([np.interp(wavelength, list(_SPECTRUM), channel) for channel in nodes.T])
+    red, green, blue = (np.interp(wavelength, list(_SPECTRUM), nodes[:, n]) for n in range(3))
+    return to_hex((float(red), float(green), float(blue)))
 
 
 def wavelength_handles(wavelengths: Sequence[float] | Tensor) -> list[Line2D]:

@@ -104,4 +104,5 @@ def place_of(system: OpticalSystem, number: int) -> tuple[Tensor, Tensor]:
     if axes.rotation is None:
         z = float(axes.z)
         return torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0.0, z], dtype=torch.float64)
+    assert axes.origin is not None  # as there is a rotation
     return axes.rotation.detach().double().cpu(), axes.origin.detach().double().cpu()

@@ -36,6 +36,7 @@ def draw_axes_title(axes: Axes, text: str | None, size: float = TITLE) -> None:
     """Write a title above axes that fill their figure's width, as `draw_title` does."""
     if text:
         figure = axes.get_figure(root=True)
+        assert figure is not None  # axes are drawn in one
         added = _fit(axes.set_title(text, fontsize=size), _ROOM_OVER_AXES * figure.bbox.width)
         _grow(figure, added, size)
 

@@ -4,6 +4,7 @@ bars.
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,7 +65,7 @@ def matrix_figure(
     else:
         size = (min(max(widths) + 0.35 + _LEFT, PAGE), len(panels) * tall + 0.3)
     figure = Figure(figsize=size, layout="constrained")
-    shape = {"width_ratios": widths} if beside else {}
+    shape: dict[str, Any] = {"width_ratios": widths} if beside else {}
     grid = figure.add_gridspec(*((1, len(panels)) if beside else (len(panels), 1)), **shape)
     for place, (name, (matrix, columns)) in enumerate(panels.items()):
         axes = figure.add_subplot(grid[0, place] if beside else grid[place, 0])
@@ -114,7 +115,6 @@ def yield_figure(
         title: above all.
     """
     figure = Figure(figsize=(max(PAGE * len(panels) / 2.0, 4.6), 4.2), layout="constrained")
-    legend = None
     for place, (name, series) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), place + 1)
         far = 0.0
@@ -141,7 +141,7 @@ def yield_figure(
             finite = radii[radii.isfinite()]
             if len(finite):
                 far = max(far, 1e3 * float(finite[min(int(0.998 * len(radii)), len(finite) - 1)]))
-        look = {"color": "0.3", "linewidth": 0.9, "linestyle": ":"}
+        look: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": ":"}
         axes.axvline(1e3 * nominal[name], label="as designed, refocused", **look)
         near = 1e3 * nominal[name]
         if far > near:
@@ -153,9 +153,9 @@ def yield_figure(
         axes.grid(True, axis="y", color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
         open_axes(axes)
-        legend = axes.get_legend_handles_labels()
+        handles = axes.get_legend_handles_labels()[0]
     band = Patch(facecolor="0.5", alpha=0.3, label="±2σ of the share, by the number of lenses")
-    legend_below(figure, [*legend[0], band], 3 if len(panels) > 1 else 2)
+    legend_below(figure, [*handles, band], 3 if len(panels) > 1 else 2)
     draw_title(figure, title)
     return figure
 
@@ -226,7 +226,9 @@ def tolerance_label(name: str, tolerance: str) -> str:
         name: of the parameter.
         tolerance: as `Tolerances.label` writes it.
     """
-    number, unit = _TOLERANCE.fullmatch(tolerance).groups()
+    match = _TOLERANCE.fullmatch(tolerance)
+    assert match is not None  # as `Tolerances.label` writes it
+    number, unit = match.groups()
     return f"{parameter_label(name)}, ±{number_text(float(number), 4)}{unit}"
 
 

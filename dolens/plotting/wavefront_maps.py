@@ -1,6 +1,7 @@
 """Wavefront maps are shown as panels over the stop, and their Zernike coefficients as bars."""
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -113,7 +114,7 @@ def zernike_figure(
     lit = [n for n in range(len(maps.fields)) if math.isfinite(float(maps.rms[n, 0]))]
     height = 0.8 / max(len(lit), 1)
     colours = ordered_colours(len(maps.fields))
-    bars = []
+    bars: list[Any] = []
     for place, number in enumerate(lit):
         at = np.arange(len(shown)) + (place - 0.5 * (len(lit) - 1)) * height
         label = field_label(maps.fields[number], maps.field_unit)

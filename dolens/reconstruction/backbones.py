@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -68,7 +69,9 @@ class Backbone(nn.Module):
         self._fold_batch_normalization()
         further = in_channels - COLORS
         name = architecture.first_convolution
-        first = _widened(self.layers.get_submodule(name), further, zero=self.pretrained)
+        narrow = self.layers.get_submodule(name)
+        assert isinstance(narrow, nn.Conv2d)
+        first = _widened(narrow, further, zero=self.pretrained)
         self.layers.set_submodule(name, first)
         mean = (*architecture.mean, *[0.0] * further)
         deviation = (*architecture.standard_deviation, *[1.0] * further)
@@ -104,6 +107,8 @@ class Backbone(nn.Module):
         for before, after in zip(names[::2], names[1::2], strict=True):
             convolution = self.layers.get_submodule(before)
             norm = self.layers.get_submodule(after)
+            assert isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
+            assert norm.running_mean is not None and norm.running_var is not None
             folded = fuse_conv_bn_weights(
                 convolution.weight,
                 convolution.bias,
@@ -114,7 +119,9 @@ class Backbone(nn.Module):
                 norm.bias,
             )
             # Parameters anew: torch would leave a bias that was not there before untrained.
-            convolution.weight, convolution.bias = (nn.Parameter(v.detach()) for v in folded)
+            weight, bias = folded
+            convolution.weight = nn.Parameter(weight.detach())
+            convolution.bias = nn.Parameter(bias.detach())
             self.layers.set_submodule(after, nn.Identity())
 
 
@@ -177,16 +184,22 @@ def _column(values: tuple[float, ...]) -> Tensor:
     return torch.tensor(values).view(-1, 1, 1)
 
 
+def _pair(sides: Any) -> tuple[int, int]:
+    rows, columns = sides
+    return rows, columns
+
+
 def _widened(convolution: nn.Conv2d, further: int, zero: bool) -> nn.Conv2d:
     if further == 0:
         return convolution
     wider = nn.Conv2d(
         convolution.in_channels + further,
         convolution.out_channels,
-        convolution.kernel_size,
-        convolution.stride,
-        convolution.padding,
+        _pair(convolution.kernel_size),
+        _pair(convolution.stride),
+        _pair(convolution.padding),
     )
+    assert wider.bias is not None and convolution.bias is not None
     with torch.no_grad():
         wider.bias.copy_(convolution.bias)
         if zero:

@@ -72,7 +72,7 @@ class FeaturePyramid(nn.Module):
         self.output = nn.Conv2d(quarter, out_channels, kernel_size=1)
         if zero_output:
             nn.init.zeros_(self.output.weight)
-            nn.init.zeros_(self.output.bias)
+            nn.init.zeros_(self.output.bias)  # type: ignore[arg-type]  # it has one
         # Channels last is how convolutions run fastest; see `UNet`.
         self.to(memory_format=torch.channels_last)
 
@@ -124,5 +124,5 @@ def _block(before: int, after: int) -> nn.Sequential:
 def _initialised(convolution: nn.Conv2d, slope: float) -> nn.Conv2d:
     # He et al. 2015: values keep their variance from layer to layer, as nothing normalises them.
     nn.init.kaiming_normal_(convolution.weight, a=slope, nonlinearity="leaky_relu")
-    nn.init.zeros_(convolution.bias)
+    nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]  # it has one
     return convolution

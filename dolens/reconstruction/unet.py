@@ -61,7 +61,7 @@ class UNet(nn.Module):
         self.output = nn.Conv2d(width, out_channels, kernel_size=1)
         if zero_output:
             nn.init.zeros_(self.output.weight)
-            nn.init.zeros_(self.output.bias)
+            nn.init.zeros_(self.output.bias)  # type: ignore[arg-type]  # it has one
         # Channels last is how convolutions run fastest: 0.7 of the time on a CPU.  The weights'
         # layout decides the layout of everything that flows through them.
         self.to(memory_format=torch.channels_last)

@@ -29,6 +29,15 @@ class WienerMatrices(nn.Module):
         width: of the images, pixels.
     """
 
+    weight_real: Tensor
+    weight_imaginary: Tensor
+    row_cosine: Tensor
+    row_sine: Tensor
+    column_cosine: Tensor
+    column_sine: Tensor
+    inverse_cosine: Tensor
+    inverse_sine: Tensor
+
     def __init__(
         self,
         point_spread_function: Tensor,

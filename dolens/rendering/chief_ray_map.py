@@ -38,7 +38,8 @@ class ChiefRayMap(NamedTuple):
         ):
             place = torch.arange(part, dtype=torch.float64) - 0.5 * (part - 1) + (own - centre)
             sides.append(_at(place / max(0.5 * (whole - 1), 0.5), order).to(device))
-        return (sides[0] @ self.coefficients @ sides[1].mT).unbind(0)
+        row, column = (sides[0] @ self.coefficients @ sides[1].mT).unbind(0)
+        return row, column
 
 
 def fit_chief_ray_map(imaging: ImagingSystem) -> ChiefRayMap | None:
@@ -112,7 +113,8 @@ def _by_itself(imaging: ImagingSystem, window: Sensor) -> tuple[Tensor, Tensor]:
         torch.arange(window.width, **options),
         indexing="ij",
     )
-    return _object_points(imaging, row, column).unbind(0)
+    row, column = _object_points(imaging, row, column).unbind(0)
+    return row, column
 
 
 def _object_points(imaging: ImagingSystem, row: Tensor, column: Tensor) -> Tensor:

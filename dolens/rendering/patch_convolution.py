@@ -63,7 +63,9 @@ class _Convolution(torch.autograd.Function):
     ):
         ctx.settings = settings
         patches = settings.layout.patches
-        object_points = None if rows is None else Coordinates(rows, columns)
+        object_points = None
+        if rows is not None and columns is not None:
+            object_points = Coordinates(rows, columns)
         shape = (settings.depths, settings.channels, *settings.layout.image_size)
         image = textures.new_zeros((textures.shape[0], *shape))
         tiles = _Tiles(textures, kernels.shape[-1], settings, object_points)
@@ -80,7 +82,9 @@ class _Convolution(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         textures, kernels, rows, columns, spectrum = ctx.saved_tensors
-        object_points = None if rows is None else Coordinates(rows, columns)
+        object_points = None
+        if rows is not None and columns is not None:
+            object_points = Coordinates(rows, columns)
         of_textures, of_kernels, of_rows, of_columns = (
             torch.zeros_like(t) if needed else None
             for t, needed in zip(
@@ -254,6 +258,7 @@ class _Tile:
         of_textures.index_add_(-2, self.rows, gathered)
 
     def _lookup_arguments(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        assert self.coordinates is not None
         rows, columns = (self._batched(c, image) for c in self.coordinates)
         return image.reshape(-1, *image.shape[-2:]), rows, columns
 

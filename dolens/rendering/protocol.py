@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import torch
 from torch import Tensor
@@ -138,7 +138,8 @@ class Renderer(ABC):
 
     def on(self, sensor: Sensor) -> Self:
         """The same renderer for another sensor."""
-        return replace(self, sensor=sensor)
+        other: Any = self  # a dataclass, as every renderer
+        return replace(other, sensor=sensor)
 
     def for_windows(self, sensor: Sensor, windows: Mapping[str, Sensor]) -> Self:
         """The same renderer for windows of a large sensor.
@@ -183,7 +184,7 @@ class Renderer(ABC):
 
     def settings(self) -> dict[str, Any]:
         """All settings but the sensor, as plain values that a checkpoint can hold."""
-        names = [f.name for f in fields(self) if f.init and f.name != "sensor"]
+        names = [f.name for f in fields(cast(Any, self)) if f.init and f.name != "sensor"]
         named = {name: getattr(self, name) for name in names}
         return {name: list(v) if isinstance(v, tuple) else v for name, v in named.items()}
 

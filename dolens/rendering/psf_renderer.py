@@ -169,7 +169,7 @@ class PsfRenderer(Renderer):
         x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
         found = self.point_spread_functions(imaging, seed, (x, y))
         self._warn_of_loss(found)
-        object_points = [None] * len(windows)
+        object_points: list[Any] = [None] * len(windows)
         if self.registration == "chief_rays":
             object_points = chief_ray_maps(imaging, windows)
         nodes, images = self.fields[0] * self.fields[1], []

@@ -24,14 +24,14 @@ def random_words(seed: int, pixel: Tensor, sample: Tensor) -> tuple[Tensor, Tens
     Returns:
         Four int64 tensors of the common shape, from 0 to 2³² - 1.
     """
-    z, w = ((word * _FACTOR + _SUMMAND) & _MASK for word in (seed & _MASK, seed >> 32 & _MASK))
+    low, high = ((word * _FACTOR + _SUMMAND) & _MASK for word in (seed & _MASK, seed >> 32 & _MASK))
     # Products wrap around in 64 bits; their 32 lowest are right.
     y = (sample * _FACTOR + _SUMMAND) & _MASK
     x = (pixel * _FACTOR + _SUMMAND) & _MASK
-    x = (x + (y * w & _MASK)) & _MASK
-    y = (y + z * x) & _MASK
-    z = (x * y).add_(z).bitwise_and_(_MASK)
-    w = (y * z).add_(w).bitwise_and_(_MASK)
+    x = (x + (y * high & _MASK)) & _MASK
+    y = (y + low * x) & _MASK
+    z = (x * y).add_(low).bitwise_and_(_MASK)
+    w = (y * z).add_(high).bitwise_and_(_MASK)
     x, y, z, w = (word.bitwise_xor_(word >> 16) for word in (x, y, z, w))
     x = x.addcmul_(y, w).bitwise_and_(_MASK)
     y = y.addcmul_(z, x).bitwise_and_(_MASK)

@@ -155,10 +155,14 @@ class RayRenderer(Renderer):
 
         def moved(
             tensors: Sequence[Tensor],
-        ) -> tuple[OpticalSystem, DifferentiableGeometry, Sequence[Tensor]]:
+        ) -> tuple[OpticalSystem, DifferentiableGeometry, tuple[Tensor, ...]]:
             """The lens, the view and what planes show, from a piece's own tensors."""
             values = dict(zip(names, tensors[planes:-1], strict=True))
-            return lens.system(values).traced_by(backend), moving.of(tensors[-1]), tensors[:planes]
+            return (
+                lens.system(values).traced_by(backend),
+                moving.of(tensors[-1]),
+                tuple(tensors[:planes]),
+            )
 
         fused = backend == "cpu" and scene.separate_planes
         if fused:
@@ -170,7 +174,8 @@ class RayRenderer(Renderer):
             pieces = self._pieces(self.chunk_rays // edge_samples(self.pupil_samples))
 
             def edge_light(i: int, *tensors: Tensor) -> Tensor:
-                return rays.edge_light(*moved(tensors), *pieces[i], moving.still)
+                now, geometry, planes_shown = moved(tensors)
+                return rays.edge_light(now, geometry, planes_shown, *pieces[i], moving.still)
 
             tensors = [*(t.detach() for t in shown), *leaves]
             return image + self._image(replay(edge_light, _sizes(pieces), tensors))
@@ -180,7 +185,8 @@ class RayRenderer(Renderer):
         pieces = self._chunks
 
         def light(i: int, *tensors: Tensor) -> Tensor:
-            return rays.light(*moved(tensors), *pieces[i])
+            now, geometry, planes_shown = moved(tensors)
+            return rays.light(now, geometry, planes_shown, *pieces[i])
 
         tensors = [*shown, *leaves]
         if self.replay:

@@ -40,7 +40,8 @@ def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
     )
     # No two of them on one circle: strata lie on rings, which an aperture's edge takes as wholes.
     spiral = uniform_pupil_points(rays)[0][:rays].to(dtype=system.dtype, device=system.device)
-    disc = tuple(d.expand(max(RADII, _SIDE**2), -1) for d in spiral.unbind(-1))
+    u, v = spiral.expand(max(RADII, _SIDE**2), -1, -1).unbind(-1)
+    disc = u, v
     if system.rotationally_symmetric:
         x, y = sensor.positions(*grid)
         distance = torch.hypot(x, y)
@@ -49,7 +50,7 @@ def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
         points = (radius, torch.zeros_like(radius))
         _, weight = pupil_rays(imaging, points, disc)
         light = weight.sum(-1)
-        few = tuple(p[::_RIM_RADII] for p in points)
+        few = points[0][::_RIM_RADII], points[1][::_RIM_RADII]
         rim = rim_rays(imaging, few)
         if rim is not None:
             light = light + functional.interpolate(
@@ -65,9 +66,8 @@ def relative_illumination(imaging: ImagingSystem, rays: int = RAYS) -> Tensor:
     points = sensor.positions(row.reshape(-1), column.reshape(-1))
     _, weight = pupil_rays(imaging, points, disc)
     light = weight.sum(-1).unflatten(-1, (_SIDE, _SIDE))
-    few = tuple(
-        p.unflatten(0, (_SIDE, _SIDE))[::_RIM_SIDE, ::_RIM_SIDE].reshape(-1) for p in points
-    )
+    x, y = (p.unflatten(0, (_SIDE, _SIDE))[::_RIM_SIDE, ::_RIM_SIDE].reshape(-1) for p in points)
+    few = x, y
     rim = rim_rays(imaging, few)
     if rim is not None:
         coarse = rim.weight.sum(-1).unflatten(-1, (-1, 1 + (_SIDE - 1) // _RIM_SIDE))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -165,7 +165,9 @@ class LayeredScene(Scene):
     ) -> Tensor:
         """Return the light that rays collect through the stack, (B, 1, P); see `Scene.gather`."""
         light, opacity = shown
-        seen, covered, through = 0.0, 0.0, torch.ones_like(weight)
+        seen: Any = 0.0
+        covered: Any = 0.0
+        through = torch.ones_like(weight)
         for plane, (rows, columns) in enumerate(places):
             maps = torch.cat((light[:, plane, channel], opacity[:, plane, 0]))
             glow, alpha = bilinear(maps, rows, columns).chunk(2)

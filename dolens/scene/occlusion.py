@@ -78,9 +78,10 @@ def _sum_of_neighbours(maps: Tensor, step: int) -> Tensor:
     """Sum of 3×3 texels `step` apart, none beyond the edges."""
     height, width = maps.shape[-2:]
     padded = functional.pad(maps, (0, 0, step, step))
-    maps = sum(padded[..., i * step : i * step + height, :] for i in range(3))
-    padded = functional.pad(maps, (step, step))
-    return sum(padded[..., j * step : j * step + width] for j in range(3))
+    first, second, third = (padded[..., i * step : i * step + height, :] for i in range(3))
+    padded = functional.pad(first + second + third, (step, step))
+    first, second, third = (padded[..., j * step : j * step + width] for j in range(3))
+    return first + second + third
 
 
 def stopped_share(opacity: Tensor, through: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.paraxial_numbers import Number, ParaxialNumbers
 from dolens.optics.system import OpticalSystem
 
 REFERENCE_WAVELENGTH = 587.5618
@@ -200,9 +200,7 @@ class Scene(ABC):
         ]
 
 
-def _paraxial_magnifications(
-    first_order: ParaxialNumbers, depths: Iterable[float]
-) -> list[float | Tensor]:
+def _paraxial_magnifications(first_order: ParaxialNumbers, depths: Iterable[float]) -> list[Number]:
     return [
         abs(first_order.chief_ray_magnification(REFERENCE_WAVELENGTH, depth)) for depth in depths
     ]

@@ -85,7 +85,7 @@ def linear_spots(lens: Lens, spots: SpotRays, names: Sequence[str]) -> LinearSpo
     # Rays are straight behind the lens: their points on a second sensor give the tangents exactly.
     behind = copy.deepcopy(lens)
     with torch.no_grad():
-        behind.sensor_distance += 1.0
+        behind.sensor_distance.add_(1.0)
     points = _points(lens, spots, names)
     rows = torch.stack([points, _points(behind, spots, names) - points], -1)
     spot, weight = spots.spot.cpu(), spots.weight.cpu()[:, None, None, None]

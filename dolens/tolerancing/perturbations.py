@@ -155,15 +155,14 @@ def scaled_tolerances(tolerances: Tolerances, factor: float) -> Tolerances:
 def _row(pattern: str, given: object) -> tuple[float, bool, bool]:
     """Return half-range, whether normal, whether relative."""
     where = f"tolerances.{pattern}"
-    if not isinstance(given, Mapping):
-        given = {"half_range": given}
-    check_keys(given, _KEYS, where)
-    half_range = given.get("half_range")
-    if not _is_number(half_range) or not 0.0 < half_range < math.inf:
+    named: Mapping[str, Any] = given if isinstance(given, Mapping) else {"half_range": given}
+    check_keys(named, _KEYS, where)
+    half_range = named.get("half_range")
+    if half_range is None or not _is_number(half_range) or not 0.0 < half_range < math.inf:
         raise InputError(f"{where}: half_range must be a positive number, not {half_range!r}")
-    distribution = given.get("distribution", "uniform")
+    distribution = named.get("distribution", "uniform")
     check_choice(distribution, DISTRIBUTIONS, f"{where}: distribution")
-    relative = given.get("relative", False)
+    relative = named.get("relative", False)
     if not isinstance(relative, bool):
         raise InputError(f"{where}: relative must be true or false, not {relative!r}")
     return float(half_range), distribution == "normal", relative

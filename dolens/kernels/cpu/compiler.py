@@ -114,14 +114,14 @@ int8_at = _pointer_at(types.int8)
 @cache
 def compile_block(factory: Factory, real: str) -> int:
     """Return the address of a block function for `float32` or `float64`."""
-    return _compiled(factory, real, block_signature(REALS[real])).address
+    return _compiled(factory, real, block_signature(REALS[real])).address or 0
 
 
 @cache
 def compile_driver(factory: Factory, real: str) -> int:
     """Return the address of a driver, a C function of (job, first, end)."""
     signature = types.void(INTEGERS, types.int64, types.int64)
-    return _compiled(factory, real, signature).address
+    return _compiled(factory, real, signature).address or 0
 
 
 @cache
@@ -172,7 +172,9 @@ def _compiled(factory: Factory, real: str, signature: Any) -> CFunc:
                 kernel = CFunc(function, form, locals={}, options=dict(OPTIONS))
                 try:
                     source = (*source_of(factory), real)
-                    kernel._cache = KernelFiles(f"{factory.__name__}-{real}", stamp(), source)
+                    kernel._cache = KernelFiles(  # type: ignore[attr-defined]
+                        f"{factory.__name__}-{real}", stamp(), source
+                    )
                 except RuntimeError as error:  # no source, or no home folder
                     logger.warning("compiled kernels cannot be kept for the next start: %s", error)
                 kernel.compile()

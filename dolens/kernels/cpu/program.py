@@ -61,8 +61,7 @@ _STEPS = {
 
 def functions_of(code: int) -> StepFunctions:
     """Return the functions of a step with this code; a surface's module is imported for them."""
-    step = _STEPS.get(code)
-    return kernels_of(code, "cpu") if step is None else step
+    return _STEPS[Kind(code)] if code in _STEPS else kernels_of(code, "cpu")
 
 
 class Steps(NamedTuple):
@@ -97,8 +96,8 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
         numbers = int(row[Code.LENGTH]) - Slot.HEADER
         if functions.numbers not in (None, numbers):
             raise InputError(
-                f"the CPU kernels '{functions.sag.__qualname__}' take {functions.numbers} numbers "
-                f"of a surface; its `packed` gives {numbers}"
+                f"the CPU kernels '{functions.forward.__qualname__}' take {functions.numbers} "
+                f"numbers of a surface; its `packed` gives {numbers}"
             )
         row[FORWARD] = compiler.compile_block(functions.forward, real)
         if functions.sag is not None:

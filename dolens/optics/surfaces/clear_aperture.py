@@ -233,7 +233,9 @@ class ClearAperture:
         return [
             (blocks, [(kind, (x + cx, y + cy), own) for kind, (x, y), own in outline.figures()])
             for outline, blocks in limits
-            if outline is not None and outline.packed()[0] == OutlineKind.FIGURES
+            if outline is not None
+            and not isinstance(outline, Unlimited)
+            and outline.packed()[0] == OutlineKind.FIGURES
         ]
 
     def opened(self) -> "ClearAperture":

@@ -60,7 +60,7 @@ class Phase(Law):
         constants: names among the parameters that no optimizer varies.
     """
 
-    type: ClassVar[str] = ""
+    type: ClassVar[str] = ""  # type: ignore[assignment]  # in the place of a cast of modules
     constants: ClassVar[tuple[str, ...]] = ("order", "norm_radius")
 
     def __init__(

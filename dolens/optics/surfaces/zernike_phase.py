@@ -151,7 +151,7 @@ def _name(i: int, j: int) -> str:
 class ZernikeFringePhase(ZernikePhase):
     """The polynomials are in the University of Arizona's order, 1 at the disc's edge ("fringe")."""
 
-    type = "zernike_fringe"
+    type: ClassVar[str] = "zernike_fringe"  # type: ignore[assignment]
     kind = "Zernike phase"
     terms = FRINGE_TERMS
     term = staticmethod(fringe)
@@ -164,7 +164,7 @@ class ZernikeStandardPhase(ZernikePhase):
     They end with the radial order 12, beyond which monomials lose too many digits.
     """
 
-    type = "zernike_standard"
+    type: ClassVar[str] = "zernike_standard"  # type: ignore[assignment]
     kind = "Zernike phase"
     terms = 91
     term = staticmethod(noll)

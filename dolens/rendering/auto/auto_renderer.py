@@ -143,6 +143,7 @@ class AutoRenderer(Renderer):
         if dtype == lens.dtype:
             return lens, values
         values = {**dict(lens.named_parameters()), **(values or {})}
+        assert self._cast is not None  # the choice was made with it
         return self._cast, {name: value.to(dtype) for name, value in values.items()}
 
     @torch.no_grad()
@@ -229,7 +230,9 @@ class AutoRenderer(Renderer):
         """Choose, measure on the probe images, log; the choice is kept for `render`."""
         self.choice = None
         self.prepare(lens, scene, values, measure)
-        return self.choice
+        found: Choice | None = self.choice
+        assert found is not None  # `prepare` chose
+        return found
 
     def numbers(self) -> dict[str, float]:
         """The plan as metrics, `auto/…`."""

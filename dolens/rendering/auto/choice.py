@@ -156,7 +156,8 @@ class Choice:
         """
         model, bits = state.get("model", PsfRenderer.model), torch.finfo(dtype).bits
         try:
-            renderer = MODELS[model](sensor=sensor, **state["settings"])
+            make: Any = MODELS[model]
+            renderer = make(sensor=sensor, **state["settings"])
             chosen = _DTYPES[state.get("bits", bits)]
         except (KeyError, TypeError) as error:
             raise InputError(
@@ -207,7 +208,7 @@ def choose(trial: Trial, tolerances: Tolerances) -> Choice:
         return worst, (choice, found.without_diffraction)
 
     worst, (choice, without) = _tightened(attempt, tolerances.error)
-    if trial.probes.windows:
+    if trial.probes.windows or not isinstance(choice.renderer, PsfRenderer):
         return choice
     samples, noise, times = trial.rays_instead(choice.renderer)
     # Rays know no diffraction.
@@ -247,12 +248,14 @@ def _tightened(
         attempt: a tolerance to plan for → the error that was measured, and the plan.
         tolerance: of the measured error.
     """
-    share, best = 1.0, None
-    for _ in range(_ROUNDS):
-        error, found = attempt(share * tolerance)
-        if best is None or error < best[0]:
-            best = error, found
+    share = 1.0
+    best = attempt(tolerance)
+    error = best[0]
+    for _ in range(_ROUNDS - 1):
         if error <= tolerance:
             break
         share *= max(0.25, 0.7 * tolerance / error)
+        error, found = attempt(share * tolerance)
+        if error < best[0]:
+            best = error, found
     return best

@@ -5,7 +5,7 @@ import math
 from dolens.rendering.patch_convolution import transform_length
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.relative_illumination import RADII, RAYS
-from dolens.scene.planar import PlanarScene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 # Nanoseconds: a ray and surface, forward and back; a ray's lookup of a texel, forward and back; a
@@ -17,15 +17,13 @@ _MAPPED, _RENDER, _NODE = 12.0, 4e6, 1e6
 _TRANSFORMS = 6  # of texture, kernel and image, forward and back
 
 
-def rays_cost(
-    sensor: Sensor, samples: int, scene: PlanarScene, surfaces: int, images: int = 1
-) -> float:
+def rays_cost(sensor: Sensor, samples: int, scene: Scene, surfaces: int, images: int = 1) -> float:
     """Nanoseconds of a render by `samples` rays a pixel and colour."""
     rays = sensor.height * sensor.width * samples * len(scene.wavelengths)
     return rays * (surfaces * _SURFACE + len(scene.depths) * images * _TEXEL)
 
 
-def psf_cost(renderer: PsfRenderer, scene: PlanarScene, surfaces: int, images: int = 1) -> float:
+def psf_cost(renderer: PsfRenderer, scene: Scene, surfaces: int, images: int = 1) -> float:
     """Nanoseconds of a render by point spread functions."""
     sensor, depths, channels = renderer.sensor, len(scene.depths), len(scene.wavelengths)
     nodes = renderer.fields[0] * renderer.fields[1]

@@ -85,6 +85,7 @@ def choose_fields(
             best = error, renderer
         if error <= FIELDS_SHARE * tolerance:
             break
+    assert best is not None  # there is a candidate
     error, renderer = best
     well = error <= FIELDS_SHARE * tolerance
     why = "the least that interpolates well" if well else "the best there is"
@@ -109,18 +110,18 @@ def _candidates(
         if size is None:
             continue
         for count in _GRIDS:
-            fields = tuple(
+            rows, columns = (
                 1 if count == 1 else max(2, math.ceil(count * side / longer))
                 for side in (sensor.height, sensor.width)
             )
-            if count > 1 and (fields[0] > sensor.height // 4 or fields[1] > sensor.width // 4):
+            if count > 1 and (rows > sensor.height // 4 or columns > sensor.width // 4):
                 continue
             for illumination in ("functions", "map"):
                 yield PsfRenderer(
                     sensor,
-                    fields,
+                    (rows, columns),
                     size=size,
-                    registration=registration,
+                    registration="chief_rays" if distortion else "pinhole",
                     illumination=illumination,
                 )
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from dolens.rendering.auto.probes import blurred_grey_levels, grey_levels
 from dolens.rendering.auto.survey import Pixels, Survey, spread_pixels, survey
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.psf_renderer import PsfRenderer
-from dolens.scene.planar import PlanarScene
+from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 
 # Points of the sensor where functions are compared.
@@ -104,14 +105,16 @@ def plan(single: ImagingSystem, double: ImagingSystem, requirements: Requirement
         ("depths", _shared_depths(functions, scene, shared)),
         ("colours", _shared_colours(functions, scene, shared)),
     ):
-        renderer = replace(renderer, **{name: decision.selected})
+        chosen: dict[str, Any] = {name: decision.selected}
+        renderer = replace(renderer, **chosen)
         decisions.append(decision)
     decision, without = _diffraction(functions, truth, renderer, tolerance)
     if not requirements.diffraction:
         decision = Decision(
             "diffraction", "none", 0.0, f"as asked for; it would change {without:.2g}"
         )
-    renderer = replace(renderer, diffraction=decision.selected)
+    chosen = {"diffraction": decision.selected}
+    renderer = replace(renderer, **chosen)
     decisions.append(decision)
     if decision.selected != "none":
         decision = _wider_window(truth, renderer, tolerance)
@@ -119,7 +122,7 @@ def plan(single: ImagingSystem, double: ImagingSystem, requirements: Requirement
         decisions.append(decision)
         functions = truth.functions(renderer.size, distortion)
     few = slice(0, 8)
-    part = tuple(place[few] for place in truth.pixels)
+    part = truth.pixels[0][few], truth.pixels[1][few]
     decision = _sampling(double, part, functions[few], renderer, tolerance)
     renderer = replace(renderer, pupil_samples=int(decision.selected))
     decisions.append(decision)
@@ -139,7 +142,7 @@ def union(plans: Mapping[str, Plan], sensor: Sensor) -> Plan:
     parts = [found.renderer for found in plans.values()]
     renderer = PsfRenderer(
         sensor,
-        tuple(max(part.fields[side] for part in parts) for side in (0, 1)),
+        (max(part.fields[0] for part in parts), max(part.fields[1] for part in parts)),
         max(part.pupil_samples for part in parts),
         max(part.size for part in parts),
         illumination="map" if any(p.illumination == "map" for p in parts) else "functions",
@@ -161,12 +164,12 @@ def union(plans: Mapping[str, Plan], sensor: Sensor) -> Plan:
     )
 
 
-def _shared_depths(functions: Tensor, scene: PlanarScene, tolerance: float) -> Decision:
+def _shared_depths(functions: Tensor, scene: Scene, tolerance: float) -> Decision:
     middle = functions[:, scene.depths.index(scene.middle_depth)][:, None]
     return _sharing("depths", functions - middle, len(scene.depths), tolerance)
 
 
-def _shared_colours(functions: Tensor, scene: PlanarScene, tolerance: float) -> Decision:
+def _shared_colours(functions: Tensor, scene: Scene, tolerance: float) -> Decision:
     middle = functions[:, :, scene.wavelengths.index(scene.middle_wavelength)][:, :, None]
     return _sharing("colours", functions - middle, len(scene.wavelengths), tolerance)
 
@@ -218,10 +221,10 @@ def _diffraction(
         return Decision("diffraction", "limit", error, because), error
     waves = found.waves(size, distortion)
     pair = [s.functions(size, distortion).double() for s in (found, again)]
-    rays, noise = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
+    rays, differing = 0.5 * (pair[0] + pair[1]), 0.5 * (pair[0] - pair[1])
     limited = with_diffraction_limit(rays, pitch, scene.wavelengths, truth.f_number)
     # Wavefronts have no noise of sampling: that of the rays is not diffraction.
-    noise = float(grey_levels(noise).square().mean())
+    noise = float(grey_levels(differing).square().mean())
     without, with_limit = (
         math.sqrt(max(float(grey_levels(f - waves).square().mean()) - noise, 0.0))
         for f in (rays, limited)

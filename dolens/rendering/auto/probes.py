@@ -218,7 +218,7 @@ def reference(
 
 def _rms(squares: list[Tensor]) -> Tensor:
     """(B,), grey levels, from squares (B, ...) on several windows."""
-    total = sum(s.double().flatten(1).sum(1) for s in squares)
+    total = torch.stack([s.double().flatten(1).sum(1) for s in squares]).sum(0)
     return (total / sum(s[0].numel() for s in squares)).sqrt() / GREY_LEVEL
 
 

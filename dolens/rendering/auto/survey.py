@@ -60,7 +60,10 @@ class Survey:
 
     def centres(self, distortion: bool) -> tuple[Tensor, Tensor]:
         """The points that functions are centred on: the chief rays', or a pinhole's."""
-        return self.chief if distortion else self.pinhole
+        if not distortion:
+            return self.pinhole
+        assert self.chief is not None  # no plan is made of those that do not pass
+        return self.chief
 
     def offsets(self, distortion: bool) -> PlanePoints:
         """Rays by their distance from the centres."""

@@ -95,7 +95,7 @@ class Trial:
         self._measure = None
         if measure is not None:
             self._measure = measure(self._each)
-        elif not probes.windows and any(v.requires_grad for v in (values or {}).values()):
+        elif not probes.windows and values and any(v.requires_grad for v in values.values()):
             (window,), (textures,) = self.windows, self._textures
             truth = pinhole_image(textures, window.sensor, window.texture_centre)[:, None]
             self._measure = image_measure(values, truth)
@@ -177,8 +177,8 @@ class Trial:
         pupil = paraxial_exit_pupil(system, wavelengths)
         object_points = chief_ray_maps(ImagingSystem(system, middle, sensor, pupil), windows)
         return [
-            SensorWindow(window, tuple(float(c.mean().round()) for c in points))
-            for window, points in zip(windows, object_points, strict=True)
+            SensorWindow(window, (float(row.mean().round()), float(column.mean().round())))
+            for window, (row, column) in zip(windows, object_points, strict=True)
         ]
 
     def _rendered_by_rays(self) -> Sequence[Reference]:

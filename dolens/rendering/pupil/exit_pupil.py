@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
-from dolens.optics.paraxial_numbers import ParaxialNumbers
+from dolens.optics.paraxial_numbers import Number, ParaxialNumbers
 from dolens.optics.ray_tracing import trace_components
 from dolens.optics.rays import Components
 from dolens.optics.straight import require_plane_sensor, require_refracting
@@ -41,15 +41,15 @@ class ExitPupil(NamedTuple):
         axial_radius: of the disc that pixels on the axis see filled.
     """
 
-    z: float | Tensor
-    radius: float | Tensor
-    axial_radius: float | Tensor
+    z: Number
+    radius: Number
+    axial_radius: Number
 
     def numbers(self) -> "ExitPupil":
         """The same without gradients."""
         return ExitPupil(*(float(v.detach() if isinstance(v, Tensor) else v) for v in self))
 
-    def axial_mean(self, sensor_z: float | Tensor) -> float | Tensor:
+    def axial_mean(self, sensor_z: Number) -> Number:
         """The mean of cos⁴ over the axial disc of radius a at distance L from a sensor plane, as
         an axial pixel sees it: L²/(L² + a²).
         """
@@ -172,7 +172,7 @@ def _get_through(system: OpticalSystem, ray: Components, wavelengths: Sequence[f
     return valid.all(dim=0)
 
 
-def working_f_number(pupil: ExitPupil, sensor_z: float | Tensor) -> float | Tensor:
+def working_f_number(pupil: ExitPupil, sensor_z: Number) -> Number:
     """1/(2·sin u') of the axial beam, u' the angle of its edge in air; a tensor where any is."""
     square = ((sensor_z - pupil.z) / pupil.axial_radius) ** 2 + 1.0
     return 0.5 * square**0.5

@@ -128,6 +128,7 @@ def edge_distances(
 
 
 def _edge_distance(system: OpticalSystem, surface: int, point: Sequence[Tensor]) -> Tensor:
-    zero = torch.zeros_like(point[0])
-    here = from_lens_axes(Components(*point, zero, zero, zero), system.axes[surface - 1])
+    x, y, z = point
+    zero = torch.zeros_like(x)
+    here = from_lens_axes(Components(x, y, z, zero, zero, zero), system.axes[surface - 1])
     return system.surfaces[surface - 1].edge_distance(here.x, here.y)

@@ -155,7 +155,7 @@ class PupilBoundaryMap:
         first = place.long().clamp(max=AZIMUTHS - 1)
         after, part = (first + 1) % AZIMUTHS, place - first
         nodes, shares = self._nodes(x, y)
-        middle = radius = 0.0
+        middle, radius = x.new_zeros(len(x), 2), torch.zeros_like(part)
         for node, share in zip(nodes, shares, strict=True):
             rows = self.edges.radius[node]
             found = torch.lerp(rows.gather(1, first), rows.gather(1, after), part)
@@ -225,7 +225,10 @@ def pupil_boundary_map(imaging: ImagingSystem) -> PupilBoundaryMap | None:
         corner, step = (low, 0.0), (max(high - low, 1e-12) / (_RADII - 1), 1.0)
     else:
         corner = (float(x.min()), float(y.min()))
-        step = tuple(float(p.max() - p.min()) / (_GRID - 1) for p in (x, y))
+        step = (
+            float(x.max() - x.min()) / (_GRID - 1),
+            float(y.max() - y.min()) / (_GRID - 1),
+        )
         grid = torch.arange(_GRID, **options)
         up, across = torch.meshgrid(
             corner[1] + grid * step[1], corner[0] + grid * step[0], indexing="ij"
