@@ -114,7 +114,7 @@ class SweepJob:
         """Return the configuration without Hydra's own part."""
         return OmegaConf.masked_copy(self.config, [key for key in self.config if key != "hydra"])
 
-    def _return(self, objective: float) -> JobReturn:
+    def _return(self, objective: float | tuple[float, ...]) -> JobReturn:
         return JobReturn(
             overrides=OmegaConf.to_container(self.config.hydra.overrides.task, resolve=False),
             cfg=self.settings(),

@@ -63,10 +63,13 @@ def refuse_other_settings(folder: Path, settings: str) -> None:
         )
 
 
-def recorded_objective(folder: Path) -> float:
-    """Return the objective of a finished run; NaN where its metrics do not have it."""
-    settings = read_yaml(folder / RESOLVED) or {}
-    return metrics_of(folder).get(str(settings.get("objective")), math.nan)
+def recorded_objective(folder: Path) -> float | tuple[float, ...]:
+    """Return the objective of a finished run, or several; NaN where its metrics do not have it."""
+    named = (read_yaml(folder / RESOLVED) or {}).get("objective")
+    metrics = metrics_of(folder)
+    if isinstance(named, list):
+        return tuple(metrics.get(str(name), math.nan) for name in named)
+    return metrics.get(str(named), math.nan)
 
 
 def last_checkpoint(folder: Path) -> Path | None:

@@ -3,18 +3,18 @@
 import inspect
 import logging
 import re
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.utils import JobReturn, configure_log, setup_globals
+from hydra.core.utils import JobReturn, JobStatus, configure_log, setup_globals
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
+from dolens.experiments.running.command_line import command
 from dolens.experiments.running.run_files import is_finished
 from dolens.experiments.sweeps.job import SweepJob
 from dolens.experiments.sweeps.job_folder import refuse_other_settings
@@ -33,6 +33,7 @@ def launch(
     task: TaskFunction,
     overrides: Sequence[Sequence[str]],
     first: int,
+    announce: bool = True,
 ) -> list[JobReturn]:
     """Run jobs that have not been run before in their folders.
 
@@ -44,6 +45,7 @@ def launch(
         task: runs the configuration of a job.
         overrides: of each job.
         first: the number of the first job.
+        announce: whether to say how a sweep that is stopped goes on.
 
     Raises:
         InputError: an option is unknown, or a job's folder holds a run of other settings; then no
@@ -69,12 +71,18 @@ def launch(
             *(len(done), len(jobs), ", ".join(str(job.number) for job in done)),
         )
     to_run = [job for job in jobs if job.number not in returns]
-    logger.info("If this sweep is stopped, this goes on with it: %s", command_to_go_on(config))
+    if announce:
+        logger.info("If this sweep is stopped, this goes on with it: %s", command_to_go_on(config))
     for number, (job, result) in enumerate(runner(to_run, **options), 1):
-        returns[job.number] = result
         # A job that ran in this process has changed where lines go.
         configure_log(config.hydra.hydra_logging, config.hydra.verbose)
-        logger.info("Job %d has ended (%d of %d): %s", job.number, number, len(to_run), job.text())
+        if result.status == JobStatus.FAILED:
+            error = result._return_value
+            result = job.failed(one_line(f"{type(error).__name__}: {error}"))
+        returns[job.number] = result
+        logger.info(
+            "Job %d has ended (%d of %d): %s", job.number, number, len(to_run), result.return_value
+        )
     return [returns[job.number] for job in jobs]
 
 
@@ -91,7 +99,7 @@ def composed_job(
         own.hydra.job.num = number
         own.hydra.job.id = f"{own.hydra.job.name}_{number}"
     before = HydraConfig.instance().cfg
-    HydraConfig.instance().set_config(own)
+    HydraConfig.instance().cfg = own
     try:
         # The time of the sweep's beginning must not be read anew in another process.
         places = {key: str(own.hydra.sweep[key]) for key in ("dir", "subdir")}
@@ -109,7 +117,7 @@ def command_to_go_on(config: DictConfig) -> str:
     Args:
         config: of the sweep.
     """
-    program, *arguments = sys.argv
+    arguments = sys.argv[1:]
     given = [entry for entry in arguments if entry.startswith("hydra.sweep.dir=")]
     if not given:
         # Jobs of several experiments have folders of their own: what names them stays as it is.
@@ -118,8 +126,7 @@ def command_to_go_on(config: DictConfig) -> str:
         if "experiment,several" in place and Path(resolved).parent.parent.name == "several":
             resolved = re.sub(r"\$\{now:[^}]*\}", Path(resolved).name[:19], place)
         arguments.append(f"hydra.sweep.dir={resolved}")
-    command = shlex.join(["python", program]) if program.endswith(".py") else program
-    return f"{command} {shlex.join(arguments)}"
+    return command(arguments)
 
 
 def one_after_another(jobs: Sequence[SweepJob]) -> Iterator[tuple[SweepJob, JobReturn]]:

@@ -28,6 +28,7 @@ class SweepLauncher(Launcher):
             else value
             for name, value in options.items()
         }
+        self.launched = False
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -41,6 +42,7 @@ class SweepLauncher(Launcher):
         """Run a batch of jobs; see `dolens.experiments.sweeps.launch.launch`."""
         from dolens.experiments.sweeps.launch import launch
 
+        announce, self.launched = not self.launched, True
         return launch(
             self.runner(),
             self.options,
@@ -49,6 +51,7 @@ class SweepLauncher(Launcher):
             self.task,
             job_overrides,
             initial_job_idx,
+            announce,
         )
 
     @abstractmethod
