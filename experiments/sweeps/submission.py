@@ -17,6 +17,7 @@ from dolens.experiments.sweeps.shares import share_of
 logger = logging.getLogger(__name__)
 
 _LOOK_S = 0.2
+_LINES = 2
 
 
 def in_local_submissions(
@@ -117,8 +118,9 @@ def _ended(running: list[tuple[SweepJob, Any]]) -> Iterator[tuple[SweepJob, JobR
         try:
             result = submission.results()[0]
         except Exception as error:
-            # submitit adds the whole of a job's standard error below the first line.
-            reason = next((line for line in str(error).splitlines() if line.strip()), "")
+            # submitit adds the whole of a job's standard error below the first lines.
+            lines = [line for line in str(error).splitlines() if line.strip()]
+            reason = " ".join(lines[:_LINES])
             result = job.failed(one_line(f"{type(error).__name__}: {reason}"))
         yield job, result
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,10 @@ from dolens.experiments.comparison.run import read_unfinished
 from dolens.experiments.running.own_folder import OwnFolder
 from dolens.experiments.running.run_files import is_finished
 from dolens.experiments.sweeps import shares
+from dolens.experiments.sweeps.processes import in_processes
+from dolens.experiments.sweeps.ray_tasks import in_ray_tasks
 from dolens.experiments.sweeps.shares import share_of
+from dolens.experiments.sweeps.submission import in_slurm_jobs
 from tests.experiments.small_sweep import ROOT, sweep
 
 
@@ -68,7 +72,7 @@ def test_a_failed_job_and_a_killed_one_leave_the_others(tmp_path, launcher, monk
 
 
 def told_of_kill(reason: str) -> bool:
-    return any(word in reason for word in ("killed", "died", "terminated", "has not produced any"))
+    return any(word in reason for word in ("was killed", "has not produced any output"))
 
 
 def test_a_sweep_goes_on_with_what_is_not_finished(tmp_path):
@@ -182,3 +186,17 @@ def test_runs_of_one_second_have_folders_of_their_own(tmp_path):
     OwnFolder().on_run_start(chosen)
     assert chosen.hydra.run.dir == str(tmp_path)
     assert json.dumps(sorted(path.name for path in first.parent.iterdir()))
+
+
+@pytest.mark.parametrize(
+    ("package", "runner", "extra"),
+    [
+        ("joblib", in_processes, "sweep"),
+        ("ray", in_ray_tasks, "ray"),
+        ("submitit", partial(in_slurm_jobs, folder="jobs"), "slurm"),
+    ],
+)
+def test_a_missing_package_is_named_with_its_extra(monkeypatch, package, runner, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"'{package}' is not installed; .*dolens\[{extra}\]"):
+        list(runner([Job()]))
