@@ -11,6 +11,7 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import OmegaConf
 
 from dolens.experiments.running.user_configuration import use_working_folder
+from dolens.experiments.sweeps.basic_launcher import OwnBasicLauncher
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = {"value": 0, "act": "finish", "objective": "score", "threads": None, "ckpt_path": None}
@@ -68,6 +69,7 @@ def sweep(folder: Path, launcher: str, jobs: list[str], *options: str) -> list[f
     with initialize_config_dir(str(conf), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         config = loader.load_configuration("sweep", overrides, run_mode=RunMode.MULTIRUN)
+        OwnBasicLauncher().on_multirun_start(config)
         found = Plugins.instance().instantiate_launcher(
             HydraContext(config_loader=loader, callbacks=Callbacks()), small_task(), config
         )

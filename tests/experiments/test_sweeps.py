@@ -34,14 +34,14 @@ def begun(folder: Path, job: int) -> list[str]:
 
 
 LAUNCHERS = {
-    "serial": [],
+    "basic": [],
     "joblib": ["hydra.launcher.n_jobs=2"],
     "submitit_local": ["hydra.launcher.n_jobs=2", "hydra.launcher.timeout_min=5"],
     "ray": ["hydra.launcher.num_cpus=1"],
 }
 # What jobs do.  Hydra's own process would be gone; submitit repeats nothing by itself.
 ACTS = {
-    "serial": ["finish", "fail", "finish"],
+    "basic": ["finish", "fail", "finish"],
     "joblib": ["finish", "fail", "kill", "kill_once"],
     "submitit_local": ["finish", "kill"],
     "ray": ["fail", "kill_once"],
@@ -77,30 +77,30 @@ def told_of_kill(reason: str) -> bool:
 
 def test_a_sweep_goes_on_with_what_is_not_finished(tmp_path):
     jobs = ["value=1", "value=2 act=fail", "value=3"]
-    sweep(tmp_path, "serial", jobs)
+    sweep(tmp_path, "basic", jobs)
     # As a job that was killed after its first checkpoint, and one killed while it wrote one.
     stopped = tmp_path / "jobs" / "1" / "checkpoints"
     stopped.mkdir()
     with zipfile.ZipFile(stopped / "last.ckpt", "w") as file:
         file.writestr("data", "")
-    assert sweep(tmp_path, "serial", jobs) == pytest.approx([1.0, math.nan, 3.0], nan_ok=True)
+    assert sweep(tmp_path, "basic", jobs) == pytest.approx([1.0, math.nan, 3.0], nan_ok=True)
     assert [len(begun(tmp_path, job)) for job in range(3)] == [1, 2, 1]
     assert begun(tmp_path, 1)[-1] == f"MULTIRUN None {stopped / 'last.ckpt'}".replace(
         "None", str(os.environ.get("OMP_NUM_THREADS")), 1
     )
     (stopped / "last.ckpt").write_bytes(b"PK\x03\x04 half of it")
     # The job went on before, as its recorded configuration says: that is no other setting.
-    sweep(tmp_path, "serial", [*jobs[:2], "value=3 threads=2"])
+    sweep(tmp_path, "basic", [*jobs[:2], "value=3 threads=2"])
     assert begun(tmp_path, 1)[-1].endswith(" None") and not stopped.exists()
 
 
 def test_a_folder_of_other_settings_is_refused_before_any_job(tmp_path):
-    sweep(tmp_path, "serial", ["value=1", "value=2"])
+    sweep(tmp_path, "basic", ["value=1", "value=2"])
     with pytest.raises(InputError, match=r"jobs/1 holds .*other settings: value is 3, was 2;"):
-        sweep(tmp_path, "serial", ["value=1", "value=3", "value=4"])
+        sweep(tmp_path, "basic", ["value=1", "value=3", "value=4"])
     assert len(begun(tmp_path, 1)) == 1 and not (tmp_path / "jobs" / "2").exists()
     with pytest.raises(InputError, match=r"hydra\.launcher: .*'n_threads'"):
-        sweep(tmp_path, "serial", ["value=1"], "+hydra.launcher.n_threads=2")
+        sweep(tmp_path, "basic", ["value=1"], "+hydra.launcher.n_threads=2")
 
 
 def test_processes_end_with_a_sweep_that_is_killed(tmp_path):
@@ -120,7 +120,7 @@ sweep(Path({str(tmp_path)!r}), "joblib", ["value=1", "value=2 act=wait"], "hydra
     process.send_signal(signal.SIGKILL)
     process.wait()
     jobs = ["value=1", "value=2 act=wait"]
-    assert sweep(tmp_path, "serial", jobs) == [1.0, 2.0]  # waits until the folder is free
+    assert sweep(tmp_path, "basic", jobs) == [1.0, 2.0]  # waits until the folder is free
     assert [len(begun(tmp_path, job)) for job in (0, 1)] == [1, 2]
 
 
