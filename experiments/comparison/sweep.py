@@ -61,8 +61,8 @@ def write_comparison(folder: Path) -> None:
         logger.warning("no comparison of this sweep: %s", error)
         return
     best = best_lines(comparison.found.runs)
-    text = "\n\n".join([markdown_of(comparison), *best])
-    (folder / "comparison.md").write_text(f"{text.rstrip()}\n", encoding="utf-8")
+    text = "\n\n".join([markdown_of(comparison).rstrip(), *best])
+    (folder / "comparison.md").write_text(f"{text}\n", encoding="utf-8")
     (folder / "comparison.csv").write_text(csv_of(comparison), encoding="utf-8")
     save_figure(figure_of(comparison), folder / "comparison.png")
     logger.info("Comparison of the sweep: %s", folder / "comparison.md")

@@ -18,7 +18,7 @@ from dolens.experiments.sweeps.job_folder import (
     clear,
     held,
     last_checkpoint,
-    log_error,
+    log_in,
     recorded_objective,
 )
 
@@ -81,6 +81,7 @@ class SweepJob:
                 with open_dict(config):
                     config.ckpt_path = str(checkpoint)
                 logger.info("Job %d goes on from %s", self.number, checkpoint)
+                log_in(self.folder, "INFO", f"The run was stopped, and goes on from {checkpoint}")
             return run_job(
                 hydra_context=self.context,
                 config=config,
@@ -106,7 +107,7 @@ class SweepJob:
             OmegaConf.save(hydra.hydra.overrides.task, self.folder / OVERRIDES)
             OmegaConf.save(hydra, self.folder / HYDRA)
             OmegaConf.save(self.settings(), self.folder / CONFIG)
-        log_error(self.folder, reason)
+        log_in(self.folder, "ERROR", reason)
         logger.error("Job %d: %s", self.number, reason)
         return self._return(math.nan)
 

@@ -93,11 +93,17 @@ def clear(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def log_error(folder: Path, reason: str) -> None:
-    """Write an error into the log of a run whose own process cannot do so any more."""
+def log_in(folder: Path, level: str, text: str) -> None:
+    """Write a line into the log of a run whose own process does not write there, or not yet.
+
+    Args:
+        folder: of the run.
+        level: `INFO`, `ERROR` and so on.
+        text: of one line.
+    """
     time = datetime.now().strftime("%Y-%m-%d %H:%M:%S,%f")[:-3]
     with (folder / "log.txt").open("a", encoding="utf-8") as file:
-        file.write(f"[{time}] ERROR {__name__}: {reason}\n")
+        file.write(f"[{time}] {level} {__name__}: {text}\n")
 
 
 @contextmanager

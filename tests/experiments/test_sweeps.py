@@ -88,6 +88,8 @@ def test_a_sweep_goes_on_with_what_is_not_finished(tmp_path):
     assert begun(tmp_path, 1)[-1] == f"MULTIRUN None {stopped / 'last.ckpt'}".replace(
         "None", str(os.environ.get("OMP_NUM_THREADS")), 1
     )
+    log = (tmp_path / "jobs" / "1" / "log.txt").read_text()
+    assert "The run was stopped, and goes on from" in log
     (stopped / "last.ckpt").write_bytes(b"PK\x03\x04 half of it")
     # The job went on before, as its recorded configuration says: that is no other setting.
     sweep(tmp_path, "basic", [*jobs[:2], "value=3 threads=2"])
