@@ -9,6 +9,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from dolens.errors import InputError
+from dolens.experiments.comparison.best import best_lines
 from dolens.experiments.comparison.comparison import compared, csv_of, figure_of, markdown_of
 from dolens.experiments.comparison.found import run_folders
 from dolens.experiments.comparison.run import read_unfinished
@@ -47,7 +48,9 @@ class SweepComparison(Callback):
 
 
 def write_comparison(folder: Path) -> None:
-    """Write the comparison of a sweep into its folder; without finished runs, log the reasons.
+    """Write the comparison of a sweep into its folder, and log how the best job is repeated.
+
+    Without finished runs, log the reasons.
 
     Args:
         folder: of the sweep.
@@ -57,7 +60,11 @@ def write_comparison(folder: Path) -> None:
     except InputError as error:
         logger.warning("no comparison of this sweep: %s", error)
         return
-    (folder / "comparison.md").write_text(markdown_of(comparison), encoding="utf-8")
+    best = best_lines(comparison.found.runs)
+    text = "\n\n".join([markdown_of(comparison).rstrip(), *best])
+    (folder / "comparison.md").write_text(f"{text}\n", encoding="utf-8")
     (folder / "comparison.csv").write_text(csv_of(comparison), encoding="utf-8")
     save_figure(figure_of(comparison), folder / "comparison.png")
     logger.info("Comparison of the sweep: %s", folder / "comparison.md")
+    for line in best:
+        logger.info("%s", line)

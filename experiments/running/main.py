@@ -42,7 +42,7 @@ def main(arguments: Sequence[str], program: str) -> None:
         start()
     except HydraException as error:
         sys.exit(f"error: {one_line(explained(error, arguments))}")
-    except OmegaConfBaseException as error:
+    except (InputError, OmegaConfBaseException) as error:
         sys.exit(f"error: {one_line(error)}")
 
 

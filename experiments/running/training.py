@@ -1,7 +1,6 @@
 """From a composed configuration to a finished run folder."""
 
 import logging
-import shlex
 import sys
 import time
 from pathlib import Path
@@ -24,6 +23,7 @@ from dolens.experiments.running.checkpoints import (
     checked_checkpoint,
     settings_of,
 )
+from dolens.experiments.running.command_line import command
 from dolens.experiments.running.compared_settings import all_settings, choices_of
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.extensions import import_extensions
@@ -192,7 +192,8 @@ def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
 
 
 def resume_command() -> str:
-    """The command that started this run, for a notice."""
-    program, *arguments = sys.argv
-    command = shlex.join(["python", program]) if program.endswith(".py") else program
-    return f"{command} {shlex.join(arguments)}"
+    """The command that runs this run again, for a notice; it runs a job of a sweep alone."""
+    hydra = HydraConfig.get()
+    if hydra.mode is not None and hydra.mode.name == "MULTIRUN":
+        return command(OmegaConf.to_container(hydra.overrides.task, resolve=False))
+    return command(sys.argv[1:])

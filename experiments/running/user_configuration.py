@@ -4,10 +4,12 @@ import sys
 from pathlib import Path
 
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
 from dolens.experiments.running.catalogue import user_configuration
+from dolens.packaged import packaged_configuration
 
 
 class UserConfiguration(SearchPathPlugin):
@@ -23,6 +25,7 @@ class UserConfiguration(SearchPathPlugin):
 def use_working_folder() -> None:
     """Make the configuration and the modules of the working folder known, in this process."""
     Plugins.instance().register(UserConfiguration)
+    _prefer_own_launchers()
     make_importable(Path.cwd())
 
 
@@ -33,3 +36,14 @@ def make_importable(folder: Path) -> None:
     """
     if str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
+
+
+def _prefer_own_launchers() -> None:
+    """Forget what other plugins store of launchers that are files of the configuration here.
+
+    Hydra would take the keys of hydra-joblib-launcher, where that is installed, for those of
+    `conf/hydra/launcher/joblib.yaml`.
+    """
+    stored = ConfigStore.instance().repo.get("hydra", {}).get("launcher", {})
+    for file in (packaged_configuration() / "hydra" / "launcher").glob("*.yaml"):
+        stored.pop(file.name, None)

@@ -14,6 +14,7 @@ from dolens.cli.app import app
 from dolens.cli.compare import fitting
 from dolens.errors import InputError
 from dolens.experiments.camera.photograph_scores import TABLE, scores_by_photograph
+from dolens.experiments.comparison.best import best_lines
 from dolens.experiments.comparison.comparison import compared, csv_of, markdown_of, plain
 from dolens.experiments.comparison.gains import gain
 from dolens.experiments.comparison.labels import metric_label, setting_label
@@ -332,3 +333,33 @@ def test_a_sweep_writes_its_comparison_and_names_a_job_that_failed(tmp_path):
         SweepComparison().on_multirun_end(config)
     text = (tmp_path / "comparison.md").read_text()
     assert "6: failed: surface 1: semi_diameter exceeds" in text
+
+
+def test_a_sweep_says_how_its_best_job_is_repeated(tmp_path, caplog, monkeypatch):
+    """More is better or less, by the metric's name, or as the run chose its best checkpoint."""
+    monkeypatch.setattr("sys.argv", ["dolens train", "-m", "hydra/launcher=joblib"])
+    for number, psnr in enumerate((24.0, 26.0, 25.0)):
+        folder = made(tmp_path / "psnr" / str(number), "joint", 0, psnr, number=number)
+        overrides = ["experiment=joint", f"network.name='a b {number}'"]
+        (folder / ".hydra/overrides.yaml").write_text(yaml.safe_dump(overrides))
+    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "psnr")}}})
+    with caplog.at_level("INFO"):
+        SweepComparison().on_multirun_end(config)
+    repeat = """dolens train experiment=joint 'network.name='"'"'a b 1'"'"''"""
+    line = f"The best test/psnr_db/worst, 26, has {tmp_path / 'psnr/1'}; to repeat it: {repeat}"
+    assert line in caplog.text and line in (tmp_path / "psnr/comparison.md").read_text()
+
+    def best(name, value, **settings):
+        folder = made(tmp_path / name / str(value), "joint", 0, 20.0, objective=name, **settings)
+        (folder / "metrics.json").write_text(json.dumps({name: value}))
+        return best_lines(compared([tmp_path / name]).found.runs)
+
+    best("rms_spot_um/final", 3.0)
+    assert best("rms_spot_um/final", 4.0)[0].startswith("The best rms_spot_um/final, 3,")
+    best("test/glow", 1.0)
+    assert best("test/glow", 2.0) == [
+        "Whether more of test/glow is better is not known: see the table for the best job"
+    ]
+    checkpoints = {"best": {"monitor": "val/shine", "mode": "max"}}
+    best("test/shine", 1.0, callbacks=checkpoints)
+    assert best("test/shine", 2.0, callbacks=checkpoints)[0].startswith("The best test/shine, 2,")
