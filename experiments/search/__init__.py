@@ -1,1 +1,1 @@
-"""A search for the best values of a configuration: Optuna proposes, jobs of a sweep try them out."""
+"""A search for the best values of a configuration: Optuna proposes, jobs of a sweep try."""

@@ -6,23 +6,18 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial
 
 from dolens.experiments.comparison.labels import metric_label
 from dolens.experiments.comparison.rows import text_of
 from dolens.experiments.running.command_line import command
 from dolens.experiments.search.directions import MAXIMIZE
-from dolens.experiments.search.search import PRUNED, Search
+from dolens.experiments.search.search import FAILED, FINISHED, PRUNED, Search, outcome
 from dolens.plotting import save_figure
 from dolens.plotting.search import SearchTrial, search_history_figure, trade_off_figure
 
 logger = logging.getLogger(__name__)
 
-_STATES = {
-    TrialState.COMPLETE: "finished",
-    TrialState.PRUNED: "pruned",
-    TrialState.FAIL: "failed",
-}
 # So many trials are listed.
 _LISTED = 10
 # Of fewer trials, the best tenth tells nothing about what matters.
@@ -50,7 +45,7 @@ def best_trials(search: Search) -> list[FrozenTrial]:
     """Return the finished trials from the best on; of several objectives, the Pareto front."""
     if len(search.objectives) > 1:
         return sorted(search.record.study.best_trials, key=lambda trial: tuple(trial.values))
-    finished = [trial for trial in search.trials() if trial.state == TrialState.COMPLETE]
+    finished = [trial for trial in search.trials() if outcome(trial) == FINISHED]
     (direction,) = _directions(search)
     return sorted(finished, key=lambda t: t.values[0], reverse=direction == MAXIMIZE)
 
@@ -62,7 +57,7 @@ def importances(search: Search) -> dict[str, Mapping[str, float]]:
     parameter, or of parameters that not all trials have.
     """
     study = search.record.study
-    finished = [trial for trial in search.trials() if trial.state == TrialState.COMPLETE]
+    finished = [trial for trial in search.trials() if outcome(trial) == FINISHED]
     if len(finished) < _ENOUGH or len(search.space.parameters) < 2:
         return {}
     found = {}
@@ -82,7 +77,8 @@ def importances(search: Search) -> dict[str, Mapping[str, float]]:
 def markdown_of(search: Search) -> str:
     """Return the tables and commands as Markdown."""
     trials, best = search.trials(), best_trials(search)
-    counts = {name: sum(t.state == s for t in trials) for s, name in _STATES.items()}
+    outcomes = [outcome(trial) for trial in trials]
+    counts = {name: outcomes.count(name) for name in (FINISHED, PRUNED, FAILED)}
     count = ", ".join(f"{number} {name}" for name, number in counts.items() if number)
     several = len(search.objectives) > 1
     lines = [f"## Search: {len(trials)} trials ({count})", ""]
@@ -109,7 +105,7 @@ def markdown_of(search: Search) -> str:
         heading = ["objective", *(_name(parameter) for parameter in parameters)]
         rows = [[n, *(f"{of.get(p, 0.0):.0%}" for p in parameters)] for n, of in shares.items()]
         lines += ["", *_table(heading, rows)]
-    pruned = [t for t in trials if t.state == TrialState.PRUNED and PRUNED in t.user_attrs]
+    pruned = [trial for trial in trials if outcome(trial) == PRUNED]
     if pruned:
         lines += ["", "Pruned:", "", *(f"- {t.number}: {t.user_attrs[PRUNED]}" for t in pruned)]
     lines += ["", "To repeat:" if several else "To repeat the best:", "", "```bash"]
@@ -120,9 +116,8 @@ def markdown_of(search: Search) -> str:
 def figure_of(search: Search) -> Figure | None:
     """Draw the course of a search with one objective, or the Pareto front of two; else nothing."""
     trials = [
-        SearchTrial(t.number, tuple(t.values) if state == "finished" else (), state)
+        SearchTrial(t.number, tuple(t.values) if (end := outcome(t)) == FINISHED else (), end)
         for t in search.trials()
-        if (state := _STATES.get(t.state))
     ]
     labels = [metric_label(name) for name in search.objectives]
     title = f"Search: {len(trials)} trials"

@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 # Attributes of a trial: why it was pruned; that a command that died left it; what it repeats.
 PRUNED, INTERRUPTED, REPEATS = "pruned", "interrupted", "repeats"
+# What becomes of a trial.
+FINISHED, FAILED = "finished", "failed"
 # Where so many trials all fail from the start, the next would too.
 _HOPELESS = 3
 
@@ -45,6 +47,15 @@ class Result:
 
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[Result]]
+
+
+def outcome(trial: FrozenTrial) -> str:
+    """Return `finished`, `pruned` or `failed`; `running` before the end."""
+    if not trial.state.is_finished():
+        return "running"
+    if trial.state == TrialState.COMPLETE:
+        return FINISHED
+    return PRUNED if PRUNED in trial.user_attrs else FAILED
 
 
 class Search:
@@ -108,13 +119,13 @@ class Search:
         """
         with alone(self.folder / JOURNAL):
             self._settle_interrupted()
-            launched: list[TrialState] = []
+            launched: list[str] = []
             while batch := self._propose():
                 overrides = [self.space.overrides(trial.params) for trial in batch]
                 results = launch(overrides, batch[0].number)
                 for trial, result in zip(batch, results, strict=True):
                     launched.append(self._take(trial.number, result))
-                if len(launched) >= _HOPELESS and set(launched) == {TrialState.FAIL}:
+                if len(launched) >= _HOPELESS and set(launched) == {FAILED}:
                     raise InputError(
                         f"search: the first {len(launched)} trials all failed: "
                         f"{self._reason(results[-1])}"
@@ -146,16 +157,16 @@ class Search:
 
     # ---------------------------------------------------------------- results
 
-    def _take(self, number: int, result: Result) -> TrialState:
-        """Note what became of a trial."""
-        study, trial = self.record.study, self.record.trial(number)[1]
-        values = result.values
+    def _take(self, number: int, result: Result) -> str:
+        """Note what became of a trial, and return it."""
+        study, values = self.record.study, result.values
         if len(values) == len(self.objectives) and all(map(math.isfinite, values)):
             study.tell(number, list(values))
-            return TrialState.COMPLETE
-        state = TrialState.PRUNED if PRUNED in trial.user_attrs else TrialState.FAIL
-        study.tell(number, state=state)
-        return state
+        else:
+            # Samplers pass over trials that fail, and would go on proposing such; they learn from
+            # those that were pruned.
+            study.tell(number, state=TrialState.PRUNED)
+        return outcome(self.record.trial(number)[1])
 
     def _settle_interrupted(self) -> None:
         """Settle trials that ran when a command died: by their results, or to be repeated."""
