@@ -1,0 +1,109 @@
+"""`dolens train -m search=optuna`: the trials of a search are the jobs of a sweep."""
+
+import json
+import sys
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from typer.testing import CliRunner
+
+from dolens.cli.app import app
+from dolens.errors import InputError
+from dolens.experiments.running.training import run
+
+SHORT = [
+    *("experiment=asphere", "optimizer=adam", "optimizer.betas=[0.5,0.9]", "backend=reference"),
+    *("data.iterations=3", "trainer.max_epochs=3", "module.round_tolerance=0"),
+    *("merit.sampling_options.count=7", "callbacks.pictures=null", "callbacks.files=null"),
+    *("callbacks.progress=null", "+trainer.enable_progress_bar=false", "logger=null"),
+]
+
+
+@pytest.fixture
+def trained(tmp_path, monkeypatch):
+    """Call `dolens train` in a folder of its own; return its exit status and what it printed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "argv", [])
+
+    def call(*arguments):
+        done = CliRunner().invoke(app, ["train", *arguments], env={"COLUMNS": "100"})
+        return done.exit_code, done.output
+
+    yield call
+    GlobalHydra.instance().clear()
+    HydraConfig.instance().cfg = None
+
+
+def test_a_search_prunes_what_falls_behind_and_leaves_tables_and_the_best_command(
+    trained, tmp_path
+):
+    status, _ = trained(
+        *("-m", *SHORT, "search=optuna", "hydra/sweeper/pruner=median", "hydra.sweep.dir=found"),
+        *("optimizer.lr=choice(0.003,1e-6)", "hydra.sweeper.trials=9"),
+        *("hydra.sweeper.pruner.n_startup_trials=1", "hydra.sweeper.pruner.n_warmup_steps=0"),
+    )
+    assert status == 0
+    found = tmp_path / "found"
+    runs = {n: json.loads((found / str(n) / "run.json").read_text()) for n in range(9)}
+    pruned = [n for n, info in runs.items() if info["status"] == "pruned"]
+    assert 0 < len(pruned) < 9
+    assert {info["status"] for info in runs.values()} == {"pruned", "finished"}
+    assert not any((found / str(n) / "metrics.json").exists() for n in pruned)
+    for name in ("comparison.md", "search.md"):
+        text = (found / name).read_text()
+        assert "val/merit = " in text and "after epoch" in text and f"{len(pruned)} " in text
+    (command,) = (line for line in text.splitlines() if line.startswith("dolens train"))
+    assert "optimizer.lr=0.003" in command and "-m" not in command
+    for name in ("multirun.yaml", "search.journal", "search.png", "comparison.png"):
+        assert (found / name).is_file()
+
+
+SEARCH = ["-m", *SHORT, "search=optuna"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([*SEARCH], "there is nothing to search; give a value as interval(low,high)"),
+        ([*SEARCH, "optimizer.lr=interval(2,1)"], "interval(2,1): the lower end comes first"),
+        ([*SEARCH, "optimizer.lrr=interval(1,2)"], "optimizer.lrr: there is no such setting"),
+        ([*SEARCH, "lens=interval(1,2)"], "lens="),
+        ([*SEARCH, "network=unet,unett"], "network=unett: there is no such file"),
+        ([*SEARCH, "seed=1,2", "hydra/sweeper/sampler=tpa"], "did you mean 'tpe'?"),
+        ([*SEARCH, "seed=1,2", "+hydra.sweeper.sampler.x=1"], "sampler: unknown key 'x'"),
+        ([*SEARCH, "seed=1,2", "+hydra.sweeper.trial=1"], "hydra.sweeper: unknown key 'trial'"),
+        ([*SEARCH, "seed=1,2", "objective=efl_mm/final"], "hydra.sweeper.directions"),
+        ([*SEARCH, "experiment=asphere,pose_bounds"], "a search has one objective for all"),
+        (
+            [*SEARCH, "seed=1,2", "objective=[test/ssim,cost/wall_s]", "hydra/sweeper/pruner=median"],
+            "hopeless by 2 objectives",
+        ),
+    ],
+)
+def test_a_mistake_is_one_line_before_any_job(trained, tmp_path, arguments, expected):
+    status, output = trained(*arguments, "hydra.sweep.dir=found")
+    assert status == 1
+    (line,) = (line for line in output.splitlines() if line.startswith("error: "))
+    assert expected in line
+    assert not (tmp_path / "found" / "0").exists()
+
+
+def test_what_no_job_can_do_ends_the_search(trained):
+    status, output = trained(*SEARCH, "seed=1,2", "objective=error/nothing", "trainer.max_epochs=0")
+    assert status == 1
+    assert "the first 3 trials all failed: objective: 'error/nothing' is not among" in output
+
+
+def test_a_run_returns_each_of_several_objectives(composed):
+    names = ["rms_spot_um/final", "cost/iterations"]
+    values = run(composed(*SHORT, f"objective=[{','.join(names)}]"))
+    assert values[0] > 0 and values[1] == 9
+
+
+@pytest.mark.parametrize("objective", ["[]", "[a,a]", "[1]", "{a:1}"])
+def test_an_objective_that_is_none_is_one_line(composed, objective):
+    with pytest.raises(InputError, match="^objective: ") as caught:
+        run(composed(*SHORT, f"objective={objective}"))
+    assert "\n" not in str(caught.value)
