@@ -13,8 +13,12 @@ from dolens.experiments.comparison.rows import text_of
 from dolens.experiments.running.command_line import command
 from dolens.experiments.search.directions import MAXIMIZE
 from dolens.experiments.search.search import FAILED, FINISHED, PRUNED, Search, outcome
-from dolens.plotting import save_figure
-from dolens.plotting.search import SearchTrial, search_history_figure, trade_off_figure
+from dolens.plotting import (
+    SearchTrial,
+    save_figure,
+    search_history_figure,
+    trade_off_figure,
+)
 
 logger = logging.getLogger(__name__)
 

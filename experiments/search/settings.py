@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
 from dolens.experiments.running.target_keys import refuse_unknown_keys
 
 if TYPE_CHECKING:
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
 
 _KEY = "hydra.sweeper"
+# Keys there that are the sweeper's own.
+_OTHERS = ("_target_", "_recursive_", "params", "storage")
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,14 @@ class SearchSettings:
 
     @classmethod
     def of(cls, sweeper: Mapping[str, Any]) -> "SearchSettings":
-        """Read them from `hydra.sweeper`; keys that are not theirs are passed over."""
-        names = [name for name in inspect.signature(cls).parameters if name in sweeper]
-        return cls(**{name: _plain(sweeper[name]) for name in names})
+        """Read them from `hydra.sweeper`.
+
+        Raises:
+            InputError: an unknown key, or a value that is not allowed.
+        """
+        settings = {str(key): value for key, value in sweeper.items() if key not in _OTHERS}
+        check_keys(settings, inspect.signature(cls).parameters, _KEY)
+        return cls(**{name: _plain(value) for name, value in settings.items()})
 
     def make_sampler(self, index: int) -> "BaseSampler":
         """Return the sampler of a trial.

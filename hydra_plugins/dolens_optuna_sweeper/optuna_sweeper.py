@@ -60,9 +60,8 @@ class OptunaSweeper(Sweeper):
         from dolens.errors import InputError
         from dolens.experiments.search.settings import SearchSettings
 
-        loader = self.hydra_context.config_loader
         params = [f"{key}={value}" for key, value in self.params.items()]
-        parser = OverridesParser.create(config_loader=loader)
+        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         try:
             settings = SearchSettings.of(self.settings)
             from dolens.experiments.search.sweep import search  # needs Optuna
@@ -71,11 +70,18 @@ class OptunaSweeper(Sweeper):
                 parser.parse_overrides([*params, *arguments]),
                 settings,
                 Path(self.config.hydra.sweep.dir),
-                compose=lambda job: loader.load_sweep_config(self.config, list(job)),
+                compose=self._compose,
                 begin=self._begin,
                 launch=self._launch,
             )
         except InputError as error:
+            raise HydraException(str(error)) from error
+
+    def _compose(self, job: Sequence[str]) -> DictConfig:
+        try:
+            return self.hydra_context.config_loader.load_sweep_config(self.config, list(job))
+        except ValueError as error:
+            # Hydra says so of a group that is chosen by a number.
             raise HydraException(str(error)) from error
 
     def _begin(self) -> None:

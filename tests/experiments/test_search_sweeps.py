@@ -14,9 +14,9 @@ from dolens.experiments.running.training import run
 
 SHORT = [
     *("experiment=asphere", "optimizer=adam", "optimizer.betas=[0.5,0.9]", "backend=reference"),
-    *("data.iterations=3", "trainer.max_epochs=3", "module.round_tolerance=0"),
+    *("data.iterations=3", "trainer.max_epochs=2", "module.round_tolerance=0"),
     *("merit.sampling_options.count=7", "callbacks.pictures=null", "callbacks.files=null"),
-    *("callbacks.progress=null", "+trainer.enable_progress_bar=false", "logger=null"),
+    *("callbacks.progress=null", "+trainer.enable_progress_bar=false", "logger.tensorboard=null"),
 ]
 
 
@@ -41,14 +41,14 @@ def test_a_search_prunes_what_falls_behind_and_leaves_tables_and_the_best_comman
 ):
     status, _ = trained(
         *("-m", *SHORT, "search=optuna", "hydra/sweeper/pruner=median", "hydra.sweep.dir=found"),
-        *("optimizer.lr=choice(0.003,1e-6)", "hydra.sweeper.trials=9"),
+        *("optimizer.lr=choice(0.003,1e-6)", "hydra.sweeper.trials=5"),
         *("hydra.sweeper.pruner.n_startup_trials=1", "hydra.sweeper.pruner.n_warmup_steps=0"),
     )
     assert status == 0
     found = tmp_path / "found"
-    runs = {n: json.loads((found / str(n) / "run.json").read_text()) for n in range(9)}
+    runs = {n: json.loads((found / str(n) / "run.json").read_text()) for n in range(5)}
     pruned = [n for n, info in runs.items() if info["status"] == "pruned"]
-    assert 0 < len(pruned) < 9
+    assert 0 < len(pruned) < 5
     assert {info["status"] for info in runs.values()} == {"pruned", "finished"}
     assert not any((found / str(n) / "metrics.json").exists() for n in pruned)
     for name in ("comparison.md", "search.md"):
@@ -67,17 +67,19 @@ SEARCH = ["-m", *SHORT, "search=optuna"]
     ("arguments", "expected"),
     [
         ([*SEARCH], "there is nothing to search; give a value as interval(low,high)"),
-        ([*SEARCH, "optimizer.lr=interval(2,1)"], "interval(2,1): the lower end comes first"),
         ([*SEARCH, "optimizer.lrr=interval(1,2)"], "optimizer.lrr: there is no such setting"),
-        ([*SEARCH, "lens=interval(1,2)"], "lens="),
-        ([*SEARCH, "network=unet,unett"], "network=unett: there is no such file"),
         ([*SEARCH, "seed=1,2", "hydra/sweeper/sampler=tpa"], "did you mean 'tpe'?"),
-        ([*SEARCH, "seed=1,2", "+hydra.sweeper.sampler.x=1"], "sampler: unknown key 'x'"),
-        ([*SEARCH, "seed=1,2", "+hydra.sweeper.trial=1"], "hydra.sweeper: unknown key 'trial'"),
-        ([*SEARCH, "seed=1,2", "objective=efl_mm/final"], "hydra.sweeper.directions"),
-        ([*SEARCH, "experiment=asphere,pose_bounds"], "a search has one objective for all"),
         (
-            [*SEARCH, "seed=1,2", "objective=[test/ssim,cost/wall_s]", "hydra/sweeper/pruner=median"],
+            ["-m", "search=optuna", "experiment=asphere,pose_bounds"],
+            "a search has one objective for all",
+        ),
+        (
+            [
+                *SEARCH,
+                "seed=1,2",
+                "objective=[test/ssim,cost/wall_s]",
+                "hydra/sweeper/pruner=median",
+            ],
             "hopeless by 2 objectives",
         ),
     ],
@@ -99,7 +101,7 @@ def test_what_no_job_can_do_ends_the_search(trained):
 def test_a_run_returns_each_of_several_objectives(composed):
     names = ["rms_spot_um/final", "cost/iterations"]
     values = run(composed(*SHORT, f"objective=[{','.join(names)}]"))
-    assert values[0] > 0 and values[1] == 9
+    assert values[0] > 0 and values[1] == 6
 
 
 @pytest.mark.parametrize("objective", ["[]", "[a,a]", "[1]", "{a:1}"])
