@@ -94,7 +94,7 @@ class Search:
                 f"{len(objectives)} objectives ({', '.join(objectives)}); leave it out, or name "
                 "one objective"
             )
-        settings.make_pruner()
+        pruner = settings.make_pruner()
         settings.make_sampler(0)
         self.folder, self.space, self.settings = folder, space, settings
         self.objectives = tuple(objectives)
@@ -107,6 +107,8 @@ class Search:
                 "overrides": list(space.fixed),
             },
         )
+        if pruner is not None:
+            self.record.study.pruner = pruner  # TPE keeps to the brackets of Hyperband
 
     def run(self, launch: Launch) -> None:
         """Run trials until there are as many as asked for.

@@ -6,11 +6,16 @@ import sys
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from optuna.trial import TrialState
 from typer.testing import CliRunner
 
 from dolens.cli.app import app
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
+from dolens.experiments.search.pruned import TrialPruned
+from dolens.experiments.search.pruning import PruneTrial
+from dolens.experiments.search.storage import record_of_job
+from tests.experiments.test_search import begun
 
 SHORT = [
     *("experiment=asphere", "optimizer=adam", "optimizer.betas=[0.5,0.9]", "backend=reference"),
@@ -98,6 +103,53 @@ def test_what_no_job_can_do_ends_the_search(trained):
     assert "the first 3 trials all failed: objective: 'error/nothing' is not among" in output
 
 
+@pytest.fixture
+def as_trial(composed, tmp_path, monkeypatch):
+    """Run the first trial of a search that prunes; return the search."""
+
+    def build(direction="minimize", **others):
+        found = begun(tmp_path / "search", directions=(direction,), pruner=NEVER, **others)
+        (trial,) = found._propose()
+        journal = tmp_path / "search" / "search.journal"
+        callback = PruneTrial(journal, trial.number, found.settings)
+        monkeypatch.setattr(
+            "dolens.experiments.running.training.trial_callbacks", lambda: [callback]
+        )
+        run(composed(*SHORT))
+        return found
+
+    return build
+
+
+NEVER = {"_target_": "optuna.pruners.NopPruner"}
+
+
+@pytest.mark.parametrize("direction", ["minimize", "maximize"])
+def test_a_search_is_told_so_that_a_pruner_compares_as_the_study_does(as_trial, direction):
+    search = as_trial(direction=direction, every_n_steps=2, monitor="train/merit")
+    (told,) = (trial.intermediate_values for trial in search.record.study.trials)
+    assert list(told) == [2, 4, 6]
+    values = [value if direction == "minimize" else -value for value in told.values()]
+    assert 0.0 < values[-1] < values[0]
+
+
+def test_a_metric_to_prune_by_that_is_never_logged_is_one_line(as_trial):
+    with pytest.raises(InputError, match="'val/loss' was never logged"):
+        as_trial(monitor="val/loss")
+
+
+def test_a_run_that_its_search_has_repeated_stops(as_trial, tmp_path):
+    def finish(self, trainer, pl_module):
+        other = record_of_job(tmp_path / "search" / "search.journal")
+        other.study.tell(0, state=TrialState.FAIL)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PruneTrial, "on_train_start", finish)
+        with pytest.raises(TrialPruned, match="went on without it"):
+            as_trial()
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "pruned"
+
+
 def test_a_run_returns_each_of_several_objectives(composed):
     names = ["rms_spot_um/final", "cost/iterations"]
     values = run(composed(*SHORT, f"objective=[{','.join(names)}]"))
@@ -106,6 +158,6 @@ def test_a_run_returns_each_of_several_objectives(composed):
 
 @pytest.mark.parametrize("objective", ["[]", "[a,a]", "[1]", "{a:1}"])
 def test_an_objective_that_is_none_is_one_line(composed, objective):
-    with pytest.raises(InputError, match="^objective: ") as caught:
+    with pytest.raises(InputError, match=r"^objective: ") as caught:
         run(composed(*SHORT, f"objective={objective}"))
     assert "\n" not in str(caught.value)
