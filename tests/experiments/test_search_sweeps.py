@@ -97,12 +97,6 @@ def test_a_mistake_is_one_line_before_any_job(trained, tmp_path, arguments, expe
     assert not (tmp_path / "found" / "0").exists()
 
 
-def test_what_no_job_can_do_ends_the_search(trained):
-    status, output = trained(*SEARCH, "seed=1,2", "objective=error/nothing", "trainer.max_epochs=0")
-    assert status == 1
-    assert "the first 3 trials all failed: objective: 'error/nothing' is not among" in output
-
-
 @pytest.fixture
 def as_trial(composed, tmp_path, monkeypatch):
     """Run the first trial of a search that prunes; return the search."""
