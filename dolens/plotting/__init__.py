@@ -11,11 +11,13 @@ from dolens.plotting.psf import psf_figure
 from dolens.plotting.ray_fans import ray_fans_figure
 from dolens.plotting.rms_curves import rms_curves_figure
 from dolens.plotting.runs import RunPoint, runs_curve, runs_figure
+from dolens.plotting.search import SearchTrial, search_history_figure, trade_off_figure
 from dolens.plotting.spots import spots_comparison_figure, spots_figure
 
 __all__ = [
     "Point",
     "RunPoint",
+    "SearchTrial",
     "before_after_figure",
     "comparison_figure",
     "figure_to_image",
@@ -31,6 +33,8 @@ __all__ = [
     "runs_figure",
     "save_figure",
     "save_figures",
+    "search_history_figure",
     "spots_comparison_figure",
     "spots_figure",
+    "trade_off_figure",
 ]

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import lightning
 
+from dolens.experiments.search.pruned import TrialPruned
+
 logger = logging.getLogger(__name__)
 
 
@@ -28,7 +30,9 @@ class InterruptionNotice(lightning.Callback):
         pl_module: lightning.LightningModule,
         exception: BaseException,
     ) -> None:
-        """Log one line."""
+        """Log one line; none where a search has given the run up."""
+        if isinstance(exception, TrialPruned):
+            return
         written = [self.folder / f"{name}.ckpt" for name in ("last", "best")]
         newest = next((path for path in written if path.exists()), None)
         if newest is not None:

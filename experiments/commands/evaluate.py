@@ -126,7 +126,7 @@ def evaluate(
         numbers = plain_metrics(metrics)
         write_json(output / METRICS, numbers)
         logger.info("Evaluation: %s", output)
-    return Evaluated(output, numbers, run.settings.objective, run)
+    return Evaluated(output, numbers, run.settings.objectives[0], run)
 
 
 def own_metrics(found: Evaluated) -> dict[str, float]:

@@ -107,7 +107,7 @@ def chosen_metrics(rows: Rows, wanted: Sequence[str] = ()) -> list[str]:
 def objectives(rows: Rows) -> list[str]:
     """Return the metrics that the runs returned, without those that no run has."""
     metrics = _of_all(rows)
-    named = (run.objective for row in rows.rows for run in row.runs.values())
+    named = (n for row in rows.rows for run in row.runs.values() for n in run.objectives)
     return [name for name in dict.fromkeys(named) if name in metrics]
 
 

@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError
 from dolens.experiments.camera.photograph_scores import PhotographScores, read_scores
+from dolens.experiments.running.objectives import objective_names
 from dolens.experiments.running.plain_values import flat
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_files import (
@@ -44,7 +45,7 @@ class Run:
             in all runs.
         values: the same settings with interpolations resolved, for a reader.
         overridden: the settings that the command line named.
-        objective: the name of the metric that the run returned.
+        objectives: the names of the metrics that the run returned.
         metrics: those of metrics.json.
         scores: of each test photograph, or None where the run kept none.
         code: the git commit, and the device, as run.json has them.
@@ -57,7 +58,7 @@ class Run:
     config: Mapping[str, str]
     values: Mapping[str, Any]
     overridden: tuple[str, ...]
-    objective: str
+    objectives: tuple[str, ...]
     metrics: Mapping[str, float]
     scores: PhotographScores | None
     code: tuple[str, str]
@@ -73,7 +74,7 @@ class UnfinishedRun:
 
     Attributes:
         folder: of the run.
-        status: `failed`, `interrupted` or `unfinished`.
+        status: `failed`, `interrupted`, `unfinished`, `pruned` or `repeated`.
         reason: the last error in its log, or what else is known.
     """
 
@@ -118,7 +119,7 @@ def read_run(folder: Path, judge: str | None = None) -> Run:
         own,
         values,
         tuple(override.lstrip("+~").partition("=")[0] for override in overrides),
-        str(values.get("objective", "")),
+        objective_names(values.get("objective", "")),
         metrics,
         read_scores(folder, f"test_{judge}" if judge else "test"),
         _code(folder),
@@ -135,7 +136,9 @@ def read_unfinished(folder: Path) -> UnfinishedRun:
     status = info.get("status", "failed")
     lines = _log(folder)
     errors = [match[1] for line in lines if (match := _ERROR.match(line))]
-    if errors:
+    if "reason" in info:  # of a run that a search gave up
+        reason = str(info["reason"])
+    elif errors:
         reason = errors[-1]
     elif status == "running":
         last = f"; its log ends with: {lines[-1]}" if lines else ""

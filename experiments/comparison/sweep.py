@@ -13,7 +13,7 @@ from dolens.experiments.comparison.best import best_lines
 from dolens.experiments.comparison.comparison import compared, csv_of, figure_of, markdown_of
 from dolens.experiments.comparison.found import run_folders
 from dolens.experiments.comparison.run import read_unfinished
-from dolens.experiments.running.run_files import has_metrics
+from dolens.experiments.running.run_files import has_metrics, is_given_up
 from dolens.plotting import save_figure
 
 logger = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class SweepComparison(Callback):
         folder = Path(config.hydra.sweep.dir)
         write_comparison(folder)
         jobs = run_folders(folder) if folder.is_dir() else []
-        failed = [job for job in jobs if not has_metrics(job)]
+        failed = [job for job in jobs if not has_metrics(job) and not is_given_up(job)]
         if failed:
             of_reason: dict[str, list[str]] = {}
             for run in map(read_unfinished, failed):

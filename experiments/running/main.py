@@ -18,6 +18,7 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
+from dolens.experiments.search.pruned import TrialPruned
 from dolens.packaged import packaged_configuration
 
 logger = logging.getLogger(__name__)
@@ -46,8 +47,8 @@ def main(arguments: Sequence[str], program: str) -> None:
         sys.exit(f"error: {one_line(error)}")
 
 
-def job(cfg: DictConfig) -> float:
-    """Run one composed experiment and return its objective; launchers bring it to processes.
+def job(cfg: DictConfig) -> float | tuple[float, ...]:
+    """Run one composed experiment and return its objectives; launchers bring it to processes.
 
     In a sweep a job that fails does not end the others: it returns NaN, and the sweep's comparison
     names it.  The log of a run that fails ends with the reason.
@@ -56,6 +57,8 @@ def job(cfg: DictConfig) -> float:
     swept = HydraConfig.get().mode == RunMode.MULTIRUN
     try:
         return run(cfg)
+    except TrialPruned as pruned:
+        logger.info("Pruned: %s", pruned)
     except (InputError, HydraException, OmegaConfBaseException) as error:
         # Hydra reports a class that could not be made; the reason is what the user can mend.
         reason = error.__cause__ if isinstance(error.__cause__, InputError) else error

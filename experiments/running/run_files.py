@@ -10,6 +10,7 @@ import yaml
 INFO, METRICS = "run.json", "metrics.json"
 CONFIG, RESOLVED = ".hydra/config.yaml", ".hydra/resolved.yaml"
 OVERRIDES, HYDRA = ".hydra/overrides.yaml", ".hydra/hydra.yaml"
+_GIVEN_UP = ("pruned", "repeated")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -47,6 +48,11 @@ def overrides_of(folder: Path) -> tuple[str, ...]:
 def has_metrics(folder: Path) -> bool:
     """Return whether a run came to its end, and wrote its metrics."""
     return (folder / METRICS).is_file()
+
+
+def is_given_up(folder: Path) -> bool:
+    """Return whether a search stopped a run, or repeated it elsewhere: it has not failed."""
+    return info_of(folder).get("status") in _GIVEN_UP
 
 
 def is_finished(folder: Path) -> bool:

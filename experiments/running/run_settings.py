@@ -7,6 +7,7 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from dolens.errors import InputError, check_choice
+from dolens.experiments.running.objectives import objective_names
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 _PRECISIONS = ("highest", "high", "medium")
@@ -35,7 +36,7 @@ class RunSettings:
         train: whether to train.
         test: whether to test.
         ckpt_path: a checkpoint to resume from, or None.
-        objective: the name of the metric that the run returns.
+        objective: the name of the metric that the run returns, or a list of them.
         state: of a lens that zooms or focuses, the state to work with; None: the lens itself.
 
     Raises:
@@ -57,7 +58,7 @@ class RunSettings:
     train: bool
     test: bool
     ckpt_path: str | None
-    objective: str
+    objective: str | ListConfig
     # Run folders of old lack it.
     state: str | None = None
 
@@ -69,10 +70,9 @@ class RunSettings:
         _check_type("seed", self.seed, int, "an integer")
         if self.threads is not None:
             _check_type("threads", self.threads, int, "an integer, or null")
-        if self.objective.startswith("test/") and not self.test:
-            raise InputError(
-                f"objective: '{self.objective}' needs test=true, or name another metric"
-            )
+        for name in self.objectives:
+            if name.startswith("test/") and not self.test:
+                raise InputError(f"objective: '{name}' needs test=true, or name another metric")
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -91,6 +91,11 @@ class RunSettings:
         if missing:
             raise InputError(f"{missing[0]}: is missing from the configuration")
         return cls(**{name: cfg[name] for name in cls.names() if name in cfg})
+
+    @property
+    def objectives(self) -> tuple[str, ...]:
+        """Return the names of the metrics that the run returns."""
+        return objective_names(self.objective)
 
     @property
     def dtype(self) -> torch.dtype:

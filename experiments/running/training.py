@@ -27,6 +27,7 @@ from dolens.experiments.running.command_line import command
 from dolens.experiments.running.compared_settings import all_settings, choices_of
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.extensions import import_extensions
+from dolens.experiments.running.objectives import returned
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_files import INFO, METRICS, RESOLVED, write_json
 from dolens.experiments.running.run_folder import (
@@ -35,6 +36,8 @@ from dolens.experiments.running.run_folder import (
     plain_metrics,
 )
 from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.search.pruned import TrialPruned
+from dolens.experiments.search.pruning import trial_callbacks
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
 
@@ -43,14 +46,15 @@ logger = logging.getLogger(__name__)
 register_resolvers()
 
 
-def run(cfg: DictConfig) -> float:
-    """Train, test, and write the run folder; return the objective that the config names.
+def run(cfg: DictConfig) -> float | tuple[float, ...]:
+    """Train, test, and write the run folder; return the objectives that the config names.
 
     Args:
         cfg: the composed configuration, as Hydra gives it to the job.
 
     Raises:
         InputError: what the configuration asks for cannot be done; see `checked`.
+        TrialPruned: the run is one of a search, and hopeless there.
     """
     started = time.perf_counter()
     folder = Path(HydraConfig.get().runtime.output_dir)
@@ -78,6 +82,7 @@ def run(cfg: DictConfig) -> float:
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
     callbacks.append(SettingsInCheckpoints(written))
+    callbacks.extend(trial_callbacks())
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
@@ -103,6 +108,9 @@ def run(cfg: DictConfig) -> float:
     except (KeyboardInterrupt, SystemExit):  # Lightning turns Ctrl-C into an exit
         status = "interrupted"
         raise
+    except TrialPruned as pruned:
+        status, info["reason"] = "pruned", str(pruned)
+        raise
     finally:
         save_lens(module.lens, folder / "lens" / "final.yaml")
         write_json(folder / INFO, {**info, "status": status})
@@ -114,7 +122,7 @@ def run(cfg: DictConfig) -> float:
     summary = RunSummary(
         choices=choices_of(cfg),
         settings=all_settings(cfg),
-        objective=settings.objective,
+        objective=settings.objectives[0],
         numbers=numbers,
         step=trainer.global_step,
     )
@@ -122,13 +130,10 @@ def run(cfg: DictConfig) -> float:
         summarise(entry, summary)
         entry.finalize("success")
     logger.info("Run folder: %s", folder)
-    objective = settings.objective
-    if objective not in numbers:
-        raise InputError(
-            f"objective: '{objective}' is not among the metrics ({', '.join(numbers)})"
-        )
-    logger.info("%s = %.4g", objective, numbers[objective])
-    return numbers[objective]
+    found = returned(settings.objectives, numbers)
+    for objective in settings.objectives:
+        logger.info("%s = %.4g", objective, numbers[objective])
+    return found
 
 
 def build_lens(settings: RunSettings) -> Lens:

@@ -84,7 +84,7 @@ def installed(root, tmp_path_factory) -> Path:
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("installed")
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(root / name, source)
-    for name in ("dolens", "experiments", "conf"):
+    for name in ("dolens", "experiments", "conf", "hydra_plugins"):
         shutil.copytree(root / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     build = "import setuptools.build_meta as b, sys; b.build_wheel(sys.argv[1])"
     subprocess.run(
@@ -108,6 +108,9 @@ def test_the_wheel_holds_every_file_of_the_library_the_experiments_and_the_confi
     for path in tracked:
         assert (installed / "dolens" / path.removeprefix("dolens/")).is_file(), path
     assert not (installed / "experiments").exists()
+    plugins = installed / "hydra_plugins"
+    assert (plugins / "dolens_optuna_sweeper/optuna_sweeper.py").is_file()
+    assert not (plugins / "__init__.py").exists()  # other packages have plugins there too
 
 
 def test_a_user_s_experiment_lens_and_surfaces_run_with_the_wheel(installed, root, tmp_path):
