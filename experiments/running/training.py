@@ -4,6 +4,8 @@ import logging
 import shlex
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,12 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
+from dolens.experiments.running.checkpoint_files import WholeCheckpoints
 from dolens.experiments.running.checkpoints import (
     SettingsInCheckpoints,
     checked_checkpoint,
@@ -81,6 +84,8 @@ def run(cfg: DictConfig) -> float:
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
+    if not settings.trainer.get("plugins"):  # which may bring a writer of their own
+        trainer.strategy.checkpoint_io = WholeCheckpoints()
     (folder / "lens").mkdir(exist_ok=True)
     (folder / ".hydra").mkdir(exist_ok=True)
     OmegaConf.save(cfg, folder / RESOLVED, resolve=True)
@@ -100,12 +105,17 @@ def run(cfg: DictConfig) -> float:
             trainer.test(module, data, ckpt_path=trained, weights_only=True, verbose=False)
             metrics.update(trainer.callback_metrics)
         status = "finished"
-    except (KeyboardInterrupt, SystemExit):  # Lightning turns Ctrl-C into an exit
-        status = "interrupted"
+    except BaseException as error:
+        # Lightning turns Ctrl-C into an exit.
+        stopped = isinstance(error, KeyboardInterrupt | SystemExit)
+        status = "interrupted" if stopped else "failed"
         raise
     finally:
-        save_lens(module.lens, folder / "lens" / "final.yaml")
-        write_json(folder / INFO, {**info, "status": status})
+        # An error on its way out is the one to be heard of.
+        with logged_if(status != "finished"):
+            write_json(folder / INFO, {**info, "status": status})
+        with logged_if(status != "finished"):
+            save_lens(module.lens, folder / "lens" / "final.yaml")
     metrics.update(summary_of(module))
     metrics["cost/wall_s"] = time.perf_counter() - started
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
@@ -129,6 +139,17 @@ def run(cfg: DictConfig) -> float:
         )
     logger.info("%s = %.4g", objective, numbers[objective])
     return numbers[objective]
+
+
+@contextmanager
+def logged_if(failing: bool) -> Iterator[None]:
+    """Log what goes wrong in a block in the place of raising it, if a run is failing already."""
+    try:
+        yield
+    except Exception as error:
+        if not failing:
+            raise
+        logger.error("%s", one_line(error))
 
 
 def build_lens(settings: RunSettings) -> Lens:
