@@ -70,6 +70,11 @@ class History(Logger):
         self.finalize("success")
 
     @rank_zero_only
+    def save(self) -> None:
+        """Write the rows that wait."""
+        self._write()
+
+    @rank_zero_only
     def finalize(self, status: str) -> None:
         """Write the last rows."""
         self._write()

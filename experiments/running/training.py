@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
+from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
@@ -40,6 +41,7 @@ from dolens.experiments.running.run_folder import (
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
+from dolens.whole_files import written_whole
 
 logger = logging.getLogger(__name__)
 
@@ -80,7 +82,7 @@ def run(cfg: DictConfig) -> float:
     if not settings.trainer.get("enable_progress_bar", True):
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
-    callbacks.append(SettingsInCheckpoints(written))
+    callbacks += [LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
@@ -88,7 +90,8 @@ def run(cfg: DictConfig) -> float:
         trainer.strategy.checkpoint_io = WholeCheckpoints()
     (folder / "lens").mkdir(exist_ok=True)
     (folder / ".hydra").mkdir(exist_ok=True)
-    OmegaConf.save(cfg, folder / RESOLVED, resolve=True)
+    with written_whole(folder / RESOLVED) as aside:
+        OmegaConf.save(cfg, aside, resolve=True)
     save_lens(lens, folder / "lens" / "initial.yaml")
     device = str(trainer.strategy.root_device)
     info = describe_run(settings.seed, device, settings.lens_dtype, sys.argv)
