@@ -166,7 +166,8 @@ def _command_of(process: Process, arguments: list[str], run: Path) -> tuple[list
 def table(results: list[Kills]) -> list[str]:
     """Return lines of Markdown."""
     lines = [
-        "| kind | run, s | SIGKILL | SIGTERM | Ctrl-C | in writing | resumed | equal | rows lost | faults |",
+        "| kind | run, s | SIGKILL | SIGTERM | Ctrl-C | in writing | resumed | equal | rows lost "
+        "| faults |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in results:
