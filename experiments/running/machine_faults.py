@@ -32,7 +32,7 @@ def machine_fault(error: BaseException) -> str | None:
     for found in _chain(error):
         if isinstance(found, OSError) and found.errno in _FAULTS:
             place = found.filename2 or found.filename
-            return one_line(f"{f'{place}: ' if place else ''}{_FAULTS[found.errno]} ({found})")
+            return one_line(f"{place}: {_FAULTS[found.errno]}" if place else _FAULTS[found.errno])
         lost = _LOST_WORKER.search(str(found)) if isinstance(found, RuntimeError) else None
         if lost:
             return one_line(

@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
 from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
+from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
@@ -82,7 +83,7 @@ def run(cfg: DictConfig) -> float:
     if not settings.trainer.get("enable_progress_bar", True):
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
-    callbacks += [LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
+    callbacks += [ResumedEpochs(), LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)

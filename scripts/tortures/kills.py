@@ -54,21 +54,23 @@ def killed(kind: str, overrides: list[str], count: int, folder: Path, first: int
         kind: its name.
         overrides: of the configuration.
         count: of runs to kill.
-        folder: for the runs; those that end well are removed.
+        folder: for the runs; those that end well are removed.  The run that nobody kills is made
+            once in it.
         first: number of the first one, which decides its moments.
     """
     found = Kills(kind)
     folder.mkdir(parents=True, exist_ok=True)
     whole = folder / "whole"
-    shutil.rmtree(whole, ignore_errors=True)
-    for prepare in (None, trust):  # the first may compile kernels
+    timed = folder / "seconds"
+    for prepare in () if timed.exists() else (None, trust):  # the first may compile kernels
         shutil.rmtree(whole, ignore_errors=True)
         began = time.monotonic()
         process = start([*overrides, f"hydra.run.dir={whole}"], folder / "whole.log", prepare)
         if process.wait(600.0):
             found.faults.append(f"the whole run fails: {process.said()[-500:]}")
             return found
-        found.seconds = time.monotonic() - began
+        timed.write_text(str(time.monotonic() - began))
+    found.seconds = float(timed.read_text())
     for number in range(first, first + count):
         faults = _one(found, overrides, folder / str(number), number, whole)
         found.faults += [f"{number}: {fault}" for fault in faults]

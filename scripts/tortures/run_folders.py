@@ -62,16 +62,27 @@ def differences(one: Path, other: Path) -> list[str]:
             found += [f"{name}: {line}" for line in _of_checkpoints(*map(read_checkpoint, paths))]
         elif name == "metrics.json":
             numbers = [_timeless(json.loads(path.read_text())) for path in paths]
+            # A run resumed behind its last step has no numbers of a step.
+            numbers[0] = {n: v for n, v in numbers[0].items() if n in numbers[1] or not _of_step(n)}
             found += [f"{name}: {line}" for line in _of_values(*numbers)]
         elif name.endswith(".csv"):
             tables = [[_timeless(row) for row in _rows(path)] for path in paths]
             if name == "metrics.csv":
                 steps = [{row["step"] for row in table} for table in tables]
                 tables = [[r for r in t if r["step"] in steps[0] & steps[1]] for t in tables]
+                tables[0] = [
+                    {name: value for name, value in row.items() if other.get(name)}
+                    for row, other in zip(*tables, strict=True)
+                ]
+                tables[1] = [{n: v for n, v in row.items() if v} for row in tables[1]]
             found += [f"{name}: {line}" for line in _of_values(*tables)][:3]
         elif name.startswith("lens/") and paths[0].read_bytes() != paths[1].read_bytes():
             found.append(f"{name}: other text")
     return found
+
+
+def _of_step(name: str) -> bool:
+    return name.startswith(("train/", "operand/", "lens_step/", "val/"))
 
 
 def lost_rows(one: Path, other: Path) -> int:
