@@ -7,6 +7,8 @@ from typing import Any, TypeVar
 
 from lightning.pytorch.loggers.logger import Logger
 
+from dolens.errors import one_line
+
 _log = logging.getLogger(__name__)
 
 _CALLED = (
@@ -38,13 +40,20 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
             return method(self, *arguments, **options)
         except Exception as error:
             self.has_failed = True
+            first = _first_of(error)
             _log.exception(
                 "The logger %s has failed in %s (%s: %s); the run goes on without it",
                 type(self).__name__,
                 name,
-                type(error).__name__,
-                error,
+                type(first).__name__,
+                one_line(first),
             )
             return None
 
     return guarded
+
+
+def _first_of(error: BaseException) -> BaseException:
+    """Return the error that others were raised for, as Lightning does for one about a value."""
+    before = error.__cause__ or error.__context__
+    return error if before is None else _first_of(before)

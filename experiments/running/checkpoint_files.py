@@ -46,16 +46,16 @@ class WholeCheckpoints(TorchCheckpointIO):
 
 
 def _save(checkpoint: Mapping[str, Any], path: Path) -> None:
-    with path.open("wb") as file:
-        try:
+    try:
+        with path.open("wb") as file:
             torch.save(dict(checkpoint), file)
-        except RuntimeError as error:
-            # PyTorch's writer reports a place in the file that does not fit, for every reason.
-            reason = error.__context__
-            if isinstance(reason, OSError):
-                reason.filename = str(path)
-                raise reason from None
-            raise
+    except (OSError, RuntimeError) as error:
+        # PyTorch's writer reports a place in the file that does not fit, for every reason.
+        reason = error if isinstance(error, OSError) else error.__context__
+        if isinstance(reason, OSError):
+            reason.filename = str(path)
+            raise reason from None
+        raise
 
 
 def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
