@@ -12,12 +12,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dolens.whole_files import UNFINISHED
-from scripts.tortures.processes import Process, start, trust, write_slowly
+from scripts.tortures.processes import PATIENCE_S, Process, start, trust, write_slowly
 from scripts.tortures.run_folders import differences, faults_of, lost_rows
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-_TRIES = 4  # of a moment at which the process still runs
-_AGAIN = 0.2  # how often a resumed run is killed too
+_TRIES = 4  # more, where a run has ended before it was killed
+_AGAIN = 0.6  # how often a resumed run is killed too
 
 
 @dataclass
@@ -27,17 +27,19 @@ class Kills:
     Attributes:
         kind: its name.
         seconds: of a run that nobody kills.
+        runs: that were killed, some of them again and again.
         by_signal: kills by name of the signal.
         in_writing: kills while a checkpoint was written.
         half_written: folders with a checkpoint that was not finished, beside a whole one or none.
-        resumed: runs resumed from a checkpoint; the others had none yet, and began anew.
+        resumed: kills after which there was a checkpoint; after the others the run began anew.
         lost_rows: steps that metrics.csv does not have.
-        equal: runs that ended as the one that nobody killed.
+        equal: runs that ended at last as the one that nobody killed.
         faults: what went wrong, with the number that repeats it.
     """
 
     kind: str
     seconds: float = 0.0
+    runs: int = 0
     by_signal: Counter = field(default_factory=Counter)
     in_writing: int = 0
     half_written: int = 0
@@ -53,7 +55,7 @@ def killed(kind: str, overrides: list[str], count: int, folder: Path, first: int
     Args:
         kind: its name.
         overrides: of the configuration.
-        count: of runs to kill.
+        count: of kills, at least.
         folder: for the runs; those that end well are removed.  The run that nobody kills is made
             once in it.
         first: number of the first one, which decides its moments.
@@ -71,51 +73,52 @@ def killed(kind: str, overrides: list[str], count: int, folder: Path, first: int
             return found
         timed.write_text(str(time.monotonic() - began))
     found.seconds = float(timed.read_text())
-    for number in range(first, first + count):
+    number = first
+    while found.by_signal.total() < count and found.runs < 3 * count:
+        found.runs += 1
         faults = _one(found, overrides, folder / str(number), number, whole)
         found.faults += [f"{number}: {fault}" for fault in faults]
         if not faults:
             shutil.rmtree(folder / str(number))
+        number += 1
     return found
 
 
 def _one(found: Kills, overrides: list[str], place: Path, number: int, whole: Path) -> list[str]:
-    """Kill one run once or twice, resume it, and return what was wrong."""
+    """Kill a run, and those that go on with it; let the last one end. Return what is wrong."""
     chance = random.Random(f"{found.kind} {number}")
     run = place / "run"
     place.mkdir(parents=True, exist_ok=True)
     arguments = [*overrides, f"hydra.run.dir={run}"]
-    command, faults = arguments, []
-    for attempt in range(_TRIES):
+    command, faults, kills, wanted = arguments, [], 0, 1
+    while chance.random() < _AGAIN:
+        wanted += 1
+    for attempt in range(wanted + _TRIES):
+        last = kills == wanted
         sent = SIGNALS[chance.randrange(len(SIGNALS))]
-        in_writing = chance.random() < 0.5 and (whole / "checkpoints").exists()
-        process = start(command, place / f"{attempt}.log", write_slowly if in_writing else trust)
-        hit = _kill(process, sent, chance, run, found.seconds, in_writing)
+        in_writing = chance.random() < 0.5 and (whole / "checkpoints").exists() and not last
+        prepare = write_slowly if in_writing else trust
+        process = start(command, place / f"{attempt}.log", prepare)
+        hit = not last and _kill(process, sent, chance, run, found.seconds, in_writing)
         try:
-            status = process.wait()
+            status = process.wait(600.0 if last else PATIENCE_S)
         except TimeoutError as error:
-            return [f"{sent.name}: {error}"]
+            return [*faults, f"{sent.name}: {error}"]
         if not hit:
             if status:
-                return [f"fails by itself: {process.said()[-300:]}"]
+                return [*faults, f"fails by itself: {process.said()[-400:]}"]
+            if kills:
+                break  # it has ended before it was killed once more
             shutil.rmtree(run)
-            command = arguments
             continue
+        kills += 1
         found.by_signal[sent.name] += 1
         found.in_writing += in_writing
         found.half_written += any(run.rglob(f"*{UNFINISHED}")) if run.exists() else 0
         faults += [f"after {sent.name}: {fault}" for fault in faults_of(run)]
         command, complaint = _command_of(process, arguments, run)
         faults += complaint
-        if chance.random() >= _AGAIN:
-            break
-    found.resumed += command is not arguments
-    process = start(command, place / "resumed.log", trust)
-    try:
-        if process.wait(600.0):
-            return [*faults, f"the resumed run fails: {process.said()[-400:]}"]
-    except TimeoutError as error:
-        return [*faults, str(error)]
+        found.resumed += command is not arguments
     faults += faults_of(run)
     left = differences(whole, run)
     found.lost_rows += lost_rows(whole, run)
@@ -144,7 +147,7 @@ def _kill(
                 break
             time.sleep(0.003)
     else:
-        end = time.monotonic() + chance.uniform(0.1, 0.95) * seconds
+        end = time.monotonic() + chance.uniform(0.1, 0.9) * seconds
         while process.poll() is None and time.monotonic() < end:
             time.sleep(0.002)
     if process.poll() is not None:
@@ -167,15 +170,11 @@ def _command_of(process: Process, arguments: list[str], run: Path) -> tuple[list
 
 def table(results: list[Kills]) -> list[str]:
     """Return lines of Markdown."""
-    lines = [
-        "| kind | run, s | SIGKILL | SIGTERM | Ctrl-C | in writing | resumed | equal | rows lost "
-        "| faults |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    heads = ["kind", "run, s", "runs", "SIGKILL", "SIGTERM", "Ctrl-C", "in writing", "resumed"]
+    rows = [[*heads, "equal", "rows lost", "faults"]]
+    rows.append(["---"] * len(rows[0]))
     for r in results:
-        sent = " | ".join(str(r.by_signal[s.name]) for s in SIGNALS)
-        lines.append(
-            f"| {r.kind} | {r.seconds:.1f} | {sent} | {r.in_writing} | {r.resumed} | {r.equal} "
-            f"| {r.lost_rows} | {len(r.faults)} |"
-        )
-    return lines
+        sent = [r.by_signal[s.name] for s in SIGNALS]
+        counts = [*sent, r.in_writing, r.resumed, r.equal, r.lost_rows, len(r.faults)]
+        rows.append([r.kind, f"{r.seconds:.1f}", str(r.runs), *map(str, counts)])
+    return ["| " + " | ".join(row) + " |" for row in rows]
