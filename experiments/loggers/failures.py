@@ -41,12 +41,13 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         except Exception as error:
             self.has_failed = True
             first = _first_of(error)
-            _log.exception(
+            _log.error(
                 "The logger %s has failed in %s (%s: %s); the run goes on without it",
                 type(self).__name__,
                 name,
                 type(first).__name__,
                 one_line(first),
+                exc_info=not isinstance(first, OSError),  # as a full disk, which needs no traceback
             )
             return None
 

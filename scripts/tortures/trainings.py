@@ -69,7 +69,7 @@ def unreadable_photograph(folder: Path) -> list[str]:
     for path in images.iterdir():
         path.write_bytes(path.read_bytes()[:200])
     process.wait()
-    return refused(process, ".png") + faults_of(run)
+    return refused(process, str(images)) + faults_of(run)
 
 
 def failing_figure(folder: Path) -> list[str]:
