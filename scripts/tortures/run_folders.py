@@ -68,13 +68,7 @@ def differences(one: Path, other: Path) -> list[str]:
         elif name.endswith(".csv"):
             tables = [[_timeless(row) for row in _rows(path)] for path in paths]
             if name == "metrics.csv":
-                steps = [{row["step"] for row in table} for table in tables]
-                tables = [[r for r in t if r["step"] in steps[0] & steps[1]] for t in tables]
-                tables[0] = [
-                    {name: value for name, value in row.items() if other.get(name)}
-                    for row, other in zip(*tables, strict=True)
-                ]
-                tables[1] = [{n: v for n, v in row.items() if v} for row in tables[1]]
+                tables = _in_both(*map(_by_step, tables))
             found += [f"{name}: {line}" for line in _of_values(*tables)][:3]
         elif name.startswith("lens/") and paths[0].read_bytes() != paths[1].read_bytes():
             found.append(f"{name}: other text")
@@ -92,6 +86,23 @@ def lost_rows(one: Path, other: Path) -> int:
     """
     steps = [{row["step"] for row in _rows(folder / "metrics.csv")} for folder in (one, other)]
     return len(steps[0] - steps[1])
+
+
+def _by_step(rows: list[dict[str, str]]) -> dict[str, dict[str, str]]:
+    """Return the numbers of each step; the end of a design's round has a row of its own."""
+    found: dict[str, dict[str, str]] = {}
+    for row in rows:
+        found.setdefault(row["step"], {}).update({n: v for n, v in row.items() if v})
+    return found
+
+
+def _in_both(one: dict[str, dict], other: dict[str, dict]) -> list[list[dict]]:
+    """Return the numbers that two tables have in common."""
+    both = [(one[step], other[step]) for step in one if step in other]
+    return [
+        [{n: a[n] for n in a if n in b} for a, b in both],
+        [{n: b[n] for n in a if n in b} for a, b in both],
+    ]
 
 
 def _names(folder: Path) -> set[str]:
