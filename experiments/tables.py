@@ -4,6 +4,8 @@ import csv
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from dolens.whole_files import written_whole
+
 Row = Mapping[str, float | str]
 
 
@@ -19,7 +21,7 @@ def write_table(path: Path, rows: Iterable[Row], digits: int | None = None) -> N
     if not kept:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with written_whole(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
         columns = dict.fromkeys(key for row in kept for key in row)
         writer = csv.DictWriter(file, list(columns), lineterminator="\n")
         writer.writeheader()

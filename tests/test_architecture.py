@@ -16,11 +16,12 @@ ALLOWED = {
     "html": set(),
     "file_text": {"errors"},
     "stages": set(),
+    "whole_files": set(),
     "cached_tensors": set(),
     "packaged": {"errors"},
     "kernels": {"cached_tensors", "errors", "stages"},
     "optics": {"cached_tensors", "errors", "file_text", "html", "kernels"},
-    "prescriptions": {"errors", "file_text", "packaged", "optics"},
+    "prescriptions": {"errors", "file_text", "packaged", "whole_files", "optics"},
     "sensor": {"errors", "optics"},
     "scene": {"errors", "optics", "sensor"},
     "analysis": {"errors", "optics", "scene", "sensor"},
@@ -48,6 +49,17 @@ ALLOWED["cli"] = {*ALLOWED, "experiments"}
 # one folder may import them, inside functions only: tracing and training need none of them.
 VIEWS = ROOT / "dolens" / "optics" / "lens_views"
 VIEWS_MAY_CALL = {"analysis", "diffraction", "plotting"}
+
+
+# What executes what a file holds.
+EXECUTING = {
+    *("pickle.load", "pickle.loads", "pickle.Unpickler", "joblib.load", "shelve.open"),
+    *("marshal.load", "marshal.loads", "yaml.unsafe_load", "yaml.full_load", "yaml.load_all"),
+    *("torch.jit.load", "torch.hub.load", "torch.package.PackageImporter", "os.system", "os.popen"),
+    *("pd.read_pickle", "importlib.machinery.SourceFileLoader"),
+}
+# Machine code of the user's own processor is code, however it is read.
+COMPILED = "dolens/kernels/cpu/kernel_files.py"
 
 
 def imports(path):
@@ -95,6 +107,13 @@ def test_views_of_a_lens_import_upper_floors_only_when_called():
 def test_nothing_prints_or_runs_text(path):
     for node, called in calls(path):
         assert called not in {"print", "exec", "eval", "compile"}, node.lineno
+        if name(path) != COMPILED:
+            assert called not in EXECUTING, node.lineno
+        if called in ("np.load", "numpy.load"):
+            given = {k.arg: k.value for k in node.keywords}.get("allow_pickle")
+            assert isinstance(given, ast.Constant) and given.value is False, node.lineno
+        if called == "yaml.load":  # by a loader of plain values
+            assert ast.unparse(node).endswith("Loader=_PlainLoader)"), node.lineno
         if called == "torch.load":
             safe = {k.arg: k.value for k in node.keywords}.get("weights_only")
             assert isinstance(safe, ast.Constant) and safe.value is True, node.lineno

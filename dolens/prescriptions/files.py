@@ -17,6 +17,7 @@ from dolens.prescriptions.published import PUBLISHED_KEY
 from dolens.prescriptions.read_file import ReadPrescription
 from dolens.prescriptions.states import STATES_KEY
 from dolens.prescriptions.yaml_text import plain_values
+from dolens.whole_files import written_whole
 
 __all__ = [
     "SUFFIXES",
@@ -209,4 +210,6 @@ def save_lens(lens: Lens, path: str | Path, glass_catalogues: GlassPlaces = None
     if path.suffix.lower() in _WITHOUT_SOURCE:
         prescription.pop("source", None)
     with glass_folders(glass_catalogues):
-        path.write_bytes(encode_prescription(prescription, path))
+        content = encode_prescription(prescription, path)
+    with written_whole(path) as aside:
+        aside.write_bytes(content)

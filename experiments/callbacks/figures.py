@@ -86,6 +86,8 @@ def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -
                 keep(name, draw())
         except InputError as problem:
             logger.warning("No figure '%s': %s", name, problem)
+        except OSError as problem:  # as a full disk, of which a traceback says nothing
+            logger.error("No figure '%s': %s", name, problem)
         except Exception:
             logger.exception("No figure '%s'", name)
 

@@ -1,10 +1,12 @@
 """A notice to the user when a run stops early."""
 
 import logging
+import shlex
 from pathlib import Path
 
 import lightning
 
+from dolens.experiments.running.override_text import override_text
 from dolens.experiments.search.pruned import TrialPruned
 
 logger = logging.getLogger(__name__)
@@ -37,11 +39,11 @@ class InterruptionNotice(lightning.Callback):
         newest = next((path for path in written if path.exists()), None)
         if newest is not None:
             logger.warning(
-                "Stopped at step %d (%s). Resume with: %s ckpt_path=%s",
+                "Stopped at step %d (%s). Resume with: %s %s",
                 trainer.global_step,
                 type(exception).__name__,
                 self.command,
-                newest,
+                shlex.quote(f"ckpt_path={override_text(str(newest))}"),
             )
         else:
             logger.warning(

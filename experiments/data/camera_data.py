@@ -1,7 +1,7 @@
 """The data modules share the way from photographs to batches of crops."""
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import lightning
 import torch
@@ -188,6 +188,14 @@ class CropDataModule(lightning.LightningDataModule):
         order.
         """
         return self._evaluation_crops(split).names()
+
+    def training_photographs(self) -> list[str]:
+        """Return the name of the photograph that each crop of the present batch is cut from."""
+        crops = cast(TrainingCrops, cast(DataLoader, self.trainer.train_dataloader).dataset)
+        progress = self.trainer.fit_loop.epoch_loop.batch_progress
+        first = progress.total.processed * self.batch_size
+        numbers = range(first, first + self.batch_size)
+        return [crops.photographs[crops.photograph_number(number)].name for number in numbers]
 
     def most_detailed(self) -> Tensor:
         """Return the colours, (1, 3, height, width), of the validation crop, among several, whose

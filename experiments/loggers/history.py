@@ -1,7 +1,7 @@
 """The history of a run as a table, `metrics.csv`."""
 
 import csv
-import os
+import logging
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +12,8 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from dolens.experiments.loggers.protocol import RunSummary
 from dolens.experiments.tables import write_table
+
+logger = logging.getLogger(__name__)
 
 _STEP = "step"
 # Seconds that rows may wait to be written together: the iterations of a design take less.
@@ -37,6 +39,7 @@ class History(Logger):
         self._written: int | None = None  # the last step in the table
         self._waiting: list[dict[str, Any]] = []
         self._last_write = float("-inf")
+        self._failed = False
 
     @property
     def name(self) -> str:
@@ -67,15 +70,32 @@ class History(Logger):
         self.finalize("success")
 
     @rank_zero_only
+    def save(self) -> None:
+        """Write the rows that wait."""
+        self._write()
+
+    @rank_zero_only
     def finalize(self, status: str) -> None:
         """Write the last rows."""
         self._write()
 
     def _write(self) -> None:
-        """Write the rows that wait."""
-        rows, self._waiting, self._last_write = self._waiting, [], time.monotonic()
+        """Write the rows that wait; where that fails, as on a full disk, they wait on."""
+        rows, self._last_write = self._waiting, time.monotonic()
         if not rows:
             return
+        try:
+            self._add(rows)
+        except OSError as error:
+            if not self._failed:
+                logger.error("%s cannot be written (%s); its rows wait", self.path, error)
+            # What was begun may be half a row: the table is written whole the next time.
+            self._failed, self._columns = True, []
+            return
+        self._waiting, self._failed = [], False
+
+    def _add(self, rows: list[dict[str, Any]]) -> None:
+        """Write rows behind those that are there."""
         first = not self._columns
         known = all(row.keys() <= set(self._columns) for row in rows)
         if known and rows[0][_STEP] != self._written:
@@ -91,10 +111,8 @@ class History(Logger):
         self._written = rows[-1][_STEP]
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
-        """Write the whole table aside, and put it in its place at once."""
-        aside = self.path.with_suffix(".csv.new")
-        write_table(aside, rows)
-        os.replace(aside, self.path)
+        """Write the whole table anew, with all columns."""
+        write_table(self.path, rows)
         self._columns = list(dict.fromkeys(name for row in rows for name in row))
 
 
@@ -102,6 +120,7 @@ def _rows_before(path: Path, step: int | None) -> list[dict[str, str]]:
     """Return the rows of a table, those before a step where one is given; none without a table."""
     if not path.exists():
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    # What is behind the last end of a line is half a row, of a full disk or a process that ended.
+    whole = path.read_text(encoding="utf-8").rpartition("\n")[0]
+    rows = list(csv.DictReader(whole.splitlines()))
     return [row for row in rows if step is None or int(row[_STEP]) < step]

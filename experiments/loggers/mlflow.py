@@ -7,12 +7,14 @@ import numpy as np
 from lightning.pytorch.loggers import MLFlowLogger
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
+from dolens.experiments.loggers.failures import ends_alone
 from dolens.experiments.loggers.protocol import RunSummary, require_package
 
 # MLflow refuses longer values.
 _LONGEST = 500
 
 
+@ends_alone
 class MLflow(MLFlowLogger):
     """Writes to MLflow.  Nothing leaves this machine, whatever MLFLOW_TRACKING_URI says.
 

@@ -10,9 +10,11 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
+from dolens.experiments.loggers.failures import ends_alone
 from dolens.experiments.loggers.protocol import RunSummary
 
 
+@ends_alone
 class TensorBoard(TensorBoardLogger):
     """Writes event files for TensorBoard.
 

@@ -6,9 +6,11 @@ import numpy as np
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
+from dolens.experiments.loggers.failures import ends_alone
 from dolens.experiments.loggers.protocol import RunSummary, require_package
 
 
+@ends_alone
 class WeightsAndBiases(WandbLogger):
     """Writes to Weights & Biases, offline unless the configuration says otherwise.
 

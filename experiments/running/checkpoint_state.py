@@ -1,10 +1,8 @@
-"""The state of a checkpoint is found, read and given to a module."""
+"""The state of a checkpoint is found, and given to a module."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.experiment import Experiment
@@ -37,22 +35,6 @@ def checkpoint_file(record: RecordedRun, checkpoint: str | Path) -> Path:
         f"{record.folder}: this run ({record.status}) has no checkpoint checkpoints/{file.name}; "
         f"{there}"
     )
-
-
-def read_checkpoint(file: Path) -> Mapping[str, Any]:
-    """Read a checkpoint as plain tensors and values, on the CPU.
-
-    Raises:
-        InputError: the file holds something else, or no state of a module.
-    """
-    try:
-        found = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:
-        reason = one_line(error)[:200]
-        raise InputError(f"{file} is not a safe checkpoint ({reason})") from None
-    if not isinstance(found, Mapping) or "state_dict" not in found:
-        raise InputError(f"{file} holds no state of a module")
-    return found
 
 
 def take_up(module: Experiment, state: Mapping[str, Any], file: Path) -> None:

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, refuse_another
+from dolens.experiments.running.checkpoint_files import read_checkpoint
 from dolens.experiments.running.plain_values import flat
 
 logger = logging.getLogger(__name__)
@@ -65,18 +65,12 @@ def checked_checkpoint(
         training: whether the run goes on training, and not only tests what was trained.
 
     Raises:
-        InputError: the file is missing, is no checkpoint of plain tensors and values, or is of
+        InputError: the file is missing, damaged, no checkpoint of plain tensors and values, or of
             another experiment, lens, network or (where training goes on) precision of the lens.
     """
     if not Path(path).is_file():
         raise InputError(f"ckpt_path: {path} does not exist")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"ckpt_path: {path} is not a safe checkpoint ({reason})") from None
-    if not isinstance(checkpoint, Mapping) or "state_dict" not in checkpoint:
-        raise InputError(f"ckpt_path: {path} holds no state of a module")
+    checkpoint = read_checkpoint(path, "ckpt_path: ")
     refuse_another(checkpoint.get("dolens"), module.identity())
     written = checkpoint.get(SETTINGS)
     if not isinstance(written, Mapping):

@@ -18,12 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError
 from dolens.experiments.experiment import Experiment, check_experiment
-from dolens.experiments.running.checkpoint_state import (
-    CHECKPOINTS,
-    checkpoint_file,
-    read_checkpoint,
-    take_up,
-)
+from dolens.experiments.running.checkpoint_files import read_checkpoint
+from dolens.experiments.running.checkpoint_state import CHECKPOINTS, checkpoint_file, take_up
 from dolens.experiments.running.composition import with_overrides
 from dolens.experiments.running.extensions import import_extensions
 from dolens.experiments.running.perturbed_lens import perturbed_state

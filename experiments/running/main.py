@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.running.machine_faults import machine_fault
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
@@ -45,6 +46,11 @@ def main(arguments: Sequence[str], program: str) -> None:
         sys.exit(f"error: {one_line(explained(error, arguments))}")
     except (InputError, OmegaConfBaseException) as error:
         sys.exit(f"error: {one_line(error)}")
+    except (OSError, ValueError) as error:  # as Hydra makes the folder of a run, and its log
+        fault = machine_fault(error)
+        if fault is None:
+            raise
+        sys.exit(f"error: {fault}")
 
 
 def job(cfg: DictConfig) -> float | tuple[float, ...]:
@@ -68,9 +74,12 @@ def job(cfg: DictConfig) -> float | tuple[float, ...]:
             # Exiting here, within the job, keeps Hydra from adding lines of its own.
             sys.exit(f"error: {line}")
     except Exception as error:
-        line = one_line(f"{type(error).__name__}: {error}")
+        fault = machine_fault(error)
+        line = fault or one_line(f"{type(error).__name__}: {error}")
         _record(line, to_all=swept, with_traceback=True)
         if not swept:
+            if fault is not None:
+                sys.exit(f"error: {fault}")
             raise
     return math.nan
 

@@ -12,13 +12,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, did_you_mean
+from dolens.experiments.running.override_text import override_text
 from dolens.experiments.running.plain_values import walk
 from dolens.experiments.running.renamed_keys import RENAMED, Key, Renamed
 from dolens.experiments.running.target_keys import Target, arguments_of, located
-
-# Text that the command line takes without quotes, and that it would not take for text.
-_PLAIN = re.compile(r"[A-Za-z_][\w./-]*")
-_WORDS = ("true", "false", "null", "nan", "inf")
 
 
 class Change(NamedTuple):
@@ -157,7 +154,7 @@ def _translated(override: Override, renamed: Renamed) -> tuple[list[str], list[s
     if not changes:
         return [override.input_line], []
     outside = [c for c in inner if c.new is not None and not c.new.startswith(f"{path}.")]
-    found = [f"++{change.new}={_text(change.after)}" for change in outside]
+    found = [f"++{change.new}={override_text(change.after)}" for change in outside]
     if own is None or own.new is not None:
         # A key that was added may be there by itself now.
         kind = OverrideType.FORCE_ADD if override.is_add() else override.type
@@ -169,7 +166,7 @@ def _translated(override: Override, renamed: Renamed) -> tuple[list[str], list[s
             found.insert(0, f"{key}={override.get_value_string()}")
         else:
             now = _rewritten(path, own.after if own else value, {c.old: c for c in inner})
-            found.insert(0, f"{key}={_text(now)}")
+            found.insert(0, f"{key}={override_text(now)}")
     return found, [change.message() for change in changes]
 
 
@@ -186,19 +183,6 @@ def _rewritten(path: str, node: Any, changes: Mapping[str, Change]) -> Any:
             name = change.new.removeprefix(f"{path}.")
             found[name] = _rewritten(f"{path}.{key}", change.after, changes)
     return found
-
-
-def _text(value: Any) -> str:
-    """A value as the command line takes it."""
-    if isinstance(value, dict):
-        return "{" + ",".join(f"{key}:{_text(part)}" for key, part in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ",".join(map(_text, value)) + "]"
-    if value is None:
-        return "null"
-    if isinstance(value, str) and (not _PLAIN.fullmatch(value) or value.lower() in _WORDS):
-        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
-    return str(value)
 
 
 def _change(path: str, value: Any, renamed: Renamed) -> Change | None:

@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from dolens.whole_files import written_whole
+
 INFO, METRICS = "run.json", "metrics.json"
 CONFIG, RESOLVED = ".hydra/config.yaml", ".hydra/resolved.yaml"
 OVERRIDES, HYDRA = ".hydra/overrides.yaml", ".hydra/hydra.yaml"
@@ -15,9 +17,9 @@ _GIVEN_UP = ("pruned", "repeated")
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a mapping as JSON, whole or not at all."""
-    temporary = path.with_suffix(path.suffix + ".part")
-    temporary.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-    temporary.replace(path)
+    text = json.dumps(content, indent=2, sort_keys=True) + "\n"
+    with written_whole(path) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 import logging
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,14 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import DictConfig, OmegaConf
 
-from dolens.errors import InputError
+from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
+from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
+from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
+from dolens.experiments.running.checkpoint_files import WholeCheckpoints
 from dolens.experiments.running.checkpoints import (
     SettingsInCheckpoints,
     checked_checkpoint,
@@ -40,6 +45,7 @@ from dolens.experiments.search.pruned import TrialPruned
 from dolens.experiments.search.pruning import trial_callbacks
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
+from dolens.whole_files import written_whole
 
 logger = logging.getLogger(__name__)
 
@@ -81,14 +87,17 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     if not settings.trainer.get("enable_progress_bar", True):
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
-    callbacks.append(SettingsInCheckpoints(written))
-    callbacks.extend(trial_callbacks())
+    callbacks += [ResumedEpochs(), LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
+    callbacks += trial_callbacks()
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
+    if not settings.trainer.get("plugins"):  # which may bring a writer of their own
+        trainer.strategy.checkpoint_io = WholeCheckpoints()
     (folder / "lens").mkdir(exist_ok=True)
     (folder / ".hydra").mkdir(exist_ok=True)
-    OmegaConf.save(cfg, folder / RESOLVED, resolve=True)
+    with written_whole(folder / RESOLVED) as aside:
+        OmegaConf.save(cfg, aside, resolve=True)
     save_lens(lens, folder / "lens" / "initial.yaml")
     device = str(trainer.strategy.root_device)
     info = describe_run(settings.seed, device, settings.lens_dtype, sys.argv)
@@ -105,15 +114,20 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
             trainer.test(module, data, ckpt_path=trained, weights_only=True, verbose=False)
             metrics.update(trainer.callback_metrics)
         status = "finished"
-    except (KeyboardInterrupt, SystemExit):  # Lightning turns Ctrl-C into an exit
-        status = "interrupted"
-        raise
     except TrialPruned as pruned:
         status, info["reason"] = "pruned", str(pruned)
         raise
+    except BaseException as error:
+        # Lightning turns Ctrl-C into an exit.
+        stopped = isinstance(error, KeyboardInterrupt | SystemExit)
+        status = "interrupted" if stopped else "failed"
+        raise
     finally:
-        save_lens(module.lens, folder / "lens" / "final.yaml")
-        write_json(folder / INFO, {**info, "status": status})
+        # An error on its way out is the one to be heard of.
+        with logged_if(status != "finished"):
+            write_json(folder / INFO, {**info, "status": status})
+        with logged_if(status != "finished"):
+            save_lens(module.lens, folder / "lens" / "final.yaml")
     metrics.update(summary_of(module))
     metrics["cost/wall_s"] = time.perf_counter() - started
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
@@ -134,6 +148,17 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     for objective in settings.objectives:
         logger.info("%s = %.4g", objective, numbers[objective])
     return found
+
+
+@contextmanager
+def logged_if(failing: bool) -> Iterator[None]:
+    """Log what goes wrong in a block in the place of raising it, if a run is failing already."""
+    try:
+        yield
+    except Exception as error:
+        if not failing:
+            raise
+        logger.error("%s", one_line(error))
 
 
 def build_lens(settings: RunSettings) -> Lens:

@@ -1,0 +1,95 @@
+"""Checkpoints are files that are written whole, read as plain values, and checked for damage."""
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+
+from dolens.errors import InputError, one_line
+from dolens.whole_files import written_whole
+
+# So much of a foreign program's reason is repeated.
+_REASON = 200
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Writes a checkpoint beside the one before it, and replaces that once the disk has it all.
+
+    Lightning's own writer brings it together in the system's temporary folder, which may be on
+    another disk: it is then copied over the checkpoint before it, and what interrupts the copy
+    leaves neither.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        """Write a checkpoint.
+
+        Args:
+            checkpoint: plain values and tensors.
+            path: of the file, or an address of a store that `fsspec` knows.
+            storage_options: none are taken.
+
+        Raises:
+            OSError: it cannot be written, as on a full disk; the one before it stays.
+        """
+        if storage_options is not None or "://" in str(path):
+            super().save_checkpoint(checkpoint, path, storage_options)
+            return
+        file = Path(path)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with written_whole(file) as aside:
+            _save(checkpoint, aside)
+
+
+def _save(checkpoint: Mapping[str, Any], path: Path) -> None:
+    try:
+        with path.open("wb") as file:
+            torch.save(dict(checkpoint), file)
+    except (OSError, RuntimeError) as error:
+        # PyTorch's writer reports a place in the file that does not fit, for every reason.
+        reason = error if isinstance(error, OSError) else error.__context__
+        if isinstance(reason, OSError):
+            reason.filename = str(path)
+            raise reason from None
+        raise
+
+
+def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
+    """Read a checkpoint as plain tensors and values, on the CPU; nothing in it is executed.
+
+    Every part of the file has a checksum (CRC-32), which PyTorch writes and does not look at.
+
+    Args:
+        path: of the file.
+        where: what messages begin with, such as `ckpt_path: `.
+
+    Raises:
+        InputError: the file is damaged, holds something else, or no state of a module.
+    """
+    try:
+        damaged = _damaged_part(path)
+        if damaged is None:
+            found = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        reason = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
+        raise InputError(f"{where}{path} is not a safe checkpoint ({reason[:_REASON]})") from None
+    if damaged is not None:
+        raise InputError(
+            f"{where}{path} is damaged: the checksum of its part '{damaged}' is not that of its "
+            "content; take another checkpoint of the run, or one of a copy"
+        )
+    if not isinstance(found, Mapping) or "state_dict" not in found:
+        raise InputError(f"{where}{path} holds no state of a module")
+    return found
+
+
+def _damaged_part(path: str | Path) -> str | None:
+    """Return the first part of a zip file that is not what was written; None: there is none."""
+    if not zipfile.is_zipfile(path):
+        return None  # of a PyTorch before 1.6, or no checkpoint, which PyTorch says
+    with zipfile.ZipFile(path) as file:
+        return file.testzip()

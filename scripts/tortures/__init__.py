@@ -1,0 +1,1 @@
+"""Kills and faults, done to experiments that take seconds: see scripts/torture.py."""

@@ -1,0 +1,57 @@
+"""How a run ended: in one line, and so that it can go on."""
+
+import time
+from pathlib import Path
+
+from scripts.tortures.processes import Process, start, trust
+from scripts.tortures.run_folders import differences
+
+
+def line_of(process: Process) -> str:
+    """Return the line by which a run ended."""
+    lines = [line for line in process.said().splitlines() if line.strip()]
+    return lines[-1] if lines else ""
+
+
+def refused(process: Process, *words: str) -> list[str]:
+    """Return what is wrong with the way in which a run failed."""
+    said, line = process.said(), line_of(process)
+    wrong = [] if process.status else ["the run did not fail"]
+    if not line.startswith("error: "):
+        wrong.append(f"ends in: {line[:200]}")
+    if "Traceback" in said:
+        wrong.append("prints a traceback")
+    return wrong + [f"'{word}' is not in: {line[:300]}" for word in words if word not in line]
+
+
+def goes_on(folder: Path, overrides: list[str], whole: list[str] | None = None) -> list[str]:
+    """Resume a run, and return in what it differs from one that nothing happened to."""
+    process = start([*whole_run(overrides), f"hydra.run.dir={folder.parent}/whole"], log(folder))
+    if process.wait(600.0):
+        return [f"the whole run fails: {line_of(process)}"]
+    last = folder / "checkpoints" / "last.ckpt"
+    resume = [f"ckpt_path={last}"] if last.exists() else []
+    command = [*(whole or overrides), f"hydra.run.dir={folder}", *resume]
+    process = start(command, log(folder), trust)
+    if process.wait(600.0):
+        return [f"the resumed run fails: {line_of(process)}"]
+    return differences(folder.parent / "whole", folder)
+
+
+def whole_run(overrides: list[str]) -> list[str]:
+    """Return the overrides of a run without workers, whose samples are the same."""
+    return [entry for entry in overrides if not entry.startswith("data.num_workers")]
+
+
+def log(folder: Path) -> Path:
+    """Return a new file for what a process prints."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return folder.parent / f"{len(list(folder.parent.glob('*.log')))}.log"
+
+
+def await_checkpoint(process: Process, run: Path) -> bool:
+    """Wait for the first checkpoint of a run; return whether there is one, and the run goes on."""
+    last = run / "checkpoints" / "last.ckpt"
+    while process.poll() is None and not last.exists():
+        time.sleep(0.003)
+    return process.poll() is None
