@@ -20,7 +20,7 @@ from dolens.tasks import TaskMap
 from dolens.tolerancing.linear_spots import check_whole_pupil
 from dolens.tolerancing.through_focus import FocusCurves
 
-# Rays that a thread traces at a time, whatever their number, so that sums have one order: their intermediate results take 0.1 GB.
+# Rays that a thread traces at a time: their intermediate results take 0.1 GB.
 RAYS_AT_A_TIME = 1 << 17
 
 

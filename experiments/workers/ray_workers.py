@@ -15,8 +15,6 @@ from dolens.tasks import TaskError, TaskMap, error_of_task, task_label
 if TYPE_CHECKING:
     from types import ModuleType
 
-# A task whose process dies is begun so many times again.
-RETRIES = 3
 # Tasks that are handed over before the first result is taken: bounds the memory of results.
 _AHEAD = 512
 
@@ -29,9 +27,11 @@ class RayWorkers:
 
     Attributes:
         count: processes on this machine; None: those of a cluster that runs already.
+        retries: how often a task is begun again whose process died.
     """
 
     count: int | None
+    retries: int = 3
 
     @contextmanager
     def open(self) -> Iterator[TaskMap]:
@@ -47,16 +47,25 @@ class RayWorkers:
             def map_tasks(
                 function: Callable[[Any], Any], tasks: Sequence[Any], name: str
             ) -> Iterator[Any]:
-                return _mapped(cluster(), function, tasks, name)
+                return _mapped(cluster(), self.retries, function, tasks, name)
 
             yield map_tasks
 
 
 def _mapped(
-    ray: "ModuleType", function: Callable[[Any], Any], tasks: Sequence[Any], name: str
+    ray: "ModuleType",
+    retries: int,
+    function: Callable[[Any], Any],
+    tasks: Sequence[Any],
+    name: str,
 ) -> Iterator[Any]:
-    """Yield results in order, while up to `_AHEAD` tasks behind them are under way."""
-    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_run)
+    """Yield results in order, while up to `_AHEAD` tasks behind them are under way.
+
+    Raises:
+        InputError: a task raised it.
+        TaskError: a task raised anything else, or no process brought it to its end.
+    """
+    remote = ray.remote(num_cpus=1, max_retries=retries)(_run)
     shared, precision = ray.put(function), torch.get_float32_matmul_precision()
     count, handed, done = len(tasks), 0, 0
     places: dict[int, Any] = {}  # task → reference to its result
@@ -72,7 +81,17 @@ def _mapped(
                 with stage(f"{name}: {done} of {count} done"):
                     ready, running = ray.wait(running, num_returns=1)
                 done += len(ready)
-            yield _result(ray, reference, task_label(name, number, count))
+            label = task_label(name, number, count)
+            try:
+                found = ray.get(reference)
+            except ray.exceptions.RayTaskError as error:
+                raise error_of_task(label, error.cause or error) from error
+            except ray.exceptions.RayError as error:
+                raise TaskError(
+                    f"{label}: its process died at each of {1 + retries} attempts "
+                    f"({type(error).__name__}); a task that needs more memory than there is ends so"
+                ) from error
+            yield found
     finally:
         # After an error, or Ctrl-C, nobody waits for the others.
         for reference in running:
@@ -80,25 +99,7 @@ def _mapped(
 
 
 def _run(function: Callable[[Any], Any], task: Any, precision: str) -> Any:
-    """Run a task in a worker as any other worker would, and as this process does with one thread."""
+    """Run a task as every worker does, and as `workers=0` does: in one thread."""
     torch.set_num_threads(1)
     torch.set_float32_matmul_precision(precision)
     return function(task)
-
-
-def _result(ray: "ModuleType", reference: Any, label: str) -> Any:
-    """Return a task's result.
-
-    Raises:
-        InputError: the task raised it.
-        TaskError: it raised anything else, or no process brought it to its end.
-    """
-    try:
-        return ray.get(reference)
-    except ray.exceptions.RayTaskError as error:
-        raise error_of_task(label, error.cause or error) from error
-    except ray.exceptions.RayError as error:
-        raise TaskError(
-            f"{label}: its process died {1 + RETRIES} times ({type(error).__name__}); a task that "
-            "needs more memory than there is ends so"
-        ) from error
