@@ -121,7 +121,7 @@ class _Moments:
     lens: Lens
     names: tuple[str, ...]
     ray: Components
-    wavelength: Tensor
+    wavelength: float | Tensor
     shares: Tensor
     means: Tensor
     weight: Tensor
@@ -144,7 +144,7 @@ class _Moments:
 
 
 def _traced(
-    lens: Lens, names: Sequence[str], ray: Components, wavelength: Tensor, values: Tensor
+    lens: Lens, names: Sequence[str], ray: Components, wavelength: float | Tensor, values: Tensor
 ) -> Trace:
     system = lens.system(dict(zip(names, values.unbind(), strict=True)))
     return trace_to_sensor(system, trace_surfaces(system, ray, wavelength), wavelength)

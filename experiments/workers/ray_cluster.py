@@ -50,6 +50,7 @@ def local_cluster(processes: int) -> Iterator[ModuleType]:
                 closing.callback(ray.shutdown)
                 _start(
                     ray,
+                    address="local",  # whatever RAY_ADDRESS says
                     num_cpus=processes,
                     num_gpus=0,
                     object_store_memory=_OBJECT_STORE_BYTES,
