@@ -81,8 +81,10 @@ def _start(ray: ModuleType, **settings: Any) -> None:
     try:
         ray.init(**_QUIET, **settings)
     except (ConnectionError, OSError, RuntimeError, ValueError) as error:
-        hint = "" if "num_cpus" in settings else "; start one by `ray start --head`"
-        raise InputError(f"workers: Ray does not start: {one_line(error)}{hint}") from error
+        what = "Ray does not start"
+        if "num_cpus" not in settings:
+            what = "no Ray cluster is found (start one by `ray start --head`, or set RAY_ADDRESS)"
+        raise InputError(f"workers: {what}: {one_line(error)}") from error
 
 
 def _ray(setting: str) -> ModuleType:
