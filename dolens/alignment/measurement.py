@@ -3,7 +3,7 @@
 import copy
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -45,6 +45,12 @@ class Measurement:
     mask: Tensor
     read_noise: float
     sensor: Sensor
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        """Take the fields alone to another process: what is cached within a derivative
+        (`torch.func.jvp`) cannot be stored.
+        """
+        return type(self), tuple(getattr(self, field.name) for field in fields(self))
 
     @cached_property
     def totals(self) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.optics.lens import Lens
+from dolens.tasks import TaskMap
 from dolens.tolerancing.linear_spots import linear_spots
 from dolens.tolerancing.monte_carlo import PerturbedSpots, trace_perturbed
 from dolens.tolerancing.perturbations import Tolerances
@@ -81,6 +82,7 @@ def analyse_tolerances(
     lenses: int,
     generator: torch.Generator,
     chunk_size: int | None = None,
+    map_tasks: TaskMap | None = None,
 ) -> ToleranceAnalysis:
     """Work everything out for one set of tolerances.
 
@@ -92,11 +94,12 @@ def analyse_tolerances(
         lenses: K, how many to draw.
         generator: of the errors.
         chunk_size: see `trace_perturbed`.
+        map_tasks: see `trace_perturbed`.
     """
     model = linear_spots(lens, spots, tolerances.names)
     errors = tolerances.draw(lenses, generator)
     started = time.perf_counter()
-    perturbed = trace_perturbed(lens, spots, tolerances.names, errors, chunk_size)
+    perturbed = trace_perturbed(lens, spots, tolerances.names, errors, chunk_size, map_tasks)
     seconds = time.perf_counter() - started
     return ToleranceAnalysis(
         spots,

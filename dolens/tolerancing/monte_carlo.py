@@ -1,9 +1,10 @@
 """A Monte Carlo traces thousands of lenses as they might be made in one batch."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.rays import Components
 from dolens.optics.straight import require_plane_sensor
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
+from dolens.tasks import TaskMap
 from dolens.tolerancing.linear_spots import check_whole_pupil
 from dolens.tolerancing.through_focus import FocusCurves
 
@@ -47,6 +49,7 @@ def trace_perturbed(
     names: Sequence[str],
     errors: Tensor,
     chunk_size: int | None = None,
+    map_tasks: TaskMap | None = None,
 ) -> PerturbedSpots:
     """Trace spots of lenses whose parameters are off, exactly.
 
@@ -63,8 +66,10 @@ def trace_perturbed(
         errors: (K, P), added to the parameters, in the lens's units (radians for tilts).
 
     Rarely needed:
-        chunk_size: lenses that a thread traces at a time, which bounds memory; None: as many as
-            take `RAYS_AT_A_TIME`.
+        chunk_size: lenses that are traced at a time in one thread, which bounds memory; None: as
+            many as take `RAYS_AT_A_TIME`.
+        map_tasks: runs the chunks; None: as many threads as torch has.  Results are the same to the
+            bit.
 
     Raises:
         InputError: a lens in single precision, or rays that stand for mirror images.
@@ -79,28 +84,15 @@ def trace_perturbed(
     wavelength = spots.rays.wavelength
     shares = spots.weight.new_zeros(len(spots.weight), spots.count)
     shares[torch.arange(len(spots.weight)), spots.spot] = spots.weight
-
-    def traced(values: Tensor) -> Trace:
-        system = lens.system(dict(zip(names, values.unbind(), strict=True)))
-        at_last = trace_surfaces(system, ray, wavelength)
-        return trace_to_sensor(system, at_last, wavelength)
-
     # Sums are formed about the design's centroids, so that squares of distances lose no digits.
-    design = _intercepts(traced(start).ray)
-    means = (torch.stack(design) @ shares)[:, spots.spot].unbind()
-
-    def moments(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        trace = traced(values)
-        x, y, u, v = (c - m for c, m in zip(_intercepts(trace.ray), means, strict=True))
-        sums = torch.stack([x, y, u, v, x * x + y * y, x * u + y * v, u * u + v * v]) @ shares
-        goes_on, inside = _smallest_margins(trace)
-        failed = ~(goes_on > 0.0)
-        clipped = (~(inside > 0.0) & ~failed).double()
-        return sums, failed.double().mean(), clipped @ spots.weight / spots.count
-
+    design = _intercepts(_traced(lens, names, ray, wavelength, start).ray)
+    means = (torch.stack(design) @ shares)[:, spots.spot]
+    moments = _Moments(lens, tuple(names), ray, wavelength, shares, means, spots.weight)
     if chunk_size is None:
         chunk_size = max(1, RAYS_AT_A_TIME // len(spots.weight))
-    sums, failed, vignetted = _in_chunks(vmap(moments), start + errors.to(start), chunk_size)
+    chunks = (start + errors.to(start)).split(chunk_size)
+    parts = (map_tasks or _in_threads)(moments, chunks, "batches of lenses")
+    sums, failed, vignetted = (torch.cat(part) for part in zip(*parts, strict=True))
     x, y, u, v, square, product, slope_square = sums.unbind(1)
     lost = failed[:, None] > 0.0
     curves = FocusCurves(
@@ -112,28 +104,69 @@ def trace_perturbed(
     return PerturbedSpots(curves, torch.stack([x, y], -1) + origin.T, failed, vignetted)
 
 
-def _in_chunks(
-    batch: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, size: int
-) -> list[Tensor]:
-    """Return a function of a batch, computed some rows at a time, every chunk on a thread of its
-    own.
+@dataclass(frozen=True)
+class _Moments:
+    """Finds moments of the spots of lenses with other parameters; a task may bring it elsewhere.
+
+    Attributes:
+        lens: as designed.
+        names: of P parameters.
+        ray: N of them.
+        wavelength: nm, theirs.
+        shares: (N, S), what a ray adds to each spot.
+        means: (4, N), what moments are about: x, y and tangents of each ray's spot.
+        weight: (N,), of the rays in their spots.
+    """
+
+    lens: Lens
+    names: tuple[str, ...]
+    ray: Components
+    wavelength: float | Tensor
+    shares: Tensor
+    means: Tensor
+    weight: Tensor
+
+    # Gradients are switched off thread by thread.
+    @torch.no_grad()
+    def __call__(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return moments (K, 7, S), and shares of failed and vignetted rays (K,)."""
+        return vmap(self._of_one)(values)
+
+    def _of_one(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        trace = _traced(self.lens, self.names, self.ray, self.wavelength, values)
+        pairs = zip(_intercepts(trace.ray), self.means.unbind(), strict=True)
+        x, y, u, v = (c - m for c, m in pairs)
+        sums = torch.stack([x, y, u, v, x * x + y * y, x * u + y * v, u * u + v * v]) @ self.shares
+        goes_on, inside = _smallest_margins(trace)
+        failed = ~(goes_on > 0.0)
+        clipped = (~(inside > 0.0) & ~failed).double()
+        return sums, failed.double().mean(), clipped @ self.weight / self.shares.shape[1]
+
+
+def _traced(
+    lens: Lens, names: Sequence[str], ray: Components, wavelength: float | Tensor, values: Tensor
+) -> Trace:
+    system = lens.system(dict(zip(names, values.unbind(), strict=True)))
+    return trace_to_sensor(system, trace_surfaces(system, ray, wavelength), wavelength)
+
+
+def _in_threads(
+    function: Callable[[Tensor], Any], chunks: Sequence[Tensor], name: str
+) -> Iterable[Any]:
+    """Map a function over chunks, every chunk on a thread of its own.
 
     PyTorch would else split each of the many short operations among its threads, which then wait
     for one another; on a machine that others use too, that takes up to ten times as long.
     """
-    threads = torch.get_num_threads() if rows.device.type == "cpu" else 1
-    # Gradients are switched off thread by thread.
-    quiet = torch.no_grad()(batch)
+    threads = torch.get_num_threads() if chunks[0].device.type == "cpu" else 1
     if threads == 1:
-        parts = [quiet(chunk) for chunk in rows.split(size)]
-    else:
-        torch.set_num_threads(1)
-        try:
-            with ThreadPoolExecutor(threads) as pool:
-                parts = list(pool.map(quiet, rows.split(size)))
-        finally:
-            torch.set_num_threads(threads)
-    return [torch.cat(part) for part in zip(*parts, strict=True)]
+        return [function(chunk) for chunk in chunks]
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(function, chunks))
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _intercepts(ray: Components) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -1,19 +1,19 @@
 """Errors of a pose fit by photons and rays, and its basin of convergence."""
 
 import copy
+import itertools
 import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dolens.alignment.information import fisher_information
-from dolens.alignment.measurement import Measurement
-from dolens.alignment.spot_loss import SpotLoss
 from dolens.errors import InputError, call_with_settings, check_choice, check_keys
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.experiment import Figures
@@ -24,18 +24,27 @@ from dolens.experiments.poses.accuracy_settings import (
     PhotonLevels,
     RayCounts,
 )
+from dolens.experiments.poses.accuracy_tasks import (
+    ESTIMATORS,
+    AccuracyModel,
+    AtTruth,
+    errors_by_photons,
+    errors_by_rays,
+    linearised,
+)
 from dolens.experiments.poses.basin import Basin
-from dolens.experiments.poses.bench import Bench, Light, check_precision, draw, simulate
+from dolens.experiments.poses.bench import Bench, Light, check_precision
 from dolens.experiments.tables import Row
+from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
 from dolens.rendering.spot_image import SpotImager
 from dolens.stages import stage as named_stage
+from dolens.tasks import TaskMap
 
 logger = logging.getLogger(__name__)
 
 PARTS = ("photons", "rays", "basin")
-ESTIMATORS = ("noise_weighted", "s21")
 
 
 class PoseAccuracyModule(Analysis):
@@ -58,6 +67,7 @@ class PoseAccuracyModule(Analysis):
         basin: fits from farther and farther starts.
         parts: of `photons`, `rays` and `basin`.
         seed: of simulations.
+        workers: where measurements are simulated and fits are made; see `workers_of`.
 
     Raises:
         InputError: a setting that is unknown or out of range.
@@ -78,8 +88,10 @@ class PoseAccuracyModule(Analysis):
         basin: BasinSettings,
         parts: Sequence[str] = PARTS,
         seed: int = 0,
+        workers: int | str | None = None,
     ) -> None:
         super().__init__(lens, experiment, folder)
+        self.workers = workers_of(workers)
         for part in parts:
             check_choice(part, PARTS, "parts")
         check_precision(lens, "fitted")
@@ -109,14 +121,17 @@ class PoseAccuracyModule(Analysis):
         self.numbers: dict[str, float] = {}
 
     def analyse(self) -> dict[str, float]:
-        """Measure part by part, and write the tables after each."""
-        for part in self.parts:
-            started = time.perf_counter()
-            logger.info("%s", part)
-            with named_stage(part):
-                getattr(self, f"_{part}")()
-            self.write_tables()
-            self.numbers[f"cost/{part}_s"] = time.perf_counter() - started
+        """Measure part by part, and write the tables after each, whole or not."""
+        with self.workers.open() as map_tasks:
+            for part in self.parts:
+                started = time.perf_counter()
+                logger.info("%s", part)
+                try:
+                    with named_stage(part):
+                        getattr(self, f"_{part}")(map_tasks)
+                finally:
+                    self.write_tables()
+                self.numbers[f"cost/{part}_s"] = time.perf_counter() - started
         return self.numbers
 
     def tables(self) -> dict[str, list[Row]]:
@@ -144,34 +159,33 @@ class PoseAccuracyModule(Analysis):
 
     # ---------------------------------------------------------------- light
 
-    @torch.no_grad()
-    def _photons(self) -> None:
+    def _photons(self, map_tasks: TaskMap) -> None:
         """Find errors of estimates from measurements of more and more light."""
-        for number, level in enumerate(self.by_photons.levels):
-            seeds = range(1000 * number, 1000 * number + self.by_photons.measurements)
-            measured = [self._measurement(level, seed) for seed in seeds]
-            information = fisher_information(self.true, self.imager, measured[0], self.slopes)
-            inverse = self._s21_inverse(measured[0])
-            errors = {
-                "noise_weighted": torch.stack([information.correction(m) for m in measured]),
-                "s21": torch.stack([self._s21_step(m, self.imager, inverse) for m in measured]),
-            }
-            for estimator, found in errors.items():
-                rms = found.square().mean(0).sqrt()
-                self._add("photons", estimator, level, rms, information.bounds)
+        levels, count = self.by_photons.levels, self.by_photons.measurements
+        model = self._model()
+        first = partial(linearised, model)
+        prepared = list(
+            map_tasks(first, [(level, 1000 * n) for n, level in enumerate(levels)], "levels")
+        )
+        tasks = [(n, 1000 * n + draw) for n in range(len(levels)) for draw in range(count)]
+        corrected = map_tasks(
+            partial(errors_by_photons, model, levels, prepared), tasks, "measurements"
+        )
+        for level, at_truth in zip(levels, prepared, strict=True):
+            own = list(itertools.islice(corrected, count))
+            for estimator, found in zip(ESTIMATORS, zip(*own, strict=True), strict=True):
+                rms = torch.stack(found).square().mean(0).sqrt()
+                self._add("photons", estimator, level, rms, at_truth.information.bounds)
             logger.info("%.3g photons: %s", level, self._last_ratios())
-
-    def _measurement(self, photons: int, seed: int) -> Measurement:
-        light = replace(self.light, photons=photons)
-        return simulate(self.true, self.bench, light, draw(self.seed, 0, seed))
 
     # ---------------------------------------------------------------- rays
 
     @torch.no_grad()
-    def _rays(self) -> None:
+    def _rays(self, map_tasks: TaskMap) -> None:
         """Find the errors that few rays make."""
         reference_photons, photons = self.by_rays.reference_photons, int(self.light.photons)
-        reference = self._measurement(reference_photons, 999_999)
+        model = self._model()
+        reference = model.measurement(reference_photons, 999_999)
         exact = fisher_information(self.true, self.imager, reference, self.slopes)
         # Bounds and weights are those of the light that is quoted.
         share = photons / reference_photons
@@ -181,50 +195,47 @@ class PoseAccuracyModule(Analysis):
             read_noise=self.light.read_noise,
         )
         information = fisher_information(self.true, self.imager, quoted, self.slopes)
-        inverse = self._s21_inverse(reference)
+        inverse = model.s21_inverse(reference)
         floor = float((exact.bounds / information.bounds).square().mean().sqrt())
         self.numbers["pose_error/reference_over_bound"] = floor
-        for (name, imager), count in (
-            (entry, count) for entry in self.imagers.items() for count in self.by_rays.counts
-        ):
-            found: dict[str, list[Tensor]] = {estimator: [] for estimator in ESTIMATORS}
-            seconds = []
-            for pattern in range(self.by_rays.patterns):
-                own = replace(imager, rays=count, seed=pattern + 1)
-                started = time.perf_counter()
-                shares = torch.stack([image.image for image in self.true.images(own)])
-                seconds.append(time.perf_counter() - started)
-                modelled = replace(information, expected=shares)
-                found["noise_weighted"].append(modelled.correction(quoted))
-                found["s21"].append(self._s21_step(reference, own, inverse))
-            for estimator, steps in found.items():
+        kinds = [(name, count) for name in self.imagers for count in self.by_rays.counts]
+        patterns = self.by_rays.patterns
+        tasks = [
+            replace(self.imagers[name], rays=count, seed=pattern + 1)
+            for name, count in kinds
+            for pattern in range(patterns)
+        ]
+        at_truth = AtTruth(information, inverse)
+        stepped = map_tasks(
+            partial(errors_by_rays, model, at_truth, quoted, reference), tasks, "patterns of rays"
+        )
+        for name, count in kinds:
+            *found, seconds = zip(*itertools.islice(stepped, patterns), strict=True)
+            for estimator, steps in zip(ESTIMATORS, found, strict=True):
                 rms = torch.stack(steps).square().mean(0).sqrt()
                 self._add(f"rays/{name}", estimator, count, rms, information.bounds, min(seconds))
             logger.info("%s, %.3g rays: %s", name, count, self._last_ratios())
 
     # ---------------------------------------------------------------- where it starts
 
-    def _basin(self) -> None:
+    def _basin(self, map_tasks: TaskMap) -> None:
         """Fit from starts that are farther and farther off."""
-        self.basin.run()
+        self.basin.run(map_tasks)
         self.numbers |= self.basin.summary()
 
     # ---------------------------------------------------------------- estimates and rows
 
-    def _s21_inverse(self, measurement: Measurement) -> Tensor:
-        """Return the pseudo-inverse (P, rows) of S21's Jacobian with respect to u, at the truth.
-
-        Another measurement's largest pixel scales all rows but those of the centroids a little
-        otherwise, which moves the least squares by as little.
-        """
-        loss = SpotLoss(measurement, self.slopes, self.images.centroid_weight)
-        every = torch.ones(len(self.true.names), dtype=torch.bool)
-        return torch.linalg.pinv(loss.jacobian(self.true, every)[1])
-
-    def _s21_step(self, measurement: Measurement, imager: SpotImager, inverse: Tensor) -> Tensor:
-        """Return the step (P,) of S21 from the truth, in the units of θ."""
-        loss = SpotLoss(measurement, imager, self.images.centroid_weight)
-        return -self.true.scale * (inverse @ loss.residuals(self.true))
+    def _model(self) -> AccuracyModel:
+        """Return what tasks know of this experiment."""
+        return AccuracyModel(
+            self.true,
+            self.bench,
+            self.light,
+            self.imager,
+            self.slopes,
+            self.images.centroid_weight,
+            self.seed,
+        )
 
     def _add(
         self,

@@ -1,14 +1,17 @@
 """Cramér–Rao bounds of a lens's pose for arrangements of sources and planes."""
 
 import copy
+import itertools
 import logging
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from dolens.alignment.information import fisher_information
+from dolens.alignment.information import FisherInformation, fisher_information
 from dolens.alignment.measurement import Measurement
 from dolens.alignment.pose import Pose
 from dolens.errors import InputError, check_keys
@@ -27,9 +30,9 @@ from dolens.experiments.poses.bounds_figures import bounds_figures
 from dolens.experiments.poses.results import spread_metrics
 from dolens.experiments.poses.settings import ImageSettings, blur_for, slopes_imager, spot_imager
 from dolens.experiments.tables import Row
+from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
-from dolens.stages import stage as named_stage
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +56,7 @@ class PoseBoundsModule(Analysis):
         monte_carlo: measurements with other photons, of each arrangement, whose estimates are
             compared with the bounds; 0 for none.
         seed: of simulations.
+        workers: where arrangements and measurements are worked out; see `workers_of`.
 
     Raises:
         InputError: a setting that is unknown or out of range.
@@ -71,8 +75,10 @@ class PoseBoundsModule(Analysis):
         images: ImageSettings,
         monte_carlo: int = 0,
         seed: int = 0,
+        workers: int | str | None = None,
     ) -> None:
         super().__init__(lens, experiment, folder)
+        self.workers = workers_of(workers)
         check_precision(lens, "known")
         if not variables or not arrangements:
             raise InputError("variables, arrangements: give at least one of each")
@@ -86,14 +92,21 @@ class PoseBoundsModule(Analysis):
 
     @torch.no_grad()
     def analyse(self) -> dict[str, float]:
-        """Evaluate every arrangement."""
+        """Evaluate every arrangement, then draw the measurements of each."""
         numbers: dict[str, float] = {}
-        for number, (name, pose) in enumerate(self.poses.items()):
-            with named_stage(f"arrangement: {name}"):
-                found = self._evaluate(number, name, pose)
-            self.arrangements.append(found)
-            numbers |= self._metrics(found)
-            logger.info("%s: %s", name, self._verdict(found))
+        poses = list(self.poses.values())
+        model = BoundsModel(self.bench, self.light, self.images, self.seed)
+        draws = range(1, self.monte_carlo + 1)
+        with self.workers.open() as map_tasks:
+            found = list(map_tasks(model.information, list(enumerate(poses)), "arrangements"))
+            tasks = [(number, draw) for number in range(len(poses)) for draw in draws]
+            moved = map_tasks(partial(model.correction, poses, found), tasks, "measurements")
+            for name, pose, information in zip(self.poses, poses, found, strict=True):
+                steps = list(itertools.islice(moved, len(draws)))
+                arrangement = self._arrangement(name, pose, information, steps)
+                self.arrangements.append(arrangement)
+                numbers |= self._metrics(arrangement)
+                logger.info("%s: %s", name, self._verdict(arrangement))
         return numbers
 
     def tables(self) -> dict[str, list[Row]]:
@@ -155,27 +168,15 @@ class PoseBoundsModule(Analysis):
         place.put(values)
         return place.varying({**variables, **(entry.get("variables") or {})})
 
-    def _evaluate(self, number: int, name: str, pose: Pose) -> Arrangement:
-        measured = self._measurement(number, pose, 0)
-        wavelength, settings = self.bench.wavelength, self.images
-        own = spot_imager(measured, wavelength, settings.imager)
-        slopes = slopes_imager(measured, wavelength, settings.imager, settings.slopes)
-        information = fisher_information(pose, own, measured, slopes, blur_for(measured, slopes))
+    def _arrangement(
+        self, name: str, pose: Pose, information: FisherInformation, moved: Sequence[Tensor]
+    ) -> Arrangement:
         spread, eigenvectors = information.eigenvectors(pose.scale)
         estimates = None
-        if self.monte_carlo:
+        if moved:
             theta = pose.scale * pose.scaled.detach()
-            moved = [
-                information.correction(self._measurement(number, pose, seed))
-                for seed in range(1, self.monte_carlo + 1)
-            ]
-            estimates = (theta + torch.stack(moved)) / pose.units
+            estimates = (theta + torch.stack(list(moved))) / pose.units
         return Arrangement(name, pose, information, spread, eigenvectors, estimates)
-
-    def _measurement(self, number: int, pose: Pose, seed: int) -> Measurement:
-        count = len(pose.sources) * len(pose.planes)
-        light = replace(self.light, photons=max(1, int(self.light.photons) // count))
-        return simulate(pose, self.bench, light, draw(self.seed, number, seed))
 
     def _metrics(self, found: Arrangement) -> dict[str, float]:
         numbers = {
@@ -204,3 +205,56 @@ class PoseBoundsModule(Analysis):
         if not spread < UNSEEN:
             return f"{' '.join(names)} (of their scales) cannot be seen at all"
         return f"known worst, to {spread:.2g} of their scales: {' '.join(names)}"
+
+
+@dataclass(frozen=True)
+class BoundsModel:
+    """Describes how arrangements are measured and modelled.
+
+    Attributes:
+        bench: wavelength and sensor.
+        light: its photons are those of all images of an arrangement together.
+        images: settings of the model's.
+        seed: of simulations.
+    """
+
+    bench: Bench
+    light: Light
+    images: ImageSettings
+    seed: int
+
+    @torch.no_grad()
+    def information(self, task: tuple[int, Pose]) -> FisherInformation:
+        """Return the information that an arrangement's images carry on its pose.
+
+        Args:
+            task: the arrangement's number and pose.
+        """
+        number, pose = task
+        measured = self._measurement(number, pose, 0)
+        wavelength, settings = self.bench.wavelength, self.images
+        own = spot_imager(measured, wavelength, settings.imager)
+        slopes = slopes_imager(measured, wavelength, settings.imager, settings.slopes)
+        return fisher_information(pose, own, measured, slopes, blur_for(measured, slopes))
+
+    @torch.no_grad()
+    def correction(
+        self,
+        poses: Sequence[Pose],
+        information: Sequence[FisherInformation],
+        task: tuple[int, int],
+    ) -> Tensor:
+        """Return the step (P,) from a pose to what another measurement leads to.
+
+        Args:
+            poses: of all arrangements.
+            information: on them.
+            task: numbers of the arrangement and of the measurement.
+        """
+        number, drawn = task
+        return information[number].correction(self._measurement(number, poses[number], drawn))
+
+    def _measurement(self, number: int, pose: Pose, measurement: int) -> Measurement:
+        count = len(pose.sources) * len(pose.planes)
+        light = replace(self.light, photons=max(1, int(self.light.photons) // count))
+        return simulate(pose, self.bench, light, draw(self.seed, number, measurement))

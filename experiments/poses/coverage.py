@@ -20,6 +20,7 @@ from dolens.experiments.poses.results import error_statistics
 from dolens.experiments.tables import Row
 from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
+from dolens.tasks import TaskMap
 
 logger = logging.getLogger(__name__)
 
@@ -82,10 +83,13 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         for number, fit in enumerate(self.fits):
             self._hold(number)
             self.information[fit.name] = self._information(number)
-        for case in self.cases:
-            with named_stage(f"case: {case}"):
-                self._work_out(case)
-            self.write_tables()
+        with self.workers.open() as map_tasks:
+            for case in self.cases:
+                try:
+                    with named_stage(f"case: {case}"):
+                        self._work_out(case, map_tasks)
+                finally:
+                    self.write_tables()
         return self._metrics()
 
     def tables(self) -> dict[str, list[Row]]:
@@ -135,7 +139,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             numbers[f"coverage/{case}/unsettled"] = float((~settled).sum())
         return numbers
 
-    def _work_out(self, case: str) -> None:
+    def _work_out(self, case: str, map_tasks: TaskMap) -> None:
         effects, fits = self.cases[case]
         light = replace(self.light, unmodelled=effects)
         earlier: dict[str, Estimates] = {}
@@ -143,7 +147,7 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
             if fit.name not in fits:
                 continue
             self._hold(number)
-            found = self._estimates(number, range(self.draws), light, earlier)
+            found = self._estimates(number, range(self.draws), light, earlier, map_tasks)
             earlier[fit.name] = self.found[case, fit.name] = found
             self.rows += self._variable_rows(case, fit.name)
             freedom = len(self.poses[number].names)

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from dolens.errors import InputError
 from dolens.experiments.poses.settings import Fit
 from dolens.optimize.damped_least_squares import DampedLeastSquares
 from dolens.rendering.spot_image import SpotImager
+from dolens.tasks import TaskMap, in_turn
 
 # One linear step is exact enough within so many bounds; longer ones are followed by others.
 _NEAR = 5.0
@@ -96,6 +98,7 @@ def estimates(
     truth: Mapping[str, float],
     held: Held | None = None,
     slopes: SpotImager | None = None,
+    map_tasks: TaskMap = in_turn,
 ) -> Estimates:
     """Find the pose of each of M measurements, from one pose that is near all of them.
 
@@ -108,11 +111,13 @@ def estimates(
         truth: by name, degrees and mm.
         held: what the fit takes from an earlier one; None: nothing.
         slopes: makes the images' derivatives where one step does not do; None: `imager`.
+        map_tasks: finds them, each a task.
     """
     true = torch.tensor([truth.get(name, torch.nan) for name in pose.names], dtype=torch.float64)
     values, chi, settled = [], [], []
-    for place, draw in enumerate(draws):
-        theta, done = _estimate(pose, information, imager, slopes, measured(draw), held, place)
+    one = partial(_estimate, pose, information, imager, slopes, measured, held)
+    found = map_tasks(one, list(enumerate(draws)), "measurements")
+    for place, (theta, done) in enumerate(found):
         error = theta - true * pose.units
         if held is not None:
             error = error - information.nuisance_sensitivity @ (held.found[place] - held.true)
@@ -122,21 +127,24 @@ def estimates(
     return Estimates(torch.stack(values), torch.stack(chi), torch.tensor(settled))
 
 
+@torch.no_grad()
 def _estimate(
     pose: Pose,
     information: FisherInformation,
     imager: SpotImager,
     slopes: SpotImager | None,
-    measurement: Measurement,
+    measured: Callable[[int], Measurement],
     held: Held | None,
-    place: int,
+    task: tuple[int, int],
 ) -> tuple[Tensor, bool]:
-    """Return θ (P,), and whether it has settled.
+    """Return θ (P,), and whether it has settled; a task is a place among the draws, and its draw.
 
     One step of weighted least squares with the derivatives of the pose is all that an error of some
     bounds needs.  Where it is longer, the measurement is fitted: by damped least squares, with
     weights and derivatives of every iteration's own, until a step is small.
     """
+    place, draw = task
+    measurement = measured(draw)
     at = pose.scale * pose.scaled.detach()
     moved = torch.zeros_like(at)
     if held is not None:

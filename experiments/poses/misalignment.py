@@ -4,6 +4,7 @@ import copy
 import logging
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -28,9 +29,11 @@ from dolens.experiments.poses.results import (
 )
 from dolens.experiments.poses.settings import FitPlan, spot_imager
 from dolens.experiments.tables import Row, write_table
+from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
 from dolens.rendering.spot_image import SpotImage, SpotImager
 from dolens.stages import stage as named_stage
+from dolens.tasks import TaskMap
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +57,7 @@ class MisalignmentModule(Experiment):
             each fit, whose estimates (by steps of weighted least squares, from what the fits that
             they hold would have found) are compared with the bound and the truth; 0 for none.
         seed: of simulations.
+        workers: where the estimates from other measurements are found; see `workers_of`.
 
     Raises:
         InputError: a setting that is unknown or out of range.
@@ -70,8 +74,10 @@ class MisalignmentModule(Experiment):
         measurement: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
         monte_carlo: int = 0,
         seed: int = 0,
+        workers: int | str | None = None,
     ) -> None:
         super().__init__(lens, experiment, folder)
+        self.workers = workers_of(workers)
         self.automatic_optimization = False
         check_precision(lens, "fitted")
         self.plan, self.fits, self.stages, self.light = plan, plan.fits, plan.stages, light
@@ -128,10 +134,9 @@ class MisalignmentModule(Experiment):
 
     def _hold(self, number: int) -> None:
         fit, pose = self.fits[number], self.poses[number]
-        if fit.held_from is None:
-            return
-        found = self.poses[self.plan.number(fit.held_from)].file_values()
-        pose.put({name: found[name] for name in fit.held})
+        if fit.held_from is not None:
+            found = self.poses[self.plan.number(fit.held_from)].file_values()
+            pose.put({name: found[name] for name in fit.held})
 
     def training_step(self, batch: Tensor, batch_idx: int) -> None:
         """Make one iteration of the present stage."""
@@ -171,26 +176,29 @@ class MisalignmentModule(Experiment):
     @torch.no_grad()
     def test_step(self, batch: Tensor, batch_idx: int) -> None:
         """Find errors and bounds of every fit; log them, and write the tables."""
-        for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
-            self._hold(number)
-            with named_stage(f"bounds: {fit.name}"):
-                information = self._information(number)
-            self.information[fit.name] = information
-            truth = self.truth(number)
-            rows = pose_rows(fit.name, pose, self.initial[number], information, truth)
-            self.log_dict(pose_metrics(rows))
-            if self.monte_carlo and self.observations.photograph is None:
-                draws = range(1, self.monte_carlo + 1)
-                with named_stage(f"{len(draws)} measurements drawn: {fit.name}"):
-                    found = self._estimates(number, draws, self.light, self.estimates)
-                self.estimates[fit.name] = found
-                values = found.values[found.settled]
-                self.log(f"pose_unsettled/{fit.name}", float(len(draws) - len(values)))
-                spread = (fit.name, pose.names, values, information.bounds / pose.units, truth)
-                if len(values) > 1:
-                    self.log_dict(spread_metrics(*spread))
-                rows = spread_columns(rows, *spread[1:])
-            self.results += rows
+        with self.workers.open() as map_tasks:
+            for number, (fit, pose) in enumerate(zip(self.fits, self.poses, strict=True)):
+                self._hold(number)
+                with named_stage(f"bounds: {fit.name}"):
+                    information = self._information(number)
+                self.information[fit.name] = information
+                truth = self.truth(number)
+                rows = pose_rows(fit.name, pose, self.initial[number], information, truth)
+                self.log_dict(pose_metrics(rows))
+                if self.monte_carlo and self.observations.photograph is None:
+                    draws = range(1, self.monte_carlo + 1)
+                    with named_stage(f"{len(draws)} measurements drawn: {fit.name}"):
+                        found = self._estimates(
+                            number, draws, self.light, self.estimates, map_tasks
+                        )
+                    self.estimates[fit.name] = found
+                    values = found.values[found.settled]
+                    self.log(f"pose_unsettled/{fit.name}", float(len(draws) - len(values)))
+                    spread = (fit.name, pose.names, values, information.bounds / pose.units, truth)
+                    if len(values) > 1:
+                        self.log_dict(spread_metrics(*spread))
+                    rows = spread_columns(rows, *spread[1:])
+                self.results += rows
         write_table(self.folder / "history.csv", self.history)
         write_table(self.folder / "poses.csv", self.results)
         for row in self.results:
@@ -220,7 +228,12 @@ class MisalignmentModule(Experiment):
         return information.with_nuisance_parameters(len(pose.names), covariance)
 
     def _estimates(
-        self, number: int, draws: Sequence[int], light: Light, earlier: Mapping[str, Estimates]
+        self,
+        number: int,
+        draws: Sequence[int],
+        light: Light,
+        earlier: Mapping[str, Estimates],
+        map_tasks: TaskMap,
     ) -> Estimates:
         """Return what other measurements lead to, from where a fit ended.
 
@@ -229,6 +242,7 @@ class MisalignmentModule(Experiment):
             draws: numbers of measurements.
             light: of them.
             earlier: estimates from them by earlier fits, whose numbers this one may hold.
+            map_tasks: finds the estimates.
         """
         fit, pose, truth = self.fits[number], self.poses[number], self.truth(number)
         held = None
@@ -239,11 +253,12 @@ class MisalignmentModule(Experiment):
             pose,
             self.information[fit.name],
             self.finest(number),
-            lambda draw: self.observations.simulated(number, draw, light),
+            partial(self.observations.simulated, number, light=light),
             draws,
             truth,
             held,
             self._slopes(number)[0],
+            map_tasks,
         )
 
     def images(self, number: int, scaled: Tensor | None = None) -> list[SpotImage]:
@@ -260,10 +275,8 @@ class MisalignmentModule(Experiment):
         """Return what the run cost, and errors over bounds where the truth is known."""
         numbers = {f"cost/{name}_s": value for name, value in self.seconds.items()}
         numbers["cost/iterations"] = float(len(self.history))
-        images = len(self.measurement(0).images)
-        numbers["cost/rays"] = float(self.finest(0).rays * images)
-        ratio = error_over_bound(self.results)
-        if ratio is not None:
+        numbers["cost/rays"] = float(self.finest(0).rays * len(self.measurement(0).images))
+        if (ratio := error_over_bound(self.results)) is not None:
             numbers["pose_error/over_bound"] = ratio
         return numbers
 

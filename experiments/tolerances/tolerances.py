@@ -3,6 +3,7 @@
 import copy
 import logging
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -21,6 +22,7 @@ from dolens.experiments.tolerances.tables import (
     offender_text,
     sensitivity_rows,
 )
+from dolens.experiments.workers import workers_of
 from dolens.optics.lens import Lens
 from dolens.plotting.layout import lens_title
 from dolens.stages import stage as named_stage
@@ -78,6 +80,7 @@ class TolerancesModule(Analysis):
         tolerance_factor: multiplies every half-range.
         monte_carlo: the lenses drawn.
         yield_at_um: limits of the RMS radius, µm.
+        workers: where lenses are traced; see `workers_of`.
 
     Raises:
         InputError: a setting is out of range.
@@ -96,6 +99,7 @@ class TolerancesModule(Analysis):
         tolerance_factor: float,
         monte_carlo: MonteCarlo,
         yield_at_um: Sequence[float],
+        workers: int | str | None = None,
     ) -> None:
         super().__init__(lens, experiment, folder)
         self.spots = spots
@@ -103,6 +107,8 @@ class TolerancesModule(Analysis):
         self.tolerances = tolerances_from(lens, tolerances, tolerance_factor)
         self.monte_carlo = monte_carlo
         self.yield_at_um = numbers_of("yield_at_um", yield_at_um)
+        # Chunks of this process have threads of their own, which changes no bit.
+        self.workers = None if workers is None else workers_of(workers)
         self.analysis: ToleranceAnalysis | None = None
 
     def analyse(self) -> dict[str, float]:
@@ -161,15 +167,17 @@ class TolerancesModule(Analysis):
         # Squares of small differences need double precision, whatever the lens is kept in.
         lens = copy.deepcopy(self.lens).double()
         drawn = self.monte_carlo
-        return analyse_tolerances(
-            lens,
-            self.spots.rays(lens),
-            self.tolerances,
-            self.weights,
-            drawn.lenses,
-            torch.Generator().manual_seed(drawn.seed),
-            drawn.chunk_size,
-        )
+        with nullcontext() if self.workers is None else self.workers.open() as map_tasks:
+            return analyse_tolerances(
+                lens,
+                self.spots.rays(lens),
+                self.tolerances,
+                self.weights,
+                drawn.lenses,
+                torch.Generator().manual_seed(drawn.seed),
+                drawn.chunk_size,
+                map_tasks,
+            )
 
     def _outcome(self, name: str, outcome: Outcome, refocused: bool) -> dict[str, float]:
         """Return quantiles of RMS radii, yields, and the radii of the lens as designed."""

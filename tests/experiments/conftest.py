@@ -1,3 +1,4 @@
+import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
+from dolens.experiments.workers import own_process
+from dolens.tasks import in_turn
 from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 
 
@@ -67,6 +70,21 @@ def finished_run(root: Path, parent: Path, *overrides: str, name: str = "run") -
         OmegaConf.save(own, records / "config.yaml")
         run(cfg)
     return parent / name
+
+
+@pytest.fixture
+def pickled_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every task goes through the form in which it would go to another process, and back."""
+
+    def elsewhere(piece):
+        function, task = pickle.loads(piece)
+        return pickle.dumps(function(task))
+
+    def pickled(function, tasks, name):
+        pieces = [pickle.dumps((function, task)) for task in tasks]
+        return map(pickle.loads, in_turn(elsewhere, pieces, name))
+
+    monkeypatch.setattr(own_process, "in_turn", pickled)
 
 
 @pytest.fixture

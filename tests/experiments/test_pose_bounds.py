@@ -8,6 +8,9 @@ from tiny_experiment import figure_names
 
 from dolens.experiments.running.training import run
 
+# Workers could take every task of these runs.
+pytestmark = pytest.mark.usefixtures("pickled_tasks")
+
 TINY = [
     "experiment=pose_bounds",
     "sensor.height=32",

@@ -10,6 +10,9 @@ from tiny_experiment import figure_names
 from dolens.errors import InputError
 from dolens.experiments.running.training import run
 
+# Workers could take every task of these runs.
+pytestmark = pytest.mark.usefixtures("pickled_tasks")
+
 SMALL = [
     "~fits.10",
     "~fits.25",

@@ -1,0 +1,148 @@
+"""A Ray cluster is started on this machine, or one that runs already is joined."""
+
+import importlib
+import os
+import secrets
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+from dolens.errors import InputError, one_line
+
+# Functions and results wait here; in memory that is taken when it is needed.
+_OBJECT_STORE_BYTES = 512 << 20
+# Ray's sockets lie some 70 characters below its folder, and Linux allows 107 for all.
+_LONGEST_FOLDER = 30
+_QUIET: Mapping[str, Any] = {
+    "configure_logging": False,
+    "log_to_driver": False,
+    "include_dashboard": False,
+}
+
+
+@contextmanager
+def local_cluster(processes: int) -> Iterator[ModuleType]:
+    """Start a cluster on this machine, give Ray's module, and end the cluster.
+
+    It listens on the loopback address alone, reports nothing to anybody, and leaves no file.  Where
+    this process is in a cluster already, as a job of a sweep over Ray is, that one is used and
+    stays.
+
+    Args:
+        processes: that run tasks.
+
+    Raises:
+        InputError: Ray is not installed, or does not start.
+    """
+    with ExitStack() as closing:
+        with _environment():
+            ray = _ray(str(processes))
+            if not ray.is_initialized():
+                folder = tempfile.mkdtemp(prefix="dolens-", dir=_short_folder())
+                closing.callback(shutil.rmtree, folder, ignore_errors=True)
+                closing.enter_context(_signals_kept())
+                closing.callback(ray.shutdown)
+                _start(
+                    ray,
+                    address="local",  # whatever RAY_ADDRESS says
+                    num_cpus=processes,
+                    num_gpus=0,
+                    object_store_memory=_OBJECT_STORE_BYTES,
+                    _temp_dir=folder,
+                    # Else Ray kills workers, again and again, when others fill the memory.
+                    _system_config={"memory_monitor_refresh_ms": 0},
+                )
+        yield ray
+
+
+@contextmanager
+def joined_cluster() -> Iterator[ModuleType]:
+    """Join the cluster of `RAY_ADDRESS`, or the one that `ray start` left on this machine.
+
+    Raises:
+        InputError: Ray is not installed, or there is no such cluster.
+    """
+    ray = _ray("auto")
+    with ExitStack() as closing:
+        if not ray.is_initialized():
+            closing.enter_context(_signals_kept())
+            closing.callback(ray.shutdown)
+            _start(ray, address="auto")
+        yield ray
+
+
+def _start(ray: ModuleType, **settings: Any) -> None:
+    try:
+        ray.init(**_QUIET, **settings)
+    except (ConnectionError, OSError, RuntimeError, ValueError) as error:
+        what = "Ray does not start"
+        if "num_cpus" not in settings:
+            what = "no Ray cluster is found (start one by `ray start --head`, or set RAY_ADDRESS)"
+        raise InputError(f"workers: {what}: {one_line(error)}") from error
+
+
+def _ray(setting: str) -> ModuleType:
+    try:
+        return importlib.import_module("ray")
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise InputError(
+            f"workers={setting} needs Ray, which is not installed; install it by: "
+            "pip install 'dolens[ray]'"
+        ) from None
+
+
+def _short_folder() -> str:
+    """Return a folder for temporary files whose name leaves room for those of sockets."""
+    folder = tempfile.gettempdir()
+    return folder if len(folder) <= _LONGEST_FOLDER else "/tmp"
+
+
+@contextmanager
+def _environment() -> Iterator[None]:
+    """Set what Ray's processes read when they start, and put back what was there."""
+    wanted = {
+        "RAY_USAGE_STATS_ENABLED": "0",
+        # Despite its name: without it Ray listens where other machines can reach it.
+        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+        "OMP_NUM_THREADS": "1",
+    }
+    if "RAY_AUTH_MODE" not in os.environ:
+        # Else Ray makes a token of its own, and writes it to a file in the home folder.
+        wanted |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@cache
+def _token() -> str:
+    """Return this process's secret, without which nobody can give tasks to its clusters."""
+    return secrets.token_hex(32)
+
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Put the handler of SIGTERM back that Ray replaces by its own."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
