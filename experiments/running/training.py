@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError
 from dolens.experiments.callbacks.interruption import InterruptionNotice
+from dolens.experiments.callbacks.starvation import StarvationWarning
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
@@ -35,6 +36,7 @@ from dolens.experiments.running.run_folder import (
     plain_metrics,
 )
 from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.threads import set_threads
 from dolens.optics.lens import Lens
 from dolens.prescriptions import lens_from_prescription, save_lens
 
@@ -59,8 +61,7 @@ def run(cfg: DictConfig) -> float:
     refuse_subprocess_ddp_in_sweep(settings)
     import_extensions(settings.extensions)
     written = settings_of(cfg)  # before Hydra resolves in place what it instantiates
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
+    set_threads(settings.threads)
     # The basic launcher runs a sweep's jobs in one process: seed at each start.
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     torch.set_float32_matmul_precision(settings.matmul_precision)
@@ -78,6 +79,8 @@ def run(cfg: DictConfig) -> float:
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
     callbacks.append(SettingsInCheckpoints(written))
+    starvation = StarvationWarning()
+    callbacks.append(starvation)
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
@@ -107,6 +110,7 @@ def run(cfg: DictConfig) -> float:
         save_lens(module.lens, folder / "lens" / "final.yaml")
         write_json(folder / INFO, {**info, "status": status})
     metrics.update(summary_of(module))
+    metrics.update(starvation.numbers())
     metrics["cost/wall_s"] = time.perf_counter() - started
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
     numbers = plain_metrics(metrics)
