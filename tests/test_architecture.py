@@ -16,6 +16,7 @@ ALLOWED = {
     "html": set(),
     "file_text": {"errors"},
     "stages": set(),
+    "processors": set(),
     "cached_tensors": set(),
     "packaged": {"errors"},
     "kernels": {"cached_tensors", "errors", "stages"},

@@ -107,7 +107,8 @@ def random_system(seed: int, wild: bool) -> tuple[Lens, Draw]:
         except InputError:
             continue  # as where an aperture is beyond the surface's end
         # Some phases have kernels on some shapes only.
-        if unsupported(lens.system()) is None and all(fits(p.detach().abs()) for p in lens.parameters()):
+        sizes = (p.detach().abs() for p in lens.parameters())
+        if unsupported(lens.system()) is None and all(map(fits, sizes)):
             return lens, draw
 
 
@@ -118,7 +119,7 @@ def any_rays(lens: Lens, draw: Draw, count: int, sense: float) -> Rays:
     odd = torch.arange(count) % 64
     direction[odd == 8] = 0.0
     direction[odd == 16] *= 1e-30
-    position[odd == 24] *= 1e30
+    position[odd == 24] *= 1e9
     position[odd == 32] -= 1e12 * direction[odd == 32]
     position[odd == 40, 0] = math.nan
     direction[odd == 48, 2] = math.inf

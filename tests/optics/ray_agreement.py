@@ -90,7 +90,10 @@ def _gradients(
     found = [torch.zeros_like(i) if g is None else g for i, g in zip(inputs, found, strict=True)]
     sizes = [torch.full_like(g, float(g.abs().max()) if g.numel() else 0.0) for g in found[2:]]
     flat = [torch.cat([g.reshape(-1) for g in each]) for each in (found[2:], sizes)]
-    return torch.cat((found[0], found[1]), 1)[which], flat[0], flat[1]
+    # Directions are unit vectors: nothing is said of the derivative along them.
+    unit, along = given.direction.detach(), found[1]
+    along = along - (along * unit).sum(1, keepdim=True) * unit
+    return torch.cat((found[0], along), 1)[which], flat[0], flat[1]
 
 
 def _spreads(lens: Lens, rays: Rays, sense: float, dtype: torch.dtype, what: str) -> torch.Tensor:
