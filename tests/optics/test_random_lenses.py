@@ -11,6 +11,7 @@ from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.hard_cases import GLASS, surface
 from tests.optics.random_lenses import SAG_KINDS
+from tests.optics.ray_agreement import any_cases, disagreements
 from tests.optics.ray_facts import BACKENDS, PRECISIONS, cases, chosen, send, violations
 
 DTYPES = pytest.mark.parametrize("dtype", PRECISIONS, ids=["f32", "f64"])
@@ -32,6 +33,17 @@ def test_surfaces_given_by_their_sag_keep_the_same_rules(number):
     for _, lens, rays, sense in cases(number // 2, bool(number % 2), 150, SAG_KINDS):
         for dtype in PRECISIONS:
             found = violations(lens, rays, sense, dtype, ("cpu",))
+            broken = {rule for rule in found if "within rounding" not in rule}
+            assert not broken, found
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_backends_agree_on_any_prescription(number):
+    """Values, statuses and gradients; `scripts/fuzz_lenses.py --any` has more."""
+    for _, lens, rays, sense in any_cases(number // 2, bool(number % 2), 150):
+        for dtype in PRECISIONS:
+            found = violations(lens, rays, sense, dtype)
+            found += disagreements(lens, rays, sense, dtype)
             broken = {rule for rule in found if "within rounding" not in rule}
             assert not broken, found
 
