@@ -1,6 +1,10 @@
 """Random lenses against what holds of every ray: a table of what breaks it, with seeds.
 
 python scripts/fuzz_lenses.py --lenses 2000 --rays 2000
+python scripts/fuzz_lenses.py --any --lenses 2000 --rays 1250     # 1e7 rays, value and gradient
+
+With --any, prescriptions have all that they can hold (phases, mirrors, breaks, ...), some rays have
+numbers that no light has, and values and gradients of the backends are compared as well.
 """
 
 import argparse
@@ -15,6 +19,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.optics.random_lenses import KINDS, SAG_KINDS
+from tests.optics.ray_agreement import any_cases, disagreements
 from tests.optics.ray_facts import PRECISIONS, cases, violations
 
 
@@ -28,6 +33,7 @@ def main() -> int:
     parser.add_argument(
         "--sags", action="store_true", help="odd aspheres, biconics, toroids, Zernike, ... instead"
     )
+    parser.add_argument("--any", action="store_true", help="all that a prescription can hold")
     options = parser.parse_args()
     kinds = SAG_KINDS if options.sags else KINDS
     end, done = time.monotonic() + 60.0 * options.minutes, 0
@@ -39,10 +45,18 @@ def main() -> int:
         seed, wild = divmod(number, 2)
         # The reference's take their time, with a column for every coefficient of a spline.
         jacobians = ("reference", "cpu") if seed % 100 == 0 else ("cpu",)
-        for way, lens, bundle, sense in cases(seed, bool(wild), options.rays, kinds):
+        drawn = (
+            any_cases(seed, bool(wild), options.rays)
+            if options.any
+            else cases(seed, bool(wild), options.rays, kinds)
+        )
+        for way, lens, bundle, sense in drawn:
             for dtype in PRECISIONS:
                 traced += 2 * len(bundle.position)
-                for rule, count in violations(lens, bundle, sense, dtype, jacobians).items():
+                found = violations(lens, bundle, sense, dtype, jacobians)
+                if options.any:
+                    found += disagreements(lens, bundle, sense, dtype)
+                for rule, count in found.items():
                     place = (
                         rule,
                         str(dtype).removeprefix("torch."),

@@ -18,6 +18,7 @@ ALLOWED = {
     "stages": set(),
     "whole_files": set(),
     "tasks": {"errors", "stages"},
+    "processors": set(),
     "cached_tensors": set(),
     "packaged": {"errors"},
     "kernels": {"cached_tensors", "errors", "stages"},

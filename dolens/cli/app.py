@@ -18,6 +18,7 @@ from dolens.cli.export import export
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
+from dolens.cli.threads import let_threads_sleep, limit_threads
 from dolens.cli.train import PassedOn, train
 from dolens.errors import InputError, one_line
 
@@ -32,6 +33,7 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command; a user's mistake ends it with one line and exit status 1."""
+    let_threads_sleep()
     try:
         app()
     except InputError as error:
@@ -39,8 +41,10 @@ def main() -> None:
 
 
 @app.callback()
-def _dolens() -> None:
-    """Keep `dolens` a group of commands, however few there are."""
+def _dolens(context: typer.Context) -> None:
+    """Keep `dolens` a group of commands, and each of them to the processors it may use."""
+    if context.invoked_subcommand != "train":
+        limit_threads()
 
 
 # In the order of `dolens --help`: a lens, an experiment, a run.

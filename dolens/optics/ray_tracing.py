@@ -11,7 +11,7 @@ from dolens.kernels import operators
 from dolens.optics.backend import choose_backend
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.packing import pack
-from dolens.optics.rays import Components, Rays, TracedRays
+from dolens.optics.rays import Components, Rays, TracedRays, finite_rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_sensor, traced_rays
 
@@ -88,7 +88,7 @@ def from_sensor(system: OpticalSystem, rays: Rays) -> Rays:
     """
     if not system.breaks:
         return rays
-    ray = rays.components()
+    ray = finite_rays(rays, system.dtype).components()
     # In double precision, a sensor metres away loses nothing that a surface needs.
     ray = Components(*(c.to(device=system.device, dtype=torch.float64) for c in ray))
     z = sum(gap.double() for gap in (*system.thicknesses, system.sensor_distance))

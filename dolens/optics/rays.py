@@ -1,6 +1,6 @@
 """Rays, and what became of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -65,6 +65,21 @@ class Rays:
         position = torch.stack((ray.x, ray.y, ray.z), -1)
         direction = torch.stack((ray.l, ray.m, ray.n), -1)
         return Rays(position, direction, wavelength)
+
+
+def finite_rays(rays: Rays, dtype: torch.dtype) -> Rays:
+    """Return rays of which those with a number that `dtype` cannot hold stand still at 0.
+
+    Without a direction they miss every surface.  NaN itself would pass through a mask into the
+    gradients of all rays together, since 0·NaN is NaN.
+    """
+    position, direction = (v.detach().to(dtype) for v in (rays.position, rays.direction))
+    known = position.isfinite().all(-1) & direction.isfinite().all(-1)
+    return replace(
+        rays,
+        position=rays.position.where(known[..., None], 0.0),
+        direction=rays.direction.where(known[..., None], 0.0),
+    )
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
-from dolens.optics.rays import Components, Rays, Status, TracedRays
+from dolens.optics.rays import Components, Rays, Status, TracedRays, finite_rays
 from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay
 from dolens.optics.surfaces.state import SurfaceState
@@ -138,7 +138,8 @@ def enter_lens(
     they meet first, before they lose it: a source at 10 km would come out 0.1 mm off.  The path is
     None for the others, which stay where they start.
     """
-    ray = Components(*(c.to(device=system.device) for c in rays.components()))
+    known = finite_rays(rays, system.dtype)
+    ray = Components(*(c.to(device=system.device) for c in known.components()))
     finer = torch.promote_types(ray.x.dtype, system.dtype)
     if finer == system.dtype:
         return Components(*(c.to(system.dtype) for c in ray)), None

@@ -41,6 +41,7 @@ from dolens.experiments.running.run_folder import (
     peak_memory_mb,
     plain_metrics,
 )
+from dolens.experiments.running.threads import set_threads
 from dolens.experiments.running.training import summary_of
 from dolens.prescriptions import save_lens
 
@@ -185,8 +186,7 @@ def _tested(
 ) -> dict[str, Any]:
     """Test, and return the metrics; run.json says how it ended."""
     settings = run.settings
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
+    set_threads(settings.threads)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     torch.set_float32_matmul_precision(settings.matmul_precision)
     with working_folder_importable():

@@ -19,6 +19,7 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
 from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
 from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
+from dolens.experiments.callbacks.starvation import StarvationWarning
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
@@ -41,6 +42,7 @@ from dolens.experiments.running.run_folder import (
     plain_metrics,
 )
 from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.threads import set_threads
 from dolens.experiments.search.pruned import TrialPruned
 from dolens.experiments.search.pruning import trial_callbacks
 from dolens.optics.lens import Lens
@@ -69,8 +71,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     refuse_subprocess_ddp_in_sweep(settings)
     import_extensions(settings.extensions)
     written = settings_of(cfg)  # before Hydra resolves in place what it instantiates
-    if settings.threads:
-        torch.set_num_threads(settings.threads)
+    set_threads(settings.threads)
     # The basic launcher runs a sweep's jobs in one process: seed at each start.
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     torch.set_float32_matmul_precision(settings.matmul_precision)
@@ -88,7 +89,8 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
         callbacks = [c for c in callbacks if not isinstance(c, ProgressBar)]
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
     callbacks += [ResumedEpochs(), LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
-    callbacks += trial_callbacks()
+    starvation = StarvationWarning()
+    callbacks += [starvation, *trial_callbacks()]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
@@ -129,6 +131,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
         with logged_if(status != "finished"):
             save_lens(module.lens, folder / "lens" / "final.yaml")
     metrics.update(summary_of(module))
+    metrics.update(starvation.numbers())
     metrics["cost/wall_s"] = time.perf_counter() - started
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
     numbers = plain_metrics(metrics)

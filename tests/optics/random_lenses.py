@@ -186,11 +186,11 @@ def random_lens(seed: int, wild: bool, kinds: tuple[str, ...] = KINDS) -> tuple[
             lens = lens_from_prescription(prescription(draw))
         except InputError:
             continue  # an aperture beyond the surface's end
-        if all(_fits_single_precision(p.detach().abs()) for p in lens.parameters()):
+        if all(fits(p.detach().abs()) for p in lens.parameters()):
             return lens, draw
 
 
-def _fits_single_precision(size: torch.Tensor) -> bool:
+def fits(size: torch.Tensor) -> bool:
     """Whether float32 holds a parameter, and derivatives by it (r²⁰ by a20, say)."""
     return bool(((size < 1e30) & ((size == 0.0) | (size > 1e-30))).all())
 

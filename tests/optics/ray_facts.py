@@ -8,7 +8,7 @@ import torch
 
 from dolens import Lens, Rays
 from dolens.optics.jacobian import OUTPUTS, normal_equations, ray_jacobian
-from dolens.optics.ray_tracing import trace_rays
+from dolens.optics.ray_tracing import from_sensor, trace_rays
 from dolens.optics.rays import Status, TracedRays
 from tests.optics.random_lenses import KINDS, random_lens, random_rays, returning
 
@@ -51,6 +51,30 @@ def chosen(rays: Rays, which: torch.Tensor) -> Rays:
     return Rays(rays.position[which], rays.direction[which], wavelength)
 
 
+def rounded(
+    values: torch.Tensor, dtype: torch.dtype, generator: torch.Generator, roundings: float = 4.0
+) -> torch.Tensor:
+    """Numbers moved by up to so many units in their last place."""
+    exact = values.detach().double()
+    return (exact * (1.0 + _noise(exact, dtype, generator, roundings))).to(dtype)
+
+
+def vectors(
+    values: torch.Tensor, dtype: torch.dtype, generator: torch.Generator, roundings: float = 4.0
+) -> torch.Tensor:
+    """Vectors (..., 3) moved by up to so many units in the last place of their lengths."""
+    exact = values.detach().double()
+    length = exact.norm(dim=-1, keepdim=True)
+    return (exact + _noise(exact, dtype, generator, roundings) * length).to(dtype)
+
+
+def _noise(
+    like: torch.Tensor, dtype: torch.dtype, generator: torch.Generator, roundings: float
+) -> torch.Tensor:
+    drawn = torch.rand(like.shape, generator=generator, dtype=torch.float64)
+    return roundings * torch.finfo(dtype).eps * (2.0 * drawn - 1.0)
+
+
 def undecided(
     lens: Lens,
     rays: Rays,
@@ -72,18 +96,9 @@ def undecided(
             their lengths.
     """
     generator = torch.Generator().manual_seed(0)
-    epsilon = roundings * torch.finfo(dtype).eps
 
-    def noise(values: torch.Tensor) -> torch.Tensor:
-        drawn = torch.rand(values.shape, generator=generator, dtype=torch.float64)
-        return epsilon * (2.0 * drawn - 1.0)
-
-    def rounded(values: torch.Tensor) -> torch.Tensor:
-        return (values.detach().double() * (1.0 + noise(values))).to(dtype)
-
-    def vectors(values: torch.Tensor) -> torch.Tensor:
-        exact = values.detach().double()
-        return (exact + noise(exact) * exact.norm(dim=-1, keepdim=True)).to(dtype)
+    def moved_vectors(values: torch.Tensor) -> torch.Tensor:
+        return vectors(values, dtype, generator, roundings)
 
     fates = {backend: [] for backend in BACKENDS}
     with torch.no_grad():
@@ -92,9 +107,9 @@ def undecided(
             between = None
             if attempt:
                 for parameter in moved.parameters():
-                    parameter.copy_(rounded(parameter))
-                given = Rays(vectors(given.position), vectors(given.direction), rays.wavelength)
-                between = vectors
+                    parameter.copy_(rounded(parameter, dtype, generator, roundings))
+                numbers = (moved_vectors(v) for v in (given.position, given.direction))
+                given, between = Rays(*numbers, rays.wavelength), moved_vectors
             for backend in BACKENDS:
                 fates[backend].append(_fate(moved, given, sense, backend, between))
     reference, cpu = (torch.stack(fates[backend]) for backend in BACKENDS)
@@ -116,6 +131,7 @@ def _fate(
         return 4 * hit.surface.long() + hit.status
     system, ended, vignetted = lens.system().traced_by(backend), None, None
     count = len(system.surfaces)
+    rays = rays if sense > 0.0 else from_sensor(system, rays)
     for number in range(1, count + 1) if sense > 0.0 else range(count, 0, -1):
         # The sensor's plane belongs to the last surface's step.
         last = None if sense > 0.0 and number == count else number

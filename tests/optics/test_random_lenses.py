@@ -11,6 +11,7 @@ from dolens.optics.jacobian import normal_equations, ray_jacobian
 from dolens.prescriptions import lens_from_prescription
 from tests.optics.hard_cases import GLASS, surface
 from tests.optics.random_lenses import SAG_KINDS
+from tests.optics.ray_agreement import any_cases, disagreements
 from tests.optics.ray_facts import BACKENDS, PRECISIONS, cases, chosen, send, violations
 
 DTYPES = pytest.mark.parametrize("dtype", PRECISIONS, ids=["f32", "f64"])
@@ -32,6 +33,17 @@ def test_surfaces_given_by_their_sag_keep_the_same_rules(number):
     for _, lens, rays, sense in cases(number // 2, bool(number % 2), 150, SAG_KINDS):
         for dtype in PRECISIONS:
             found = violations(lens, rays, sense, dtype, ("cpu",))
+            broken = {rule for rule in found if "within rounding" not in rule}
+            assert not broken, found
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_backends_agree_on_any_prescription(number):
+    """Values, statuses and gradients; `scripts/fuzz_lenses.py --any` has more."""
+    for _, lens, rays, sense in any_cases(number // 2, bool(number % 2), 150):
+        for dtype in PRECISIONS:
+            found = violations(lens, rays, sense, dtype)
+            found += disagreements(lens, rays, sense, dtype)
             broken = {rule for rule in found if "within rounding" not in rule}
             assert not broken, found
 
@@ -161,3 +173,32 @@ def test_sums_of_squares_beyond_single_precision():
     assert math.sqrt(float(expected.max())) > 1e19
     found = normal_equations(copy.deepcopy(lens).float(), rays, ["surfaces.2.*"]).jtj
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
+
+
+@DTYPES
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("lens_dtype", PRECISIONS, ids=["lens_f32", "lens_f64"])
+def test_rays_with_numbers_that_no_light_has_are_missed_and_spoil_no_gradient(
+    backend, dtype, lens_dtype
+):
+    """0·NaN is NaN: one such ray among 1e6 would make all gradients of the lens NaN."""
+    lens = asphere(elements={"1": {"surfaces": [2, 2], "tilt_x": 1.0}}).to(lens_dtype)
+    lens.backend = backend
+    position = torch.tensor([[1.0, 2.0, -1.0]], dtype=dtype).repeat(7, 1)
+    direction = torch.tensor([[0.0, 0.0, 1.0]], dtype=dtype).repeat(7, 1)
+    position[1, 0], position[2, 2], position[3, 1] = math.nan, math.inf, -math.inf
+    direction[4, 2], direction[5, 0], direction[6] = math.nan, math.inf, 0.0
+    position.requires_grad_()
+    direction.requires_grad_()
+    results = []
+    for some in (slice(None), slice(0, 1)):
+        hit = lens.trace(Rays(position[some], direction[some]))
+        outputs = torch.cat((hit.position, hit.direction, hit.path_length[:, None]), 1)
+        assert outputs.isfinite().all()
+        inputs = [position, direction, *lens.parameters()]
+        results.append(torch.autograd.grad(outputs.sum(), inputs, allow_unused=True))
+        assert hit.status.tolist() == [Status.OK, *[Status.MISSED] * 6][some]
+    for found, alone in zip(*results, strict=True):
+        if alone is not None:
+            torch.testing.assert_close(found, alone)
+            assert found.isfinite().all()

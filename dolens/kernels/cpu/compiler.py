@@ -4,6 +4,7 @@ A kernel is a function of pointers, made by a factory: a function of a real type
 kernel as a Python function.  Each is compiled when a lens first needs it, and kept on disk.
 """
 
+import ctypes
 import hashlib
 import inspect
 import logging
@@ -21,6 +22,7 @@ from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
+from dolens.kernels.cpu import machine_code
 from dolens.kernels.cpu.kernel_files import KernelFiles
 from dolens.stages import stage
 
@@ -114,20 +116,21 @@ int8_at = _pointer_at(types.int8)
 @cache
 def compile_block(factory: Factory, real: str) -> int:
     """Return the address of a block function for `float32` or `float64`."""
-    return _compiled(factory, real, block_signature(REALS[real])).address or 0
+    return _compiled(factory, real, block_signature(REALS[real]))
 
 
 @cache
 def compile_driver(factory: Factory, real: str) -> int:
     """Return the address of a driver, a C function of (job, first, end)."""
     signature = types.void(INTEGERS, types.int64, types.int64)
-    return _compiled(factory, real, signature).address or 0
+    return _compiled(factory, real, signature)
 
 
 @cache
 def compile_team(factory: Factory) -> Any:
     """Return the C function of a task that each thread of a team runs, without Python's lock."""
-    return _compiled(factory, "float64", types.void(INTEGERS)).ctypes
+    address = _compiled(factory, "float64", types.void(INTEGERS))
+    return ctypes.CFUNCTYPE(None, ctypes.POINTER(ctypes.c_int64))(address)
 
 
 @cache
@@ -159,26 +162,50 @@ def source_of(factory: Factory) -> tuple[str, ...]:
     return function.__module__, function.__qualname__, factory.__name__, digest
 
 
-_kernels: dict[tuple[Factory, str], CFunc] = {}
+_kernels: dict[tuple[Factory, str], int] = {}
 
 
-def _compiled(factory: Factory, real: str, signature: Any) -> CFunc:
+def _compiled(factory: Factory, real: str, signature: Any) -> int:
+    """Return the address of a kernel, from this process, from disk or from the compiler."""
     with _lock:
-        kernel = _kernels.get((factory, real))
-        if kernel is None:
+        address = _kernels.get((factory, real))
+        if address is None:
             with _wide_vectors(), _announced(factory.__name__.replace("_", " ")):
-                function = factory(REALS[real])
-                form = normalize_signature(signature)
-                kernel = CFunc(function, form, locals={}, options=dict(OPTIONS))
-                try:
-                    source = (*source_of(factory), real)
-                    kernel._cache = KernelFiles(  # type: ignore[attr-defined]
-                        f"{factory.__name__}-{real}", stamp(), source
-                    )
-                except RuntimeError as error:  # no source, or no home folder
-                    logger.warning("compiled kernels cannot be kept for the next start: %s", error)
-                kernel.compile()
-            _kernels[factory, real] = kernel
+                files = _files(factory, real)
+                address = _read(files) if files else None
+                if address is None:
+                    kernel = _made(factory, real, signature)
+                    address = kernel.address
+                    if files:
+                        files.write(machine_code.taken_from(kernel))
+            _kernels[factory, real] = address
+    return address
+
+
+def _files(factory: Factory, real: str) -> KernelFiles | None:
+    try:
+        source = (*source_of(factory), real)
+        return KernelFiles(f"{factory.__name__}-{real}", stamp(), source, machine_code.target())
+    except RuntimeError as error:  # no source, or no home folder
+        logger.warning("compiled kernels cannot be kept for the next start: %s", error)
+        return None
+
+
+def _read(files: KernelFiles) -> int | None:
+    """Return the address of a kernel from disk; None where there is none that can be loaded."""
+    found = files.read()
+    try:
+        return None if found is None else machine_code.load(found)
+    except RuntimeError as error:
+        logger.warning("a compiled kernel on disk is made anew: %s (%s)", error, files.path)
+        return None
+
+
+def _made(factory: Factory, real: str, signature: Any) -> CFunc:
+    form = normalize_signature(signature)
+    kernel = CFunc(factory(REALS[real]), form, locals={}, options=dict(OPTIONS))
+    kernel.compile()
+    # The function itself belongs to the engine of Numba, which is there for good.
     return kernel
 
 

@@ -5,33 +5,39 @@ LLVM, and the processor with its features.  So machines that share a home folder
 file, and processes that compile at the same time write the same content: each writes a file of its
 own and renames it, and the last one stays.
 
-Files belong to one user: they hold machine code, and nobody else may write there.
+A file holds machine code and the name of its function, behind a digest of both and of what the
+kernel was made from; no Python object is in it, and nothing is unpickled.  The digest finds damage,
+and files that were exchanged.  Machine code is executed, of course, so a file counts only if this
+user (or root) owns it and nobody else may write to it; what a user runs can write such files too,
+as it can write the user's Python packages.
 """
 
 import hashlib
 import logging
 import os
-import pickle
 import platform
 import shutil
+import stat
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import llvmlite
 import numba
 from numba.core import config
-from numba.core.compiler import CompileResult
-from numba.core.runtime import rtsys
-from numba.core.serialize import dumps
+
+from dolens.kernels.cpu.machine_code import MachineCode
 
 logger = logging.getLogger("dolens.kernels")
 
 # Days after which the kernels of another version of the sources are deleted.
 _KEPT_DAYS = 90.0
 _DIGEST = hashlib.sha256().digest_size
+# What has been said of the cache's folder: every kernel would say it again.
+_said: set[str] = set()
 
 
 def cache_folder() -> Path:
@@ -57,7 +63,7 @@ def cache_folder() -> Path:
 
 
 class KernelFiles:
-    """Numba's cache of one kernel: a file with machine code.
+    """The file of one kernel.
 
     A file that cannot be written costs only the cache, and one that is damaged is replaced.
 
@@ -65,47 +71,72 @@ class KernelFiles:
         name: of the kernel, for people who look into the folder.
         stamp: digest of the sources that all kernels have in common.
         source: what tells this kernel from others.
+        target: what Numba's code generator says of the processor that it compiles for.
     """
 
-    def __init__(self, name: str, stamp: str, source: tuple[str, ...]) -> None:
-        self.name, self.source = name, source
-        self.folder = cache_folder() / stamp[:16]
-
-    def path(self, codegen: Any) -> Path:
-        """Return the kernel's file for the processor that Numba's `codegen` compiles for."""
+    def __init__(
+        self, name: str, stamp: str, source: tuple[str, ...], target: tuple[Any, ...]
+    ) -> None:
         versions = (sys.version, platform.machine(), numba.__version__, llvmlite.__version__)
-        key = repr((self.source, versions, codegen.magic_tuple()))
-        return self.folder / f"{self.name}-{hashlib.sha256(key.encode()).hexdigest()[:32]}.kernel"
+        self._key = repr((stamp, source, versions, target)).encode()
+        self.folder = cache_folder() / stamp[:16]
+        self.path = self.folder / f"{name}-{hashlib.sha256(self._key).hexdigest()[:32]}.kernel"
 
-    def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        """Return the compiled kernel, or None where there is none."""
-        # Numba's own cache prepares to compile first, which imports SciPy and half of Numba
-        # (0.6 s); compiled code needs the runtime's symbols only.
-        rtsys.initialize(target_context)
-        path = self.path(target_context.codegen())
+    def read(self) -> MachineCode | None:
+        """Return the compiled kernel, or None where there is none that could be used."""
         try:
-            content = path.read_bytes()
+            with open(self.path, "rb") as file:
+                if not is_private(os.fstat(file.fileno())):
+                    logger.warning(
+                        "a compiled kernel on disk is not used: others may have written it (%s)",
+                        self.path,
+                    )
+                    return None
+                content = file.read()
         except FileNotFoundError:
             return None
         except OSError as error:
-            logger.warning("compiled kernels on disk cannot be read: %s", error)
+            _say_once("compiled kernels on disk cannot be read", error)
             return None
         digest, payload = content[:_DIGEST], content[_DIGEST:]
-        if hashlib.sha256(payload).digest() != digest:
-            logger.warning("a compiled kernel on disk is damaged and made anew: %s", path)
+        if self._digest(payload) != digest:
+            logger.warning("a compiled kernel on disk is damaged and made anew: %s", self.path)
             return None
-        return CompileResult._rebuild(target_context, *pickle.loads(payload))
+        function, _, code = payload.partition(b"\0")
+        return MachineCode(function.decode(), code)
 
-    def save_overload(self, sig: Any, data: CompileResult) -> None:
+    def write(self, kernel: MachineCode) -> None:
         """Keep a compiled kernel for the next process."""
-        payload = dumps(data._reduce())
+        payload = kernel.function.encode() + b"\0" + kernel.code
         try:
             if not self.folder.is_dir():
-                self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+                for folder in (self.folder.parent, self.folder):
+                    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
                 delete_old(self.folder.parent)
-            write_whole(self.path(data.codegen), hashlib.sha256(payload).digest() + payload)
+            write_whole(self.path, self._digest(payload) + payload)
         except OSError as error:
-            logger.warning("compiled kernels cannot be kept for the next start: %s", error)
+            _say_once("compiled kernels cannot be kept for the next start", error)
+
+    def _digest(self, payload: bytes) -> bytes:
+        """Return the digest that stands before a payload; another kernel's file has another."""
+        return hashlib.sha256(self._key + payload).digest()
+
+
+def is_private(status: os.stat_result) -> bool:
+    """Return whether nobody but this user or root can have written a file.
+
+    Windows keeps a user's cache folder from others by itself.
+    """
+    if not hasattr(os, "geteuid"):
+        return True
+    others = stat.S_IWGRP | stat.S_IWOTH
+    return status.st_uid in (os.geteuid(), 0) and not status.st_mode & others
+
+
+def _say_once(what: str, error: OSError) -> None:
+    if what not in _said:
+        _said.add(what)
+        logger.warning("%s: %s", what, error)
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -124,5 +155,6 @@ def delete_old(folder: Path) -> None:
     """Delete the kernels of other versions that nothing was added to for months."""
     oldest = time.time() - _KEPT_DAYS * 86400.0
     for version in folder.iterdir():
-        if version.is_dir() and version.stat().st_mtime < oldest:
-            shutil.rmtree(version, ignore_errors=True)
+        with suppress(OSError):  # another process may be faster
+            if version.is_dir() and version.stat().st_mtime < oldest:
+                shutil.rmtree(version, ignore_errors=True)
