@@ -2,23 +2,29 @@
 
 import statistics
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torch import Tensor
 
+# Steps that medians are of, at most: a run may have any number.
+_STEPS = 100_000
+
 
 class StepCosts:
     """Measures the wall time of training steps.
 
-    The optics' share is the time in which images are made, and in the backward pass the time after
-    the gradient has reached the images.
+    Waiting for data comes before a step and is no part of it.  The optics' share is the time in
+    which images are made, and in the backward pass the time after the gradient has reached the
+    images.
     """
 
     def __init__(self) -> None:
-        self._steps: list[float] = []
-        self._optics: list[float] = []
+        self._steps: deque[float] = deque(maxlen=_STEPS)
+        self._optics: deque[float] = deque(maxlen=_STEPS)
         self._step_started = 0.0
+        self.data: float | None = None  # mean seconds of waiting for a batch, where it is measured
         self._backward_started: float | None = None
 
     def start(self) -> None:
@@ -49,10 +55,11 @@ class StepCosts:
         return _costs(self._steps[-1], self._optics[-1])
 
     def numbers(self) -> dict[str, float]:
-        """Return the medians of all steps in seconds; none before the first."""
+        """Return the medians of the latest steps in seconds; none before the first."""
         if not self._steps:
             return {}
-        return _costs(statistics.median(self._steps), statistics.median(self._optics))
+        waited = {} if self.data is None else {"cost/data_s": self.data}
+        return waited | _costs(statistics.median(self._steps), statistics.median(self._optics))
 
     def _start_backward(self, gradient: Tensor) -> None:
         self._backward_started = time.perf_counter()

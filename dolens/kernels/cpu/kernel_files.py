@@ -10,13 +10,9 @@ Files belong to one user: they hold machine code, and nobody else may write ther
 
 import hashlib
 import logging
-import os
 import pickle
 import platform
-import shutil
 import sys
-import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -27,33 +23,24 @@ from numba.core.compiler import CompileResult
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
+from dolens.user_cache import delete_old, user_cache_folder, write_whole
+
 logger = logging.getLogger("dolens.kernels")
 
-# Days after which the kernels of another version of the sources are deleted.
-_KEPT_DAYS = 90.0
 _DIGEST = hashlib.sha256().digest_size
 
 
 def cache_folder() -> Path:
     """Return the folder of compiled kernels.
 
-    It is NUMBA_CACHE_DIR where that is set, and else `dolens/kernels` in the user's cache folder:
-    XDG_CACHE_HOME or ~/.cache on Linux, ~/Library/Caches on macOS, LOCALAPPDATA on Windows.
+    It is NUMBA_CACHE_DIR where that is set, and else `dolens/kernels` in the user's cache folder.
 
     Raises:
         RuntimeError: the user has no home folder.
     """
     if config.CACHE_DIR:
         return Path(config.CACHE_DIR) / "dolens"
-    if sys.platform == "win32":
-        of_user = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        of_user = Path.home() / "Library" / "Caches"
-    else:
-        # The convention says that a relative path is to be passed over.
-        of_user = Path(os.environ.get("XDG_CACHE_HOME", ""))
-        of_user = of_user if of_user.is_absolute() else Path.home() / ".cache"
-    return Path(of_user) / "dolens" / "kernels"
+    return user_cache_folder() / "kernels"
 
 
 class KernelFiles:
@@ -106,23 +93,3 @@ class KernelFiles:
             write_whole(self.path(data.codegen), hashlib.sha256(payload).digest() + payload)
         except OSError as error:
             logger.warning("compiled kernels cannot be kept for the next start: %s", error)
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that other processes see whole or not at all."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
-def delete_old(folder: Path) -> None:
-    """Delete the kernels of other versions that nothing was added to for months."""
-    oldest = time.time() - _KEPT_DAYS * 86400.0
-    for version in folder.iterdir():
-        if version.is_dir() and version.stat().st_mtime < oldest:
-            shutil.rmtree(version, ignore_errors=True)
