@@ -23,6 +23,7 @@ class StepCosts:
     def __init__(self) -> None:
         self._steps: deque[float] = deque(maxlen=_STEPS)
         self._optics: deque[float] = deque(maxlen=_STEPS)
+        self.latest: dict[str, float] = {}
         self._step_started = 0.0
         self.data: float | None = None  # mean seconds of waiting for a batch, where it is measured
         self._backward_started: float | None = None
@@ -52,7 +53,8 @@ class StepCosts:
     def end(self) -> dict[str, float]:
         """End a step, and return its costs in seconds."""
         self._steps.append(time.perf_counter() - self._step_started)
-        return _costs(self._steps[-1], self._optics[-1])
+        self.latest = _costs(self._steps[-1], self._optics[-1])
+        return self.latest
 
     def numbers(self) -> dict[str, float]:
         """Return the medians of the latest steps in seconds; none before the first."""
