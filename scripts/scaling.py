@@ -39,7 +39,7 @@ from scripts.scaling_model import (
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = ("wavefront_coding", "large_fov_doublet")
-_STEPS = 16
+_STEPS = 12
 # Steps before the medians begin: kernels are loaded, and memory is fetched.
 _WARM_UP = 4
 _QUICK = [

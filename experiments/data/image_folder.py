@@ -124,6 +124,10 @@ class ImageFolderDataModule(CropDataModule):
             self._paths = self._listed()
         return self._paths
 
+    def prepare_data(self) -> None:
+        """List the files; of several processes one does so first, and the others find its index."""
+        self.paths  # noqa: B018
+
     def load_split(self, split: Split) -> FolderPhotographs:
         """Return the photographs of a split, none of them decoded yet."""
         return self._photographs_of(split, read_photograph)
