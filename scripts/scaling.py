@@ -1,7 +1,8 @@
 """Compute what a training and a search cost on other machines from a few measured steps.
 
-    python scripts/scaling.py measure --output measured.json   # about 3 minutes, on a quiet machine
-    python scripts/scaling.py show measured.json                # the tables of docs/scaling.md
+    python scripts/scaling.py measure --output measured.json    # about 3 minutes on a quiet machine
+    python scripts/scaling.py show measured.json                 # the tables of docs/scaling.md
+    python scripts/scaling.py show measured.json --page docs/scaling.md   # writes them there
 
 `measure` trains the default camera and the large field of view for some steps on one and two
 threads, and two at once on one thread each.  `show` computes: Amdahl's law in each part of a step
@@ -38,10 +39,16 @@ from scripts.scaling_model import (
 )
 
 ROOT = Path(__file__).resolve().parents[1]
-EXPERIMENTS = ("wavefront_coding", "large_fov_doublet")
+# Renderers that need no plan, which would take longer than the steps.
+EXPERIMENTS = {
+    "wavefront_coding": ["renderer=psf", "reference_renderers=none", "miscalibrations=none"],
+    "large_fov_doublet": ["renderer=psf_window"],
+}
 _STEPS = 12
 # Steps before the medians begin: kernels are loaded, and memory is fetched.
 _WARM_UP = 4
+# Between these marks a page has the tables.
+_BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
 _QUICK = [
     *("trainer.max_epochs=1", f"data.steps_per_epoch={_STEPS}", "+trainer.limit_val_batches=0"),
     *("test=false", "objective=train/loss", "callbacks.pictures=null", "callbacks.best=null"),
@@ -161,6 +168,7 @@ def _started(experiment: str, threads: int, folder: Path, name: str) -> _Run:
     path = folder / f"{experiment}_{name}.json"
     command = [
         *(sys.executable, str(ROOT / "train.py"), f"experiment={experiment}", *_QUICK),
+        *EXPERIMENTS[experiment],
         *(f"threads={threads}", f"hydra.run.dir={path.with_suffix('')}"),
         f"+callbacks.parts={{_target_: scripts.scaling.Parts, path: {path}}}",
     ]
@@ -197,6 +205,19 @@ def show(measured: Mapping[str, Any], assumed: Mapping[str, float]) -> list[str]
     return [*lines, "", *search_lines(experiments, assumed)]
 
 
+def written_into(page: str, lines: Sequence[str]) -> str:
+    """Return a page with other tables between its two marks.
+
+    Raises:
+        ValueError: the page has not both marks.
+    """
+    before, begin, rest = page.partition(_BEGIN)
+    _, end, after = rest.partition(_END)
+    if not begin or not end:
+        raise ValueError(f"no {_BEGIN} … {_END}")
+    return "".join((before, begin, "\n", "\n".join(lines), "\n", end, after))
+
+
 def main(arguments: Sequence[str]) -> int:
     """Measure, or print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -205,6 +226,7 @@ def main(arguments: Sequence[str]) -> int:
     measuring.add_argument("--output", type=Path, required=True)
     showing = commands.add_parser("show", help="compute the tables")
     showing.add_argument("measured", type=Path)
+    showing.add_argument("--page", type=Path, help="whose tables are replaced")
     for name, (value, unit) in ASSUMED.items():
         showing.add_argument(f"--{name}", type=float, default=value, help=f"{unit} ({value:g})")
     given = parser.parse_args(arguments)
@@ -214,7 +236,12 @@ def main(arguments: Sequence[str]) -> int:
         given.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         return 0
     assumed = {name: getattr(given, name.replace("-", "_")) for name in ASSUMED}
-    print("\n".join(show(json.loads(given.measured.read_text(encoding="utf-8")), assumed)))
+    lines = show(json.loads(given.measured.read_text(encoding="utf-8")), assumed)
+    if given.page is None:
+        print("\n".join(lines))
+    else:
+        page = written_into(given.page.read_text(encoding="utf-8"), lines)
+        given.page.write_text(page, encoding="utf-8")
     return 0
 
 
