@@ -85,8 +85,8 @@ class Parts(lightning.Callback):
     def __init__(self, path: str) -> None:
         self.path = Path(path)
         self.started = time.perf_counter()
-        self.steps: dict[str, list[float]] = {name: [] for name in (*PARTS, "loop")}
-        self._began = self._updating = self._update = 0.0
+        self.steps: dict[str, list[float]] = {name: [] for name in (*PARTS, "loop", "processor")}
+        self._began = self._processor = self._updating = self._update = 0.0
         self._modes: tuple[FlopCounterMode, _Operators] | None = None
         self._step = 0
         self._first_step = 0.0
@@ -107,6 +107,7 @@ class Parts(lightning.Callback):
                 "data": data,
                 "rest": loop - costs["cost/step_s"] - data,
                 "loop": loop,
+                "processor": time.process_time() - self._processor,
             }
             for name, seconds in found.items():
                 self.steps[name].append(max(seconds, 0.0))
@@ -114,7 +115,7 @@ class Parts(lightning.Callback):
             self._modes = FlopCounterMode(display=False), _Operators()
             for mode in self._modes:
                 mode.__enter__()
-        self._began = time.perf_counter()
+        self._began, self._processor = time.perf_counter(), time.process_time()
 
     def on_before_optimizer_step(self, *arguments: Any) -> None:
         """Begin the update."""
@@ -134,6 +135,7 @@ class Parts(lightning.Callback):
         flops, operators = self._modes or (None, None)
         found = {
             "seconds": {name: statistics.median(self.steps[name]) for name in PARTS},
+            "processor": sum(self.steps["processor"]) / sum(self.steps["loop"]),
             "spread": (high - low) / statistics.median(self.steps["loop"]),
             "start_s": self._first_step,
             "flops": flops.get_total_flops() if flops else 0,
@@ -177,11 +179,22 @@ def _started(experiment: str, threads: int, folder: Path, name: str) -> _Run:
         return _Run(subprocess.Popen(command, env=environment, stdout=log, stderr=log), path)
 
 
-def measure(folder: Path) -> dict[str, Any]:
-    """Return the measured parts of every experiment, and the machine's load meanwhile."""
+def measure(folder: Path, busy: bool) -> dict[str, Any]:
+    """Return the measured parts of every experiment, and the machine's load meanwhile.
+
+    Args:
+        folder: for the runs.
+        busy: the machine has other work: one thread alone is measured, and the share of the time
+            counts in which it had a processor.
+    """
     began, found = os.getloadavg()[0], {}
     for experiment in EXPERIMENTS:
         one = _started(experiment, 1, folder, "one").result()
+        if busy:
+            share = one["processor"]
+            seconds = {name: share * value for name, value in one["seconds"].items()}
+            found[experiment] = {**one, "seconds": seconds}
+            continue
         two = _started(experiment, 2, folder, "two").result()
         pair = [_started(experiment, 1, folder, f"pair{number}") for number in range(2)]
         together = [run.result() for run in pair]
@@ -224,6 +237,7 @@ def main(arguments: Sequence[str]) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     measuring = commands.add_parser("measure", help="train some steps, and write their parts")
     measuring.add_argument("--output", type=Path, required=True)
+    measuring.add_argument("--busy", action="store_true", help="one thread, processor's seconds")
     showing = commands.add_parser("show", help="compute the tables")
     showing.add_argument("measured", type=Path)
     showing.add_argument("--page", type=Path, help="whose tables are replaced")
@@ -232,7 +246,7 @@ def main(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     if given.command == "measure":
         with tempfile.TemporaryDirectory() as folder:
-            found = measure(Path(folder))
+            found = measure(Path(folder), given.busy)
         given.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         return 0
     assumed = {name: getattr(given, name.replace("-", "_")) for name in ASSUMED}

@@ -26,8 +26,8 @@ class Experiment:
     Attributes:
         name: of the experiment.
         one: seconds of each part of a step on one thread.
-        two: likewise on two threads.
-        at_once: likewise of two processes at once, on one thread each.
+        two: likewise on two threads; None where they were not measured.
+        at_once: likewise of two processes at once, on one thread each; or None.
         spread: quartiles' distance of a step over its median, of the worse of both measurements.
         start: seconds from the start of the training to its first step.
         flops: of the network in a step, floating-point operations.
@@ -38,8 +38,8 @@ class Experiment:
 
     name: str
     one: Mapping[str, float]
-    two: Mapping[str, float]
-    at_once: Mapping[str, float]
+    two: Mapping[str, float] | None
+    at_once: Mapping[str, float] | None
     spread: float
     start: float
     flops: float
@@ -53,9 +53,9 @@ class Experiment:
         return cls(
             name,
             found["seconds"],
-            found["seconds_two_threads"],
-            found["seconds_of_two_at_once"],
-            max(found["spread"], found["spread_two_threads"]),
+            found.get("seconds_two_threads"),
+            found.get("seconds_of_two_at_once"),
+            max(found["spread"], found.get("spread_two_threads", 0.0)),
             found["start_s"],
             found["flops"],
             found["operators"],
@@ -64,8 +64,10 @@ class Experiment:
         )
 
     def serial(self, part: str) -> float:
-        """Return the seconds of a part that more threads do not shorten, by Amdahl's law."""
-        one, two = self.one[part], self.two[part]
+        """Return the seconds of a part that more threads do not shorten, by Amdahl's law; all of it
+        where two threads were not measured.
+        """
+        one, two = self.one[part], (self.two or self.one)[part]
         return min(max(2.0 * two - one, 0.0), one)
 
     def on_threads(self, threads: int) -> dict[str, float]:
@@ -78,7 +80,7 @@ class Experiment:
 
     def crowding(self) -> float:
         """Return how many times longer a step takes where every core has a process of its own."""
-        return max(sum(self.at_once.values()) / sum(self.one.values()), 1.0)
+        return max(sum((self.at_once or self.one).values()) / sum(self.one.values()), 1.0)
 
     def on_processes(self, processes: int, assumed: Mapping[str, float]) -> dict[str, float]:
         """Return the parts of a step of processes of one thread, which share their gradients."""
@@ -116,6 +118,8 @@ def measured_lines(experiments: Sequence[Experiment]) -> list[str]:
     ]
     for e in experiments:
         for what, parts in (("1 thread", e.one), ("2 threads", e.two), ("2 at once", e.at_once)):
+            if parts is None:
+                continue
             total = sum(parts.values())
             crops = (2 if what == "2 at once" else 1) * e.batch / total
             numbers = " | ".join(f"{1e3 * parts[part]:.1f}" for part in PARTS)
@@ -137,6 +141,8 @@ def machine_lines(experiments: Sequence[Experiment], assumed: Mapping[str, float
             ("1 GPU (assumed)", 1, e.on_gpus(1, assumed)),
             ("8 GPUs (assumed)", 8, e.on_gpus(8, assumed)),
         ):
+            if "1 process" in what and e.two is None:
+                continue
             total = sum(parts.values())
             crops = processes * e.batch / total
             longest = max(parts, key=parts.__getitem__)

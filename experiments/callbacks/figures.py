@@ -89,8 +89,8 @@ def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -
             logger.warning("No figure '%s': %s", name, problem)
         except Exception:
             logger.exception("No figure '%s'", name)
-    # A figure and its parts refer to one another: many MB of pixels would wait until Python looks for
-    # such circles, which it does after many objects, not after much memory.
+    # A figure and its parts refer to one another: many MB of pixels would wait until Python looks
+    # for such circles, which it does after many objects, not after much memory.
     gc.collect()
 
 
