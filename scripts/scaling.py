@@ -213,7 +213,16 @@ def measure(folder: Path, busy: bool) -> dict[str, Any]:
 def show(measured: Mapping[str, Any], assumed: Mapping[str, float]) -> list[str]:
     """Return the tables in Markdown."""
     experiments = [Experiment.of(name, e) for name, e in measured["experiments"].items()]
-    lines = [f"Load of the machine when measuring began: {measured['machine']['load_before']:.1f}."]
+    load = f"load {measured['machine']['load_before']:.0f} when measuring began"
+    if any(e.two is None for e in experiments):
+        text = (
+            f"Measured on a machine with other work ({load}): one thread, and the time in which it "
+            "had a processor. Rows of several threads need a quiet machine."
+        )
+    else:
+        spread = 100.0 * max(e.spread for e in experiments)
+        text = f"Measured on two cores ({load}); half of the steps lie within {spread:.0f} %."
+    lines = [text]
     lines += ["", *measured_lines(experiments), "", *machine_lines(experiments, assumed)]
     return [*lines, "", *search_lines(experiments, assumed)]
 
