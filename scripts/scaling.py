@@ -51,7 +51,7 @@ _WARM_UP = 4
 _BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
 _QUICK = [
     *("trainer.max_epochs=1", f"data.steps_per_epoch={_STEPS}", "+trainer.limit_val_batches=0"),
-    *("test=false", "objective=train/loss", "callbacks.pictures=null", "callbacks.best=null"),
+    *("test=false", "objective=train/loss", "callbacks.pictures=null"),
     *("callbacks.validation_pictures=null", "+trainer.enable_progress_bar=false"),
 ]
 
@@ -162,7 +162,8 @@ class _Run:
     def result(self) -> dict[str, Any]:
         """Wait for the run, and return what it wrote."""
         if self.process.wait():
-            raise SystemExit(f"{self.path.with_suffix('.log')}: the run failed")
+            log = self.path.with_suffix(".log").read_text(encoding="utf-8")
+            raise SystemExit(f"{self.path.stem}: the run failed\n{log[-2000:]}")
         return json.loads(self.path.read_text(encoding="utf-8"))
 
 
