@@ -76,7 +76,7 @@ def read_measurement(
     try:
         with Image.open(path) as image:
             values = np.asarray(image)
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"data.measurement: {path} cannot be read ({reason})") from error
     if values.ndim != 2 or values.dtype.kind not in "ui":

@@ -1,5 +1,6 @@
 """Figures of an experiment, saved and logged."""
 
+import gc
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -90,6 +91,9 @@ def _keep(figures: Callable[[], Figures], keep: Callable[[str, Figure], None]) -
             logger.error("No figure '%s': %s", name, problem)
         except Exception:
             logger.exception("No figure '%s'", name)
+    # A figure and its parts refer to one another: many MB of pixels would wait until Python looks
+    # for such circles, which it does after many objects, not after much memory.
+    gc.collect()
 
 
 def _log(trainer: lightning.Trainer, name: str, figure: Figure) -> None:

@@ -187,6 +187,10 @@ class CameraModule(Camera):
     def on_train_batch_end(self, outputs: Any, batch: Tensor, batch_idx: int) -> None:
         """Log the costs, and the lens's variables."""
         self.log_dict(self.costs.end())
+        waiting = getattr(self.trainer.datamodule, "waiting", None)
+        if waiting is not None and waiting.batches:
+            self.costs.data = waiting.mean()
+            self.log("cost/data_s", waiting.latest)
         self.log("cost/rays", float(self.views.rays()))
         self.log_dict(variable_numbers(self.variables()))
 

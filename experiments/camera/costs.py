@@ -2,23 +2,30 @@
 
 import statistics
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from torch import Tensor
 
+# Steps that medians are of, at most: a run may have any number.
+_STEPS = 100_000
+
 
 class StepCosts:
     """Measures the wall time of training steps.
 
-    The optics' share is the time in which images are made, and in the backward pass the time after
-    the gradient has reached the images.
+    Waiting for data comes before a step and is no part of it.  The optics' share is the time in
+    which images are made, and in the backward pass the time after the gradient has reached the
+    images.
     """
 
     def __init__(self) -> None:
-        self._steps: list[float] = []
-        self._optics: list[float] = []
+        self._steps: deque[float] = deque(maxlen=_STEPS)
+        self._optics: deque[float] = deque(maxlen=_STEPS)
+        self.latest: dict[str, float] = {}
         self._step_started = 0.0
+        self.data: float | None = None  # mean seconds of waiting for a batch, where it is measured
         self._backward_started: float | None = None
 
     def start(self) -> None:
@@ -46,13 +53,15 @@ class StepCosts:
     def end(self) -> dict[str, float]:
         """End a step, and return its costs in seconds."""
         self._steps.append(time.perf_counter() - self._step_started)
-        return _costs(self._steps[-1], self._optics[-1])
+        self.latest = _costs(self._steps[-1], self._optics[-1])
+        return self.latest
 
     def numbers(self) -> dict[str, float]:
-        """Return the medians of all steps in seconds; none before the first."""
+        """Return the medians of the latest steps in seconds; none before the first."""
         if not self._steps:
             return {}
-        return _costs(statistics.median(self._steps), statistics.median(self._optics))
+        waited = {} if self.data is None else {"cost/data_s": self.data}
+        return waited | _costs(statistics.median(self._steps), statistics.median(self._optics))
 
     def _start_backward(self, gradient: Tensor) -> None:
         self._backward_started = time.perf_counter()

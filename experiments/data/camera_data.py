@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader
 from dolens.errors import InputError
 from dolens.experiments.checks import check_count
 from dolens.experiments.data.crop_dataset import EvaluationCrops, TrainingCrops
+from dolens.experiments.data.loading import CropLoader, Waiting
 from dolens.experiments.data.photographs import Photograph
 from dolens.experiments.data.resumable import ResumableLoader, ResumableSampler
 
@@ -57,7 +58,9 @@ class CropDataModule(lightning.LightningDataModule):
         evaluation_scale: photograph pixels per texel in validation and test.
         flip_horizontal: mirror half of the training crops left and right.
         flip_vertical: mirror half of the training crops top and bottom.
-        num_workers: processes that cut crops; 0 cuts them in the training process.
+        num_workers: processes that cut crops; 0 cuts them in the training process.  The crops are
+            the same for any number.
+        prefetch: batches that each worker cuts ahead.
 
     Raises:
         InputError: an argument is out of range; the line names it.
@@ -76,6 +79,7 @@ class CropDataModule(lightning.LightningDataModule):
         flip_horizontal: bool = True,
         flip_vertical: bool = False,
         num_workers: int = 0,
+        prefetch: int = 2,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -102,7 +106,9 @@ class CropDataModule(lightning.LightningDataModule):
         self.flip_horizontal = flip_horizontal
         self.flip_vertical = flip_vertical
         self.num_workers = _count("data.num_workers", num_workers, 0)
+        self.prefetch = _count("data.prefetch", prefetch, 1)
         self.seed = _count("data.seed", seed, 0)
+        self.waiting = Waiting()
         self._photographs: dict[Split, Sequence[Photograph]] = {}
         self._evaluation: dict[Split, EvaluationCrops] = {}
         self._detailed: Tensor | None = None
@@ -173,7 +179,9 @@ class CropDataModule(lightning.LightningDataModule):
             flip_vertical=self.flip_vertical,
         )
         sampler = ResumableSampler(self.samples_per_epoch, self.first_sample)
-        return ResumableLoader(dataset, sampler=sampler, **self._loader_arguments())
+        return ResumableLoader(
+            dataset, sampler=sampler, waiting=self.waiting, **self._loader_arguments()
+        )
 
     def val_dataloader(self) -> DataLoader:
         """Return the validation crops, always the same."""
@@ -240,13 +248,18 @@ class CropDataModule(lightning.LightningDataModule):
 
     def _evaluation_loader(self, split: Split) -> DataLoader:
         dataset = self._evaluation_crops(split)
-        return DataLoader(dataset, shuffle=False, **self._loader_arguments())
+        return CropLoader(dataset, shuffle=False, **self._loader_arguments())
 
     def _loader_arguments(self) -> dict[str, Any]:
         return {
             "batch_size": self.batch_size,
             "num_workers": self.num_workers,
+            # Workers stay for the next epoch, with what they have decoded.
+            "persistent_workers": self.num_workers > 0,
+            "prefetch_factor": self.prefetch if self.num_workers else None,
             "pin_memory": torch.cuda.is_available(),
+            # Of its own, so that no random number of the training depends on how crops are cut.
+            "generator": torch.Generator(),
         }
 
 

@@ -116,14 +116,15 @@ class EvaluationCrops(Dataset):
         self.photographs = photographs
         self.size = size
         self.scale = scale
-        self.counts = [
+        fitting = (
             1 if count == 1 else min(count, crops_that_fit(photographs[number], size, scale))
             for number in range(len(photographs))
-        ]
-        self._crops = [(p, n) for p, crops in enumerate(self.counts) for n in range(crops)]
+        )
+        self.counts = np.fromiter(fitting, dtype=np.int64)
+        self._ends = np.cumsum(self.counts)  # no list: see PackedNames
 
     def __len__(self) -> int:
-        return len(self._crops)
+        return int(self._ends[-1])
 
     def __getitem__(self, index: int) -> Tensor:
         """Return crop `index`, photograph by photograph: (3, height, width) float32, linear
@@ -131,11 +132,16 @@ class EvaluationCrops(Dataset):
         """
         if not 0 <= index < len(self):
             raise IndexError(f"crop {index} of {len(self)}")
-        photograph, number = self._crops[index]
-        count = self.counts[photograph]
+        photograph = int(np.searchsorted(self._ends, index, side="right"))
+        count = int(self.counts[photograph])
+        number = index - int(self._ends[photograph]) + count
         return centred_crop(self.photographs[photograph], self.size, count, number, self.scale)
 
     def names(self) -> list[str]:
         """Return the name of the photograph of every crop, in the order of the crops."""
-        names = [self.photographs[number].name for number in range(len(self.photographs))]
-        return [names[photograph] for photograph, _ in self._crops]
+        name = getattr(self.photographs, "name", None) or self._decoded_name
+        names = [name(number) for number in range(len(self.photographs))]
+        return [n for n, count in zip(names, self.counts, strict=True) for _ in range(count)]
+
+    def _decoded_name(self, number: int) -> str:
+        return self.photographs[number].name

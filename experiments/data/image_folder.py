@@ -2,21 +2,32 @@
 
 import hashlib
 import logging
-from collections.abc import Sequence
+import math
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from dolens.errors import InputError
+import numpy as np
+
+from dolens.errors import InputError, check_choice
 from dolens.experiments.data.camera_data import CropDataModule, Split
+from dolens.experiments.data.folder_index import SOUND, FolderIndex, IndexedFiles
 from dolens.experiments.data.folder_photographs import FolderPhotographs
+from dolens.experiments.data.headers import with_headers
+from dolens.experiments.data.index_files import IndexFile
 from dolens.experiments.data.photographs import (
     EXTENSIONS,
-    list_photographs,
+    Photograph,
     normalised_extensions,
-    probe_photograph,
+    read_photograph,
 )
 
 _log = logging.getLogger(__name__)
+
+# Files without a sound header that warnings of their own name; all are counted.
+_NAMED = 20
+_SEPARATOR = os.sep.encode()
 
 
 class ImageFolderDataModule(CropDataModule):
@@ -38,9 +49,12 @@ class ImageFolderDataModule(CropDataModule):
 
     Rarely needed:
         extensions: endings of the files to take; case is ignored.
-        verify: look at every file's header at set-up and leave out those that are no images.
-            False leaves it to decoding, where the next readable file takes the place of an
-            unreadable one: what to choose for very many files.
+        verify: look at every file's header at set-up and leave out those that are no images.  The
+            index remembers what was found, so that only the first start takes long.
+        unreadable: `error` where a file cannot be decoded when its turn comes; `skip` takes the
+            next readable file in its place, names it, and counts such files.
+        index: keep the list of the files in the user's cache folder, for the next start.  It is
+            checked against the times of the folders; small folders have none.
         cache_bytes: decoded pixels kept in memory, in each split and process.
 
     Raises:
@@ -57,6 +71,8 @@ class ImageFolderDataModule(CropDataModule):
         evaluation_limit: int | None = None,
         verify: bool = True,
         cache_bytes: int = 2**28,
+        unreadable: Literal["error", "skip"] = "error",
+        index: bool = True,
         **crops: Any,
     ) -> None:
         super().__init__(**crops)
@@ -75,6 +91,7 @@ class ImageFolderDataModule(CropDataModule):
             raise InputError(
                 f"data.evaluation_limit: {evaluation_limit}; allowed: 1 or more, or null"
             )
+        check_choice(unreadable, ("error", "skip"), "data.unreadable")
         self.root = Path(root).expanduser()
         self.extensions = normalised_extensions(extensions)
         self.validation_fraction = validation_fraction
@@ -82,20 +99,22 @@ class ImageFolderDataModule(CropDataModule):
         self.evaluation_limit = evaluation_limit
         self.verify = verify
         self.cache_bytes = cache_bytes
-        self._paths: dict[Split, list[Path]] | None = None
+        self.unreadable = unreadable
+        self.index = index
+        self._paths: dict[Split, IndexedFiles] | None = None
+        self._indices: list[tuple[IndexFile, FolderIndex]] = []
         self._refused: dict[Path, None] = {}
 
     @property
     def skipped_files(self) -> list[Path]:
         """Return the files left out or replaced so far because they cannot be read, sorted."""
         found = set(self._refused)
-        for photographs in self._photographs.values():
-            if isinstance(photographs, FolderPhotographs):
-                found.update(photographs.unreadable)
+        for photographs in self._opened():
+            found.update(photographs.unreadable)
         return sorted(found)
 
     @property
-    def paths(self) -> dict[Split, list[Path]]:
+    def paths(self) -> dict[Split, IndexedFiles]:
         """Return the files of each split, listed (and verified, if asked for) at the first call.
 
         Raises:
@@ -105,18 +124,45 @@ class ImageFolderDataModule(CropDataModule):
             self._paths = self._listed()
         return self._paths
 
+    def prepare_data(self) -> None:
+        """List the files; of several processes one does so first, and the others find its index."""
+        self.paths  # noqa: B018
+
     def load_split(self, split: Split) -> FolderPhotographs:
         """Return the photographs of a split, none of them decoded yet."""
-        return FolderPhotographs(self.root, self.paths[split], self.cache_bytes)
+        return self._photographs_of(split, read_photograph)
 
     def teardown(self, stage: str) -> None:
-        """Report how many files could not be read."""
+        """Report how many files could not be read; the index forgets files that have changed."""
         skipped = self.skipped_files
         if skipped and self._paths is not None:
             total = sum(len(paths) for paths in self._paths.values()) + len(self._refused)
             _log.warning("skipped %d unreadable files of %d in %s", len(skipped), total, self.root)
+        for file, index in self._indices:
+            changed = [
+                int(files.numbers[place])
+                for photographs in self._opened()
+                for files in (photographs.paths,)
+                if isinstance(files, IndexedFiles) and files.index is index
+                for place in photographs.changed
+            ]
+            if changed:
+                file.keep(index.forgetting(changed))
 
-    def _listed(self) -> dict[Split, list[Path]]:
+    def _opened(self) -> list[FolderPhotographs]:
+        found = self._photographs.values()
+        return [photographs for photographs in found if isinstance(photographs, FolderPhotographs)]
+
+    def _photographs_of(
+        self, split: Split, read: Callable[[Path], Photograph]
+    ) -> FolderPhotographs:
+        """Return the photographs of a split, which `read` is to decode."""
+        files = self.paths[split]
+        return FolderPhotographs(
+            self.root, files, self.cache_bytes, read, self.unreadable, files.recorded
+        )
+
+    def _listed(self) -> dict[Split, IndexedFiles]:
         train, validation, test = (self.root / name for name in ("train", "val", "test"))
         if train.is_dir() and validation.is_dir():
             listed = {folder: self._list(folder) for folder in (train, validation)}
@@ -145,59 +191,71 @@ class ImageFolderDataModule(CropDataModule):
             "test": self._limited(test_paths),
         }
 
-    def _list(self, folder: Path) -> list[Path]:
+    def _list(self, folder: Path) -> IndexedFiles:
         """List the files under a folder, without those whose header Pillow refuses."""
-        paths = self._listed_files(folder)
+        file = IndexFile(folder, self.extensions, self.index)
+        index = file.index()
+        numbers = self._wanted(index)
         if not self.verify:
-            return paths
-        readable: list[Path] = []
-        for path in paths:
-            reason = probe_photograph(path)
-            if reason is None:
-                readable.append(path)
-            else:
-                self._refused[path] = None
-                _log.warning("%s: not a readable image (%s); skipped", path, reason)
-        skipped = len(paths) - len(readable)
-        if not readable:
+            self._indices.append((file, index))
+            return IndexedFiles(index, numbers)
+        index, refused = with_headers(index, numbers, file.keep)
+        self._indices.append((file, index))
+        for place, (number, reason) in enumerate(refused.items()):
+            self._refused[index.path(number)] = None
+            if place < _NAMED:
+                _log.warning("%s: not a readable image (%s); skipped", index.path(number), reason)
+        readable = numbers[index.header[numbers] == SOUND]
+        if not len(readable):
             raise InputError(
-                f"{folder}: none of {skipped} files is a readable image; allowed: images ending "
-                f"in {', '.join(self.extensions)}"
+                f"{folder}: none of {len(refused)} files is a readable image; allowed: images "
+                f"ending in {', '.join(self.extensions)}"
             )
-        if skipped:
-            _log.warning("skipped %d unreadable files of %d in %s", skipped, len(paths), folder)
-        return readable
+        if refused:
+            _log.warning(
+                "skipped %d unreadable files of %d in %s", len(refused), len(numbers), folder
+            )
+        return IndexedFiles(index, readable)
 
-    def _listed_files(self, folder: Path) -> list[Path]:
-        """List the photographs' files under a folder; none is opened."""
-        return list_photographs(folder, self.extensions)
+    def _wanted(self, index: FolderIndex) -> np.ndarray:
+        """Return the numbers of the photographs among a folder's files; none is opened."""
+        return np.arange(len(index), dtype=np.int32)
 
-    def _divided(self, paths: list[Path], bounds: list[float]) -> list[list[Path]]:
+    def _divided(self, files: IndexedFiles, bounds: list[float]) -> list[IndexedFiles]:
         """Divide the files by their hashes at each bound; no part is empty."""
-        if len(paths) <= len(bounds):
+        if len(files) <= len(bounds):
             raise InputError(
-                f"{self.root}: {len(paths)} readable images for {len(bounds) + 1} splits; "
+                f"{self.root}: {len(files)} readable images for {len(bounds) + 1} splits; "
                 "allowed: at least one for each"
             )
-        hashed = sorted((self._hash(path), path) for path in paths)
-        parts: list[list[Path]] = []
+        values, ranks = self._hashes(files), files.index.ranks()[files.numbers]
+        hashed = np.lexsort((ranks, values))
+        parts: list[IndexedFiles] = []
         begin = 0
-        for position, bound in enumerate(bounds):
-            end = sum(value < bound for value, _ in hashed)
+        for position, bound in enumerate([*bounds, math.inf]):
+            end = int((values < bound).sum())
             end = max(end, begin + 1)
-            end = min(end, len(hashed) - (len(bounds) - position))
-            parts.append(sorted(path for _, path in hashed[begin:end]))
+            end = min(end, len(files) - (len(bounds) - position))
+            part = hashed[begin:end]
+            parts.append(IndexedFiles(files.index, files.numbers[part[np.argsort(ranks[part])]]))
             begin = end
-        parts.append(sorted(path for _, path in hashed[begin:]))
         return parts
 
-    def _limited(self, paths: list[Path]) -> list[Path]:
-        if self.evaluation_limit is None or len(paths) <= self.evaluation_limit:
-            return paths
-        return sorted(sorted(paths, key=self._hash)[: self.evaluation_limit])
+    def _limited(self, files: IndexedFiles) -> IndexedFiles:
+        if self.evaluation_limit is None or len(files) <= self.evaluation_limit:
+            return files
+        first = np.argsort(self._hashes(files), kind="stable")[: self.evaluation_limit]
+        numbers = files.numbers[first]
+        return IndexedFiles(files.index, numbers[np.argsort(files.index.ranks()[numbers])])
 
-    def _hash(self, path: Path) -> float:
-        """Return a number in [0, 1) from the seed and the path below the root."""
-        text = f"{self.seed}:{path.relative_to(self.root).as_posix()}"
-        digest = hashlib.blake2b(text.encode("utf-8", "surrogateescape"), digest_size=8).digest()
-        return int.from_bytes(digest, "big") / 2**64
+    def _hashes(self, files: IndexedFiles) -> np.ndarray:
+        """Return a number in [0, 1) for each file, from the seed and its path below the root."""
+        below = files.index.folder.relative_to(self.root).as_posix()
+        text = f"{self.seed}:" if below == "." else f"{self.seed}:{below}/"
+        begun = hashlib.blake2b(text.encode("utf-8", "surrogateescape"), digest_size=8)
+        digests = bytearray()
+        for name in files.index.names.encoded(files.numbers.tolist()):
+            digest = begun.copy()
+            digest.update(name.replace(_SEPARATOR, b"/"))
+            digests += digest.digest()
+        return np.frombuffer(digests, dtype=">u8") / 2.0**64

@@ -1,6 +1,7 @@
 """Photographs are read from disk and kept in memory."""
 
 import os
+import stat
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -107,43 +108,6 @@ def normalised_extensions(extensions: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted({f".{extension}" for extension in given}))
 
 
-def list_photographs(folder: str | Path, extensions: Iterable[str] = EXTENSIONS) -> list[Path]:
-    """List the image files under a folder, searched recursively, sorted by their path in it.
-
-    Links to folders are followed (each real folder once); names that begin with a dot are
-    left out.  No file is opened.
-
-    Raises:
-        InputError: the folder does not exist or is no folder, or holds no such file.
-    """
-    folder = Path(folder).expanduser()
-    endings = normalised_extensions(extensions)
-    if not folder.is_dir():
-        state = "is not a folder" if folder.exists() else "does not exist"
-        raise InputError(
-            f"{folder}: {state}; allowed: a folder of images ending in {', '.join(endings)}"
-        )
-    found: list[str] = []
-    visited: set[str] = set()
-    for parent, folders, files in os.walk(folder, followlinks=True):
-        real = os.path.realpath(parent)
-        if real in visited:
-            folders.clear()
-            continue
-        visited.add(real)
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        found.extend(
-            os.path.join(parent, name)
-            for name in files
-            if not name.startswith(".") and os.path.splitext(name)[1].lower() in endings
-        )
-    if not found:
-        raise InputError(
-            f"{folder}: no images in this folder; allowed: files ending in {', '.join(endings)}"
-        )
-    return [Path(path) for path in sorted(found)]
-
-
 def probe_photograph(path: str | Path) -> str | None:
     """Read a file's header without decoding its pixels.
 
@@ -152,11 +116,18 @@ def probe_photograph(path: str | Path) -> str | None:
         that is cut off after its header passes, and fails in `read_photograph`.
     """
     try:
+        _check_regular(path)
         with Image.open(path) as image:
             image.verify()
     except DECODING_ERRORS as error:
         return reason_of(error)
     return None
+
+
+def _check_regular(path: str | Path) -> None:
+    """Refuse what would wait for a writer, as a pipe does."""
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise OSError("not a file")
 
 
 def read_photograph(path: str | Path, name: str | None = None) -> Photograph:
@@ -177,6 +148,7 @@ def read_photograph(path: str | Path, name: str | None = None) -> Photograph:
     """
     name = str(path) if name is None else name
     try:
+        _check_regular(path)
         with Image.open(path) as image:
             upright = ImageOps.exif_transpose(image)
             pixels = _encoded_pixels(upright, name)

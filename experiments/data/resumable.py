@@ -4,10 +4,11 @@ import logging
 from collections.abc import Callable, Iterator
 from typing import Any, cast
 
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import Sampler
 
 from dolens.errors import InputError
 from dolens.experiments.data.crop_dataset import TrainingCrops
+from dolens.experiments.data.loading import CropLoader
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +41,7 @@ class ResumableSampler(Sampler[int]):
         return iter(range(first, first + remaining))
 
 
-class ResumableLoader(DataLoader):
+class ResumableLoader(CropLoader):
     """`ResumableLoader` loads `TrainingCrops` through a `ResumableSampler`.
 
     The samples follow from the progress of the trainer, so the state kept in a checkpoint

@@ -5,8 +5,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dolens.errors import InputError
+from dolens.experiments.data.camera_data import Split
 from dolens.experiments.data.depth_maps import ENDINGS, depth_map_of, is_depth_map, read_depth_map
+from dolens.experiments.data.folder_index import FolderIndex
 from dolens.experiments.data.folder_photographs import FolderPhotographs
 from dolens.experiments.data.image_folder import ImageFolderDataModule
 from dolens.experiments.data.photographs import Photograph, read_photograph
@@ -43,23 +47,25 @@ class RgbdFolderDataModule(ImageFolderDataModule):
             raise InputError(f"data.depth_unit: {depth_unit}; allowed: mm per unit, above 0")
         self.depth_suffix, self.depth_unit = depth_suffix, float(depth_unit)
 
-    def load_split(self, split: str) -> FolderPhotographs:
+    def load_split(self, split: Split) -> FolderPhotographs:
         """Return the photographs of a split with their depths, none of them decoded yet."""
         read = partial(_read, suffix=self.depth_suffix, unit=self.depth_unit)
-        return FolderPhotographs(self.root, self.paths[split], self.cache_bytes, read)
+        return self._photographs_of(split, read)
 
-    def _listed_files(self, folder: Path) -> list[Path]:
-        """List photographs alone, each of which must have a depth map."""
-        files = super()._listed_files(folder)
-        photographs = [path for path in files if not is_depth_map(path, self.depth_suffix)]
-        missing = [p for p in photographs if depth_map_of(p, self.depth_suffix) is None]
+    def _wanted(self, index: FolderIndex) -> np.ndarray:
+        """Return photographs alone, each of which must have a depth map."""
+        paths = {number: index.folder / name for number, name in enumerate(index.names)}
+        photographs = [n for n, p in paths.items() if not is_depth_map(p, self.depth_suffix)]
+        missing = [
+            paths[n] for n in photographs if depth_map_of(paths[n], self.depth_suffix) is None
+        ]
         if missing:
             first = missing[0]
             raise InputError(
                 f"{first}: no depth map beside it (nor beside {len(missing) - 1} others); allowed: "
                 f"{first.stem}{self.depth_suffix} with the ending {', '.join(ENDINGS)}"
             )
-        return photographs
+        return np.array(photographs, dtype=np.int32)
 
 
 def _read(path: Path, suffix: str, unit: float) -> Photograph:

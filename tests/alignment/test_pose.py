@@ -253,6 +253,7 @@ def test_a_photograph_is_read_with_its_dark_level_region_and_saturation(tmp_path
     ("write", "message"),
     [
         (lambda p: p.write_bytes(b"none"), "cannot be read"),
+        (lambda p: p.write_bytes(b"P5 60000 60000 255\n"), "cannot be read .*3600000000 pixels"),
         (lambda p: Image.new("RGB", (4, 4)).save(p), "one channel of integers"),
     ],
 )

@@ -87,7 +87,7 @@ def test_a_run_leaves_the_whole_run_folder(composed, tmp_path):
         values = [metrics[f"test/{name}/{depth}"] for depth in depths]
         assert metrics[f"test/{name}"] == pytest.approx(sum(values) / 3, rel=1e-5)
         assert metrics[f"test/{name}/worst"] == min(values)
-    for name in ("wall_s", "step_s", "optics_s", "network_s", "rays", "peak_memory_mb"):
+    for name in ("wall_s", "step_s", "optics_s", "network_s", "data_s", "rays", "peak_memory_mb"):
         assert metrics[f"cost/{name}"] > 0
     assert metrics["cost/rays"] == 24 * 24 * 4 * 3
     assert metrics["loss/perceptual_available"] == 0

@@ -16,12 +16,8 @@ import hashlib
 import logging
 import os
 import platform
-import shutil
 import stat
 import sys
-import tempfile
-import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +26,10 @@ import numba
 from numba.core import config
 
 from dolens.kernels.cpu.machine_code import MachineCode
+from dolens.user_cache import delete_old, user_cache_folder, write_whole
 
 logger = logging.getLogger("dolens.kernels")
 
-# Days after which the kernels of another version of the sources are deleted.
-_KEPT_DAYS = 90.0
 _DIGEST = hashlib.sha256().digest_size
 # What has been said of the cache's folder: every kernel would say it again.
 _said: set[str] = set()
@@ -43,23 +38,14 @@ _said: set[str] = set()
 def cache_folder() -> Path:
     """Return the folder of compiled kernels.
 
-    It is NUMBA_CACHE_DIR where that is set, and else `dolens/kernels` in the user's cache folder:
-    XDG_CACHE_HOME or ~/.cache on Linux, ~/Library/Caches on macOS, LOCALAPPDATA on Windows.
+    It is NUMBA_CACHE_DIR where that is set, and else `dolens/kernels` in the user's cache folder.
 
     Raises:
         RuntimeError: the user has no home folder.
     """
     if config.CACHE_DIR:
         return Path(config.CACHE_DIR) / "dolens"
-    if sys.platform == "win32":
-        of_user = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        of_user = Path.home() / "Library" / "Caches"
-    else:
-        # The convention says that a relative path is to be passed over.
-        of_user = Path(os.environ.get("XDG_CACHE_HOME", ""))
-        of_user = of_user if of_user.is_absolute() else Path.home() / ".cache"
-    return Path(of_user) / "dolens" / "kernels"
+    return user_cache_folder() / "kernels"
 
 
 class KernelFiles:
@@ -137,24 +123,3 @@ def _say_once(what: str, error: OSError) -> None:
     if what not in _said:
         _said.add(what)
         logger.warning("%s: %s", what, error)
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that other processes see whole or not at all."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
-def delete_old(folder: Path) -> None:
-    """Delete the kernels of other versions that nothing was added to for months."""
-    oldest = time.time() - _KEPT_DAYS * 86400.0
-    for version in folder.iterdir():
-        with suppress(OSError):  # another process may be faster
-            if version.is_dir() and version.stat().st_mtime < oldest:
-                shutil.rmtree(version, ignore_errors=True)

@@ -4,9 +4,11 @@ import torch
 from PIL import Image
 
 from dolens.errors import InputError
+from dolens.experiments.data.index_files import IndexFile
 from dolens.experiments.data.photographs import (
+    EXTENSIONS,
     Photograph,
-    list_photographs,
+    normalised_extensions,
     probe_photograph,
     read_photograph,
 )
@@ -99,18 +101,18 @@ def test_listing_is_recursive_sorted_and_finite(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "b" / "loop").symlink_to(tmp_path)
-    found = [path.relative_to(tmp_path).as_posix() for path in list_photographs(tmp_path)]
-    assert found == ["a.jpeg", "b/1.png", "b/c/2.JPG"]
-    assert len(list_photographs(tmp_path, ["PNG"])) == 1
+    index = IndexFile(tmp_path, EXTENSIONS).index()
+    assert list(index.names) == ["a.jpeg", "b/1.png", "b/c/2.JPG"]
+    assert len(IndexFile(tmp_path, normalised_extensions(["PNG"])).index()) == 1
 
 
 def test_empty_and_missing_folders_are_named(tmp_path):
     with pytest.raises(InputError, match=r"no images in this folder; allowed: .*\.png"):
-        list_photographs(tmp_path)
+        IndexFile(tmp_path, EXTENSIONS).index()
     with pytest.raises(InputError, match=r"none: does not exist; allowed: .*\.png"):
-        list_photographs(tmp_path / "none")
+        IndexFile(tmp_path / "none", EXTENSIONS).index()
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="is not a folder"):
-        list_photographs(tmp_path / "file")
+        IndexFile(tmp_path / "file", EXTENSIONS).index()
     with pytest.raises(InputError, match=r"data\.extensions"):
-        list_photographs(tmp_path, [])
+        normalised_extensions([])
