@@ -4,6 +4,7 @@ python scripts/fuzz_lens_files.py --files 2000 [--folder of/other/lens/files ...
 """
 
 import argparse
+import logging
 import random
 import sys
 import tempfile
@@ -39,6 +40,9 @@ _LARGEST = 60_000
 # Glasses of a catalogue that are tried.
 _GLASSES = 4
 _CATALOGUE_LINES = 400
+# One lens in three is written as one of these, another one in three is read again.
+_WRITTEN = (".json", ".zmx", ".seq", ".txt")
+_WELL = (" lens", " one line")
 
 
 def main() -> int:
@@ -48,7 +52,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--folder", action="append", default=[], help="of lens files to begin with")
     parser.add_argument("--kind", choices=SHARES, help="files of this kind alone")
-    parser.add_argument("--seconds", type=float, default=2.0, help="of processor time for a file")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of processor time for a file")
     parser.add_argument("--show", type=int, help="write the mutated file of this seed, and read it")
     options = parser.parse_args()
     seeds = _seeds(options.folder)
@@ -59,7 +63,8 @@ def main() -> int:
         def case(number: int) -> tuple[Path, bytes]:
             rng = random.Random(f"file {number}")
             [kind] = rng.choices(list(shares), list(shares.values()))
-            data = rng.choice(seeds[kind])
+            # The smaller of two, as large files take their time.
+            data = min(rng.choices(seeds[kind], k=2), key=len)
             if kind == ".agf":
                 data = _some_glasses(data, rng)
             return Path(folder) / f"lens{kind}", mutated(data, kind, number)
@@ -76,18 +81,22 @@ def main() -> int:
             print(check(options.show))
             return 0
         _warm_up()
+        # What is passed over is told, and is not looked at here.
+        logging.disable()
         begin, found, examples = time.monotonic(), Counter(), defaultdict(list)
         numbers = range(options.first, options.first + options.files)
         for number, answer in guarded(check, numbers, options.seconds):
             said, _, where = answer.partition("\0")
             found[said] += 1
+            if said not in examples and not said.endswith(_WELL):
+                print(f"{number}: {said}: {where}", flush=True)
             if len(examples[said]) < 3:
                 examples[said].append(f"{number} {where}")
     print(f"{options.files} files in {time.monotonic() - begin:.0f} s")
     for said, count in sorted(found.items()):
-        kept = "" if said.endswith((" lens", " one line")) else " | ".join(examples[said])
+        kept = "" if said.endswith(_WELL) else " | ".join(examples[said])
         print(f"{count:7d}  {said:70s} {kept}")
-    return int(any(not said.endswith((" lens", " one line")) for said in found))
+    return int(any(not said.endswith(_WELL) for said in found))
 
 
 def outcome(path: Path) -> tuple[str, str]:
@@ -122,23 +131,42 @@ def _read_lens(path: Path) -> tuple[str, str]:
     for name, value in lens.state_dict().items():
         if not bool(torch.isfinite(value).all()):
             return "lens with parameters that are not finite", name
+    said = _used(lens)
+    turn = path.stat().st_size % 12
+    if said[0] != "lens" or turn > 3 + len(_WRITTEN):
+        return said
+    if turn < len(_WRITTEN):
+        return _written(lens, path.with_suffix(_WRITTEN[turn]))
     written = yaml_of(prescription_of(lens), str(path))
     back = lens_from_prescription(plain_values(written.decode(), str(path)), where="again")
     own, again = lens.state_dict(), back.state_dict()
     if own.keys() != again.keys() or not all(torch.equal(own[k], again[k]) for k in own):
         return "lens that is another one when it is written and read", path.suffix
-    return _used(lens)
+    return said
+
+
+def _written(lens: torch.nn.Module, path: Path) -> tuple[str, str]:
+    """Return what comes of writing a lens in another format."""
+    try:
+        encode_prescription(prescription_of(lens), path)
+    except InputError as error:  # such as: the format cannot hold the lens
+        said, shown = _message(str(error), path)
+        if said != "one line":
+            return f"written as {path.suffix}: {said}", shown
+    return "lens", ""
 
 
 def _used(lens: torch.nn.Module) -> tuple[str, str]:
     """Return what came of the first use of a lens."""
     try:
-        lens.first_order()
-    except InputError as error:
-        # Such as: it has no focal length.
+        return _traced(lens)
+    except InputError as error:  # such as: it has no focal length, or its glass no index
         said, shown = _message(f"lens.yaml: {error}", Path("lens.yaml"))
-        if said != "one line":
-            return said, shown
+        return ("lens", "") if said == "one line" else (said, shown)
+
+
+def _traced(lens: torch.nn.Module) -> tuple[str, str]:
+    lens.first_order()
     size = lens.surfaces["1"].semi_diameter if hasattr(lens.surfaces["1"], "aperture") else 1.0
     across = torch.linspace(-0.9, 0.9, 7, dtype=torch.float64) * size
     position = torch.stack((across, 0.3 * across, torch.full_like(across, -1.0)), -1)

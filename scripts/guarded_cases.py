@@ -25,7 +25,7 @@ def guarded(
     Args:
         check: from a number to a class of outcomes.
         numbers: of the cases.
-        seconds: processor time of one case; it is killed after thirty times that by the clock.
+        seconds: processor time of one case; it is killed after ten times that by the clock.
         mebibytes: memory beyond what the process has at its start.
     """
     context = multiprocessing.get_context("fork")
@@ -42,7 +42,7 @@ def guarded(
             number = waiting.pop()
             try:
                 ours.send(number)
-                if ours.poll(30.0 * seconds + 5.0):
+                if ours.poll(10.0 * seconds):
                     outcome = ours.recv()
                 else:
                     outcome, ended = "hangs", True

@@ -12,12 +12,20 @@ from typing import TypeVar
 
 from torch import Tensor
 
+from dolens.errors import InputError
+
 Wavelength = TypeVar("Wavelength", float, Tensor)
 Terms = tuple[tuple[float, float], ...]
 Formula = Callable[[float | Tensor, float, Terms], float | Tensor]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028
+
+
+def require_positive(wavelength: float | Tensor) -> None:
+    """Raise `InputError` where a wavelength (nm) that is a number is not positive."""
+    if not isinstance(wavelength, Tensor) and not wavelength > 0.0:
+        raise InputError(f"wavelength {wavelength:g} nm: it must be positive")
 
 
 def sellmeier(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:
