@@ -20,11 +20,13 @@ Formula = Callable[[float | Tensor, float, Terms], float | Tensor]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028
+# nm; no light is so short, and the square of a number that is too small is zero.
+_SHORTEST = 1e-9
 
 
 def require_positive(wavelength: float | Tensor) -> None:
     """Raise `InputError` where a wavelength (nm) that is a number is not positive."""
-    if not isinstance(wavelength, Tensor) and not wavelength > 0.0:
+    if not isinstance(wavelength, Tensor) and not wavelength > _SHORTEST:
         raise InputError(f"wavelength {wavelength:g} nm: it must be positive")
 
 

@@ -241,7 +241,8 @@ def _changed_tree(tree: Any, rng: random.Random) -> Any:
         other, there = rng.choice(places)
         try:
             _change(node, key, other, there, rng)
-        except (KeyError, IndexError):  # an earlier change took it away
+        except (KeyError, IndexError, ValueError):
+            # An earlier change took it away, or an alias holds itself.
             continue
     return tree
 
