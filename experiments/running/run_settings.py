@@ -73,6 +73,9 @@ class RunSettings:
         _check_type("seed", self.seed, int, "an integer")
         if not 0 <= self.seed < _SEEDS:
             raise InputError(f"seed: {self.seed}; allowed: an integer from 0 to {_SEEDS - 1}")
+        for key in ("ckpt_path", "state"):
+            if getattr(self, key) is not None:
+                _check_type(key, getattr(self, key), str, "a text, or null")
         if self.threads is not None:
             check_count("threads", self.threads)
         check_trainer(self.trainer)
