@@ -43,7 +43,7 @@ class PhotonLevels:
         InputError: fewer than 2 measurements.
     """
 
-    levels: Sequence[int]
+    levels: Sequence[float]
     measurements: int = 20
 
     def __post_init__(self) -> None:
