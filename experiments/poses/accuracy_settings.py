@@ -67,9 +67,9 @@ class RayCounts:
         InputError: no pattern.
     """
 
-    counts: Sequence[int]
+    counts: Sequence[float]
     patterns: int = 4
-    reference_photons: int = 200_000_000
+    reference_photons: float = 200_000_000
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "counts", tuple(int(count) for count in self.counts))
