@@ -11,18 +11,44 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
+# Letters of a message, and of a word that is worth comparing with others.
+_LONGEST = 500
+_LONGEST_WORD = 100
+# Of a longer message, so much is kept of the end, where it says what is allowed.
+_END = 200
+_CUT = " … "
+
 
 class InputError(ValueError):
     """Bad input from outside: a file, a key, a value.
 
     The message is one line that names the file, surface or key, says what was wrong
     and what is allowed.  Command-line programs print it and exit with a non-zero status.
+    Whatever it quotes, it can be printed: control characters are written out (`\\x1b`), and the
+    middle of an endless message is left out.
     """
+
+    def __init__(self, message: object = "") -> None:
+        text = readable(message)
+        if len(text) > _LONGEST:
+            text = text[: _LONGEST - _END - len(_CUT)] + _CUT + text[-_END:]
+        super().__init__(text)
 
 
 def one_line(problem: object) -> str:
     """Return a message on one line, as every message of a user's mistake is."""
     return " ".join(str(problem).split())
+
+
+def readable(text: object) -> str:
+    """Return text on one line, in which what cannot be printed is written out as in Python."""
+    found = str(text)
+    if not found.isprintable():
+        found = "".join(
+            letter if letter.isprintable() else letter.encode("unicode_escape").decode()
+            for letter in one_line(found)
+        )
+    return found
 
 
 def check_keys(given: Iterable[object], allowed: Iterable[str], where: str) -> None:
@@ -66,7 +92,7 @@ def check_choice(value: object, allowed: Iterable[str], where: str) -> None:
 
 def did_you_mean(word: str, allowed: Iterable[str]) -> str:
     """Return the end of a message about an unknown word: `; did you mean 'x'?`, or nothing."""
-    near = difflib.get_close_matches(word, list(allowed), n=1)
+    near = difflib.get_close_matches(word[:_LONGEST_WORD], list(allowed), n=1)
     return f"; did you mean '{near[0]}'?" if near else ""
 
 

@@ -1,5 +1,7 @@
 """Photographs of point sources are read from image files."""
 
+import math
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -76,7 +78,15 @@ def read_measurement(
     try:
         with Image.open(path) as image:
             values = np.asarray(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        OverflowError,
+        struct.error,
+        Image.DecompressionBombError,
+    ) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"data.measurement: {path} cannot be read ({reason})") from error
     if values.ndim != 2 or values.dtype.kind not in "ui":
@@ -84,7 +94,7 @@ def read_measurement(
             f"data.measurement: {path} has {values.dtype} of shape {values.shape}; allowed: one "
             "channel of integers"
         )
-    if downsample < 1 or not pixel_pitch > 0.0:
+    if downsample < 1 or not 0.0 < pixel_pitch < math.inf:
         raise InputError(
             f"data: downsample {downsample} and pixel_pitch {pixel_pitch}; allowed: 1 or more, "
             "and above 0 (mm)"

@@ -11,12 +11,22 @@ from collections.abc import Callable
 
 from torch import Tensor
 
+from dolens.errors import InputError
+
 Wavelength = float | Tensor
 Terms = tuple[tuple[float, float], ...]
 Formula = Callable[[Wavelength, float, Terms], Wavelength]
 
 # µm²: Herzberger's L = 1/(λ² - 0.028), the same for all media.
 _HERZBERGER = 0.028
+# nm; no light is so short, and the square of a number that is too small is zero.
+_SHORTEST = 1e-9
+
+
+def require_positive(wavelength: float | Tensor) -> None:
+    """Raise `InputError` where a wavelength (nm) that is a number is not positive."""
+    if not isinstance(wavelength, Tensor) and not wavelength > _SHORTEST:
+        raise InputError(f"wavelength {wavelength:g} nm: it must be positive")
 
 
 def sellmeier(wavelength: Wavelength, constant: float, terms: Terms) -> Wavelength:

@@ -1,5 +1,6 @@
 """A glass of a catalogue: its index at every wavelength, temperature and pressure."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -68,12 +69,25 @@ class Glass:
         The wavelength is that in air of the glass's environment, as Zemax takes it.
 
         Raises:
-            InputError: a wavelength lies outside the catalogue's range.  Tensors are checked too,
+            InputError: a wavelength lies outside the catalogue's range, or the formula gives no
+                index at a number.  Tensors are checked too,
                 also within vmap, jvp and grad (on CUDA that waits for the device once), but not
                 while torch.compile traces or a CUDA graph is captured.
         """
         self._require_within_range(wavelength)
-        micrometres = wavelength / _NM_PER_UM
+        try:
+            index = self._index(wavelength / _NM_PER_UM)
+        except ZeroDivisionError:  # a resonance of the formula
+            index = math.nan
+        # The root of a negative square is complex to Python.
+        if isinstance(index, complex) or (isinstance(index, float) and not 0.0 < index < math.inf):
+            raise InputError(
+                f"glass '{self.name}': its dispersion formula gives no index at {wavelength:g} nm"
+            )
+        return index
+
+    def _index(self, micrometres: float | Tensor) -> float | Tensor:
+        """Return what the formula gives in the glass's own environment."""
         reference = self.thermal.reference if self.thermal else STANDARD_TEMPERATURE
         here = self.environment
         if here is None or here == Environment(reference, STANDARD_PRESSURE):

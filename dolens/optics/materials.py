@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.optics.dispersion import require_positive
 from dolens.optics.glass import Glass
 from dolens.optics.glass_catalog import find_glass
 from dolens.optics.mirrors import MIRROR, Mirror
@@ -67,7 +68,11 @@ class Material:
 
         A number gives a number (in double precision, whatever the rays' precision);
         a tensor gives a tensor of its shape.
+
+        Raises:
+            InputError: the number is not positive.
         """
+        require_positive(wavelength)
         if self.b == 0.0:
             return self.a
         return self.a + self.b / (wavelength * wavelength)

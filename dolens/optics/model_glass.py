@@ -22,6 +22,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from dolens.optics.dispersion import require_positive
+
 # Mercury's g line, nm.
 LINE_G = 435.8343
 # Schott's normal line (TIE-29).
@@ -52,7 +54,11 @@ class ModelGlass:
 
         A number gives a number (in double precision, whatever the rays' precision);
         a tensor gives a tensor of its shape.
+
+        Raises:
+            InputError: the number is not positive.
         """
+        require_positive(wavelength)
         micrometres = wavelength / _NM_PER_UM
         return self.constant + self.a * micrometres**_FIRST + self.b * micrometres**_SECOND
 

@@ -87,6 +87,8 @@ class MeritSettings:
             InputError: neither the settings nor the lens name any.
         """
         if self.fields is not None:
+            if not self.fields:
+                raise InputError("merit.fields: is an empty list; give (x, y) in degrees")
             return self.fields
         if lens.fields is None:
             raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")

@@ -72,6 +72,8 @@ from dolens.prescriptions.system_data import (
     system_data_of,
 )
 
+# Far more than a lens has; so many are built in seconds.
+_MOST_SURFACES = 10_000
 _LENS_KEYS = (
     "name",
     "source",
@@ -268,6 +270,10 @@ def _rows(prescription: Mapping[str, Any], where: str) -> list[Mapping[str, Any]
     surfaces = prescription.get("surfaces")
     if not isinstance(surfaces, Mapping) or not surfaces:
         raise InputError(f"{where}: 'surfaces' must map surface numbers from 1 to surfaces")
+    if len(surfaces) > _MOST_SURFACES:
+        raise InputError(
+            f"{where}: has {len(surfaces)} surfaces; a lens has {_MOST_SURFACES} at most"
+        )
     rows = {str(number): row for number, row in surfaces.items()}
     for number in range(1, len(rows) + 1):
         if str(number) not in rows:

@@ -13,7 +13,7 @@ def as_number(value: object, what: str, finite: bool = True) -> float:
         if isinstance(value, bool):
             raise TypeError
         number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{what} must be a number, not {value!r}") from None
     if math.isnan(number) or (finite and math.isinf(number) and "radius" not in what):
         raise InputError(f"{what} must be a finite number, not {value!r}")

@@ -29,6 +29,8 @@ def curvature_from(row: Mapping[str, Any], name: str) -> float:
     radius = as_number(row[key], f"'{key}'", finite=False)
     if radius == 0.0:
         raise InputError(f"'{key}' is 0; write .inf for a plane")
+    if math.isinf(1.0 / radius):
+        raise InputError(f"'{key}' is {radius:g}, too small for a surface")
     return 1.0 / radius
 
 

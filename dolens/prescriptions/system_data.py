@@ -109,7 +109,7 @@ def system_data(prescription: Mapping[str, Any], where: str) -> dict[str, Any]:
             raise InputError(f"{where}: '{key}' must be true or false")
     distance = prescription.get("object_distance")
     if distance is not None:
-        distance = as_number(distance, f"{where}: 'object_distance'")
+        distance = as_positive(distance, f"{where}: 'object_distance'")
     fields = fields_from(prescription.get("fields"), f"{where}: fields")
     if fields is not None and fields.kind == "heights" and distance is None:
         raise InputError(f"{where}: 'fields.heights' need an 'object_distance' (mm)")

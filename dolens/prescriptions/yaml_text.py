@@ -1,6 +1,8 @@
 """Prescriptions as YAML: plain values, every key once, nothing that names code."""
 
+import re
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 import yaml
@@ -10,11 +12,18 @@ from dolens.prescriptions.read_file import ReadPrescription
 
 # Far more than a lens has; aliases (*name) let a short file mean billions of values.
 _MOST_VALUES = 2_000_000
+# Longer text is no number that a program writes, and is slow to read.
+_LONGEST_NUMBER = 400
+_TAG = "tag:yaml.org,2002:"
+# What a lens is made of; dates, sets and the like are no values of it.
+_TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """This safe YAML loader also refuses a key written twice, as the first would be lost, and a
-    file that means too many values.
+    """This safe YAML loader builds plain values only, and reads numbers as decimals.
+
+    YAML's own dates and its numbers to other bases (`0b1`, `1:30`) are texts.  It also refuses a
+    key written twice, as the first would be lost, and a file that means too many values.
     """
 
     def get_single_node(self) -> yaml.Node | None:
@@ -25,7 +34,8 @@ class _PlainLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         seen = set()
-        scalars = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        pairs = node.value if isinstance(node, yaml.MappingNode) else ()
+        scalars = [key for key, _ in pairs if isinstance(key, yaml.ScalarNode)]
         for key_node in scalars:
             key = self.construct_object(key_node, deep=True)
             if key in seen:
@@ -33,6 +43,50 @@ class _PlainLoader(yaml.SafeLoader):
                 raise yaml.YAMLError(f"key '{key}' is given twice, again in line {line}")
             seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+def _construct_number(loader: _PlainLoader, node: yaml.ScalarNode) -> int | float:
+    """Return the number of a scalar, which an explicit tag may call one without its being one."""
+    text = str(loader.construct_scalar(node))
+    kind = int if node.tag == f"{_TAG}int" else float
+    if len(text) > _LONGEST_NUMBER:
+        reason = f"a number of {len(text)} letters"
+    else:
+        try:
+            return kind(_POINTED.sub(r"\1\2", text))
+        except ValueError:
+            reason = f"'{text}' is no number"
+    raise yaml.constructor.ConstructorError(None, None, reason, node.start_mark)
+
+
+def _construct_truth(loader: _PlainLoader, node: yaml.ScalarNode) -> bool:
+    """Return the truth value of a scalar; a tag may call anything one."""
+    text = str(loader.construct_scalar(node))
+    if text.lower() not in loader.bool_values:
+        reason = f"'{text}' is neither true nor false"
+        raise yaml.constructor.ConstructorError(None, None, reason, node.start_mark)
+    return bool(loader.bool_values[text.lower()])
+
+
+# `.inf` and `.nan` are Python's words but for the point.
+_POINTED = re.compile(r"^([-+]?)\.(inf|nan)$", re.IGNORECASE)
+_INTEGER = re.compile(r"^[-+]?[0-9]+$")
+_DECIMAL = re.compile(
+    r"^[-+]?(?:\.(?:inf|Inf|INF)|(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)$|^\.(?:nan|NaN|NAN)$"
+)
+_PlainLoader.yaml_constructors = {
+    f"{_TAG}{name}": yaml.SafeLoader.yaml_constructors[f"{_TAG}{name}"] for name in _TAGS
+} | {None: yaml.SafeLoader.yaml_constructors[None]}
+for _name in ("int", "float"):
+    _PlainLoader.add_constructor(f"{_TAG}{_name}", _construct_number)
+_PlainLoader.add_constructor(f"{_TAG}bool", _construct_truth)
+_OTHERS = (f"{_TAG}int", f"{_TAG}float", f"{_TAG}timestamp", f"{_TAG}value")
+_PlainLoader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in found if tag not in _OTHERS]
+    for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_PlainLoader.add_implicit_resolver(f"{_TAG}int", _INTEGER, list("-+0123456789"))
+_PlainLoader.add_implicit_resolver(f"{_TAG}float", _DECIMAL, list("-+.0123456789"))
 
 
 def read_yaml(text: str, where: str) -> ReadPrescription:
@@ -65,7 +119,7 @@ def _values_in(node: yaml.Node, known: dict[int, int]) -> int:
         return 1
     if id(node) not in known:
         known[id(node)] = _MOST_VALUES + 1  # until it is counted, for a node that holds itself
-        entries = node.value if isinstance(node, yaml.SequenceNode) else sum(node.value, ())
+        entries = node.value if isinstance(node, yaml.SequenceNode) else chain(*node.value)
         known[id(node)] = 1 + sum(_values_in(entry, known) for entry in entries)
     return known[id(node)]
 

@@ -1,5 +1,6 @@
 """Pixels form a rectangular grid on the sensor plane."""
 
+import math
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -31,7 +32,7 @@ class Sensor:
     centre_column: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.height < 1 or self.width < 1 or not self.pixel_pitch > 0.0:
+        if self.height < 1 or self.width < 1 or not 0.0 < self.pixel_pitch < math.inf:
             raise InputError(
                 "sensor: height and width must be at least 1 pixel and pixel_pitch positive (mm), "
                 f"not {self.height}, {self.width}, {self.pixel_pitch}"

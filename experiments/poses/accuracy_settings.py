@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.experiments.checks import check_count, check_positive
 from dolens.sensor.pixels import Sensor
 
 
@@ -42,11 +43,13 @@ class PhotonLevels:
         InputError: fewer than 2 measurements.
     """
 
-    levels: Sequence[int]
+    levels: Sequence[float]
     measurements: int = 20
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "levels", tuple(int(level) for level in self.levels))
+        for level in self.levels:
+            check_count("levels", level)
         if self.measurements < 2:
             raise InputError(f"measurements: {self.measurements}; allowed: 2 or more")
 
@@ -64,15 +67,17 @@ class RayCounts:
         InputError: no pattern.
     """
 
-    counts: Sequence[int]
+    counts: Sequence[float]
     patterns: int = 4
-    reference_photons: int = 200_000_000
+    reference_photons: float = 200_000_000
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "counts", tuple(int(count) for count in self.counts))
         object.__setattr__(self, "reference_photons", int(self.reference_photons))
-        if self.patterns < 1:
-            raise InputError(f"patterns: {self.patterns}; allowed: 1 or more")
+        check_count("patterns", self.patterns)
+        check_count("reference_photons", self.reference_photons)
+        for count in self.counts:
+            check_count("counts", count)
 
 
 @dataclass(frozen=True)
@@ -95,3 +100,6 @@ class BasinSettings:
     sensor: Sensor | None = None
     imager: Mapping[str, Any] = field(default_factory=dict)
     photons: float = 1_000_000
+
+    def __post_init__(self) -> None:
+        check_positive("photons", self.photons)

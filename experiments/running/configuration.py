@@ -11,6 +11,7 @@ from dolens.experiments.running.target_keys import (
     refuse_unknown_keys,
 )
 from dolens.experiments.running.unread_settings import refuse_unread
+from dolens.experiments.running.value_types import refuse_wrong_types
 
 # What Hydra makes; the lens is made by `dolens.prescriptions`, from data alone.
 _MADE = ("module", "data", "callbacks", "logger", "trainer")
@@ -27,7 +28,8 @@ def checked(cfg: DictConfig) -> DictConfig:
 
     Raises:
         InputError: an old name, an entry dropped that no parent has, a `_target_` in a lens, a key
-            that a class does not take, a setting that is missing, or one that nothing reads.
+            that a class does not take, a setting that is missing, a value of another type than the
+            class takes, or a setting that nothing reads.
     """
     own = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     refuse_renamed(own)
@@ -36,5 +38,6 @@ def checked(cfg: DictConfig) -> DictConfig:
     refuse_targets_in_lenses(plain)
     refuse_unknown_keys(plain, _MADE)
     refuse_missing(plain, _MADE)
+    refuse_wrong_types(plain, _MADE)
     refuse_unread(own, RunSettings.names())
     return own

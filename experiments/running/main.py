@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.running.failed_parts import reason_of
 from dolens.experiments.running.machine_faults import machine_fault
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.training import run
@@ -66,9 +67,7 @@ def job(cfg: DictConfig) -> float | tuple[float, ...]:
     except TrialPruned as pruned:
         logger.info("Pruned: %s", pruned)
     except (InputError, HydraException, OmegaConfBaseException) as error:
-        # Hydra reports a class that could not be made; the reason is what the user can mend.
-        reason = error.__cause__ if isinstance(error.__cause__, InputError) else error
-        line = one_line(reason)
+        line = reason_of(error)
         _record(line, to_all=swept)
         if not swept:
             # Exiting here, within the job, keeps Hydra from adding lines of its own.

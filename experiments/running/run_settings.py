@@ -7,9 +7,13 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from dolens.errors import InputError, check_choice
+from dolens.experiments.checks import check_count
 from dolens.experiments.running.objectives import objective_names
+from dolens.experiments.running.trainer_settings import check_trainer
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
+# Of NumPy's generators.
+_SEEDS = 2**32
 _PRECISIONS = ("highest", "high", "medium")
 
 
@@ -68,8 +72,14 @@ class RunSettings:
         for key in ("train", "test"):
             _check_type(key, getattr(self, key), bool, "true or false")
         _check_type("seed", self.seed, int, "an integer")
+        if not 0 <= self.seed < _SEEDS:
+            raise InputError(f"seed: {self.seed}; allowed: an integer from 0 to {_SEEDS - 1}")
+        for key in ("ckpt_path", "state"):
+            if getattr(self, key) is not None:
+                _check_type(key, getattr(self, key), str, "a text, or null")
         if self.threads is not None:
-            _check_type("threads", self.threads, int, "an integer, or null")
+            check_count("threads", self.threads)
+        check_trainer(self.trainer)
         for name in self.objectives:
             if name.startswith("test/") and not self.test:
                 raise InputError(f"objective: '{name}' needs test=true, or name another metric")

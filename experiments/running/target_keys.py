@@ -4,6 +4,7 @@ import inspect
 import pkgutil
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
@@ -14,7 +15,7 @@ from dolens.experiments.running.plain_values import walk
 
 _HYDRAS = frozenset(("_target_", "_partial_", "_convert_", "_recursive_", "_args_"))
 # A value that is another part of the configuration as a whole, as `network: ${network}`.
-_REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
+REFERENCE = re.compile(r"\$\{([\w.@]+)\}")
 
 
 class Target(NamedTuple):
@@ -24,11 +25,13 @@ class Target(NamedTuple):
         path: where it stands, as a user names it.
         name: what it makes, as `torch.optim.Adam`.
         keys: the arguments that it gives.
+        values: of these, not resolved.
     """
 
     path: str
     name: str
     keys: tuple[str, ...]
+    values: Mapping[str, Any] = MappingProxyType({})
 
 
 def refuse_unknown_keys(plain: Mapping[str, Any], parts: Sequence[str]) -> None:
@@ -61,7 +64,7 @@ def refuse_targets_in_lenses(plain: Mapping[str, Any]) -> None:
         name, _, package = str(group).partition("@")
         if name != "lens":
             continue
-        lens = _at(plain, package or name)
+        lens = value_at(plain, package or name)
         for path, node, _ in walk(package or name, lens):
             for key in sorted(_HYDRAS.intersection(node)) if isinstance(node, dict) else ():
                 raise InputError(
@@ -96,8 +99,8 @@ def targets(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[Target]:
     """
     for path, node in _settings(plain, parts):
         if isinstance(node, dict) and isinstance(node.get("_target_"), str):
-            given = tuple(str(key) for key in node if key not in _HYDRAS)
-            yield Target(path, node["_target_"], given)
+            given = {str(key): value for key, value in node.items() if key not in _HYDRAS}
+            yield Target(path, node["_target_"], tuple(given), given)
 
 
 def _settings(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[tuple[str, Any]]:
@@ -105,9 +108,9 @@ def _settings(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[tuple[
     seen: set[str] = set()
 
     def visit(path: str, node: Any) -> Iterator[tuple[str, Any]]:
-        reference = _REFERENCE.fullmatch(node) if isinstance(node, str) else None
+        reference = REFERENCE.fullmatch(node) if isinstance(node, str) else None
         if reference:
-            path, node = reference[1], _at(plain, reference[1])
+            path, node = reference[1], value_at(plain, reference[1])
         if path in seen:
             return
         seen.add(path)
@@ -155,8 +158,11 @@ def arguments_of(make: Callable[..., Any]) -> list[str] | None:
     return list(dict.fromkeys(found))
 
 
-def _at(plain: Any, path: str) -> Any:
+def value_at(plain: Any, path: str) -> Any:
     """Return the value at a path; None where there is nothing."""
     for key in path.split("."):
-        plain = plain.get(key) if isinstance(plain, dict) else None
+        if isinstance(plain, list) and key.isdecimal():
+            plain = dict(enumerate(plain)).get(int(key))
+        else:
+            plain = plain.get(key) if isinstance(plain, dict) else None
     return plain

@@ -170,7 +170,14 @@ def build_lens(settings: RunSettings) -> Lens:
     lens = lens_from_prescription(
         settings.prescription(), settings.dtype, where=where, backend=settings.backend
     )
-    return lens.in_state(settings.state)
+    lens = lens.in_state(settings.state)
+    distance = float(lens.sensor_distance.detach())
+    if lens.system().senses[-1] * distance < 0.0:
+        raise InputError(
+            f"lens.sensor.distance: {distance:g} mm; the sensor must stand behind the last surface "
+            "as light travels (negative where it travels towards -z)"
+        )
+    return lens
 
 
 def refuse_untrained(settings: RunSettings, module: Experiment) -> None:

@@ -2,6 +2,8 @@
 
 import copy
 import math
+import struct
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -249,11 +251,22 @@ def test_a_photograph_is_read_with_its_dark_level_region_and_saturation(tmp_path
     )
 
 
+def bomb():
+    """A few bytes of a PNG that mean ten thousand million pixels."""
+    size = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
+    chunks = ((b"IHDR", size), (b"IDAT", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", crc32(name + data))
+        for name, data in chunks
+    )
+
+
 @pytest.mark.parametrize(
     ("write", "message"),
     [
         (lambda p: p.write_bytes(b"none"), "cannot be read"),
         (lambda p: p.write_bytes(b"P5 60000 60000 255\n"), "cannot be read .*3600000000 pixels"),
+        (lambda p: p.write_bytes(bomb()), r"cannot be read \(Image size \(10000000000 pixels\)"),
         (lambda p: Image.new("RGB", (4, 4)).save(p), "one channel of integers"),
     ],
 )

@@ -12,7 +12,7 @@ from dolens.errors import InputError
 from dolens.kernels.table import Figure
 from dolens.kernels.table import Outline as OutlineKind
 from dolens.optics.surfaces.obscurations import Ring, Spider, Together
-from dolens.optics.surfaces.outlines import CENTRE, Figures, Polygons, Simple
+from dolens.optics.surfaces.outlines import CENTRE, Figures, Polygons, Simple, require_length
 
 
 @dataclass(frozen=True)
@@ -193,8 +193,7 @@ class ClearAperture:
             raise InputError("a second outline goes with a circular edge")
         for outline in (self.edge, self.obscuration, self.window):
             for name, value in outline.lengths.items() if outline else ():
-                if not 0.0 < value < math.inf:
-                    raise InputError(f"{name} must be positive and finite, not {value}")
+                require_length(name, value)
         if self.obscuration is not None and not isinstance(self.edge, Unlimited):
             # A disc about the vertex that is blocked for certain.
             reach = self.obscuration.inscribed - math.hypot(*self.center)

@@ -78,7 +78,7 @@ def check_reach(surface: Surface) -> None:
     alpha = (1.0 + (0.0 if conic is None else float(conic.detach()))) * c * c
     # A whole hemisphere is allowed, and 1/R has rounded.
     rounding = 4.0 * torch.finfo(curvature.dtype).eps
-    if alpha * surface.semi_diameter**2 > 1.0 + rounding:
+    if alpha * (surface.semi_diameter * surface.semi_diameter) > 1.0 + rounding:
         raise InputError(
             f"semi_diameter {surface.semi_diameter:g} mm exceeds the surface, which ends at "
             f"{1.0 / math.sqrt(alpha):g} mm from the axis (radius {1.0 / c:g} mm)"

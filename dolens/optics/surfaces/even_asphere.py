@@ -1,6 +1,5 @@
 """An even asphere is a conic plus powers of r² (S1, S2)."""
 
-import re
 from collections.abc import Mapping
 
 import torch
@@ -9,17 +8,17 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters
+from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
 from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import register_surface
 
-_POWER = re.compile(r"a([1-9]\d*)")
+_POWER = order_pattern("a")
 
 
 def power_of(name: str) -> int | None:
     """Return the power of r whose coefficient has this name: 4 for `a4`; None for another name."""
-    match = _POWER.fullmatch(name)
-    return None if match is None else int(match[1])
+    return order_of(_POWER, name)
 
 
 def even_power(name: str) -> int | None:

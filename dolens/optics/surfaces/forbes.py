@@ -1,6 +1,5 @@
 """Rotational aspheres in Forbes's orthogonal polynomials: Q_con and Q_bfs."""
 
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -10,6 +9,7 @@ from torch import Tensor
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import ClearAperture
+from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.conic import check_reach, conic_distance, conic_sag
 from dolens.optics.surfaces.forbes_basis import q_bfs, to_auxiliary
 from dolens.optics.surfaces.jacobi import jacobi
@@ -17,7 +17,7 @@ from dolens.optics.surfaces.refraction import PlaneRay
 from dolens.optics.surfaces.registry import register_surface
 from dolens.optics.surfaces.zernike import require_normalization_radius
 
-_TERM = re.compile(r"q(0|[1-9]\d*)")
+_TERM = order_pattern("q", 0)
 _KERNELS = ("dolens.kernels.cpu.forbes", "dolens.kernels.cuda.forbes")
 # The square of the smallest cosine that the departure along the normal is divided by.
 _STEEPEST = 1e-12
@@ -51,7 +51,7 @@ class ForbesSag(Surface):
         """Return curvature, conic constant, the coefficients that the prescription names, by rising
         orders, and the normalisation radius.
         """
-        orders = sorted(int(match[1]) for key in keys if (match := _TERM.fullmatch(str(key))))
+        orders = sorted(order for key in keys if (order := order_of(_TERM, key)) is not None)
         return ["curvature", "conic", *(f"q{order}" for order in orders), *cls.constants]
 
     @classmethod

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.kernels.table import Figure
-from dolens.optics.surfaces.outlines import CENTRE, Composite, Covered, Figures, Point
-
-
-def _positive(what: str, value: float) -> None:
-    if not 0.0 < value < math.inf:
-        raise InputError(f"{what} must be positive and finite, not {value}")
+from dolens.optics.surfaces.outlines import (
+    CENTRE,
+    Composite,
+    Covered,
+    Figures,
+    Point,
+    require_length,
+)
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,8 @@ class Ring(Composite):
     semi_diameter: float
 
     def __post_init__(self) -> None:
-        _positive("inner_semi_diameter", self.inner_semi_diameter)
-        _positive("semi_diameter", self.semi_diameter)
+        require_length("inner_semi_diameter", self.inner_semi_diameter)
+        require_length("semi_diameter", self.semi_diameter)
         if self.inner_semi_diameter >= self.semi_diameter:
             raise InputError(
                 f"inner_semi_diameter {self.inner_semi_diameter:g} must be below semi_diameter "
@@ -91,7 +93,7 @@ class Spider(Composite):
     angle: float = 0.0
 
     def __post_init__(self) -> None:
-        _positive("a spider's width", self.width)
+        require_length("a spider's width", self.width)
         if self.arms != int(self.arms) or not 1 <= self.arms <= 1000:
             raise InputError(f"a spider's arms must be a whole number from 1, not {self.arms}")
         if not math.isfinite(self.angle):

@@ -21,6 +21,14 @@ Covered = Callable[[Tensor], Tensor]
 # Kind, centre and numbers of each figure; see `Figure`.
 Figures = list[tuple[Figure, Point, tuple[float, ...]]]
 CENTRE: Point = (0.0, 0.0)
+# mm; the square of a length beyond leaves the range of numbers.
+_LONGEST = 1e100
+
+
+def require_length(what: str, value: float) -> None:
+    """Raise `InputError` where a length of an outline (mm) is not positive, or is endless."""
+    if not 0.0 < value <= _LONGEST:
+        raise InputError(f"{what} must be positive and finite, not {value:g} mm")
 
 
 class Simple:

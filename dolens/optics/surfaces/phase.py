@@ -17,7 +17,6 @@ the status of a total reflection.
 """
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
@@ -27,6 +26,7 @@ from torch import Tensor, nn
 from dolens.errors import InputError
 from dolens.kernels.law_kernel import LawKernel
 from dolens.optics.surfaces.base import Parameters, tensor_of
+from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.deflection import (
     Deflected,
     Law,
@@ -41,7 +41,7 @@ from dolens.optics.surfaces.xy_polynomial import monomial_powers
 
 # Path in mm for a radian of phase, over the wavelength in nm.
 _PATH = 1e-6 / (2.0 * math.pi)
-_TERM = re.compile(r"p([1-9]\d*)")
+_TERM = order_pattern("p")
 # An order that would turn light by more than this sine is evanescent.
 _STEEPEST = 1e6
 
@@ -195,12 +195,12 @@ class RadialPhase(Phase):
         """
         powers = []
         for key in keys:
-            match = _TERM.fullmatch(str(key))
-            if match is None:
+            power = order_of(_TERM, key)
+            if power is None:
                 continue
-            if int(match[1]) % 2:
+            if power % 2:
                 raise InputError(f"'{key}': coefficients of a radial phase are p2, p4, p6, ...")
-            powers.append(int(match[1]))
+            powers.append(power)
         return ["order", "norm_radius", *(f"p{power}" for power in sorted(powers))]
 
     @staticmethod

@@ -8,8 +8,11 @@ from torch import Tensor
 
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.coefficient_names import checked_order
 from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
+
+_MONOMIAL = re.compile(r"(?:(x)([2-9]|[1-9][0-9]+)?)?(?:(y)([2-9]|[1-9][0-9]+)?)?")
 
 
 def monomial_powers(name: str) -> tuple[int, int] | None:
@@ -17,12 +20,18 @@ def monomial_powers(name: str) -> tuple[int, int] | None:
     name.
 
     `x3` is (3, 0), `x2y` (2, 1), `xy` (1, 1), `y3` (0, 3); a power of one is not written.
+
+    Raises:
+        InputError: a power is beyond what a surface can have.
     """
-    match = re.fullmatch(r"(?:(x)([2-9]|[1-9]\d+)?)?(?:(y)([2-9]|[1-9]\d+)?)?", name)
+    match = _MONOMIAL.fullmatch(name)
     if match is None or not name:
         return None
     x, i, y, j = match.groups()
-    return (int(i or 1) if x else 0), (int(j or 1) if y else 0)
+    powers = [
+        checked_order(power or "1", name) if letter else 0 for letter, power in ((x, i), (y, j))
+    ]
+    return powers[0], powers[1]
 
 
 @register_surface

@@ -1,6 +1,5 @@
 """Surfaces add Zernike polynomials to a conic and even powers of r."""
 
-import re
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
@@ -12,11 +11,12 @@ from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.asphere_with_terms import AsphereWithTerms
 from dolens.optics.surfaces.base import PackedShape, Parameters
 from dolens.optics.surfaces.clear_aperture import ClearAperture
+from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.jacobi import jacobi
 from dolens.optics.surfaces.registry import register_surface
 from dolens.optics.surfaces.zernike_terms import FRINGE_TERMS, ZernikeTerm, fringe, noll
 
-_TERM = re.compile(r"z([1-9]\d*)")
+_TERM = order_pattern("z")
 _KERNELS = ("dolens.kernels.cpu.zernike", "dolens.kernels.cuda.zernike")
 
 
@@ -46,7 +46,7 @@ class ZernikeSag(AsphereWithTerms):
     @classmethod
     def added_names(cls, keys: Mapping[str, object]) -> list[str]:
         """Return the coefficients that the prescription names, by rising numbers, and constants."""
-        numbers = sorted(int(match[1]) for key in keys if (match := _TERM.fullmatch(str(key))))
+        numbers = sorted(order for key in keys if (order := order_of(_TERM, key)) is not None)
         if numbers and numbers[-1] > cls.terms:
             raise InputError(f"'z{numbers[-1]}': {cls.kind} has z1 to z{cls.terms}")
         return [*(f"z{number}" for number in numbers), *cls.constants]

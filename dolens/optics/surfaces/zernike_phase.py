@@ -5,7 +5,6 @@ coefficients are sums of these ones.
 """
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import ClassVar
@@ -15,12 +14,13 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.optics.surfaces.base import Parameters
+from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.deflection import Number, ParaxialPower
 from dolens.optics.surfaces.jacobi import jacobi
 from dolens.optics.surfaces.phase import Phase, XYPhase, register_phase
 from dolens.optics.surfaces.zernike_terms import FRINGE_TERMS, ZernikeTerm, fringe, noll
 
-_TERM = re.compile(r"z([1-9]\d*)")
+_TERM = order_pattern("z")
 _RADIANS = 2.0 * math.pi
 
 
@@ -40,7 +40,7 @@ class ZernikePhase(Phase):
         """Return order, radius of normalisation, and the coefficients that the prescription
         names.
         """
-        numbers = sorted(int(match[1]) for key in keys if (match := _TERM.fullmatch(str(key))))
+        numbers = sorted(order for key in keys if (order := order_of(_TERM, key)) is not None)
         if numbers and numbers[-1] > cls.terms:
             raise InputError(f"'z{numbers[-1]}': a phase of type {cls.type} has z1 to z{cls.terms}")
         return ["order", "norm_radius", *(f"z{number}" for number in numbers)]

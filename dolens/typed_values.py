@@ -1,0 +1,112 @@
+"""Values that a user wrote are compared with the type hints of what takes them.
+
+The hints of a constructor say what its settings are: a number, an integer, true or false, a text,
+a list, a mapping.  What they do not say, such as that a number is positive, the constructor checks.
+"""
+
+import inspect
+import math
+import types
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from dolens.errors import InputError
+
+# What plain data is made of; anything else in the place of a value was made of it before.
+_PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
+_LISTS = (list, tuple, Sequence, set, frozenset)
+_WORDS: dict[Any, str] = {
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "a text",
+    Path: "a path",
+    type(None): "null",
+}
+
+
+def hints_of(make: Callable[..., Any]) -> dict[str, Any]:
+    """Return the type hints of the parameters that a class or a function takes; none where they
+    cannot be found out.
+    """
+    call = make.__init__ if isinstance(make, type) else make
+    try:
+        names = inspect.signature(call).parameters
+        hints = get_type_hints(call)
+    except Exception:  # hints of others' classes may name what is not installed
+        return {}
+    return {name: hint for name, hint in hints.items() if name in names}
+
+
+def check_type(value: object, hint: Any, where: str) -> None:
+    """Refuse a plain value that a type hint does not allow.
+
+    Args:
+        value: what a user wrote; objects that are no plain data are taken as they are.
+        hint: of the parameter that takes it.
+        where: the key; the message begins with it.
+
+    Raises:
+        InputError: it is of another type, or no number at all (NaN).
+    """
+    if not _fits(value, hint):
+        raise InputError(f"{where}: {_shown(value)}; allowed: {_allowed(hint)}")
+
+
+def _fits(value: object, hint: Any) -> bool:
+    if not isinstance(value, _PLAIN):
+        return True
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _fits(value, inner[0])
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, one) for one in inner)
+    if origin is Literal:
+        return value in inner
+    if hint is bool:
+        return isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint is float:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        return number and not math.isnan(float(value))  # type: ignore[arg-type]
+    if hint in (str, Path):
+        return isinstance(value, str)
+    if hint is type(None):
+        return value is None
+    base = origin or hint
+    if base in _LISTS:
+        return isinstance(value, list | tuple) and _entries_fit(value, base, inner)
+    if base in (dict, Mapping):
+        return isinstance(value, dict) and all(_fits(v, inner[1]) for v in value.values() if inner)
+    return True
+
+
+def _entries_fit(value: Sequence[object], base: Any, inner: tuple[Any, ...]) -> bool:
+    if base is tuple and inner and inner[-1] is not Ellipsis:
+        return len(value) == len(inner) and all(map(_fits, value, inner))
+    return all(_fits(entry, inner[0]) for entry in value) if inner else True
+
+
+def _allowed(hint: Any) -> str:
+    """Return what a hint allows, in words."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _allowed(inner[0])
+    if origin in (Union, types.UnionType):
+        return " or ".join(dict.fromkeys(map(_allowed, inner)))
+    if origin is Literal:
+        return ", ".join(map(str, inner))
+    base = origin or hint
+    if base in _LISTS:
+        entries = [_allowed(one) for one in inner if one is not Ellipsis]
+        return f"a list ({', '.join(dict.fromkeys(entries))})" if entries else "a list"
+    if base in (dict, Mapping):
+        return "a mapping"
+    return _WORDS.get(base, getattr(base, "__name__", str(base)))
+
+
+def _shown(value: object) -> str:
+    words = {None: "null", True: "true", False: "false"}
+    return words[value] if value is None or isinstance(value, bool) else repr(value)

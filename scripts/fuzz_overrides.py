@@ -1,0 +1,184 @@
+"""Wrong values are given to every setting of every experiment: each is one clear line.
+
+python scripts/fuzz_overrides.py --overrides 1000
+
+A run is made up to its first step.  What is taken without a word is listed, to be judged: a huge
+number may be allowed, a negative count is not.
+"""
+
+import argparse
+import contextlib
+import copy
+import logging
+import random
+import sys
+import tempfile
+import time
+import unicodedata
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import lightning
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from dolens.errors import InputError, one_line
+from dolens.experiments.running.failed_parts import reason_of
+from dolens.experiments.running.plain_values import flat
+from dolens.experiments.running.training import run
+from scripts.guarded_cases import guarded, place_of
+from tests.experiments.conftest import composing
+
+ROOT = Path(__file__).resolve().parents[1]
+LONGEST = 500
+_NUMBERS = ("abc", "-1", "0", ".nan", ".inf", "-.inf", "1e300", "''", "null", "[]", "[1,2]", "true",
+            "{a:1}", "-1e-3", "1.5", "1000000000000")  # fmt: skip
+_TEXTS = ("''", "foo", "3", "-1.5", "null", "[]", "true", "{a:1}")
+_TRUTHS = ("foo", "2", "null", "[]", "1.5", "''")
+_LISTS = ("[]", "foo", "3", "null", "[[]]", "[abc]", "[.nan]", "[-1]", "{a:1}", "[0]", "[.inf]")
+# Where files are written, and what is looked at elsewhere (the prescription).
+_LEFT = ("hydra", "lens", "_target_", "_partial_", "_convert_", "trainer.default_root_dir",
+         "callbacks", "logger")  # fmt: skip
+
+
+class Reached(BaseException):
+    """A run came as far as its first step."""
+
+
+def main() -> int:
+    """Print the table; the exit status is 1 where a run ended in a traceback."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--overrides", type=int, default=1000, help="how many runs are tried")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--experiment", action="append", help="this one alone")
+    parser.add_argument("--override", action="append", help="this one alone, of each experiment")
+    parser.add_argument("--key", default="", help="settings whose names begin so")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of processor time for a run")
+    options = parser.parse_args()
+    names = options.experiment or sorted(p.stem for p in (ROOT / "conf" / "experiment").iterdir())
+    logging.disable()
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as folder:
+        cases = [(name, one) for name in names for one in options.override or ()]
+        cases = cases or _cases(names, options.key, Path(folder))
+        random.Random(options.first).shuffle(cases)
+        # Those of one experiment follow each other: it is composed once.
+        cases = sorted(cases[: options.overrides])
+        begin, found, kept = time.monotonic(), Counter(), defaultdict(list)
+
+        def check(number: int) -> str:
+            experiment, override = cases[number]
+            return outcome(Path(folder), experiment, override)
+
+        for number, answer in guarded(check, range(len(cases)), options.seconds, 4096):
+            said, _, detail = answer.partition("\0")
+            found[said] += 1
+            kept[said].append(" ".join(cases[number]))
+            if said != "one line":
+                print(f"{said}: {' '.join(cases[number])}: {detail}", flush=True)
+    print(f"{len(cases)} overrides in {time.monotonic() - begin:.0f} s")
+    for said, count in sorted(found.items()):
+        print(f"{count:7d}  {said}")
+    return int(any(said not in ("one line", "taken") for said in found))
+
+
+def outcome(folder: Path, experiment: str, *overrides: str) -> str:
+    """Return what comes of a run up to its first step: `one line` or `taken` where all is well."""
+    stop = patch.object(lightning.Trainer, "fit", side_effect=Reached)
+    idle = patch.object(lightning.Trainer, "test", side_effect=Reached)
+    try:
+        with _settings_of_torch(), stop, idle:
+            run(_changed(folder, experiment, overrides))
+        return "taken"
+    except Reached:
+        return "taken"
+    except (SystemExit, Exception) as error:
+        return _judged(error, overrides)
+
+
+def _changed(folder: Path, experiment: str, overrides: tuple[str, ...]) -> DictConfig:
+    """Return an experiment's configuration with some values changed."""
+    cfg = copy.deepcopy(_composed(folder, experiment))
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        OmegaConf.update(cfg, override.key_or_group, override.value(), merge=False)
+    HydraConfig.instance().set_config(cfg)
+    return cfg
+
+
+@cache
+def _composed(folder: Path, experiment: str) -> DictConfig:
+    # The published settings need the paper's photographs.
+    more = [f"data.root={folder}"] if experiment.endswith("_paper") else []
+    with composing(ROOT, folder) as build:
+        return build(f"experiment={experiment}", *more)
+
+
+def _judged(error: BaseException, overrides: tuple[str, ...]) -> str:
+    """Return whether an error is one line that names the setting, as `main` would print it."""
+    if not isinstance(error, InputError | HydraException | OmegaConfBaseException):
+        return f"{type(error).__name__} at {place_of(error)}\0{one_line(error)[:300]}"
+    message = reason_of(error)
+    if any(unicodedata.category(letter) in ("Cc", "Cf", "Cs") for letter in message):
+        return f"message with control characters\0{message[:200]!a}"
+    if len(message) > LONGEST:
+        return f"message is endless\0{message[:300]}"
+    key = overrides[-1].partition("=")[0].lstrip("+~")
+    last = key.rpartition(".")[2]
+    if last not in message and key.split(".")[0] not in message:
+        return f"message does not name the setting\0{message[:300]}"
+    return "one line"
+
+
+@contextlib.contextmanager
+def _settings_of_torch() -> Iterator[None]:
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        torch.set_float32_matmul_precision(precision)
+
+
+def _cases(names: list[str], begin: str, folder: Path) -> list[tuple[str, str]]:
+    """Return every experiment with every wrong value of each of its settings."""
+    found = []
+    for name in names:
+        plain = OmegaConf.to_container(_composed(folder, name), resolve=False)
+        for key, value in _leaves(plain):
+            if key.startswith(begin):
+                found += [(name, f"{key}={wrong}") for wrong in _wrong(value)]
+    return found
+
+
+def _leaves(plain: Any) -> Iterator[tuple[str, Any]]:
+    for key, value in flat(plain):
+        if any(part in _LEFT for part in (key, key.split(".")[0], key.rpartition(".")[2])):
+            continue
+        if isinstance(value, str) and "${" in value:
+            continue
+        if not any(part.isdecimal() for part in key.split(".")):
+            yield key, value
+
+
+def _wrong(value: Any) -> tuple[str, ...]:
+    if isinstance(value, bool):
+        return _TRUTHS
+    if isinstance(value, int | float):
+        return _NUMBERS
+    return _LISTS if isinstance(value, list) else _TEXTS
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    sys.exit(main())
