@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.running.processes import own_arguments, report_failure
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
@@ -35,11 +36,12 @@ def main(arguments: Sequence[str], program: str) -> None:
     """
     # Let errors through to here: a user's mistake is one line, a fault keeps its whole traceback.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    sys.argv = [program, *arguments]
     use_working_folder()
     start = hydra.main(str(packaged_configuration()), "train", version_base="1.3")(job)
     try:
-        start()
+        with own_arguments(arguments) as own:
+            sys.argv = [program, *own]
+            start()
     except HydraException as error:
         sys.exit(f"error: {one_line(explained(error, arguments))}")
     except OmegaConfBaseException as error:
@@ -57,14 +59,17 @@ def job(cfg: DictConfig) -> float:
     try:
         return run(cfg)
     except (InputError, HydraException, OmegaConfBaseException) as error:
+        told = report_failure(error.__cause__ or error)
         # Hydra reports a class that could not be made; the reason is what the user can mend.
         reason = error.__cause__ if isinstance(error.__cause__, InputError) else error
         line = one_line(reason)
         _record(line, to_all=swept)
         if not swept:
             # Exiting here, within the job, keeps Hydra from adding lines of its own.
-            sys.exit(f"error: {line}")
+            sys.exit(1 if told else f"error: {line}")
     except Exception as error:
+        if report_failure(error):
+            sys.exit(1)
         line = one_line(f"{type(error).__name__}: {error}")
         _record(line, to_all=swept, with_traceback=True)
         if not swept:
