@@ -78,11 +78,23 @@ def all_processes(trainer: lightning.Trainer, threads: int | None) -> Iterator[N
     Raises:
         InputError: another process failed; the line says how.
     """
-    environment = getattr(trainer.strategy, "cluster_environment", None)
-    alone = trainer.world_size == 1 or environment is None
-    if alone or environment.creates_processes_externally:
+    if trainer.world_size == 1:
         yield
         return
+    with warnings.catch_warnings():
+        # What is logged is the same in all processes: it is gathered before.
+        warnings.filterwarnings("ignore", message=".*sync_dist=True.*")
+        if trainer.strategy.cluster_environment.creates_processes_externally:
+            yield
+            return
+        with _started(trainer, threads):
+            yield
+
+
+@contextmanager
+def _started(trainer: lightning.Trainer, threads: int | None) -> Iterator[None]:
+    """Start the other processes, and end them with this one."""
+    environment = trainer.strategy.cluster_environment
     if trainer.num_nodes > 1:
         raise InputError(
             f"trainer.num_nodes: {trainer.num_nodes} needs torchrun or srun, which start the "
