@@ -18,6 +18,7 @@ from dolens.experiments.camera.figures import camera_figures
 from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
+from dolens.experiments.camera.reconstruction import compile_network
 from dolens.experiments.camera.settings import Reconstruction, Training
 from dolens.experiments.camera.views.base import Imaging
 from dolens.experiments.experiment import Figures
@@ -78,6 +79,7 @@ class CameraModule(Camera):
         self.learning_rates = rates = training.learning_rates
         discriminator, rate = reconstruction.discriminator, rates.discriminator or rates.network
         self.adversary = Adversary(discriminator, rate) if discriminator else None
+        self.compiled = reconstruction.compiled
         self.costs = StepCosts()
         self.evaluation = Evaluation(miscalibrations)
         self.test_scores: dict[str, PhotographScores] = {}
@@ -114,6 +116,15 @@ class CameraModule(Camera):
             )
 
     # ---------------------------------------------------------------- training
+
+    def setup(self, stage: str) -> None:
+        """Compile the network that is to be trained, where that is asked for.
+
+        Raises:
+            InputError: torch cannot compile on this machine.
+        """
+        if self.compiled and stage == "fit":
+            compile_network(self.network, self.device)
 
     def configure_optimizers(self) -> Any:
         """Return one optimizer, with a group for the network and one for the lens's variables."""

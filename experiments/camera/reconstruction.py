@@ -157,6 +157,26 @@ def check_reconstruction(
         _tried("loss", _name(loss), raw, lambda: loss_terms(loss, restored, truth))
 
 
+def compile_network(network: nn.Module, device: torch.device) -> None:
+    """Let `torch.compile` make a network, in its place; the names of its weights stay.
+
+    Args:
+        network: compiled when it is called next, in training and in evaluation mode by itself.
+        device: that it is on.
+
+    Raises:
+        InputError: torch cannot compile here, as without a C++ compiler.
+    """
+    try:
+        torch.compile(lambda number: 2.0 * number)(torch.ones(1, device=device))
+    except Exception as error:
+        raise InputError(
+            f"compile_network: torch.compile does not work here ({one_line(error)[:200]}); "
+            "allowed: false"
+        ) from error
+    network.compile()
+
+
 @contextmanager
 def evaluating(network: nn.Module) -> Iterator[None]:
     """Put a network and all its parts into evaluation mode, and back into their own afterwards."""

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -58,8 +59,12 @@ def report_failure(error: BaseException) -> bool:
     folder = os.environ.get(_REPORTS)
     if folder is None or not rank_zero_only.rank:
         return False
-    line = one_line(error) if isinstance(error, InputError) else _named(error)
-    report = {"line": line, "lost": _has_lost_another(error)}
+    mistake = isinstance(error, InputError)
+    report = {
+        "line": one_line(error) if mistake else _named(error),
+        "lost": _has_lost_another(error),
+        "trace": "" if mistake else "".join(traceback.format_exception(error)),
+    }
     path = Path(folder) / f"{rank_zero_only.rank}.json"
     temporary = path.with_suffix(".part")
     temporary.write_text(json.dumps(report), encoding="utf-8")
@@ -168,6 +173,8 @@ class _Started:
             if path.is_file():
                 report = json.loads(path.read_text(encoding="utf-8"))
                 if not report["lost"]:
+                    if report["trace"]:
+                        logger.error("process %d: %s", number, report["trace"])
                     return f"process {number} of {count} (from 0) failed: {report['line']}"
                 continue
             code = self.processes[number - 1].returncode
@@ -187,9 +194,10 @@ class _Started:
         while not self.over and time.monotonic() < ends:
             time.sleep(_LOOK_S)
         if not self.over:
-            logger.error("%s", self.reason())
+            reason = self.reason() or "another process has ended"
             self.end()
-            sys.stderr.write(f"error: {self.reason()}\n")
+            logger.error("%s", reason)
+            sys.stderr.write(f"error: {reason}\n")
             os._exit(1)
 
     def wait(self) -> None:
