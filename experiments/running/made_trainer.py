@@ -61,10 +61,7 @@ def made_trainer(
     try:
         return instantiate(settings, callbacks=list(callbacks), logger=list(loggers), **own)
     except InstantiationException as error:
-        reason = error.__cause__ or error
-        if isinstance(reason, InputError):
-            raise reason from error
-        raise InputError(f"trainer: {one_line(reason)}") from error
+        raise InputError(f"trainer: {one_line(error.__cause__ or error)}") from None
 
 
 def _check_precision(precision: Any) -> None:
