@@ -85,12 +85,11 @@ class CameraModule(Camera):
         self.test_scores: dict[str, PhotographScores] = {}
         self._looked_in_epoch: int | None = None
         self._shown: dict[str, Tensor] = {}  # stage → its first crop, for figures
-        # The discriminators have an optimizer of their own, and no variables take no gradient: both
-        # are none of Lightning's strategy to average.
-        self._ddp_params_and_buffers_to_ignore = [
-            *(f"adversary.{name}" for name in (self.adversary.names() if self.adversary else ())),
-            *([] if len(self.variables) else ["variables.scaled"]),
-        ]
+        # Not for Lightning's strategy to average: discriminators have an optimizer of their own.
+        others = self.adversary.names() if self.adversary else []
+        self._ddp_params_and_buffers_to_ignore = [f"adversary.{name}" for name in others]
+        if not len(self.variables):
+            self._ddp_params_and_buffers_to_ignore.append("variables.scaled")
         views.check(lens)
         self.lens_steps = LensSteps(
             self.lens,
@@ -163,8 +162,7 @@ class CameraModule(Camera):
             with named_stage("looking at the lens"):
                 photographs = self._photographs()
                 self.views.prepare(self.lens, self.variables(), self.comparison(), photographs)
-        if processes() > 1:
-            # Plans are made by the clock too: what one process found serves all.
+        if processes() > 1:  # plans are made by the clock too: what one process found serves all
             found = self.trainer.strategy.broadcast(self.views.state())
             if not self.trainer.is_global_zero:
                 self.views.load_state(self.lens, found)
@@ -184,8 +182,7 @@ class CameraModule(Camera):
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
         with self.costs.making_images():
             values, share = self.variables(), self.share_of_step(len(batch), batch_idx)
-            step = self.global_step
-            taken, functions = self.take(values, batch, "train", step, share=share)
+            taken, functions = self.take(values, batch, "train", self.global_step, share=share)
         self.costs.watch_backward(taken.raw)
         restored = self.restore(taken, functions)
         truth = taken.truth.to(restored.dtype)

@@ -29,7 +29,7 @@ from dolens.errors import InputError, one_line
 
 logger = logging.getLogger(__name__)
 
-# Where a process says how it failed, for the first one to report.
+# Where a process works, and says how it failed, for the first one to report.
 _REPORTS = "DOLENS_PROCESS_REPORTS"
 # Seconds that a process is given to end by itself.
 _GRACE_S = 10.0
@@ -50,7 +50,9 @@ def own_arguments(arguments: Sequence[str]) -> Iterator[list[str]]:
         return
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore")
-    with tempfile.TemporaryDirectory(prefix="dolens-process-") as folder:
+    # In the first process's folder, which goes with it, where it has started this one.
+    parent = os.environ.get(_REPORTS)
+    with tempfile.TemporaryDirectory(prefix="dolens-process-", dir=parent) as folder:
         yield [*arguments, f"hydra.run.dir={folder}", "hydra.output_subdir=null"]
 
 
@@ -113,7 +115,7 @@ def _started(trainer: lightning.Trainer, threads: int | None) -> Iterator[None]:
         "WORLD_SIZE": str(count),
     }
     if threads or "OMP_NUM_THREADS" not in os.environ:
-        share = threads or max(1, len(os.sched_getaffinity(0)) // count)
+        share = threads or max(1, torch.get_num_threads() // count)
         torch.set_num_threads(share)
         added["OMP_NUM_THREADS"] = str(share)
     before = dict(os.environ)
