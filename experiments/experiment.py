@@ -10,6 +10,9 @@ from matplotlib.figure import Figure
 from dolens.errors import InputError
 from dolens.optics.lens import Lens
 
+# Precisions of a trainer: single, and the network's in half where Lightning's autocast reaches it.
+EXACT, MIXED = "32-true", "bf16-mixed"
+
 # Name → a function that draws the figure.  Nothing is drawn until somebody wants to keep it.
 Figures = Mapping[str, Callable[[], Figure]]
 
@@ -54,6 +57,26 @@ class Experiment(lightning.LightningModule):
     def training_figures(self) -> Figures:
         """Return the figures that are logged every few epochs, after validation."""
         return {}
+
+    def check_trainer(self, trainer: lightning.Trainer) -> None:
+        """Refuse a trainer that would do this work otherwise than one process in single precision.
+
+        An experiment that can share its batches among processes, accumulate gradients, or compute
+        some of its work in half precision, overrides this.
+
+        Raises:
+            InputError: the line names the setting.
+        """
+        kind = type(self).__name__
+        if trainer.world_size > 1:
+            raise InputError(f"trainer.devices: {trainer.world_size}; allowed for {kind}: 1")
+        if trainer.accumulate_grad_batches > 1:
+            raise InputError(
+                f"trainer.accumulate_grad_batches: {trainer.accumulate_grad_batches}; allowed for "
+                f"{kind}: 1"
+            )
+        if trainer.precision != EXACT:
+            raise InputError(f"trainer.precision: {trainer.precision}; allowed for {kind}: {EXACT}")
 
     # ---------------------------------------------------------------- checkpoints
 

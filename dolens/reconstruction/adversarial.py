@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from dolens.errors import InputError
+from dolens.reconstruction.processes import mean_over_processes
 
 
 def relativistic_discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
@@ -18,13 +19,15 @@ def relativistic_discriminator_loss(real: Tensor, fake: Tensor) -> Tensor:
     D(x) being the scores of true images, D(G) those of restored ones and E the mean over all of
     a kind (Jolicoeur-Martineau 2018; the RaGAN-LS of DeblurGAN-v2).  It is zero where every true
     image scores one more than the mean restored one, and conversely; 1 where all score alike.
+    Processes that share a batch take E over all of it, so that the mean of their losses is its.
 
     Args:
         real: scores of true images, any shape.
         fake: scores of restored images, any shape.
     """
+    mean_real, mean_fake = mean_over_processes(real.mean()), mean_over_processes(fake.mean())
     return 0.5 * (
-        (real - fake.mean() - 1.0).square().mean() + (fake - real.mean() + 1.0).square().mean()
+        (real - mean_fake - 1.0).square().mean() + (fake - mean_real + 1.0).square().mean()
     )
 
 

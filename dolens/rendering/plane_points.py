@@ -172,9 +172,9 @@ def chief_ray_points(
     return torch.stack(rows).permute(2, 0, 1), torch.stack(columns).permute(2, 0, 1)
 
 
-def distinct_radii(points: tuple[Tensor, Tensor]) -> int:
-    """Count the distances from the axis that there are among points."""
-    return len(torch.unique(_rounded(torch.hypot(*points))))
+def distinct_radii(points: tuple[Tensor, Tensor]) -> Tensor:
+    """Return the distances from the axis that there are among points, sorted."""
+    return torch.unique(_rounded(torch.hypot(*points)))
 
 
 def pinhole_points(imaging: ImagingSystem, points: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:

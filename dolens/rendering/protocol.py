@@ -30,6 +30,19 @@ class SensorWindow:
 
 
 @dataclass(frozen=True)
+class WindowShare:
+    """Windows that are a part of those of a batch; the others are rendered elsewhere.
+
+    Attributes:
+        first: number in the batch of the first window here.
+        windows: the pixels of all windows of the batch, by which random numbers are numbered.
+    """
+
+    first: int
+    windows: Sequence[Sensor]
+
+
+@dataclass(frozen=True)
 class GradientMeasure:
     """A loss and the variables that its gradient is taken with respect to.
 
@@ -121,6 +134,29 @@ class Renderer(ABC):
             renderer = self.on(window.sensor)
             images.append(renderer.render(lens, placed, texture[None], seed + i, values))
         return torch.cat(images)
+
+    def render_share(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        windows: Sequence[SensorWindow],
+        seed: int,
+        values: Values | None,
+        share: WindowShare,
+    ) -> Tensor:
+        """Image each texture on its window as `render_windows` does where all windows are together.
+
+        Args:
+            lens: as of `render_windows`, and the others.
+            scene: of all windows.
+            textures: (W, channels, h, w), of this share.
+            windows: W, of this share.
+            seed: of the whole batch.
+            values: lens parameters.
+            share: where these windows stand among all.
+        """
+        return self.render_windows(lens, scene, textures, windows, seed + share.first, values)
 
     def rays_per_image(self, scene: Scene, sensor: Sensor | None = None) -> int:
         """Rays traced through the lens for one render, all wavelengths together.

@@ -41,6 +41,18 @@ class FieldPointSpreadFunctions(NamedTuple):
     truncated: Tensor
 
 
+class PointShare(NamedTuple):
+    """Points that are a part of others, by which their samples of the pupil are numbered.
+
+    Attributes:
+        first: number among the others of the first point here.
+        points: x and y of all of them, mm.
+    """
+
+    first: int
+    points: tuple[Tensor, Tensor]
+
+
 def field_point_spread_functions(
     imaging: ImagingSystem,
     points: tuple[Tensor, Tensor],
@@ -48,6 +60,7 @@ def field_point_spread_functions(
     pupil_samples: int,
     seed: int | None,
     distortion: bool,
+    among: PointShare | None = None,
 ) -> FieldPointSpreadFunctions:
     """Geometric point spread functions at points of the sensor.
 
@@ -64,13 +77,14 @@ def field_point_spread_functions(
         seed: of the points in the strata; None: their centres.
         distortion: whether a function's centre is where the chief ray meets the plane, else where
             a pinhole sees it.
+        among: all points, where these are a part of them and are to have the same samples.
 
     Centres move with the lens, and so do the functions about them: gradients are of both, and where
     pixels look has to carry its own (`convolve_patches`).
     """
     system = imaging.system
-    count = distinct_radii(points) if system.rotationally_symmetric else len(points[0])
-    disc = sampled_disc(count, pupil_samples, seed, system)
+    places = _places(points, among, system.rotationally_symmetric)
+    disc = sampled_disc(places, pupil_samples, seed, system)
     seen = plane_points(imaging, points, disc)
     centre = (chief_ray_points if distortion else pinhole_points)(imaging, points)
     rows, columns = (c[..., None].to(system.dtype) for c in centre)
@@ -113,7 +127,7 @@ def wave_point_spread_functions(
     shape = (len(points[0]), len(scene.depths), len(scene.wavelengths))
     kernels = wave_kernels(system, *places, PixelWindow(pitch, size), settings)
     kernels = kernels.reshape(*shape, size, size)
-    disc = sampled_disc(1, _LIGHT_SAMPLES, 0, system)
+    disc = sampled_disc(torch.zeros(1, dtype=torch.int64), _LIGHT_SAMPLES, 0, system)
     seen = plane_points(imaging, points, disc)
     light = seen.weight.sum(-1)
     total = kernels.sum((-2, -1))
@@ -164,18 +178,31 @@ def _object_points(
     return positions.reshape(-1, 3), wavelengths.reshape(-1), centres.reshape(-1, 2)
 
 
-def sampled_disc(
-    count: int, side: int, seed: int | None, system: OpticalSystem
-) -> tuple[Tensor, Tensor]:
-    """Points of the unit disc, one in each of side² strata: x and y, each (count, side²).
-
-    Every one of the `count` has samples of its own; `seed` None takes the strata's centres.
+def _places(points: tuple[Tensor, Tensor], among: PointShare | None, symmetric: bool) -> Tensor:
+    """Return the numbers of the samples that points have: each its own, or each distance from the
+    axis where the lens is symmetric about it.
     """
-    shape = (count, side * side)
+    if among is None:
+        return torch.arange(len(distinct_radii(points) if symmetric else points[0]))
+    if not symmetric:
+        return among.first + torch.arange(len(points[0]))
+    own, every = distinct_radii(points), distinct_radii(among.points)
+    return (own[:, None] - every).abs().argmin(dim=1)
+
+
+def sampled_disc(
+    places: Tensor, side: int, seed: int | None, system: OpticalSystem
+) -> tuple[Tensor, Tensor]:
+    """Points of the unit disc, one in each of side² strata: x and y, each (N, side²).
+
+    Every one of the N places (int64) has samples of its own; `seed` None takes the strata's
+    centres.
+    """
+    shape = (len(places), side * side)
     if seed is None:
         u = v = torch.full(shape, 0.5, dtype=system.dtype, device=system.device)
     else:
-        place = torch.arange(count, device=system.device)[:, None]
+        place = places.to(system.device)[:, None]
         sample = torch.arange(side * side, device=system.device)
         words = random_words(seed, place, sample)
         u, v = (uniform(word, system.dtype).expand(shape) for word in words[:2])

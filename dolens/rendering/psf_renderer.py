@@ -16,9 +16,10 @@ from dolens.rendering.chief_ray_map import chief_ray_maps
 from dolens.rendering.imaging_system import ImagingSystem
 from dolens.rendering.patches import PatchLayout, node_positions, patches
 from dolens.rendering.plane_blur import PlaneBlur, places_in_texture
-from dolens.rendering.protocol import Renderer, SensorWindow
+from dolens.rendering.protocol import Renderer, SensorWindow, WindowShare
 from dolens.rendering.psf_grid import (
     FieldPointSpreadFunctions,
+    PointShare,
     field_point_spread_functions,
     wave_point_spread_functions,
 )
@@ -143,6 +144,20 @@ class PsfRenderer(Renderer):
         shown = [(window, texture[None]) for window, texture in zip(windows, textures, strict=True)]
         return torch.cat(self._render(lens, scene, shown, seed, values))
 
+    def render_share(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        windows: Sequence[SensorWindow],
+        seed: int,
+        values: Mapping[str, Tensor] | None,
+        share: WindowShare,
+    ) -> Tensor:
+        """Image each texture on its window, one of a larger batch; see `Renderer.render_share`."""
+        shown = [(window, texture[None]) for window, texture in zip(windows, textures, strict=True)]
+        return torch.cat(self._render(lens, scene, shown, seed, values, share))
+
     def _render(
         self,
         lens: Lens,
@@ -150,6 +165,7 @@ class PsfRenderer(Renderer):
         shown: Sequence[tuple[SensorWindow, Tensor]],
         seed: int,
         values: Mapping[str, Tensor] | None,
+        share: WindowShare | None = None,
     ) -> list[Tensor]:
         """Images (B, images, C, height, width) of windows of the sensor and textures that are shown
         to each, all rays traced at once.
@@ -166,8 +182,11 @@ class PsfRenderer(Renderer):
         pupil = differentiable_exit_pupil(system, scene.wavelengths, pupil)
         imaging = ImagingSystem(system, scene, self.sensor, pupil)
         parts = [self.on(window) for window in windows]
-        x, y = (torch.cat(c) for c in zip(*(part.points() for part in parts), strict=True))
-        found = self.point_spread_functions(imaging, seed, (x, y))
+        points, among = self._points_of(windows), None
+        if share is not None:
+            nodes = self.fields[0] * self.fields[1]
+            among = PointShare(share.first * nodes, self._points_of(share.windows))
+        found = self.point_spread_functions(imaging, seed, points, among)
         self._warn_of_loss(found)
         object_points: list[Any] = [None] * len(windows)
         if self.registration == "chief_rays":
@@ -218,6 +237,7 @@ class PsfRenderer(Renderer):
         imaging: ImagingSystem,
         seed: int,
         points: tuple[Tensor, Tensor] | None = None,
+        among: PointShare | None = None,
     ) -> FieldPointSpreadFunctions:
         """The functions at the grid's points, row after row, or at others; differentiable.
 
@@ -225,6 +245,7 @@ class PsfRenderer(Renderer):
             imaging: the lens, its pupil, and the scene with all its depths and wavelengths.
             seed: of the points in the pupil's strata.
             points: x and y on the sensor, mm, each (N,), double precision; None: the grid's.
+            among: all points by which samples are numbered, where these are a part of them.
         """
         imaging = imaging.showing(self.shared(imaging.scene))
         points = points or self.points()
@@ -238,6 +259,7 @@ class PsfRenderer(Renderer):
             self.pupil_samples,
             seed if self.jitter else None,
             centred,
+            among,
         )
         if self.diffraction == "none":
             return found
@@ -265,6 +287,12 @@ class PsfRenderer(Renderer):
     def load_state(self, lens: Lens, state: Mapping[str, Any]) -> "PsfRenderer":
         """The renderer with the pupil that was kept."""
         return replace(self, pupil=ExitPupil(*state["pupil"])) if "pupil" in state else self
+
+    def _points_of(self, windows: Sequence[Sensor]) -> tuple[Tensor, Tensor]:
+        """x and y of the grids on windows, one after the other, each (windows · fields,)."""
+        grids = [self.on(window).points() for window in windows]
+        x, y = (torch.cat(coordinate) for coordinate in zip(*grids, strict=True))
+        return x, y
 
     def points(self) -> tuple[Tensor, Tensor]:
         """x and y of the grid on the sensor, mm, each (fields,), double precision."""

@@ -3,25 +3,31 @@
 import torch
 from torch import Tensor
 
+from dolens.sensor.batch_share import BatchShare
 
-def add_read_noise(image: Tensor, sigma: float, generator: torch.Generator) -> Tensor:
+
+def add_read_noise(
+    image: Tensor, sigma: float, generator: torch.Generator, share: BatchShare | None = None
+) -> Tensor:
     """Add Gaussian read noise.
 
     Args:
         image: linear light, 1 is full scale.
         sigma: standard deviation in units of full scale; 0 returns the image itself.
         generator: the source of randomness, on the image's device.
+        share: of a batch whose images these are (B, ...); None: they are all of it.
 
     Returns:
         The noisy image, not clipped: a real sensor's black level keeps negative noise too.
     """
     if sigma == 0.0:
         return image
-    noise = torch.randn(image.shape, generator=generator, device=image.device, dtype=image.dtype)
-    return image + sigma * noise
+    return image + sigma * _normal(image, generator, share)
 
 
-def add_shot_noise(image: Tensor, full_well: float, generator: torch.Generator) -> Tensor:
+def add_shot_noise(
+    image: Tensor, full_well: float, generator: torch.Generator, share: BatchShare | None = None
+) -> Tensor:
     """Add shot noise, as a Gaussian whose variance follows the light.
 
     A pixel of irradiance s collects a Poisson number of electrons of mean and variance N·s, with
@@ -34,11 +40,12 @@ def add_shot_noise(image: Tensor, full_well: float, generator: torch.Generator) 
         image: linear light, 1 is full scale; below 0 there is no shot noise.
         full_well: N, electrons at full scale.
         generator: the source of randomness, on the image's device.
+        share: of a batch whose images these are (B, ...); None: they are all of it.
 
     Returns:
         The noisy image, not clipped.
     """
-    noise = torch.randn(image.shape, generator=generator, device=image.device, dtype=image.dtype)
+    noise = _normal(image, generator, share)
     return image + shot_noise_deviation(full_well * image) / full_well * noise
 
 
@@ -57,3 +64,10 @@ def shot_noise_deviation(electrons: Tensor) -> Tensor:
     dim = torch.where(electrons < 0.0, 0.0, electrons)
     bright = torch.where(electrons < 1.0, 1.0, electrons).sqrt()
     return torch.where(electrons < 1.0, 0.5 * dim * (3.0 - dim), bright)
+
+
+def _normal(image: Tensor, generator: torch.Generator, share: BatchShare | None) -> Tensor:
+    """Return standard normal numbers of an image's shape."""
+    if share is not None:
+        return share.normal(image, generator)
+    return torch.randn(image.shape, generator=generator, device=image.device, dtype=image.dtype)

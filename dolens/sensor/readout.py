@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.bayer import check_pattern, demosaic, mosaic
 from dolens.sensor.noise import add_read_noise, add_shot_noise
 
@@ -115,7 +116,9 @@ class Readout:
             return self.exposure
         return self.exposure * (self.reference_f_number / self.f_number) ** 2
 
-    def __call__(self, image: Tensor, generator: torch.Generator) -> Tensor:
+    def __call__(
+        self, image: Tensor, generator: torch.Generator, share: BatchShare | None = None
+    ) -> Tensor:
         """Read an image out.
 
         Args:
@@ -123,6 +126,7 @@ class Readout:
                 is 3, red, green, blue.
             generator: of the noise, on the image's device.  Shot noise is drawn first and read
                 noise second, each for every value of the raw image, and neither where it is off.
+            share: of a batch whose images these are (B, ...); None: they are all of it.
 
         Returns:
             (..., C, H, W), with a pattern (..., 1, H, W): the raw image, 1 at full scale, black
@@ -136,8 +140,8 @@ class Readout:
         if self.pattern is not None:
             raw = mosaic(raw, self.pattern)
         if self.full_well is not None:
-            raw = add_shot_noise(raw, self.full_well, generator)
-        raw = add_read_noise(raw, self.read_noise, generator)
+            raw = add_shot_noise(raw, self.full_well, generator, share)
+        raw = add_read_noise(raw, self.read_noise, generator, share)
         if self.bits is None and not self.saturate:
             return raw
         black, gain = self.black_level, 1.0 - self.black_level

@@ -1,5 +1,7 @@
 """Validation photographs as the camera sees and restores them, over the training."""
 
+from typing import NamedTuple
+
 import lightning
 import numpy as np
 import torch
@@ -12,6 +14,7 @@ from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.reconstruction import evaluating
 from dolens.experiments.loggers.protocol import TakesPictures
 from dolens.reconstruction import psnr_db
+from dolens.reconstruction.processes import gathered
 from dolens.sensor.colour import linear_to_srgb
 from dolens.stages import stage
 
@@ -42,13 +45,13 @@ class ValidationPictures(lightning.Callback):
                 )
         self.photographs, self.times = photographs, times
         self._crops: dict[int, str] = {}
-        self._seen = 0
+        self._found: list[_Picture] = []
 
     def on_validation_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Choose the crops, if it is time for pictures."""
-        self._crops, self._seen = {}, 0
+        self._crops, self._found = {}, []
         find = getattr(trainer.datamodule, "evaluation_photographs", None)
         kept = any(isinstance(entry, TakesPictures) for entry in trainer.loggers)
         if find is None or not kept or trainer.sanity_checking or not self._due(trainer):
@@ -82,31 +85,55 @@ class ValidationPictures(lightning.Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Log the pictures of the chosen crops in this batch."""
-        chosen = {n: self._crops.get(self._seen + n) for n in range(len(batch))}
-        self._seen += len(batch)
-        if not isinstance(pl_module, Camera) or not any(chosen.values()):
+        """Make the pictures of the chosen crops in this batch."""
+        if not isinstance(pl_module, Camera) or not self._crops:
+            return
+        number = pl_module.evaluation_batch("val", batch_idx)
+        first = number * getattr(trainer.datamodule, "batch_size", len(batch))
+        chosen = {n: self._crops.get(first + n) for n in range(len(batch))}
+        if not any(chosen.values()):
             return
         with stage("pictures"), evaluating(pl_module.network):
-            taken, functions = pl_module.take(pl_module.variables(), batch, "val", batch_idx)
+            taken, functions = pl_module.take(pl_module.variables(), batch, "val", number)
             restored = pl_module.restore(taken, functions).clamp(0.0, 1.0).float().cpu()
         truth, raw = taken.truth.float().cpu(), linear_to_srgb(taken.raw).float().cpu()
         for crop, photograph in chosen.items():
             for view, label in enumerate(pl_module.views.labels()):
                 if photograph is not None:
                     images = (truth[crop, view], raw[crop, view], restored[crop, view])
-                    _log(trainer, f"{shown_name(photograph)}/{label}", *images)
+                    name = f"{shown_name(photograph)}/{label}"
+                    self._found.append(_picture(first + crop, name, *images))
+
+    def on_validation_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Log the pictures, those of other processes too."""
+        if not self._crops:
+            return
+        found = {(p.crop, p.name): p for part in gathered(self._found) for p in part}
+        self._found = []
+        for picture in sorted(found.values(), key=lambda p: p.crop):
+            for entry in trainer.loggers:
+                if isinstance(entry, TakesPictures):
+                    entry.log_picture(
+                        picture.name, picture.pixels, trainer.global_step, picture.caption
+                    )
 
 
-def _log(
-    trainer: lightning.Trainer, name: str, truth: Tensor, raw: Tensor, restored: Tensor
-) -> None:
+class _Picture(NamedTuple):
+    """A picture of a crop, by its number among those of validation."""
+
+    crop: int
+    name: str
+    pixels: np.ndarray
+    caption: str
+
+
+def _picture(crop: int, name: str, truth: Tensor, raw: Tensor, restored: Tensor) -> _Picture:
     of_sensor, of_network = (float(psnr_db(i[None], truth[None])) for i in (raw, restored))
     texts = ("truth", f"sensor {of_sensor:.2f} dB", f"restored {of_network:.2f} dB")
-    picture = side_by_side(dict(zip(texts, (truth, raw, restored), strict=True)))
-    for entry in trainer.loggers:
-        if isinstance(entry, TakesPictures):
-            entry.log_picture(name, picture, trainer.global_step, ", ".join(texts[1:]))
+    pixels = side_by_side(dict(zip(texts, (truth, raw, restored), strict=True)))
+    return _Picture(crop, name, pixels, ", ".join(texts[1:]))
 
 
 def side_by_side(images: dict[str, Tensor]) -> np.ndarray:

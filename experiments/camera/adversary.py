@@ -1,9 +1,12 @@
 """Discriminators that train beside the network."""
 
+from itertools import chain
+
 import torch
 from torch import Tensor, nn
 
 from dolens.reconstruction import RelativisticDiscriminators
+from dolens.reconstruction.processes import average_gradients, mean_over_processes
 
 
 class Adversary(nn.Module):
@@ -24,6 +27,10 @@ class Adversary(nn.Module):
             discriminators.parameters(), lr=learning_rate, betas=(0.5, 0.99)
         )
 
+    def names(self) -> list[str]:
+        """Return the names of all parameters and buffers."""
+        return [name for name, _ in chain(self.named_parameters(), self.named_buffers())]
+
     def forward(self, real: Tensor, fake: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Make one step of the discriminators, and return their term of the network's loss.
 
@@ -37,7 +44,9 @@ class Adversary(nn.Module):
         own = self.discriminators.discriminator_loss(real, fake)
         self.optimizer.zero_grad()
         own.backward()
+        average_gradients(self.discriminators)
         self.optimizer.step()
         term = self.discriminators.generator_loss(real, fake)
-        numbers = {"discriminator": own.detach(), "adversarial": term.detach()}
+        both = mean_over_processes(torch.stack((own.detach(), term.detach())))
+        numbers = {"discriminator": both[0], "adversarial": both[1]}
         return self.discriminators.weight * term, numbers

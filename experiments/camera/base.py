@@ -1,6 +1,7 @@
 """A camera: a lens, the way it looks at a scene, and the network that restores its images."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
@@ -18,6 +19,8 @@ from dolens.experiments.camera.views.base import Comparison, Imaging, Views
 from dolens.experiments.experiment import Experiment
 from dolens.optics.lens import Lens
 from dolens.optimize.variables import DesignVariables
+from dolens.reconstruction.processes import processes
+from dolens.sensor.batch_share import BatchShare
 
 
 class Camera(Experiment):
@@ -67,11 +70,18 @@ class Camera(Experiment):
         """
         field = None if taken.field is None else taken.field.flatten(0, 1)
         restored = self.network(taken.raw.flatten(0, 1), functions, field)
+        # Under autocast a network may end in half precision, in which nothing is to be compared.
+        restored = restored.to(self.network.dtype)
         return restored.unflatten(0, taken.raw.shape[:2])
 
-    def loss_over_views(self, restored: Tensor, truth: Tensor) -> dict[str, Tensor]:
-        """Return the loss and its terms for images (B, V, 3, H, W)."""
-        return loss_over_views(self.loss, restored, truth, self.view_norm)
+    def loss_over_views(
+        self, restored: Tensor, truth: Tensor, shared: bool = False
+    ) -> dict[str, Tensor]:
+        """Return the loss and its terms for images (B, V, 3, H, W).
+
+        Where they are shared, the loss is that of all processes' images together.
+        """
+        return loss_over_views(self.loss, restored, truth, self.view_norm, shared)
 
     def take(
         self,
@@ -80,6 +90,7 @@ class Camera(Experiment):
         stage: str,
         index: int,
         reference: str | None = None,
+        share: BatchShare | None = None,
     ) -> tuple[Views, Tensor | None]:
         """Image textures, and find point spread functions where the network asks for them.
 
@@ -91,10 +102,38 @@ class Camera(Experiment):
             stage: `train`, `val` or `test`.
             index: of the batch; with the stage and the seed it decides all random numbers.
             reference: the renderer that makes the images; None: the camera's own.
+            share: of a larger batch, whose random numbers these textures have their part of.
         """
-        with torch.autocast(self.device.type, enabled=False):
-            taken = self.views.take(self.lens, values, batch, stage, index, reference)
+        with self.exact():
+            images = (self.lens, values, batch, stage, index, reference)
+            # Views that know no shares are asked for none.
+            taken = self.views.take(*images) if share is None else self.views.take(*images, share)
             return taken, self.functions(values)
+
+    def share_of_step(self, count: int, batch_idx: int) -> BatchShare | None:
+        """Return which images of a step's batch these are: of all processes, and of all batches
+        whose gradients are accumulated; None where they are all of it.
+        """
+        parts = self.trainer.accumulate_grad_batches
+        total = parts * self.trainer.world_size * count
+        number = batch_idx % parts * self.trainer.world_size + self.trainer.global_rank
+        return None if total == count else BatchShare(number * count, total)
+
+    def evaluation_batch(self, stage: str, batch_idx: int) -> int:
+        """Return the number of an evaluation batch among those of all processes.
+
+        Args:
+            stage: `val` or `test`.
+            batch_idx: its number among those of this process.
+        """
+        if processes() == 1:
+            return batch_idx
+        split = {"val": "validation", "test": "test"}[stage]
+        return self.trainer.datamodule.evaluation_batches(split)[batch_idx]
+
+    def exact(self) -> AbstractContextManager:
+        """Compute without autocast within: optics and measures are never in half precision."""
+        return torch.autocast(self.device.type, enabled=False)
 
     def functions(self, values: Mapping[str, Tensor]) -> Tensor | None:
         """Return point spread functions (views, 3, K, K); None if the network asks for none."""

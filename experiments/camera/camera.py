@@ -3,9 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import lightning
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.experiments.camera.adversary import Adversary
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
@@ -16,11 +18,13 @@ from dolens.experiments.camera.figures import camera_figures
 from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.experiments.camera.photograph_scores import PhotographScores
+from dolens.experiments.camera.reconstruction import compile_network
 from dolens.experiments.camera.settings import Reconstruction, Training
 from dolens.experiments.camera.views.base import Imaging
 from dolens.experiments.experiment import Figures
 from dolens.optics.lens import Lens
 from dolens.reconstruction import psnr_db
+from dolens.reconstruction.processes import mean_over_processes, processes
 from dolens.stages import stage as named_stage
 
 
@@ -75,11 +79,17 @@ class CameraModule(Camera):
         self.learning_rates = rates = training.learning_rates
         discriminator, rate = reconstruction.discriminator, rates.discriminator or rates.network
         self.adversary = Adversary(discriminator, rate) if discriminator else None
+        self.compiled = reconstruction.compiled
         self.costs = StepCosts()
         self.evaluation = Evaluation(miscalibrations)
         self.test_scores: dict[str, PhotographScores] = {}
         self._looked_in_epoch: int | None = None
         self._shown: dict[str, Tensor] = {}  # stage → its first crop, for figures
+        # Not for Lightning's strategy to average: discriminators have an optimizer of their own.
+        others = self.adversary.names() if self.adversary else []
+        self._ddp_params_and_buffers_to_ignore = [f"adversary.{name}" for name in others]
+        if not len(self.variables):
+            self._ddp_params_and_buffers_to_ignore.append("variables.scaled")
         views.check(lens)
         self.lens_steps = LensSteps(
             self.lens,
@@ -91,7 +101,29 @@ class CameraModule(Camera):
         views.expose(self.lens)
         check_miscalibrations(self.evaluation.miscalibrations, lens)
 
+    def check_trainer(self, trainer: lightning.Trainer) -> None:
+        """Refuse what the data or the discriminators cannot share; see `Experiment.check_trainer`.
+
+        Raises:
+            InputError: the line names the setting.
+        """
+        batches = trainer.accumulate_grad_batches
+        if batches > 1 and self.adversary is not None:
+            raise InputError(
+                f"trainer.accumulate_grad_batches: {batches}; allowed with a discriminator: 1, as "
+                "it makes a step for every batch"
+            )
+
     # ---------------------------------------------------------------- training
+
+    def setup(self, stage: str) -> None:
+        """Compile the network that is to be trained, where that is asked for.
+
+        Raises:
+            InputError: torch cannot compile on this machine.
+        """
+        if self.compiled and stage == "fit":
+            compile_network(self.network, self.device)
 
     def configure_optimizers(self) -> Any:
         """Return one optimizer, with a group for the network and one for the lens's variables."""
@@ -126,8 +158,14 @@ class CameraModule(Camera):
         epoch's first step comes here instead.
         """
         self._looked_in_epoch = self.current_epoch
-        with named_stage("looking at the lens"):
-            self.views.prepare(self.lens, self.variables(), self.comparison(), self._photographs())
+        if self.trainer.is_global_zero:
+            with named_stage("looking at the lens"):
+                photographs = self._photographs()
+                self.views.prepare(self.lens, self.variables(), self.comparison(), photographs)
+        if processes() > 1:  # plans are made by the clock too: what one process found serves all
+            found = self.trainer.strategy.broadcast(self.views.state())
+            if not self.trainer.is_global_zero:
+                self.views.load_state(self.lens, found)
 
     def _photographs(self) -> Tensor | None:
         """Return photographs on which a renderer chooses its model, if the data have some."""
@@ -143,18 +181,20 @@ class CameraModule(Camera):
     def training_step(self, batch: Tensor, batch_idx: int) -> Tensor:
         """Render, restore, compare; `batch` holds textures (B, 3, h, w) in linear light."""
         with self.costs.making_images():
-            values = self.variables()
-            taken, functions = self.take(values, batch, "train", self.global_step)
+            values, share = self.variables(), self.share_of_step(len(batch), batch_idx)
+            taken, functions = self.take(values, batch, "train", self.global_step, share=share)
         self.costs.watch_backward(taken.raw)
         restored = self.restore(taken, functions)
         truth = taken.truth.to(restored.dtype)
-        terms = self.loss_over_views(restored, truth)
-        penalty, operands = self.lens_steps.penalty(values)
+        terms = self.loss_over_views(restored, truth, shared=True)
+        with self.exact():
+            penalty, operands = self.lens_steps.penalty(values)
         total = terms["total"]
         if not self.lens_steps.apart:
             total = total + penalty.to(restored.dtype)
         with torch.no_grad():
             psnr = psnr_db(restored.flatten(0, 1), truth.flatten(0, 1)).mean()
+            psnr = mean_over_processes(psnr)
         self.log("train/loss", terms["total"], prog_bar=True)
         self.log("train/psnr_db", psnr, prog_bar=True)
         for name, value in terms.items():
@@ -207,7 +247,7 @@ class CameraModule(Camera):
     def _evaluate(self, batch: Tensor, stage: str, index: int) -> None:
         if index == 0:
             self._shown[stage] = batch[:1].clone()
-        self.evaluation.measure(self, batch, stage, index)
+        self.evaluation.measure(self, batch, stage, self.evaluation_batch(stage, index))
 
     def on_validation_epoch_end(self) -> None:
         """Log the means."""

@@ -14,8 +14,12 @@ from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
 from dolens.experiments.camera.views.base import Views, seed_of
 from dolens.reconstruction import psnr_db, structural_similarity
+from dolens.reconstruction.processes import gathered
 from dolens.sensor.colour import linear_to_srgb
 from dolens.stages import stage as named_stage
+
+# Stage → metric → number of a batch → scores (B, V).
+Rows = dict[str, dict[str, dict[int, Tensor]]]
 
 
 class Evaluation:
@@ -31,7 +35,7 @@ class Evaluation:
 
     def __init__(self, miscalibrations: Mapping[str, Miscalibration] | None = None) -> None:
         self.miscalibrations = dict(miscalibrations or {})
-        self._rows: dict[str, dict[str, list[Tensor]]] = {}
+        self._rows: Rows = {}
         self._seconds: dict[str, list[float]] = {}
 
     @torch.no_grad()
@@ -45,7 +49,7 @@ class Evaluation:
             if reference is not None:
                 self._seconds.setdefault(reference, []).append(time.perf_counter() - started)
             name = stage if reference is None else f"{stage}_{reference}"
-            self._add(name, _row(camera, taken, camera.restore(taken, functions)))
+            self._add(name, index, _row(camera, taken, camera.restore(taken, functions)))
             if reference is None and stage == "test" and functions is not None:
                 self._miscalibrated(camera, values, taken, functions, index)
 
@@ -60,27 +64,35 @@ class Evaluation:
         for kind, calibration in self.miscalibrations.items():
             generator = torch.Generator().manual_seed(seed_of(0, "test", index))
             with named_stage(f"calibration {kind}"):
-                wrong = calibration.functions(camera.views, camera.lens, values, exact, generator)
+                with camera.exact():
+                    wrong = calibration.functions(
+                        camera.views, camera.lens, values, exact, generator
+                    )
                 restored = camera.restore(taken, wrong).clamp(0.0, 1.0)
             row = {f"psnr_db_miscalibrated/{kind}": _compared(psnr_db, restored, taken.truth)}
-            self._add("test", row)
+            self._add("test", index, row)
 
-    def _add(self, stage: str, row: Mapping[str, Tensor]) -> None:
+    def _add(self, stage: str, index: int, row: Mapping[str, Tensor]) -> None:
         kept = self._rows.setdefault(stage, {})
         for name, values in row.items():
-            kept.setdefault(name, []).append(values)
+            kept.setdefault(name, {})[index] = values.cpu()
 
     def scores(self, trainer: object, labels: Sequence[str]) -> dict[str, PhotographScores]:
         """Return the scores by photograph of every stage that was measured, and forget their rows.
+
+        Processes that measured batches of their own have all scores in the end.
 
         Args:
             trainer: whose data module may know the photographs.
             labels: of the views.
         """
-        rows, self._rows = self._rows, {}
+        rows, self._rows = together(self._rows), {}
         found: dict[str, PhotographScores] = {}
         for stage, columns in rows.items():
-            crops = {name: torch.cat(values).float().cpu() for name, values in columns.items()}
+            crops = {
+                name: torch.cat([values[number] for number in sorted(values)]).float()
+                for name, values in columns.items()
+            }
             of_crops = _photographs(trainer, stage.partition("_")[0], len(crops["psnr_db"]))
             found[stage] = scores_by_photograph(crops, of_crops, labels)
         return found
@@ -127,12 +139,23 @@ def _photographs(trainer: object, stage: str, count: int) -> Sequence[str]:
 def _row(camera: Camera, taken: Views, restored: Tensor) -> dict[str, Tensor]:
     """Return scores (B, V) by name."""
     restored, truth = restored.clamp(0.0, 1.0), taken.truth
-    loss = camera.loss_over_views(restored, truth.to(restored.dtype))
-    row = {"loss": loss["total"].expand(truth.shape[:2])}
-    for name, image in (("", restored), ("raw_", linear_to_srgb(taken.raw))):
-        for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
-            row[f"{name}{metric}"] = _compared(measure, image, truth)
+    with camera.exact():
+        loss = camera.loss_over_views(restored, truth.to(restored.dtype))
+        row = {"loss": loss["total"].expand(truth.shape[:2])}
+        for name, image in (("", restored), ("raw_", linear_to_srgb(taken.raw))):
+            for metric, measure in (("psnr_db", psnr_db), ("ssim", structural_similarity)):
+                row[f"{name}{metric}"] = _compared(measure, image, truth)
     return row
+
+
+def together(rows: Rows) -> Rows:
+    """Return the rows that all processes have measured."""
+    found: Rows = {}
+    for part in gathered(rows):
+        for stage, columns in part.items():
+            for name, values in columns.items():
+                found.setdefault(stage, {}).setdefault(name, {}).update(values)
+    return found
 
 
 def _compared(measure: object, image: Tensor, truth: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError, one_line
 from dolens.reconstruction import Restoration
+from dolens.reconstruction.processes import mean_over_processes
 from dolens.sensor.colour import linear_to_srgb
 
 # Of restored and true images (B, 3, H, W), display-encoded, to a number or a mapping with `total`.
@@ -81,7 +82,9 @@ def loss_terms(loss: Loss, restored: Tensor, truth: Tensor) -> dict[str, Tensor]
     return {name: torch.as_tensor(value) for name, value in terms.items()}
 
 
-def loss_over_views(loss: Loss, restored: Tensor, truth: Tensor, norm: float) -> dict[str, Tensor]:
+def loss_over_views(
+    loss: Loss, restored: Tensor, truth: Tensor, norm: float, shared: bool = False
+) -> dict[str, Tensor]:
     """Return a loss and its terms for images of several views.
 
     Terms are means over the V views.  The total is the power mean (Σ L_v^p / V)^(1/p) of the views'
@@ -93,12 +96,17 @@ def loss_over_views(loss: Loss, restored: Tensor, truth: Tensor, norm: float) ->
         restored: (B, V, 3, H, W), display-encoded.
         truth: of the same shape.
         norm: p, at least 1.
+        shared: whether the images are one process's equal part of a batch, of which the loss is to
+            be; all processes must call this.
 
     Raises:
         InputError: the loss gives no total, or a negative one for p > 1.
     """
     rows = [loss_terms(loss, restored[:, v], truth[:, v]) for v in range(restored.shape[1])]
     terms = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+    if shared:
+        # The power mean is not linear: the views' losses are averaged before it.
+        terms = {name: mean_over_processes(values) for name, values in terms.items()}
     totals = terms["total"]
     largest = totals.detach().amax().clamp(min=torch.finfo(restored.dtype).tiny)
     negative = (totals.detach() < 0.0).any()
@@ -147,6 +155,26 @@ def check_reconstruction(
             )
         truth = torch.zeros_like(restored)
         _tried("loss", _name(loss), raw, lambda: loss_terms(loss, restored, truth))
+
+
+def compile_network(network: nn.Module, device: torch.device) -> None:
+    """Let `torch.compile` make a network, in its place; the names of its weights stay.
+
+    Args:
+        network: compiled when it is called next, in training and in evaluation mode by itself.
+        device: that it is on.
+
+    Raises:
+        InputError: torch cannot compile here, as without a C++ compiler.
+    """
+    try:
+        torch.compile(lambda number: 2.0 * number)(torch.ones(1, device=device))
+    except Exception as error:
+        raise InputError(
+            f"compile_network: torch.compile does not work here ({one_line(error)[:200]}); "
+            "allowed: false"
+        ) from error
+    network.compile()
 
 
 @contextmanager

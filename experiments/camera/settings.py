@@ -23,12 +23,16 @@ class Reconstruction:
             mapping with the number as `total`.
         view_norm: p of the power mean that joins the views' losses; see `loss_over_views`.
         discriminator: judges the restored images besides; None for no adversarial term.
+        compiled: whether `torch.compile` makes the network that is trained; its weights keep their
+            names.
     """
 
     network: nn.Module
     loss: Loss
     view_norm: float
     discriminator: RelativisticDiscriminators | None
+    # Run folders of old lack it.
+    compiled: bool = False
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class CropDataModule(lightning.LightningDataModule):
     Args:
         crop_size: texels of the crop, one number for a square or (height, width).
         margin: texels added on each side, so that a renderer's blur finds no edge.
-        batch_size: crops in a batch.
+        batch_size: crops in a batch, of all processes together.
         steps_per_epoch: batches in a training epoch; None: as many as `iterations_per_photograph`
             asks for.
         iterations_per_photograph: crops of each training photograph in an epoch, where
@@ -156,19 +156,26 @@ class CropDataModule(lightning.LightningDataModule):
         """Return batches of the present training epoch, from the next sample on.
 
         Raises:
-            InputError: the trainer runs several processes, or overfits batches: both would
-                replace the sampler.
+            InputError: the processes cannot have equal parts of a batch, an epoch ends within a
+                step, or the trainer overfits batches, which would replace the sampler.
         """
         trainer = self.trainer
-        if trainer is not None and trainer.world_size > 1:
+        rank, processes = self._place()
+        if self.batch_size % processes:
             raise InputError(
-                f"trainer.devices: {trainer.world_size} processes; allowed: 1, samples are "
-                "numbered within one process"
+                f"data.batch_size: {self.batch_size} cannot be shared equally by {processes} "
+                f"processes; allowed: multiples of {processes}"
             )
         if trainer is not None and trainer.overfit_batches:
             raise InputError(
                 f"trainer.overfit_batches: {trainer.overfit_batches}; allowed: 0, crops do not "
                 "repeat; use few photographs and trainer.limit_train_batches"
+            )
+        batches = 1 if trainer is None else trainer.accumulate_grad_batches
+        if self.steps_per_epoch % batches:
+            raise InputError(
+                f"trainer.accumulate_grad_batches: {batches} does not divide the batches of an "
+                f"epoch, {self.steps_per_epoch} (data.steps_per_epoch)"
             )
         dataset = TrainingCrops(
             self.photographs("train"),
@@ -178,10 +185,21 @@ class CropDataModule(lightning.LightningDataModule):
             flip_horizontal=self.flip_horizontal,
             flip_vertical=self.flip_vertical,
         )
-        sampler = ResumableSampler(self.samples_per_epoch, self.first_sample)
-        return ResumableLoader(
-            dataset, sampler=sampler, waiting=self.waiting, **self._loader_arguments()
+        sampler = ResumableSampler(
+            self.samples_per_epoch, self.first_sample, self.batch_size, rank, processes
         )
+        return ResumableLoader(
+            dataset,
+            sampler=sampler,
+            batch_size=self.batch_size // processes,
+            waiting=self.waiting,
+            **self._loader_arguments(),
+        )
+
+    def _place(self) -> tuple[int, int]:
+        """Return the number of this process, and how many share the work."""
+        trainer = self.trainer
+        return (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
 
     def val_dataloader(self) -> DataLoader:
         """Return the validation crops, always the same."""
@@ -204,6 +222,29 @@ class CropDataModule(lightning.LightningDataModule):
         first = progress.total.processed * self.batch_size
         numbers = range(first, first + self.batch_size)
         return [crops.photographs[crops.photograph_number(number)].name for number in numbers]
+
+    def evaluation_batches(self, split: Split) -> list[int]:
+        """Return the numbers of the evaluation batches that are this process's, in order.
+
+        Batches go around among the processes.  One for which none is left does one of the others'
+        again, so that all of them evaluate.
+
+        Raises:
+            InputError: several processes, and a trainer that evaluates a share of the batches.
+        """
+        count = -(-len(self._evaluation_crops(split)) // self.batch_size)
+        rank, processes = self._place()
+        if processes == 1:
+            return list(range(count))
+        key = {"validation": "limit_val_batches"}.get(split, "limit_test_batches")
+        limit = getattr(self.trainer, key)
+        if isinstance(limit, float) and 0.0 < limit < 1.0:
+            raise InputError(
+                f"trainer.{key}: {limit:g}; allowed with several processes: a number of batches"
+            )
+        if isinstance(limit, int) and limit:
+            count = min(count, limit)
+        return list(range(rank, count, processes)) or [rank % count]
 
     def most_detailed(self) -> Tensor:
         """Return the colours, (1, 3, height, width), of the validation crop, among several, whose
@@ -248,11 +289,18 @@ class CropDataModule(lightning.LightningDataModule):
 
     def _evaluation_loader(self, split: Split) -> DataLoader:
         dataset = self._evaluation_crops(split)
-        return CropLoader(dataset, shuffle=False, **self._loader_arguments())
+        if self._place()[1] == 1:
+            size = self.batch_size
+            return CropLoader(dataset, size, shuffle=False, **self._loader_arguments())
+        size, count = self.batch_size, len(dataset)
+        batches = [
+            list(range(n * size, min(n * size + size, count)))
+            for n in self.evaluation_batches(split)
+        ]
+        return CropLoader(dataset, batch_sampler=batches, **self._loader_arguments())
 
     def _loader_arguments(self) -> dict[str, Any]:
         return {
-            "batch_size": self.batch_size,
             "num_workers": self.num_workers,
             # Workers stay for the next epoch, with what they have decoded.
             "persistent_workers": self.num_workers > 0,

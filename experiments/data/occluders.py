@@ -12,6 +12,7 @@ def with_occluders(
     farthest: float,
     count: int,
     generator: torch.Generator,
+    before: int = 0,
 ) -> Tensor:
     """Give photographs a depth: a slanted background, and ellipses in front of it.
 
@@ -25,6 +26,7 @@ def with_occluders(
         farthest: mm.
         count: ellipses in each image.
         generator: of the random numbers, on the CPU.
+        before: photographs whose random numbers come before: of a batch, of which these are a part.
 
     Returns:
         (B, C + 1, H, W), as `LayeredScene` takes them: the depth is the last channel.
@@ -37,6 +39,8 @@ def with_occluders(
     if count < 0:
         raise InputError(f"occluders: {count} of them; allowed: 0 or more")
     near, far = 1.0 / nearest, 1.0 / farthest
+    for _ in range(before):
+        _drawn(count, generator)
     return torch.stack([_scene(image, near, far, count, generator) for image in textures])
 
 
@@ -48,12 +52,11 @@ def _scene(
     row = torch.linspace(-1.0, 1.0, height, **options)[:, None]
     column = torch.linspace(-1.0, 1.0, width, **options)
     middle = 0.5 * (near + far)
-    angle, tilt = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    (angle, tilt), drawn = _drawn(count, generator)
     turn = torch.tensor(2.0 * torch.pi * angle, **options)
     slope = (row * turn.sin() + column * turn.cos()) / 2.0**0.5
     vergence = far + (middle - far) * (0.5 + 0.5 * tilt * slope)
     light = image
-    drawn = torch.rand(count, 7, generator=generator, dtype=torch.float64)
     # From far to near: the later one hides the earlier one.
     for shares in drawn[drawn[:, 0].argsort()].tolist():
         place, down, across, long, short, shift_down, shift_across = shares
@@ -69,3 +72,9 @@ def _scene(
         light = torch.where(inside, image.roll(shifts, (-2, -1)), light)
         vergence = torch.where(inside, middle + (near - middle) * place, vergence)
     return torch.cat((light, (1.0 / vergence)[None].to(image)))
+
+
+def _drawn(count: int, generator: torch.Generator) -> tuple[list[float], Tensor]:
+    """Draw the random numbers of one photograph: of its background, and of its ellipses."""
+    background = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    return background, torch.rand(count, 7, generator=generator, dtype=torch.float64)

@@ -22,23 +22,39 @@ class ResumableSampler(Sampler[int]):
     Args:
         samples_per_epoch: the length of a whole epoch, whatever is left of the present one.
         first_sample: gives (number of the first sample to yield, how many remain in the epoch).
+        batch_size: samples of a batch, of which each process has an equal part; it is needed where
+            there are several.
+        rank: number of this process.
+        processes: that share each batch.
 
     Raises:
         InputError: `samples_per_epoch` below 1.
     """
 
-    def __init__(self, samples_per_epoch: int, first_sample: Callable[[], tuple[int, int]]) -> None:
+    def __init__(
+        self,
+        samples_per_epoch: int,
+        first_sample: Callable[[], tuple[int, int]],
+        batch_size: int = 1,
+        rank: int = 0,
+        processes: int = 1,
+    ) -> None:
         if samples_per_epoch < 1:
             raise InputError(f"samples of an epoch: {samples_per_epoch}; allowed: 1 or more")
+        self.batch_size, self.rank, self.processes = batch_size, rank, processes
         self.samples_per_epoch = samples_per_epoch
         self.first_sample = first_sample
 
     def __len__(self) -> int:
-        return self.samples_per_epoch
+        return self.samples_per_epoch // self.processes
 
     def __iter__(self) -> Iterator[int]:
         first, remaining = self.first_sample()
-        return iter(range(first, first + remaining))
+        if self.processes == 1:
+            return iter(range(first, first + remaining))
+        part = self.batch_size // self.processes
+        begins = range(first + self.rank * part, first + remaining, self.batch_size)
+        return (begin + number for begin in begins for number in range(part))
 
 
 class ResumableLoader(CropLoader):
@@ -53,9 +69,11 @@ class ResumableLoader(CropLoader):
         """Return the settings that the sample numbers and their crops depend on, as plain
         numbers.
         """
+        sampler = cast(ResumableSampler, self.sampler)
         return {
-            "batch_size": cast(int, self.batch_size),
-            "samples_per_epoch": cast(ResumableSampler, self.sampler).samples_per_epoch,
+            # Of all processes: a run may go on with another number of them.
+            "batch_size": cast(int, self.batch_size) * sampler.processes,
+            "samples_per_epoch": sampler.samples_per_epoch,
             "seed": cast(TrainingCrops, self.dataset).seed,
         }
 

@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from dolens.errors import InputError, one_line
 from dolens.experiments.running.failed_parts import reason_of
 from dolens.experiments.running.machine_faults import machine_fault
+from dolens.experiments.running.processes import own_arguments, report_failure
 from dolens.experiments.running.renaming import explained
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
@@ -38,11 +39,12 @@ def main(arguments: Sequence[str], program: str) -> None:
     """
     # Let errors through to here: a user's mistake is one line, a fault keeps its whole traceback.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    sys.argv = [program, *arguments]
     use_working_folder()
     start = hydra.main(str(packaged_configuration()), "train", version_base="1.3")(job)
     try:
-        start()
+        with own_arguments(arguments) as own:
+            sys.argv = [program, *own]
+            start()
     except HydraException as error:
         sys.exit(f"error: {one_line(explained(error, arguments))}")
     except (InputError, OmegaConfBaseException) as error:
@@ -67,12 +69,15 @@ def job(cfg: DictConfig) -> float | tuple[float, ...]:
     except TrialPruned as pruned:
         logger.info("Pruned: %s", pruned)
     except (InputError, HydraException, OmegaConfBaseException) as error:
+        told = report_failure(error.__cause__ or error)
         line = reason_of(error)
         _record(line, to_all=swept)
         if not swept:
             # Exiting here, within the job, keeps Hydra from adding lines of its own.
-            sys.exit(f"error: {line}")
+            sys.exit(1 if told else f"error: {line}")
     except Exception as error:
+        if report_failure(error):
+            sys.exit(1)
         fault = machine_fault(error)
         line = fault or one_line(f"{type(error).__name__}: {error}")
         _record(line, to_all=swept, with_traceback=True)

@@ -3,8 +3,8 @@
 from omegaconf import OmegaConf
 
 _RESOLVERS = {
-    # The steps of a whole training.
-    "total_steps": lambda epochs, steps: epochs * steps,
+    # The steps of a whole training, each of some batches.
+    "total_steps": lambda epochs, batches, batches_of_step=1: epochs * batches // batches_of_step,
     # The iterations of all stages together.
     "iterations": lambda stages: sum(stage["iterations"] for stage in stages),
     "count": len,

@@ -33,7 +33,9 @@ from dolens.experiments.running.command_line import command
 from dolens.experiments.running.compared_settings import all_settings, choices_of
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.extensions import import_extensions
+from dolens.experiments.running.made_trainer import made_trainer
 from dolens.experiments.running.objectives import returned
+from dolens.experiments.running.processes import all_processes
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_files import INFO, METRICS, RESOLVED, write_json
 from dolens.experiments.running.run_folder import (
@@ -68,7 +70,6 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     folder = Path(HydraConfig.get().runtime.output_dir)
     cfg = checked(cfg)
     settings = RunSettings.of(cfg)
-    refuse_subprocess_ddp_in_sweep(settings)
     import_extensions(settings.extensions)
     written = settings_of(cfg)  # before Hydra resolves in place what it instantiates
     set_threads(settings.threads)
@@ -93,7 +94,9 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     callbacks += [starvation, *trial_callbacks()]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
-    trainer: lightning.Trainer = instantiate(settings.trainer, callbacks=callbacks, logger=loggers)
+    trainer = made_trainer(settings.trainer, callbacks, loggers)
+    refuse_processes_in_sweep(trainer)
+    module.check_trainer(trainer)
     if not settings.trainer.get("plugins"):  # which may bring a writer of their own
         trainer.strategy.checkpoint_io = WholeCheckpoints()
     (folder / "lens").mkdir(exist_ok=True)
@@ -106,15 +109,16 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     write_json(folder / INFO, {**info, "status": "running"})
     status = "failed"
     try:
-        if settings.train:
-            trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
-        metrics: dict[str, Any] = dict(trainer.callback_metrics)
-        if settings.test:
-            # The weights as the last step left them: every run is judged after the same work.
-            # Where nothing was trained, they are the checkpoint's.
-            trained = None if settings.train else checkpoint
-            trainer.test(module, data, ckpt_path=trained, weights_only=True, verbose=False)
-            metrics.update(trainer.callback_metrics)
+        with all_processes(trainer, settings.threads):
+            if settings.train:
+                trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
+            metrics: dict[str, Any] = dict(trainer.callback_metrics)
+            if settings.test:
+                # The weights as the last step left them: every run is judged after the same work.
+                # Where nothing was trained, they are the checkpoint's.
+                trained = None if settings.train else checkpoint
+                trainer.test(module, data, ckpt_path=trained, weights_only=True, verbose=False)
+                metrics.update(trainer.callback_metrics)
         status = "finished"
     except TrialPruned as pruned:
         status, info["reason"] = "pruned", str(pruned)
@@ -130,7 +134,8 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
             write_json(folder / INFO, {**info, "status": status})
         with logged_if(status != "finished"):
             save_lens(module.lens, folder / "lens" / "final.yaml")
-    metrics.update(summary_of(module))
+    if trainer.is_global_zero:
+        metrics.update(summary_of(module))
     metrics.update(starvation.numbers())
     metrics["cost/wall_s"] = time.perf_counter() - started
     metrics["cost/peak_memory_mb"] = peak_memory_mb(trainer.strategy.root_device)
@@ -224,11 +229,17 @@ def summary_of(module: Experiment) -> dict[str, float]:
         return {}
 
 
-def refuse_subprocess_ddp_in_sweep(settings: RunSettings) -> None:
-    """Ranks started as subprocesses would train different samples of a sweep; refuse."""
+def refuse_processes_in_sweep(trainer: lightning.Trainer) -> None:
+    """Processes that one run starts would each train another sample of a sweep; refuse.
+
+    Raises:
+        InputError: there are several.
+    """
     multirun = HydraConfig.get().mode is not None and HydraConfig.get().mode.name == "MULTIRUN"
-    if multirun and "ddp" in str(settings.trainer.get("strategy", "auto")):
-        raise InputError("trainer.strategy: ddp starts processes and cannot be swept with -m")
+    if multirun and trainer.world_size > 1:
+        raise InputError(
+            f"trainer.devices: {trainer.world_size} processes cannot be swept with -m; allowed: 1"
+        )
 
 
 def resume_command() -> str:

@@ -109,7 +109,7 @@ def test_settings_that_differ_are_named_in_one_line(composed, trained, tmp_path,
             f"ckpt_path={trained}",
             "seed=3",
             "learning_rates.network=0.01",
-            "+trainer.precision=64-true",
+            "trainer.precision=bf16-mixed",
             folder="resumed",
         )
     )
@@ -117,7 +117,7 @@ def test_settings_that_differ_are_named_in_one_line(composed, trained, tmp_path,
         "learning_rates.network is 0.01, was 0.05",
         "seed is 3, was 0",
         "trainer.max_epochs is 2, was 1",
-        "trainer.precision is '64-true', was not set",
+        "trainer.precision is 'bf16-mixed', was '32-true'",
     ]
 
 

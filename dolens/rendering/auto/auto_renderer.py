@@ -16,7 +16,7 @@ from dolens.rendering.auto.choice import Choice, Tolerances, choose, measured
 from dolens.rendering.auto.field_grid import REGISTRATIONS
 from dolens.rendering.auto.plan import Requirements
 from dolens.rendering.auto.trial import ProbeSet, Trial, with_values
-from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values
+from dolens.rendering.protocol import Measure, Renderer, SensorWindow, Values, WindowShare
 from dolens.scene.scene import Scene
 from dolens.sensor.pixels import Sensor
 from dolens.stages import stage
@@ -130,6 +130,22 @@ class AutoRenderer(Renderer):
         choice = self._choice(lens, scene, values)
         planned, values = self._as_planned(lens, choice.dtype, values)
         image = choice.renderer.render_windows(planned, scene, textures, windows, seed, values)
+        return image.to(lens.dtype)
+
+    def render_share(
+        self,
+        lens: Lens,
+        scene: Scene,
+        textures: Tensor,
+        windows: Sequence[SensorWindow],
+        seed: int,
+        values: Values | None,
+        share: WindowShare,
+    ) -> Tensor:
+        """Image each texture on its window, one of a larger batch; see `Renderer.render_share`."""
+        choice = self._choice(lens, scene, values)
+        planned, values = self._as_planned(lens, choice.dtype, values)
+        image = choice.renderer.render_share(planned, scene, textures, windows, seed, values, share)
         return image.to(lens.dtype)
 
     def _choice(self, lens: Lens, scene: Scene, values: Values | None) -> Choice:

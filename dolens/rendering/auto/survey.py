@@ -105,7 +105,7 @@ def survey(imaging: ImagingSystem, pixels: Pixels, pupil_samples: int, seed: int
         seed: of the points in the strata.
     """
     points = imaging.sensor.positions(*pixels)
-    disc = sampled_disc(1, pupil_samples, seed, imaging.system)
+    disc = sampled_disc(torch.zeros(1, dtype=torch.int64), pupil_samples, seed, imaging.system)
     return Survey(
         imaging,
         pixels,

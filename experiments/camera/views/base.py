@@ -14,6 +14,7 @@ from dolens.optics.lens import Lens
 from dolens.rendering.protocol import Measure, Renderer
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.scene import Scene
+from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
 
@@ -118,10 +119,13 @@ class Imaging(ABC):
         stage: str,
         index: int,
         reference: str | None = None,
+        share: BatchShare | None = None,
     ) -> Views:
         """Image textures (B, 3, h, w), linear light; stage is `train`, `val` or `test`.
 
         With a judge, one of `reference_renderers`, it makes the images; the noise is the same.
+        Where the textures are a share of a batch, their random numbers are those that they have in
+        the whole batch.
         """
 
     @abstractmethod
@@ -204,10 +208,10 @@ class Imaging(ABC):
         """The training's loss as a function of images of textures; None where there is none."""
         return None
 
-    def _raw(self, image: Tensor, seed: int) -> Tensor:
+    def _raw(self, image: Tensor, seed: int, share: BatchShare | None = None) -> Tensor:
         """An image in linear light, read out with the noise of a seed and developed."""
         generator = torch.Generator(image.device).manual_seed(seed + _NOISE_OFFSET)
-        return self.readout.develop(self.readout(image, generator))
+        return self.readout.develop(self.readout(image, generator, share))
 
     def rays(self) -> int:
         """Rays that a training image takes; 0 before a renderer is chosen."""

@@ -30,6 +30,7 @@ from dolens.rendering.psf import axial_point_spread_functions
 from dolens.rendering.pupil.f_number import axial_f_number
 from dolens.scene.planar import as_planes, pinhole_image
 from dolens.scene.scene import Scene
+from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.readout import Readout
 
@@ -141,13 +142,14 @@ class DepthViews(Imaging):
         stage: str,
         index: int,
         reference: str | None = None,
+        share: BatchShare | None = None,
     ) -> Views:
         """Image textures at every depth."""
         renderer = self._training if stage == "train" else self.evaluation_renderer
         renderer = renderer if reference is None else self._reference_renderers[reference]
         seed = seed_of(self.seed, stage, index)
         image = renderer.render(lens, self.scene, textures, seed, values)
-        raw = self._raw(image, seed)
+        raw = self._raw(image, seed, share)
         return Views(self._truth(lens, values, textures).expand_as(raw), raw)
 
     def _truth(self, lens: Lens, values: Mapping[str, Tensor], textures: Tensor) -> Tensor:

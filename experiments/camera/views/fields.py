@@ -27,10 +27,17 @@ from dolens.experiments.camera.views.whole import (
 from dolens.optics.lens import Lens
 from dolens.rendering.auto.auto_renderer import AutoRenderer
 from dolens.rendering.imaging_system import ImagingSystem
-from dolens.rendering.protocol import GradientMeasure, Measure, Renderer, SensorWindow
+from dolens.rendering.protocol import (
+    GradientMeasure,
+    Measure,
+    Renderer,
+    SensorWindow,
+    WindowShare,
+)
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene, pinhole_image
+from dolens.sensor.batch_share import BatchShare
 from dolens.sensor.colour import linear_to_srgb
 from dolens.sensor.pixels import Sensor
 from dolens.sensor.readout import Readout
@@ -155,22 +162,30 @@ class FieldViews(Imaging):
         stage: str,
         index: int,
         reference: str | None = None,
+        share: BatchShare | None = None,
     ) -> Views:
         """Image textures (B, 3, h, w): one window each in training, one a zone otherwise."""
         seed, count = seed_of(self.seed, stage, index), len(textures)
-        rows = [self._shown(stage, index * count + i) for i in range(count)]
+        share = share or BatchShare(0, count)
+        everywhere = [self._shown(stage, index * share.total + i) for i in range(share.total)]
+        rows = everywhere[share.first : share.first + count]
         sensors = [window for row in rows for window in row]
         repeated = textures.repeat_interleave(len(rows[0]), dim=0)
         object_points, centres = self._chief_ray_points(lens, values, sensors)
         windows = [SensorWindow(*pair) for pair in zip(sensors, centres, strict=True)]
         truth = _sampled(repeated, object_points, windows)
         renderer = self._training if stage == "train" else self.evaluation_renderer
-        image = renderer.render_windows(lens, self.scene, repeated, windows, seed, values)
+        if share.total == count:
+            image = renderer.render_windows(lens, self.scene, repeated, windows, seed, values)
+        else:
+            whole = [window for row in everywhere for window in row]
+            part = WindowShare(share.first * len(rows[0]), whole)
+            image = renderer.render_share(lens, self.scene, repeated, windows, seed, values, part)
         field = torch.stack([self.windows.coordinates(window, textures) for window in sensors])
         truth, image, field = (
             t.unflatten(0, (count, len(rows[0]))) for t in (truth, image[:, 0], field)
         )
-        return Views(truth, self._raw(image, seed), field)
+        return Views(truth, self._raw(image, seed, share), field)
 
     def _shown(self, stage: str, number: int) -> list[Sensor]:
         """The windows of texture `number` of a stage."""

@@ -12,6 +12,7 @@ from dolens.experiments.camera.views.depths import DepthViews
 from dolens.experiments.data.occluders import with_occluders
 from dolens.optics.lens import Lens
 from dolens.scene.layered import LayeredScene
+from dolens.sensor.batch_share import BatchShare
 
 
 class LayerViews(DepthViews):
@@ -43,11 +44,13 @@ class LayerViews(DepthViews):
         stage: str,
         index: int,
         reference: str | None = None,
+        share: BatchShare | None = None,
     ) -> Views:
         """One image of each texture."""
         if textures.shape[1] == len(self.scene.wavelengths):
             seed = seed_of(self.seed, stage, index) + SCENE_OFFSET
             generator = torch.Generator().manual_seed(seed)
             near, far = self.scene.depths[0], self.scene.depths[-1]
-            textures = with_occluders(textures, near, far, self.occluders, generator)
-        return super().take(lens, values, textures, stage, index, reference)
+            before = 0 if share is None else share.first
+            textures = with_occluders(textures, near, far, self.occluders, generator, before)
+        return super().take(lens, values, textures, stage, index, reference, share)
