@@ -97,7 +97,7 @@ class ThreadClock:
 
 def _scheduled() -> dict[str, tuple[int, int]]:
     """Return nanoseconds that each thread ran, and waited for a processor; empty if untold."""
-    found = {}
+    found: dict[str, tuple[int, int]] = {}
     try:
         threads = os.listdir("/proc/self/task")
     except OSError:

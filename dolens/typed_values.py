@@ -30,7 +30,7 @@ def hints_of(make: Callable[..., Any]) -> dict[str, Any]:
     """Return the type hints of the parameters that a class or a function takes; none where they
     cannot be found out.
     """
-    call = make.__init__ if isinstance(make, type) else make
+    call: Any = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     try:
         names = inspect.signature(call).parameters
         hints = get_type_hints(call)

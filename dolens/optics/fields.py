@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -82,7 +82,7 @@ class Fields(NamedTuple):
         return self.kind == "angles" and any(steep)
 
 
-def require_from_the_front(angles: float | Sequence[float] | Tensor, what: str) -> None:
+def require_from_the_front(angles: float | Sequence[Any] | Tensor, what: str) -> None:
     """Raise `InputError` where an angle (degrees) has no tangent, of which `what` is made."""
     if bool((torch.as_tensor(angles).detach().abs() >= 90.0).any()):
         raise InputError(f"{what} needs fields below 90 degrees to the axis")

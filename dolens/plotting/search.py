@@ -139,5 +139,7 @@ def _scale(axis: Axis, axes: Axes, values: Sequence[float]) -> None:
         set_scale = axes.set_xscale if axis is axes.xaxis else axes.set_yscale
         set_scale("log")
         log_ticks(axis)
-    elif isinstance(axis.get_major_formatter(), ScalarFormatter):
-        axis.get_major_formatter().set_useOffset(False)
+    else:
+        formatter = axis.get_major_formatter()
+        if isinstance(formatter, ScalarFormatter):
+            formatter.set_useOffset(False)

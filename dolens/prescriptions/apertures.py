@@ -58,7 +58,7 @@ _BLOCKING: tuple[tuple[tuple[str, ...], type[Outline]], ...] = (
     *_OUTLINES,
     (("width", "arms"), Spider),
 )
-_OPTIONAL = {Spider: ("angle",)}
+_OPTIONAL: dict[Any, tuple[str, ...]] = {Spider: ("angle",)}
 _CENTER = ("decenter_x", "decenter_y")
 
 
@@ -82,7 +82,9 @@ def clear_aperture(row: Mapping[str, Any], place: str) -> ClearAperture:
     if outline is not None and (not clips or is_automatic(row)):
         raise InputError(f"{place}: 'aperture' clips: it goes with no 'clips: false' and no 'auto'")
     centers = []
-    edge = window = hole = None
+    edge: Outline | None = None
+    window: Outline | None = None
+    hole: Outline | None = None
     if size is not None:
         length = _UNKNOWN if is_automatic(row) else as_number(size, f"{place}: 'semi_diameter'")
         edge = Circle(length) if clips else Unlimited(length)
@@ -107,6 +109,7 @@ def clear_aperture(row: Mapping[str, Any], place: str) -> ClearAperture:
             edge = Ellipse(edge.semi_diameter, edge.semi_diameter)
     elif isinstance(window, Circle):
         window = Ellipse(window.semi_diameter, window.semi_diameter)
+    assert edge is not None  # one of the two is given
     try:
         return ClearAperture(edge, hole, window, center)
     except InputError as error:
@@ -130,7 +133,8 @@ def aperture_rows(aperture: ClearAperture) -> dict[str, Any]:
     else:
         outline = aperture.edge
     if outline is not None:
-        rows["aperture"] = outline.row() | beside
+        named: Any = outline  # all that may be here have a row
+        rows["aperture"] = named.row() | beside
     hole = aperture.obscuration
     if isinstance(hole, Together):
         parts = [_beside(part.row(), _absolute(at, aperture.center)) for part, at in hole.parts]
@@ -167,7 +171,7 @@ def _obscuration(value: object, place: str) -> tuple[Outline, tuple[float, float
 
 
 def _outline(
-    value: object, outlines: tuple[tuple[tuple[str, ...], type[Outline]], ...], place: str
+    value: Any, outlines: tuple[tuple[tuple[str, ...], type[Outline]], ...], place: str
 ) -> tuple[Outline, tuple[float, float]]:
     """Return an outline, one of some kinds, and the centre of it."""
     require_mapping(value, place)
@@ -187,13 +191,15 @@ def _outline(
     for key in keys:
         if value.get(key) is None:
             raise InputError(f"{place}: '{key}' is missing (mm)")
-    known = (*keys, *_OPTIONAL.get(make, ()))
-    check_keys(value, (*known, *_CENTER), place)
-    numbers = {key: value[key] for key in known if value.get(key) is not None}
+    taken = (*keys, *_OPTIONAL.get(make, ()))
+    check_keys(value, (*taken, *_CENTER), place)
+    numbers = {key: value[key] for key in taken if value.get(key) is not None}
     try:
         if make is Polygons:
             return Polygons(_vertices(numbers["polygons"], f"{place}: 'polygons'")), (x, y)
-        return make(**{k: as_number(v, f"{place}: '{k}'") for k, v in numbers.items()}), (x, y)
+        given_by_numbers: Any = make
+        read = {k: as_number(v, f"{place}: '{k}'") for k, v in numbers.items()}
+        return given_by_numbers(**read), (x, y)
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(place) else f"{place}: {message}") from None

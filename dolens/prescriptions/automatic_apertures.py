@@ -143,11 +143,12 @@ def _real_heights(lens: Lens) -> dict[str, float]:
         return _heights_of(system, [_aimed(lens, system, points, rim, waves)])
     # An inverted pupil has the rim of an upright one.
     at = torch.cat([0.5 * pupil.diameter * rim, pupil.z.expand(*rim.shape[:-1], 1)], -1)
-    if vergence(lens.object_distance) == 0.0:
+    distance = lens.object_distance
+    if distance is None or vergence(distance) == 0.0:
         towards = torch.cat([torch.deg2rad(points).tan(), torch.ones_like(points[:, :1])], -1)
         towards = towards[:, None].expand_as(at)
     else:
-        start = torch.full_like(points[:, :1], -float(lens.object_distance))
+        start = torch.full_like(points[:, :1], -float(distance))
         towards = at - torch.cat([points, start], -1)[:, None]
         towards = torch.where(towards[..., 2:] < 0.0, -towards, towards)
     towards = towards / towards.norm(dim=-1, keepdim=True)
@@ -170,7 +171,7 @@ def _aimed(
 
 def _heights_of(system: OpticalSystem, traced: Sequence[TracedRays]) -> dict[str, float]:
     """Return the largest height of rays at every surface; nothing where none gets through."""
-    passed = torch.cat([hit.points[:, hit.valid] for hit in traced], 1)
+    passed = torch.cat([h.points[:, h.valid] for h in traced if h.points is not None], 1)
     if not passed.shape[1]:
         return {}
     found = {}

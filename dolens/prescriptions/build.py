@@ -40,6 +40,7 @@ from dolens.optics.lens import Lens
 from dolens.optics.materials import index_model as find_index_model
 from dolens.optics.mirrors import media_of
 from dolens.optics.surfaces import SURFACES, Surface
+from dolens.optics.surfaces.coordinate_break import CoordinateBreak
 from dolens.prescriptions.apertures import APERTURE_KEYS, aperture_rows, clear_aperture
 from dolens.prescriptions.automatic_apertures import set_automatic_semi_diameters
 from dolens.prescriptions.breaks import KIND, break_from, break_row, is_break
@@ -121,10 +122,12 @@ def lens_from_prescription(
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     rows = _rows(prescription, where)
-    sensor = sensor_from(prescription, where)
+    sensor: dict[str, Any] = dict(sensor_from(prescription, where))
     data = system_data(prescription, where)
     air = environment_of(prescription, where)
-    surfaces, thicknesses, expansions = [], [], []
+    surfaces: list[Surface] = []
+    thicknesses: list[float] = []
+    expansions: list[float | None] = []
     first = prescription.get("object_material", "air")
     materials = [medium_of(first, model, f"{where}: object", air)]
     for number, row in enumerate(rows, 1):
@@ -189,12 +192,14 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
     """Return the prescription of a lens without its states."""
     rows: dict[str, dict[str, Any]] = {}
     for (number, surface), material in zip(lens.surfaces.items(), lens.materials[1:], strict=True):
-        if surface.changes_axes:
+        if isinstance(surface, CoordinateBreak):
             rows[number] = break_row(surface) | _gap(lens, number)
             continue
         row: dict[str, Any] = {"type": surface.kind}
         for key, value in (*surface._parameters.items(), *surface._buffers.items()):
-            number_value = value.detach().tolist()
+            if value is None:
+                continue
+            number_value: Any = value.detach().tolist()
             if key == "power" and surface.law is not None:
                 row |= power_row(number_value)
                 continue
@@ -219,7 +224,7 @@ def _rows_of(lens: Lens) -> dict[str, Any]:
         "object_material": lens.materials[0].name,
         **system_data_of(lens),
         "surfaces": rows,
-        **({"elements": element_rows(lens.elements)} if len(lens.elements) else {}),
+        **({"elements": element_rows(dict(lens.elements.items()))} if len(lens.elements) else {}),
         "sensor": sensor_row(lens),
     }
 

@@ -141,8 +141,8 @@ def _curvature(surface: dict[str, Any], place: str) -> dict[str, float]:
         radius = as_number(surface["roc"], f"{place}: 'roc'")
         return {"radius": radius or math.inf}
     curvature = number(surface, "c", place)
-    radius = radius_of(curvature)
-    return {"curvature": curvature} if radius is None else {"radius": radius}
+    exact = radius_of(curvature)
+    return {"curvature": curvature} if exact is None else {"radius": exact}
 
 
 def _coefficients(surface: dict[str, Any], place: str) -> dict[str, float]:

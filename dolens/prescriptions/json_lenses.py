@@ -90,8 +90,8 @@ def _content(text: str, where: str) -> Any:
 def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))
+        names = [key for key, _ in pairs]
+        twice = next(key for n, key in enumerate(names) if key in names[:n])
         raise ValueError(f"key '{twice}' is given twice")
     return found
 

@@ -22,7 +22,7 @@ from dolens.prescriptions.checks import as_integer, as_number, require_mapping
 _RADIANS = tuple(f"{name}_radians" for name in TILTS)
 
 
-def elements_from(value: object, dtype: torch.dtype, where: str) -> dict[str, Element]:
+def elements_from(value: Any, dtype: torch.dtype, where: str) -> dict[str, Element]:
     """Read the elements of a prescription.
 
     Raises:
@@ -53,7 +53,7 @@ def element_rows(elements: Mapping[str, Element]) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def _element(row: object, dtype: torch.dtype, place: str) -> Element:
+def _element(row: Any, dtype: torch.dtype, place: str) -> Element:
     require_mapping(row, place)
     check_keys(row, ("surfaces", *TILTS, *DISPLACEMENTS, "pivot", *_RADIANS), place)
     surfaces, pivot = row.get("surfaces"), row.get("pivot", (0.0, 0.0, 0.0))
@@ -72,7 +72,8 @@ def _element(row: object, dtype: torch.dtype, place: str) -> Element:
         pose[name] = as_number(row.get(name, 0.0), f"{place}: '{name}'")
     try:
         return Element(
-            *(as_integer(number, "'surfaces'") for number in surfaces),
+            as_integer(surfaces[0], "'surfaces'"),
+            as_integer(surfaces[1], "'surfaces'"),
             pose,
             [as_number(entry, "'pivot'") for entry in pivot],
             dtype,

@@ -200,7 +200,7 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     }
     cut = []
     for f in entries:
-        row = {}
+        row: dict[str, float] = {}
         for axis in "xy":
             upper, lower = (number(f, f"v{end}{axis}", where, 0.0) for end in "ul")
             row |= {

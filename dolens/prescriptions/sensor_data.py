@@ -12,8 +12,6 @@ that a surface's has) is curved: rays end where they meet it.  `diameter` is the
 from collections.abc import Mapping
 from typing import Any
 
-from torch import nn
-
 from dolens.errors import InputError, check_keys
 from dolens.prescriptions.checks import as_number
 from dolens.prescriptions.curvatures import curvature_from, curvature_row
@@ -47,7 +45,7 @@ def sensor_from(prescription: Mapping[str, Any], where: str) -> dict[str, float 
     return found
 
 
-def sensor_row(lens: nn.Module) -> dict[str, float]:
+def sensor_row(lens: Any) -> dict[str, float]:
     """Return the sensor of a lens as a prescription writes it."""
     row = {"distance": float(lens.sensor_distance.detach())}
     if lens.sensor_diameter is not None:

@@ -45,7 +45,9 @@ def _glass_by_numbers(prescription: Prescription, new: str) -> list[str]:
             near = parse_material(pair, model)
         except InputError:
             continue
-        error = max(abs(medium.index(w) - near.index(w)) for w in COMPARED_WAVELENGTHS)
+        error = max(
+            abs(float(medium.index(w)) - float(near.index(w))) for w in COMPARED_WAVELENGTHS
+        )
         said.setdefault(name, (pair, error, []))[2].append(str(n))
         row["material"] = pair
     return [

@@ -212,7 +212,7 @@ def merged_prescription(
     return found
 
 
-def _air(lens: Lens, overlay: Mapping[str, Any], place: str) -> dict[str, float]:
+def _air(lens: Lens, overlay: Mapping[str, Any], place: str) -> dict[str, Any]:
     """Return the temperature and pressure that a state says."""
     found = {
         key: as_number(overlay[key], f"{place}: '{key}'")

@@ -212,7 +212,8 @@ def _stop_for(key: str, target: float, lens: Lens) -> float:
             raise InputError(f"'object_na' must be below the index {n:g} of the object's medium")
         slope = math.tan(math.asin(target / n))
         matrix = matrix_to_stop(system, wavelength)
-        return abs(float(matrix[0, 0]) * float(distance) + float(matrix[0, 1]) * n) * slope
+        away = float(distance or 0.0)  # it is given with an aperture of the object's side
+        return abs(float(matrix[0, 0]) * away + float(matrix[0, 1]) * n) * slope
     size = lens.surfaces[str(lens.stop)].semi_diameter
     first = lens.first_order(wavelength, distance)
     if key == "working_f_number":
@@ -225,7 +226,7 @@ def _stop_for(key: str, target: float, lens: Lens) -> float:
 @torch.no_grad()
 def _require_telecentric(lens: Lens) -> None:
     pupil = float(lens.first_order(lens.primary_wavelength).entrance_pupil.z)
-    if abs(pupil) < _TELECENTRIC * float(lens.object_distance):
+    if abs(pupil) < _TELECENTRIC * float(lens.object_distance or math.inf):
         raise InputError(
             "'telecentric_object': the image of the stop in object space lies at "
             f"z = {pupil:.4g} mm and not at infinity"

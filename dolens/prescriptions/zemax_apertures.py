@@ -22,7 +22,7 @@ from dolens.prescriptions.decimals import number_in_text, scaled
 from dolens.prescriptions.zemax import Line
 from dolens.prescriptions.zemax_drawn_outlines import polygon_lines, read_polygons
 
-Block = dict[str, list[Line]]
+Block = Mapping[str, list[Line]]
 
 _HALF_WIDTHS = ("half_width_x", "half_width_y")
 _SEMI_AXES = ("semi_axis_x", "semi_axis_y")

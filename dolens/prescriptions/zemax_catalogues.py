@@ -63,7 +63,7 @@ def named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, 
     having = makers_of(name)
     if catalogues is None:
         return _without_catalogues(name, having, pair, place)
-    doubtful = []
+    doubtful: list[str] = []
     for catalogue in catalogues:
         known = known_catalogue(catalogue)
         if known in having:
@@ -81,8 +81,9 @@ def named_glass(name: str, catalogues: Sequence[str] | None, pair: Pair | None, 
             doubtful.append(catalogue)
     agreeing = [c for c in having if pair and _agrees(_of(c, name), pair)]
     unknown = [catalogue for catalogue in catalogues if known_catalogue(catalogue) is None]
-    if unknown and (agreeing or (pair is None and _owner(name))):
-        return _of(agreeing[0] if agreeing else _owner(name), name)
+    owner = agreeing[0] if agreeing else _owner(name) if pair is None else None
+    if unknown and owner:
+        return _of(owner, name)
     same = _SAME_MEDIUM.get(name.upper())
     if same and not having:
         logger.warning("%s is read as %s: no catalogue of the file has the name", place, same)

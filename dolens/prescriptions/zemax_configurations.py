@@ -226,7 +226,7 @@ def _names(
     for line in configuration_lines(file):
         if line.operand == TITLE and len(line.arguments) > 2:
             titles[int(number_in_text(line.arguments[1], ""))] = line.text.split('"')[1:2]
-    names = {}
+    names: dict[Any, Any] = {}
     for number in states:
         (title,) = titles.get(number) or [""]
         own = bool(_NAME.fullmatch(title)) and title not in names.values()

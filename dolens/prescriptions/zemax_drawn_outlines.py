@@ -4,7 +4,7 @@
 corners in turn.  `0 0` ends a polygon.  An angle other than zero makes a side an arc.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
 from dolens.errors import InputError
@@ -14,7 +14,7 @@ from dolens.prescriptions.zemax import Line
 
 
 def read_polygons(
-    block: dict[str, list[Line]], factor: Fraction, place: str
+    block: Mapping[str, list[Line]], factor: Fraction, place: str
 ) -> list[list[list[float]]]:
     """Return the corners of the polygons of a surface, mm.
 

@@ -39,14 +39,14 @@ def read_wavelengths(file: ZemaxFile, where: str) -> dict[str, Any]:
             raise InputError(f"{where}: line {line.at}: WAVM needs a number and a wavelength in µm")
         n = count_in_text(line.arguments[0], f"{where}: line {line.at}: WAVM")
         texts[n] = (line.arguments[1], (*line.arguments, "1", "1")[2], line.at)
-    for listed, weights in (("WAVL", "WWGT"), ("WAVN", "WWGN")):
-        line = last(file, listed)
-        if line and not texts:
-            shares = last(file, weights)
-            shares = shares.arguments if shares else []
+    for listed, weighted in (("WAVL", "WWGT"), ("WAVN", "WWGN")):
+        given = last(file, listed)
+        if given and not texts:
+            beside = last(file, weighted)
+            shares = beside.arguments if beside else []
             texts = {
-                i: (text, shares[i - 1] if i <= len(shares) else "1", line.at)
-                for i, text in enumerate(line.arguments, 1)
+                i: (text, shares[i - 1] if i <= len(shares) else "1", given.at)
+                for i, text in enumerate(given.arguments, 1)
             }
     used = _argument(file, 3, where)
     numbers = [n for n in sorted(texts) if n <= (used or len(texts))]
@@ -126,7 +126,7 @@ def read_fields(
 def is_axial(file: ZemaxFile, where: str) -> bool:
     """Return whether all fields are on the axis."""
     fields = read_fields(file, Fraction(1), True, where).get("fields", {})
-    points = next(
+    points: Any = next(
         (fields[kind] for kind in (*FIELD_KINDS.values(), PUPIL_ANGLES) if kind in fields), []
     )
     return not any(value for point in points for value in point)

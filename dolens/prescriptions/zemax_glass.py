@@ -112,10 +112,10 @@ def glass_line(material: object, place: str) -> list[str]:
         vd = vd if abs(vd) < 1e4 else 0.0
         return [f"  GLAS {word} 0 0 {nd:.8f} {vd:.6f} 0 0 0 0 0 0"]
     pair = _PAIR.fullmatch(name)
-    nd, vd, deviation = (pair[1], pair[2], pair[3]) if pair else (name, "0", "0")
+    index, abbe, deviation = (pair[1], pair[2], pair[3]) if pair else (name, "0", "0")
     if deviation is None:
-        deviation = f"{_deviation_of_two_terms(vd):.12f}"
-    return [f"  GLAS {_BLANK} 1 0 {nd} {vd} {deviation} 0 0 0 0 0"]
+        deviation = f"{_deviation_of_two_terms(abbe):.12f}"
+    return [f"  GLAS {_BLANK} 1 0 {index} {abbe} {deviation} 0 0 0 0 0"]
 
 
 def catalogue_line(materials: Sequence[object], where: str) -> list[str]:

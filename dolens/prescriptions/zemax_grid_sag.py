@@ -37,14 +37,14 @@ def _read(block: SurfaceBlock) -> Row:
         what = f"{block.place}: GARR (line {line.at})"
         if len(line.arguments) < 5:
             raise InputError(f"{what}: needs a number, sag, two slopes and the twist")
-        n = number_in_text(line.arguments[0], what)
-        if n not in range(len(nodes)):
-            raise InputError(f"{what}: must be a node from 0 to {len(nodes) - 1}, not {n:g}")
+        node = number_in_text(line.arguments[0], what)
+        if node not in range(len(nodes)):
+            raise InputError(f"{what}: must be a node from 0 to {len(nodes) - 1}, not {node:g}")
         if any(float(word) != 0.0 for word in line.arguments[5:6]):
-            raise InputError(f"{what}: node {n:g} has no data, which is not held")
+            raise InputError(f"{what}: node {node:g} has no data, which is not held")
         words = zip(line.arguments[1:5], _UNITS, strict=True)
-        nodes[int(n)] = [scaled(word, block.factor**power, what) for word, power in words]
-    missing = sum(node is None for node in nodes)
+        nodes[int(node)] = [scaled(word, block.factor**power, what) for word, power in words]
+    missing = sum(numbers is None for numbers in nodes)
     if missing:
         raise InputError(f"{block.place}: {missing} of {len(nodes)} nodes have no GARR")
     row = {"type": "grid_sag", **curvature_row(block.curvature), "conic": block.number("CONI")}

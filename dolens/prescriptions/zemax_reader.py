@@ -17,7 +17,7 @@ draws and clips nothing.  ENPD, FNUM and OBNA close the stop (see
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -49,7 +49,7 @@ _INFINITE = 1e10
 
 GlassReader = Callable[..., str]
 
-Block = dict[str, list[Line]]
+Block = Mapping[str, list[Line]]
 
 
 def prescription_from_zemax(text: str, where: str = "lens") -> dict[str, Any]:
@@ -239,7 +239,7 @@ def _with_sensor(
         rows.append(before)
     sensor = {"distance": math.fsum(gaps)}
     size = read_apertures(image, factor, place)[0].get("semi_diameter")
-    if is_fixed(image) and size != AUTOMATIC:
+    if is_fixed(image) and size is not None and size != AUTOMATIC:
         sensor["diameter"] = 2.0 * size
     sensor |= shape
     surfaces = {str(n): row for n, row in enumerate(rows, 1)}

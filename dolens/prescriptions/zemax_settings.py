@@ -85,7 +85,7 @@ def apply_setting(file: ZemaxFile, line: Line) -> None:
 
 def _indices_follow_air(file: ZemaxFile) -> bool:
     lines = file.system.get("ENVD")
-    return bool(lines) and lines[-1].arguments[2:3] == ["1"]
+    return lines is not None and lines[-1].arguments[2:3] == ["1"]
 
 
 def _surface(file: ZemaxFile, number: int, line: Line) -> dict[str, list[Line]]:

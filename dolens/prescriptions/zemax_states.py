@@ -104,9 +104,9 @@ def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, 
         elif before == after:
             continue
         elif operand in _BY_LIST and len(before) == len(after):
-            for n, (one, other) in enumerate(zip(before, after, strict=True), 1):
-                if one != other:
-                    found[Setting(_BY_LIST[operand], n)] = other
+            for n, (old, new) in enumerate(zip(before, after, strict=True), 1):
+                if old != new:
+                    found[Setting(_BY_LIST[operand], n)] = new
         elif operand in ("ENPD", "FNUM", "OBNA") and before[1:] == after[1:]:
             found[Setting("APER", 0)] = after[0]
         elif operand == "FTYP" and before[0] != after[0]:
@@ -117,8 +117,8 @@ def _differences(base: ZemaxFile, file: ZemaxFile, place: str) -> dict[Setting, 
             )
         elif operand != "NAME":
             raise InputError(f"{place}: no configuration of a .zmx file can change {operand}")
-    for n, (before, after) in enumerate(zip(base.surfaces, file.surfaces, strict=True)):
-        found |= _of_surface(n, before, after, place)
+    for n, (own, others) in enumerate(zip(base.surfaces, file.surfaces, strict=True)):
+        found |= _of_surface(n, own, others, place)
     return found
 
 

@@ -21,7 +21,8 @@ _FIRST = 3
 
 def monomials() -> list[str]:
     """Return the names of the terms in Zemax's order: x, y, x2, xy, y2, x3, x2y, ..."""
-    names, degree = [], 1
+    names: list[str] = []
+    degree = 1
     while len(names) < _TERMS:
         names += [_name(degree - j, j) for j in range(degree + 1)]
         degree += 1

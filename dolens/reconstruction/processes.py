@@ -96,7 +96,7 @@ class SharedBatchNorm(_BatchNorm):
             self.num_batches_tracked.add_(1)
             momentum = self.momentum or 1.0 / float(self.num_batches_tracked)
         found, mean, variance = _Normalise.apply(input, self.weight, self.bias, self.eps)
-        if self.running_mean is not None:
+        if self.running_mean is not None and self.running_var is not None:
             count = processes() * input.numel() // input.shape[1]
             unbiased = variance * (count / max(count - 1, 1))
             self.running_mean.lerp_(mean.to(self.running_mean), momentum)
@@ -155,7 +155,7 @@ def share_batch_statistics(module: nn.Module) -> nn.Module:
     if not isinstance(module, _BatchNorm) or isinstance(module, SharedBatchNorm):
         return module
     shared = _as(SharedBatchNorm, module)
-    shared.stands_for = type(module)
+    shared.stands_for = type(module)  # type: ignore[assignment]
     return shared
 
 

@@ -175,7 +175,7 @@ def _compiled(factory: Factory, real: str, signature: Any) -> int:
                 address = _read(files) if files else None
                 if address is None:
                     kernel = _made(factory, real, signature)
-                    address = kernel.address
+                    address = kernel.address or 0
                     if files:
                         files.write(machine_code.taken_from(kernel))
             _kernels[factory, real] = address

@@ -4,7 +4,7 @@ Numba's own cache is a pickle of the compiler's objects.  A kernel here is one C
 none of them: the object code that LLVM made is enough.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from llvmlite import binding
 from numba.core import registry
@@ -34,7 +34,8 @@ def target() -> tuple:
 
 def taken_from(compiled: CFunc) -> MachineCode:
     """Return the machine code of a compiled function."""
-    _, _, (code, _) = compiled._library.serialize_using_object_code()
+    library: Any = compiled._library  # type: ignore[attr-defined]
+    _, _, (code, _) = library.serialize_using_object_code()
     return MachineCode(compiled.native_name, code)
 
 

@@ -194,7 +194,10 @@ def _private(name: str, file: CodeVFile, used: tuple[float, float], place: str) 
     medium = parse_material(material, index_model("dfc"))
     for wave, word in table.items():
         half = 0.5 * 10.0 ** min(int(Decimal(word).as_tuple().exponent), 0)
-        if used[0] <= wave <= used[1] and abs(medium.index(wave) - float(word)) > half * 1.001:
+        if (
+            used[0] <= wave <= used[1]
+            and abs(float(medium.index(wave)) - float(word)) > half * 1.001
+        ):
             raise InputError(
                 f"{place} has another dispersion than nd and Vd say: {word} at {wave:g} nm, not "
                 f"{medium.index(wave):.6f} (nd {nd}, Vd {abbe_number(medium):.2f})"

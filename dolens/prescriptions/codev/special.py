@@ -141,7 +141,7 @@ def special_lines(row: Mapping[str, Any], place: str) -> list[str]:
             )
         numbers = {1: row.get("conic", 0.0)} | {n + 1: value for n, value in powers.items()}
         return ["  SPS ODD", *_lines(numbers, place)]
-    known = {_monomial(*powers): n for n in range(2, 67) if (powers := xy_powers(n))}
+    known = {_monomial(*xy): n for n in range(2, 67) if (xy := xy_powers(n))}
     numbers = {}
     for key in row:
         if monomial_powers(key) is None:

@@ -145,11 +145,11 @@ def _fields(fields: Mapping[str, Any], where: str) -> list[str]:
         lines.append(f"{letter}{_FIELDS[kind]}   {_texts(values, where)}")
     if fields.get("weights"):
         lines.append(f"WTF   {_texts(fields['weights'], where)}")
-    for axis in "XY" if fields.get("vignetting") else "":
+    for letter in "XY" if fields.get("vignetting") else "":
         cut: dict[str, list[str]] = {"U": [], "L": []}
         for row in fields["vignetting"]:
             shift, part = (
-                Decimal(_text(row.get(f"{name}_{axis.lower()}", 0.0), where))
+                Decimal(_text(row.get(f"{name}_{letter.lower()}", 0.0), where))
                 for name in ("decenter", "compression")
             )
             cut["U"].append(str(part - shift))
