@@ -26,10 +26,13 @@ class InputError(ValueError):
     and what is allowed.  Command-line programs print it and exit with a non-zero status.
     Whatever it quotes, it can be printed: control characters are written out (`\\x1b`), and the
     middle of an endless message is left out.
+
+    Attributes:
+        whole: the message with its middle.
     """
 
     def __init__(self, message: object = "") -> None:
-        text = readable(message)
+        self.whole = text = readable(message)
         if len(text) > _LONGEST:
             text = text[: _LONGEST - _END - len(_CUT)] + _CUT + text[-_END:]
         super().__init__(text)

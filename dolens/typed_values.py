@@ -101,7 +101,7 @@ def _allowed(hint: Any) -> str:
     base = origin or hint
     if base in _LISTS:
         entries = [_allowed(one) for one in inner if one is not Ellipsis]
-        return f"a list ({', '.join(dict.fromkeys(entries))})" if entries else "a list"
+        return f"a list, each {' or '.join(dict.fromkeys(entries))}" if entries else "a list"
     if base in (dict, Mapping):
         return "a mapping"
     return _WORDS.get(base, getattr(base, "__name__", str(base)))

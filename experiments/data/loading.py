@@ -64,7 +64,7 @@ class CropLoader(DataLoader):
             except StopIteration:
                 return
             except InputError as error:
-                raise InputError(_without_traceback(str(error))) from None
+                raise InputError(_without_traceback(error.whole)) from None
             if self.waiting is not None and not first:
                 self.waiting.add(time.perf_counter() - started)
             first = False

@@ -129,8 +129,11 @@ BAD_INPUT = {
     "no field": (["fields=[]"], "fields: none is given"),
     "weights": (["field_weights=[1]"], "weights: 9 numbers are needed, not 1"),
     "factor": (["tolerance_factor=0"], "tolerance_factor: must be a positive number"),
-    "a wavelength that is none": (["wavelengths=[red]"], "wavelengths: must be numbers"),
-    "limits": (["yield_at_um=[wide]"], "yield_at_um: must be numbers"),
+    "a wavelength that is none": (
+        ["wavelengths=[red]"],
+        "wavelengths: ['red']; allowed: a list, each a number",
+    ),
+    "limits": (["yield_at_um=[wide]"], "yield_at_um: ['wide']; allowed: a list, each a number"),
 }
 
 

@@ -100,7 +100,7 @@ def test_the_published_lens_is_data_too(composed):
 
 SETTINGS = {
     "a seed": ("seed=first", "seed: 'first'; allowed: an integer"),
-    "threads": ("threads=1.5", "threads: 1.5; allowed: an integer, or null"),
+    "threads": ("threads=1.5", "threads: 1.5; allowed: an integer of 1 or more"),
     "a switch": ("train=never", "train: 'never'; allowed: true or false"),
     "products": ("matmul_precision=hihg", "matmul_precision: 'hihg' is unknown; did you mean"),
     "a lens's precision": ("lens_dtype=float16", "lens_dtype: 'float16' is unknown"),

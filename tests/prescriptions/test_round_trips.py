@@ -131,7 +131,7 @@ def prescriptions(draw, kinds, models):
     if draw(st.booleans()):
         data["sensor"]["diameter"] = draw(st.floats(1e-3, 1e3))
     if draw(st.booleans()):
-        data["object_distance"] = draw(finite)
+        data["object_distance"] = draw(st.floats(1e-3, 1e9))
         heights = st.tuples(finite, finite).map(list)
         data["fields"] = {"heights": draw(st.lists(heights, min_size=1, max_size=4))}
     if draw(st.booleans()):

@@ -95,9 +95,10 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
         functions = functions_of(int(row[Code.KIND]))
         numbers = int(row[Code.LENGTH]) - Slot.HEADER
         if functions.numbers not in (None, numbers):
+            kernel = functions.sag or functions.forward
             raise InputError(
-                f"the CPU kernels '{functions.forward.__qualname__}' take {functions.numbers} "
-                f"numbers of a surface; its `packed` gives {numbers}"
+                f"the CPU kernels '{kernel.__qualname__}' take {functions.numbers} numbers of a "
+                f"surface; its `packed` gives {numbers}"
             )
         row[FORWARD] = compiler.compile_block(functions.forward, real)
         if functions.sag is not None:

@@ -218,8 +218,8 @@ def logging_above(console: Console) -> Iterator[None]:
 
 
 def _is_terminal(stream: Any) -> bool:
-    """Return whether a stream, which a handler may lack, is a terminal."""
-    return getattr(stream, "isatty", lambda: False)()
+    """Return whether a stream, which a handler may lack or have closed, is a terminal."""
+    return not getattr(stream, "closed", True) and stream.isatty()
 
 
 class _Above(io.TextIOBase):

@@ -206,9 +206,10 @@ def test_a_limit_on_batches_wastes_no_samples(tmp_path):
 
 def test_accumulated_gradients_count_batches_not_steps(tmp_path):
     options = {"accumulate_grad_batches": 2}
-    module, _ = _fit(tmp_path, callbacks=[_every_step(tmp_path)], **options)
-    assert len(module.seen) == 2 * STEPS
-    resumed, _ = _fit(tmp_path, resume=tmp_path / "step=2.ckpt", **options)
+    data = {"steps_per_epoch": 6}
+    module, _ = _fit(tmp_path, _data(**data), callbacks=[_every_step(tmp_path)], **options)
+    assert len(module.seen) == 2 * 6
+    resumed, _ = _fit(tmp_path, _data(**data), resume=tmp_path / "step=2.ckpt", **options)
     _same(resumed, module, 4)
 
 
