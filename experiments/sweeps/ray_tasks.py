@@ -2,13 +2,14 @@
 
 import logging
 import os
-import secrets
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from types import ModuleType
 
 from hydra.core.utils import JobReturn
 
-from dolens.errors import InputError, one_line
+from dolens.errors import one_line
+from dolens.experiments.ray_cluster import joined_cluster, local_cluster
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
 from dolens.experiments.sweeps.shares import given_threads
 
@@ -41,11 +42,7 @@ def in_ray_tasks(
     """
     if not jobs:
         return
-    ray = _ray()
-    started = not ray.is_initialized()
-    if started:
-        _begin(ray, address)
-    try:
+    with _cluster(address) as ray:
         share = num_cpus or given_threads(jobs) or _cores_of_a_job(ray, len(jobs))
         task = ray.remote(num_cpus=share, num_gpus=num_gpus, max_retries=max_retries)(_run)
         logger.info("%d tasks of Ray, of %d core%s each", len(jobs), share, "s"[: share > 1])
@@ -61,43 +58,17 @@ def in_ray_tasks(
                 reason = last[0] if lost else last[-1]
                 result = job.failed(one_line(f"{type(error).__name__}: {reason}"))
             yield job, result
-    finally:
-        if started:
-            ray.shutdown()
 
 
 def _run(job: Elsewhere) -> JobReturn:
     return job()
 
 
-def _ray() -> ModuleType:
-    # What Ray would send to its makers, about every cluster, stays here.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-    except ModuleNotFoundError:
-        raise InputError(
-            "hydra/launcher=ray: the package 'ray' is not installed; pip install 'dolens[ray]'"
-        ) from None
-    return ray
-
-
-def _begin(ray: ModuleType, address: str | None) -> None:
+def _cluster(address: str | None) -> AbstractContextManager[ModuleType]:
     address = address or os.environ.get("RAY_ADDRESS")
-    options = {"log_to_driver": False, "configure_logging": False}
     if address is None or address == "local":
-        # Whoever knows the token may run code as this user.  Ray would write one into the home
-        # folder; the cluster of one sweep needs it no longer than that.
-        if not {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & set(os.environ):
-            os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
-        ray.init(address="local", include_dashboard=False, **options)
-        return
-    try:
-        ray.init(address=address, **options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise InputError(
-            f"hydra.launcher.address: no cluster of Ray's at '{address}': {one_line(error)}"
-        ) from None
+        return local_cluster("hydra/launcher=ray")
+    return joined_cluster(f"hydra.launcher.address={address}", address)
 
 
 def _cores_of_a_job(ray: ModuleType, jobs: int) -> int:

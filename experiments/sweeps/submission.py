@@ -5,12 +5,12 @@ import os
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from typing import Any
 
 from hydra.core.utils import JobReturn
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.environment_variables import environment_variables
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
 from dolens.experiments.sweeps.shares import share_of
 
@@ -47,7 +47,7 @@ def in_local_submissions(
     while waiting or running:
         while waiting and len(running) < share.jobs:
             job = waiting.popleft()
-            with _variables(share.environment()):
+            with environment_variables(share.environment()):
                 running.append((job, executor.submit(Elsewhere(job))))
         yield from _ended(running)
 
@@ -123,18 +123,3 @@ def _ended(running: list[tuple[SweepJob, Any]]) -> Iterator[tuple[SweepJob, JobR
             reason = " ".join(lines[:_LINES])
             result = job.failed(one_line(f"{type(error).__name__}: {reason}"))
         yield job, result
-
-
-@contextmanager
-def _variables(values: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables that a process begun meanwhile inherits."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from dolens.experiments.workers.ray_cluster import joined_cluster, local_cluster
+from dolens.experiments.ray_cluster import joined_cluster, local_cluster
 from dolens.stages import stage
 from dolens.tasks import TaskError, TaskMap, error_of_task, task_label
 
@@ -40,7 +40,11 @@ class RayWorkers:
 
             @cache
             def cluster() -> "ModuleType":
-                wanted = joined_cluster() if self.count is None else local_cluster(self.count)
+                wanted = (
+                    joined_cluster("workers=auto")
+                    if self.count is None
+                    else local_cluster(f"workers={self.count}", self.count)
+                )
                 with stage("workers start"):
                     return opened.enter_context(wanted)
 

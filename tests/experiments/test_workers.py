@@ -148,7 +148,7 @@ def test_without_ray_one_line_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with (
         workers_of(2).open() as map_tasks,
-        pytest.raises(InputError, match=r"^workers=2 needs Ray, .* pip install 'dolens\[ray\]'$"),
+        pytest.raises(InputError, match=r"^workers=2: the package .* pip install 'dolens\[ray\]'$"),
     ):
         list(map_tasks(refused, [0], "tasks"))
 

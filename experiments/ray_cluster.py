@@ -14,11 +14,18 @@ from types import ModuleType
 from typing import Any
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.environment_variables import environment_variables
 
 # Functions and results wait here; in memory that is taken when it is needed.
 _OBJECT_STORE_BYTES = 512 << 20
 # Ray's sockets lie some 70 characters below its folder, and Linux allows 107 for all.
 _LONGEST_FOLDER = 30
+# What Ray's processes read when they start.
+_PRIVATE: Mapping[str, str] = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    # Despite its name: without it Ray listens where other machines can reach it.
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+}
 _QUIET: Mapping[str, Any] = {
     "configure_logging": False,
     "log_to_driver": False,
@@ -27,7 +34,7 @@ _QUIET: Mapping[str, Any] = {
 
 
 @contextmanager
-def local_cluster(processes: int) -> Iterator[ModuleType]:
+def local_cluster(setting: str, processes: int | None = None) -> Iterator[ModuleType]:
     """Start a cluster on this machine, give Ray's module, and end the cluster.
 
     It listens on the loopback address alone, reports nothing to anybody, and leaves no file.  Where
@@ -35,14 +42,23 @@ def local_cluster(processes: int) -> Iterator[ModuleType]:
     stays.
 
     Args:
-        processes: that run tasks.
+        setting: that asks for it, as `workers=2`; messages begin with it.
+        processes: that run tasks, of one thread each and without GPUs; None: all cores and GPUs.
 
     Raises:
         InputError: Ray is not installed, or does not start.
     """
+    own: dict[str, Any] = {}
+    variables = dict(_PRIVATE)
+    if processes is not None:
+        own = {"num_cpus": processes, "num_gpus": 0, "object_store_memory": _OBJECT_STORE_BYTES}
+        variables["OMP_NUM_THREADS"] = "1"
+    if not {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & set(os.environ):
+        # Else Ray makes a token of its own, and writes it to a file in the home folder.
+        variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
     with ExitStack() as closing:
-        with _environment():
-            ray = _ray(str(processes))
+        with environment_variables(variables):
+            ray = ray_module(setting)
             if not ray.is_initialized():
                 folder = tempfile.mkdtemp(prefix="dolens-", dir=_short_folder())
                 closing.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -50,10 +66,9 @@ def local_cluster(processes: int) -> Iterator[ModuleType]:
                 closing.callback(ray.shutdown)
                 _start(
                     ray,
+                    f"{setting}: Ray does not start",
                     address="local",  # whatever RAY_ADDRESS says
-                    num_cpus=processes,
-                    num_gpus=0,
-                    object_store_memory=_OBJECT_STORE_BYTES,
+                    **own,
                     _temp_dir=folder,
                     # Else Ray kills workers, again and again, when others fill the memory.
                     _system_config={"memory_monitor_refresh_ms": 0},
@@ -62,71 +77,58 @@ def local_cluster(processes: int) -> Iterator[ModuleType]:
 
 
 @contextmanager
-def joined_cluster() -> Iterator[ModuleType]:
-    """Join the cluster of `RAY_ADDRESS`, or the one that `ray start` left on this machine.
+def joined_cluster(setting: str, address: str = "auto") -> Iterator[ModuleType]:
+    """Join a cluster that runs already, give Ray's module, and leave the cluster running.
+
+    Args:
+        setting: that asks for it, as `workers=auto`; messages begin with it.
+        address: of the cluster; `auto`: that of `RAY_ADDRESS`, or the one that `ray start` left on
+            this machine.
 
     Raises:
         InputError: Ray is not installed, or there is no such cluster.
     """
-    ray = _ray("auto")
+    ray = ray_module(setting)
     with ExitStack() as closing:
         if not ray.is_initialized():
             closing.enter_context(_signals_kept())
             closing.callback(ray.shutdown)
-            _start(ray, address="auto")
+            advice = "start one by `ray start --head`, or set RAY_ADDRESS"
+            _start(ray, f"{setting}: no Ray cluster is found ({advice})", address=address)
         yield ray
 
 
-def _start(ray: ModuleType, **settings: Any) -> None:
-    try:
-        ray.init(**_QUIET, **settings)
-    except (ConnectionError, OSError, RuntimeError, ValueError) as error:
-        what = "Ray does not start"
-        if "num_cpus" not in settings:
-            what = "no Ray cluster is found (start one by `ray start --head`, or set RAY_ADDRESS)"
-        raise InputError(f"workers: {what}: {one_line(error)}") from error
+def ray_module(setting: str) -> ModuleType:
+    """Return Ray, which reports to nobody.
 
+    Args:
+        setting: that asks for it.
 
-def _ray(setting: str) -> ModuleType:
+    Raises:
+        InputError: it is not installed.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         return importlib.import_module("ray")
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
         raise InputError(
-            f"workers={setting} needs Ray, which is not installed; install it by: "
-            "pip install 'dolens[ray]'"
+            f"{setting}: the package 'ray' is not installed; pip install 'dolens[ray]'"
         ) from None
+
+
+def _start(ray: ModuleType, problem: str, **settings: Any) -> None:
+    try:
+        ray.init(**_QUIET, **settings)
+    except (ConnectionError, OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{problem}: {one_line(error)}") from error
 
 
 def _short_folder() -> str:
     """Return a folder for temporary files whose name leaves room for those of sockets."""
     folder = tempfile.gettempdir()
     return folder if len(folder) <= _LONGEST_FOLDER else "/tmp"
-
-
-@contextmanager
-def _environment() -> Iterator[None]:
-    """Set what Ray's processes read when they start, and put back what was there."""
-    wanted = {
-        "RAY_USAGE_STATS_ENABLED": "0",
-        # Despite its name: without it Ray listens where other machines can reach it.
-        "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-        "OMP_NUM_THREADS": "1",
-    }
-    if "RAY_AUTH_MODE" not in os.environ:
-        # Else Ray makes a token of its own, and writes it to a file in the home folder.
-        wanted |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 @cache
