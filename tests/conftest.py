@@ -1,4 +1,5 @@
 import copy
+import gc
 import json
 import os
 import random
@@ -14,6 +15,11 @@ from dolens import Lens, load_lens
 ROOT = Path(__file__).resolve().parents[1]
 # One thread in each of pytest-xdist's processes, two where there is only one process.
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else min(2, os.cpu_count() or 1))
+
+
+def pytest_collection_finish():
+    """The garbage collector looks no more at the modules and tests, which stay to the end."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
