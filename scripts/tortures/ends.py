@@ -61,7 +61,9 @@ def whole_run(*overrides: str) -> Path:
 def log(folder: Path) -> Path:
     """Return a new file for what a process prints."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    return folder.parent / f"{len(list(folder.parent.glob('*.log')))}.log"
+    path = folder.parent / f"{len(list(folder.parent.glob('*.log')))}.log"
+    path.touch()  # the next one is another, however soon it is asked for
+    return path
 
 
 def await_checkpoint(process: Process, run: Path) -> bool:
