@@ -8,6 +8,13 @@ from torch.utils.data import DataLoader
 
 from dolens.errors import InputError
 
+# PyTorch says so of errors that a worker raised and lived through.
+_RAISED_IN_WORKER = "in DataLoader worker process"
+
+
+class LostWorkerError(RuntimeError):
+    """This error says that a worker has ended before it handed over a batch."""
+
 
 class Waiting:
     """The time that a training waits for its batches.
@@ -51,7 +58,7 @@ class CropLoader(DataLoader):
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
         """Begin to load, and return the batches, which raise `InputError` where a photograph cannot
-        be decoded.
+        be decoded, and `LostWorkerError` where a worker hangs up.
         """
         return self._watched(super().__iter__())
 
@@ -65,6 +72,11 @@ class CropLoader(DataLoader):
                 return
             except InputError as error:
                 raise InputError(_without_traceback(error.whole)) from None
+            except (ConnectionError, EOFError) as error:
+                # A worker that is being killed hangs up a moment before PyTorch finds it dead.
+                if not self.num_workers or _RAISED_IN_WORKER in str(error):
+                    raise
+                raise LostWorkerError("it hung up") from error
             if self.waiting is not None and not first:
                 self.waiting.add(time.perf_counter() - started)
             first = False

@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator
 
 from dolens.errors import one_line
+from dolens.experiments.data.loading import LostWorkerError
 
 _FAULTS = {
     errno.ENOSPC: "the disk is full",
@@ -33,8 +34,9 @@ def machine_fault(error: BaseException) -> str | None:
         if isinstance(found, OSError) and found.errno in _FAULTS:
             place = found.filename2 or found.filename
             return one_line(f"{place}: {_FAULTS[found.errno]}" if place else _FAULTS[found.errno])
-        lost = _LOST_WORKER.search(str(found)) if isinstance(found, RuntimeError) else None
-        if lost:
+        if isinstance(found, LostWorkerError) or (
+            isinstance(found, RuntimeError) and _LOST_WORKER.search(str(found))
+        ):
             return one_line(
                 f"data.num_workers: a process that reads photographs has ended ({found}); where "
                 "memory is short, fewer of them need less"

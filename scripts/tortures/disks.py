@@ -7,7 +7,7 @@ import signal
 import subprocess
 from pathlib import Path
 
-from scripts.tortures.ends import await_checkpoint, goes_on, line_of, log, refused
+from scripts.tortures.ends import await_checkpoint, goes_on, line_of, log, refused, whole_run
 from scripts.tortures.kinds import CAMERA, COMMON
 from scripts.tortures.processes import start, trust
 from scripts.tortures.run_folders import faults_of
@@ -45,23 +45,19 @@ class Disk:
 
 def full_disk(folder: Path, share: float) -> list[str]:
     """Run where there is room for a share of what a run writes, and then for all of it."""
-    sample = folder / "sample"
-    process = start([*FIGURES, f"hydra.run.dir={sample}"], log(sample))
-    if process.wait(600.0):
-        return [line_of(process)]
+    sample = whole_run(*FIGURES)
     needed = sum(-(-p.stat().st_size // 4096) * 4 for p in sample.rglob("*") if p.is_file())
     with Disk(folder / "disk", max(int(share * needed), 4)) as disk:
         if not disk.mounted:
             return ["skipped: mounting is not allowed here"]
         run = disk.place / "run"
-        process = start([*FIGURES, f"hydra.run.dir={run}"], log(sample), trust)
+        process = start([*FIGURES, f"hydra.run.dir={run}"], log(folder / "x"), trust)
         if process.wait(600.0):
             wrong = refused(process, "the disk is full")
         else:  # what it could do without found no room (TensorBoard's thread says so itself)
             wrong = [] if (run / "metrics.json").exists() else ["no metrics.json"]
         wrong += [f"left: {fault}" for fault in faults_of(run)] if run.exists() else []
         disk.set("size=1g")
-        shutil.rmtree(sample)
         wrong += goes_on_there(folder, run)
     return wrong
 

@@ -1,6 +1,10 @@
 """How a run ended: in one line, and so that it can go on."""
 
+import atexit
+import shutil
+import tempfile
 import time
+from functools import cache
 from pathlib import Path
 
 from scripts.tortures.processes import Process, start, trust
@@ -26,27 +30,40 @@ def refused(process: Process, *words: str) -> list[str]:
 
 def goes_on(folder: Path, overrides: list[str], whole: list[str] | None = None) -> list[str]:
     """Resume a run, and return in what it differs from one that nothing happened to."""
-    process = start([*whole_run(overrides), f"hydra.run.dir={folder.parent}/whole"], log(folder))
-    if process.wait(600.0):
-        return [f"the whole run fails: {line_of(process)}"]
+    undisturbed = whole_run(*overrides)
     last = folder / "checkpoints" / "last.ckpt"
     resume = [f"ckpt_path={last}"] if last.exists() else []
     command = [*(whole or overrides), f"hydra.run.dir={folder}", *resume]
     process = start(command, log(folder), trust)
     if process.wait(600.0):
         return [f"the resumed run fails: {line_of(process)}"]
-    return differences(folder.parent / "whole", folder)
+    return differences(undisturbed, folder)
 
 
-def whole_run(overrides: list[str]) -> list[str]:
-    """Return the overrides of a run without workers, whose samples are the same."""
-    return [entry for entry in overrides if not entry.startswith("data.num_workers")]
+@cache
+def whole_run(*overrides: str) -> Path:
+    """Return the folder of a run that nothing happens to, which is made once.
+
+    It has no worker processes: its samples are the same.
+
+    Raises:
+        RuntimeError: the run fails.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="torture_whole_"))
+    atexit.register(shutil.rmtree, folder)
+    alone = [entry for entry in overrides if not entry.startswith("data.num_workers")]
+    process = start([*alone, f"hydra.run.dir={folder / 'run'}"], folder / "0.log")
+    if process.wait(600.0):
+        raise RuntimeError(f"the whole run fails: {line_of(process)}")
+    return folder / "run"
 
 
 def log(folder: Path) -> Path:
     """Return a new file for what a process prints."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    return folder.parent / f"{len(list(folder.parent.glob('*.log')))}.log"
+    path = folder.parent / f"{len(list(folder.parent.glob('*.log')))}.log"
+    path.touch()  # the next one is another, however soon it is asked for
+    return path
 
 
 def await_checkpoint(process: Process, run: Path) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from scripts.tortures.damaged_checkpoints import cut, damaged_checkpoint, flipped, with_code
 from scripts.tortures.disks import file_for_folder, full_disk, odd_names, read_only_disk
+from scripts.tortures.kernel_caches import compiled_at_once, damaged_kernels
 from scripts.tortures.trainings import (
     failing_figure,
     failing_tensorboard,
@@ -32,6 +33,8 @@ FAULTS: dict[str, Fault] = {
     "checkpoint: cut": lambda f: damaged_checkpoint(f, cut, "not a safe checkpoint"),
     "checkpoint: empty": lambda f: damaged_checkpoint(f, lambda _: b"", "not a safe checkpoint"),
     "checkpoint: code": lambda f: damaged_checkpoint(f, with_code, "not a safe checkpoint"),
+    "two first compilations at once": compiled_at_once,
+    "compiled kernels: a byte and a cut": damaged_kernels,
     "NaN in a loss": nan_in_loss,
     "a worker is killed": lost_worker,
     "a photograph turns unreadable": unreadable_photograph,

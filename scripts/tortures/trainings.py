@@ -5,7 +5,6 @@ import signal
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 from scripts.tortures.disks import FIGURES, RUN
@@ -23,8 +22,8 @@ def nan_in_loss(folder: Path) -> list[str]:
 
         real = Camera.loss_over_views
 
-        def broken(self: Camera, restored: torch.Tensor, truth: torch.Tensor) -> dict:
-            terms = real(self, restored, truth)
+        def broken(self: Camera, *arguments: object, **options: object) -> dict:
+            terms = real(self, *arguments, **options)
             if self.trainer.training and self.global_step == 2:
                 terms["total"] = terms["total"] * float("nan")
             return terms
@@ -54,22 +53,27 @@ def lost_worker(folder: Path) -> list[str]:
 
 
 def unreadable_photograph(folder: Path) -> list[str]:
-    """Cut a photograph's file short while a run reads it."""
+    """Cut the files of photographs short while a run reads them, and mend them for the next."""
     images, chance = folder / "images", np.random.default_rng(0)
     images.mkdir(parents=True)
     for number in range(8):
         pixels = chance.integers(0, 256, (96, 96, 3), dtype=np.uint8)
         Image.fromarray(pixels).save(images / f"{number}.png")
     own = [entry for entry in RUN if not entry.startswith("data.steps")]
-    own += ["data=image_folder", f"data.root={images}", "data.steps_per_epoch=30"]
+    own += ["data=image_folder", f"data.root={images}", "data.steps_per_epoch=10"]
+    own += ["data.cache_bytes=0", "data.unreadable=error"]
     run = folder / "run"
-    process = start([*own, "+data.cache_bytes=0", f"hydra.run.dir={run}"], log(run), trust)
+    process = start([*own, f"hydra.run.dir={run}"], log(run), trust)
     if not await_checkpoint(process, run):
         return [f"ends early: {line_of(process)}"]
-    for path in images.iterdir():
-        path.write_bytes(path.read_bytes()[:200])
+    whole = {path: path.read_bytes() for path in images.iterdir()}
+    for path in whole:
+        path.write_bytes(whole[path][:200])
     process.wait()
-    return refused(process, str(images)) + faults_of(run)
+    wrong = refused(process, str(images), ".png", "data.unreadable=skip") + faults_of(run)
+    for path in whole:
+        path.write_bytes(whole[path])
+    return wrong + goes_on(run, own)
 
 
 def failing_figure(folder: Path) -> list[str]:

@@ -8,7 +8,8 @@ from torch.utils.data import DataLoader
 
 from dolens.errors import InputError
 from dolens.experiments.data.image_folder import ImageFolderDataModule
-from dolens.experiments.data.loading import Waiting
+from dolens.experiments.data.loading import CropLoader, LostWorkerError, Waiting
+from dolens.experiments.running.machine_faults import machine_fault
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +83,22 @@ def test_a_loader_of_workers_keeps_them(folder):
         list(loader)
         workers.append([worker.pid for worker in loader._iterator._workers])
     assert workers[0] == workers[1]
+
+
+@pytest.mark.parametrize("fault", [ConnectionResetError, EOFError])
+def test_a_worker_that_hangs_up_is_told_from_other_errors(fault):
+    """It hangs up when it is killed, a moment before PyTorch finds it dead."""
+
+    def watched(message, workers):
+        def fail():
+            yield torch.zeros(1)
+            raise fault(message)
+
+        return list(CropLoader([torch.zeros(1)], num_workers=workers)._watched(fail()))
+
+    with pytest.raises(LostWorkerError) as caught:
+        watched("reset by peer", 1)
+    assert "reads photographs has ended" in machine_fault(caught.value)
+    for message, workers in (("Caught it in DataLoader worker process 0.", 1), ("reset", 0)):
+        with pytest.raises(fault):
+            watched(message, workers)
