@@ -102,6 +102,8 @@ def _fits(value: object, hint: Any) -> bool:
         return isinstance(value, list | tuple) and _entries_fit(value, base, inner)
     if base in (dict, Mapping):
         return isinstance(value, dict) and all(_fits(v, inner[1]) for v in value.values() if inner)
+    if base is Tensor:
+        return not isinstance(value, str)
     return not (_is_made(base) and isinstance(value, str | int | float))
 
 
@@ -111,7 +113,7 @@ def _is_made(hint: Any) -> bool:
         return True
     if not isinstance(hint, type) or getattr(hint, "_is_protocol", False):
         return False
-    return hint is Tensor or (hint.__module__.startswith("dolens.") and not issubclass(hint, Enum))
+    return hint.__module__.startswith("dolens.") and not issubclass(hint, Enum)
 
 
 def _entries_fit(value: Sequence[object], base: Any, inner: tuple[Any, ...]) -> bool:
