@@ -8,8 +8,11 @@ import inspect
 import math
 import types
 from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from torch import Tensor
 
 from dolens.errors import InputError
 
@@ -22,6 +25,8 @@ _WORDS: dict[Any, str] = {
     float: "a number",
     str: "a text",
     Path: "a path",
+    Tensor: "a tensor",
+    Callable: "what can be called",
     type(None): "null",
 }
 
@@ -54,6 +59,23 @@ def check_type(value: object, hint: Any, where: str) -> None:
         raise InputError(f"{where}: {_shown(value)}; allowed: {_allowed(hint)}")
 
 
+def check_types(make: Callable[..., Any], settings: Mapping[str, Any], where: str) -> None:
+    """Refuse settings of a class or a function that the hints of its parameters do not allow.
+
+    Args:
+        make: what takes them.
+        settings: name → value; a name that is no parameter is passed over.
+        where: what the settings are of.
+
+    Raises:
+        InputError: the first such value.
+    """
+    hints = hints_of(make)
+    for name, value in settings.items():
+        if name in hints:
+            check_type(value, hints[name], f"{where}.{name}")
+
+
 def _fits(value: object, hint: Any) -> bool:
     if not isinstance(value, _PLAIN):
         return True
@@ -80,7 +102,18 @@ def _fits(value: object, hint: Any) -> bool:
         return isinstance(value, list | tuple) and _entries_fit(value, base, inner)
     if base in (dict, Mapping):
         return isinstance(value, dict) and all(_fits(v, inner[1]) for v in value.values() if inner)
-    return True
+    if base is Tensor:
+        return not isinstance(value, str)
+    return not (_is_made(base) and isinstance(value, str | int | float))
+
+
+def _is_made(hint: Any) -> bool:
+    """Return whether a hint is a class whose instances no text and no number stands for."""
+    if hint is Callable:
+        return True
+    if not isinstance(hint, type) or getattr(hint, "_is_protocol", False):
+        return False
+    return hint.__module__.startswith("dolens.") and not issubclass(hint, Enum)
 
 
 def _entries_fit(value: Sequence[object], base: Any, inner: tuple[Any, ...]) -> bool:

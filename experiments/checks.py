@@ -44,3 +44,13 @@ def check_positive(key: str, number: Any) -> None:
     """
     if not (isinstance(number, int | float) and 0.0 < number < math.inf):
         raise InputError(f"{key}: {number!r}; allowed: a positive number")
+
+
+def check_not_negative(key: str, number: Any) -> None:
+    """Refuse what is no finite number of 0 or more.
+
+    Raises:
+        InputError: it is none.
+    """
+    if not (isinstance(number, int | float) and 0.0 <= number < math.inf):
+        raise InputError(f"{key}: {number!r}; allowed: a number of 0 or more")

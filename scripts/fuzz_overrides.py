@@ -42,11 +42,11 @@ from tests.experiments.conftest import composing
 
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST = 500
-_NUMBERS = ("abc", "-1", "0", ".nan", ".inf", "-.inf", "1e300", "''", "null", "[]", "[1,2]", "true",
+_NUMBERS = ("abc", "-1", "0", "nan", "inf", "-inf", "1e300", "''", "null", "[]", "[1,2]", "true",
             "{a:1}", "-1e-3", "1.5", "1000000000000")  # fmt: skip
 _TEXTS = ("''", "foo", "3", "-1.5", "null", "[]", "true", "{a:1}")
 _TRUTHS = ("foo", "2", "null", "[]", "1.5", "''")
-_LISTS = ("[]", "foo", "3", "null", "[[]]", "[abc]", "[.nan]", "[-1]", "{a:1}", "[0]", "[.inf]")
+_LISTS = ("[]", "foo", "3", "null", "[[]]", "[abc]", "[nan]", "[-1]", "{a:1}", "[0]", "[inf]")
 # Where files are written, and what is looked at elsewhere (the prescription).
 _LEFT = ("hydra", "lens", "_target_", "_partial_", "_convert_", "trainer.default_root_dir",
          "callbacks", "logger")  # fmt: skip

@@ -34,7 +34,7 @@ ALLOWED = {
         *("cached_tensors", "errors", "stages", "optics", "kernels", "scene", "sensor"),
         *("analysis", "diffraction"),
     },
-    "optimize": {"errors", "optics", "analysis", "rendering"},
+    "optimize": {"errors", "typed_values", "optics", "analysis", "rendering"},
     "tolerancing": {"errors", "tasks", "optics", "analysis"},
     "alignment": {"errors", "optics", "sensor", "rendering", "analysis", "diffraction", "optimize"},
     "reconstruction": {"errors", "optics", "sensor"},

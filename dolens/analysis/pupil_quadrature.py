@@ -80,8 +80,12 @@ def square_grid(
             the beam of a field aside, tan(field)·sag(r₁).
 
     Raises:
-        InputError: a spot without rays.
+        InputError: a spot without rays, or a count or a width that is not positive.
     """
+    if count < 1:
+        raise InputError(f"count: {count}; allowed: 1 or more rays along each side")
+    if half_width is not None and not 0.0 < half_width < math.inf:
+        raise InputError(f"half_width: {half_width} mm; allowed: a positive number")
     axis = torch.linspace(-1.0, 1.0, count, dtype=torch.float64)
     unit = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
 

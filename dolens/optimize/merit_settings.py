@@ -25,6 +25,7 @@ from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
+from dolens.typed_values import check_types
 
 SAMPLINGS: dict[str, Callable[..., SpotRays]] = {
     "gaussian_quadrature": gaussian_quadrature,
@@ -84,11 +85,16 @@ class MeritSettings:
         """Return (x, y) of every field that counts, degrees or mm.
 
         Raises:
-            InputError: neither the settings nor the lens name any.
+            InputError: neither the settings nor the lens name any, or one is not a pair.
         """
         if self.fields is not None:
             if not self.fields:
                 raise InputError("merit.fields: is an empty list; give (x, y) in degrees")
+            for point in self.fields:
+                if len(point) != 2:
+                    raise InputError(
+                        f"merit.fields: {list(point)}; allowed: (x, y) in degrees or mm"
+                    )
             return self.fields
         if lens.fields is None:
             raise InputError(f"merit.fields: lens '{lens.name}' names none; give (x, y) in degrees")
@@ -126,9 +132,9 @@ class MeritSettings:
                 f"'{lens.name}' has object_distance {lens.object_distance:g} mm"
             )
         sampling = SAMPLINGS[self.sampling]
-        rays = call_with_settings(
-            sampling, options, "merit.sampling_options", lens, fields, wavelengths
-        )
+        where = "merit.sampling_options"
+        check_types(sampling, options, where)
+        rays = call_with_settings(sampling, options, where, lens, fields, wavelengths)
         if self.reference == "chief":
             return with_chief_rays(lens, rays, lens.object_distance)
         return rays
@@ -188,6 +194,8 @@ class MeritSettings:
         name = self.quality if isinstance(self.quality, str) else ""
         if own_loss is None:
             check_choice(name, (*RESIDUALS, *LOSSES), "merit.quality")
+        if not 0.0 <= self.max_vignetting <= 1.0:
+            raise InputError(f"merit.max_vignetting: {self.max_vignetting}; allowed: 0 to 1")
         rays = self.rays(lens)
         common = (
             rays,
@@ -201,6 +209,7 @@ class MeritSettings:
             return call_with_settings(RESIDUALS[name], options, where, *common)
         curvature = options.pop("curvature", "directions")
         if own_loss is None:
+            check_types(LOSSES[name], options, where)
             loss = call_with_settings(LOSSES[name], options, where)
             return LossResiduals(*common, loss, curvature)
         check_keys(options, ("curvature",), where)
@@ -214,6 +223,7 @@ def _given(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def _weights(what: str, given: Sequence[float] | None, count: int) -> Tensor:
     weights = torch.tensor([1.0] * count if given is None else list(given), dtype=torch.float64)
-    if len(weights) != count or not bool((weights >= 0.0).all()) or not float(weights.sum()) > 0.0:
+    bad = not bool(((weights >= 0.0) & weights.isfinite()).all())
+    if len(weights) != count or bad or not float(weights.sum()) > 0.0:
         raise InputError(f"merit.{what}: give {count} numbers that are not negative, not all zero")
     return weights

@@ -170,6 +170,8 @@ def operand(settings: Mapping[str, Any] | Operand, lens: Lens) -> Operand:
     """
     if isinstance(settings, Operand):
         return settings
+    if not isinstance(settings, Mapping):
+        raise InputError(f"operand {settings!r}: allowed: a mapping with its kind")
     kind = str(settings.get("kind"))
     check_choice(kind, KINDS, "operand: kind")
     check_keys(settings, _KEYS, f"operand '{kind}'")

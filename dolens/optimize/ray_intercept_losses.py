@@ -33,7 +33,8 @@ class Modulation:
         target: at each frequency; one number for all.
 
     Raises:
-        InputError: no frequency, or one that is not positive, or targets of another number.
+        InputError: no frequency, or one that is not positive, or targets of another number, or
+            below zero.
     """
 
     frequencies: Sequence[float] = (50.0, 100.0)
@@ -44,6 +45,9 @@ class Modulation:
             raise InputError(f"frequencies: {self.frequencies}; allowed: positive, cycles/mm")
         if isinstance(self.target, Sequence) and len(self.target) != len(self.frequencies):
             raise InputError("target: give one number, or one for each frequency")
+        targets = self.target if isinstance(self.target, Sequence) else (self.target,)
+        if not all(0.0 <= target < math.inf for target in targets):
+            raise InputError(f"target: {self.target}; allowed: contrasts, 0 or more")
 
     def __call__(self, points: Tensor, groups: RayGroups) -> Tensor:
         """Return the loss of ray intercepts (2, N), mm from their groups' references."""

@@ -192,7 +192,7 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
     named = content.get("field_type") or entries[0].get("field_type")
     if isinstance(definition, dict):
         named = named or _DEFINITIONS.get(str(definition.get("field_type")))
-    if named not in _FIELDS:
+    if not isinstance(named, str) or named not in _FIELDS:
         raise InputError(
             f"{where}: fields of type {named!r} are not held (allowed: {', '.join(_FIELDS)})"
         )

@@ -189,8 +189,13 @@ def _specification(model: dict[str, Any], finite: bool, where: str) -> dict[str,
     return found
 
 
+def _key(content: dict[str, Any]) -> tuple[str, ...]:
+    words = content.get("key", content.get("_key", []))
+    return tuple(map(str, words[-2:])) if isinstance(words, list) else ()
+
+
 def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
-    key = tuple(str(word) for word in content.get("key", content.get("_key", []))[-2:])
+    key = _key(content)
     if key not in _FIELDS:
         raise InputError(f"{where}: fields of kind {' '.join(key) or 'none'} are not held")
     scale = number(content, "value", where) if content.get("is_relative") else 1.0
@@ -217,7 +222,7 @@ def _fields(content: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _pupil(content: dict[str, Any], finite: bool, where: str) -> dict[str, float]:
-    key = tuple(str(word) for word in content.get("key", content.get("_key", []))[-2:])
+    key = _key(content)
     value = number(content, "value", where)
     if key == ("object", "epd") or key == ("object", "pupil"):
         return {"entrance_pupil_diameter": value}

@@ -6,7 +6,8 @@ from torchmetrics.functional.image import (
     structural_similarity_index_measure,
 )
 
-_WINDOW = 11
+# Pixels along each side of the window of structural similarity; no smaller image has one.
+SIMILARITY_WINDOW = 11
 # Pixels of all images that are compared at a time: each takes some 700 bytes.
 _PIXELS = 1 << 19
 
@@ -52,17 +53,17 @@ def structural_similarity(restored: Tensor, truth: Tensor) -> Tensor:
         ValueError: the shapes differ, are not (B, C, H, W), or are smaller than the window.
     """
     _check_shapes(restored, truth)
-    if min(restored.shape[-2:]) < _WINDOW:
+    if min(restored.shape[-2:]) < SIMILARITY_WINDOW:
         raise ValueError(
             f"images of {restored.shape[-2]}×{restored.shape[-1]} pixels: structural similarity "
-            f"needs at least {_WINDOW}×{_WINDOW}"
+            f"needs at least {SIMILARITY_WINDOW}×{SIMILARITY_WINDOW}"
         )
     batch, _, height, width = restored.shape
-    strip, reach = max(_WINDOW, _PIXELS // (batch * width)), _WINDOW // 2
+    strip, reach = max(SIMILARITY_WINDOW, _PIXELS // (batch * width)), SIMILARITY_WINDOW // 2
     total = restored.new_zeros(batch)
     for first in range(0, height, strip):
         # Rows on both sides, as far as a window reaches; a mirror needs some at the image's end.
-        low = max(0, min(first, height - _WINDOW) - reach)
+        low = max(0, min(first, height - SIMILARITY_WINDOW) - reach)
         high = min(first + strip + reach, height)
         _, similarity = structural_similarity_index_measure(
             restored[..., low:high, :].clamp(0.0, 1.0),

@@ -13,7 +13,7 @@ from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.calibration import check as check_miscalibrations
 from dolens.experiments.camera.costs import StepCosts
-from dolens.experiments.camera.evaluation import Evaluation, means_of, without_loss
+from dolens.experiments.camera.evaluation import Evaluation, check_size, means_of, without_loss
 from dolens.experiments.camera.figures import camera_figures
 from dolens.experiments.camera.lens_steps import LensSteps, variable_numbers
 from dolens.experiments.camera.operands import CameraOperands
@@ -90,6 +90,7 @@ class CameraModule(Camera):
         self._ddp_params_and_buffers_to_ignore = [f"adversary.{name}" for name in others]
         if not len(self.variables):
             self._ddp_params_and_buffers_to_ignore.append("variables.scaled")
+        check_size(views.sensor.height, views.sensor.width)
         views.check(lens)
         self.lens_steps = LensSteps(
             self.lens,

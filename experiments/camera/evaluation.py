@@ -9,12 +9,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from dolens.errors import InputError
 from dolens.experiments.camera.base import Camera
 from dolens.experiments.camera.calibration import Miscalibration
 from dolens.experiments.camera.photograph_scores import PhotographScores, scores_by_photograph
 from dolens.experiments.camera.views.base import Views, seed_of
 from dolens.reconstruction import psnr_db, structural_similarity
 from dolens.reconstruction.processes import gathered
+from dolens.reconstruction.quality import SIMILARITY_WINDOW
 from dolens.sensor.colour import linear_to_srgb
 from dolens.stages import stage as named_stage
 
@@ -126,6 +128,23 @@ def without_loss(scores: PhotographScores) -> PhotographScores:
     """Return the scores without the loss, which tables of photographs leave out."""
     kept = {name: values for name, values in scores.metrics.items() if name != "loss"}
     return replace(scores, metrics=kept)
+
+
+def check_size(height: int, width: int) -> None:
+    """Refuse images that are too small to be compared.
+
+    Args:
+        height: of the sensor, pixels.
+        width: likewise.
+
+    Raises:
+        InputError: structural similarity has no window that fits in.
+    """
+    if min(height, width) < SIMILARITY_WINDOW:
+        raise InputError(
+            f"renderer.sensor: height {height} and width {width} pixels; allowed: "
+            f"{SIMILARITY_WINDOW} or more, as structural similarity needs"
+        )
 
 
 def _photographs(trainer: object, stage: str, count: int) -> Sequence[str]:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError, check_choice
+from dolens.experiments.checks import check_positive
 from dolens.experiments.design.figures import design_figures, history_figures
 from dolens.experiments.design.iteration import (
     Progress,
@@ -126,6 +127,8 @@ class DesignModule(Experiment):
             merit, quality="spots", quality_options={}, operands=()
         )
         self.optimizer, self.round_tolerance = optimizer, round_tolerance
+        if mtf_max_frequency is not None:
+            check_positive("mtf_max_frequency", mtf_max_frequency)
         self.mtf_max_frequency = mtf_max_frequency
         check_choice(semi_diameters, SEMI_DIAMETERS, "semi_diameters")
         self.automatic_semi_diameters = semi_diameters == "automatic"

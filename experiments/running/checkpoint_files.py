@@ -1,5 +1,7 @@
 """Checkpoints are files that are written whole, read as plain values, and checked for damage."""
 
+import pickle
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +15,7 @@ from dolens.whole_files import written_whole
 
 # So much of a foreign program's reason is repeated.
 _REASON = 200
+_GLOBAL = re.compile(r"GLOBAL (\S+)")
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -75,7 +78,7 @@ def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
         if damaged is None:
             found = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        reason = one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
+        reason = _reason(error)
         raise InputError(f"{where}{path} is not a safe checkpoint ({reason[:_REASON]})") from None
     if damaged is not None:
         raise InputError(
@@ -85,6 +88,16 @@ def read_checkpoint(path: str | Path, where: str = "") -> Mapping[str, Any]:
     if not isinstance(found, Mapping) or "state_dict" not in found:
         raise InputError(f"{where}{path} holds no state of a module")
     return found
+
+
+def _reason(error: Exception) -> str:
+    """Return why PyTorch does not read a file, without its advice to execute what is in it."""
+    called = _GLOBAL.search(str(error))
+    if called is not None:
+        return f"it would call {one_line(called[1])}"
+    if isinstance(error, pickle.UnpicklingError):
+        return "it holds more than plain tensors and values"
+    return one_line(str(error).splitlines()[0] if str(error) else type(error).__name__)
 
 
 def _damaged_part(path: str | Path) -> str | None:

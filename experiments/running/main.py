@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.running.choices import no_choice
 from dolens.experiments.running.failed_parts import reason_of
 from dolens.experiments.running.machine_faults import machine_fault
 from dolens.experiments.running.processes import own_arguments, report_failure
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str], program: str) -> None:
     except (InputError, OmegaConfBaseException) as error:
         sys.exit(f"error: {one_line(error)}")
     except (OSError, ValueError) as error:  # as Hydra makes the folder of a run, and its log
-        fault = machine_fault(error)
+        fault = machine_fault(error) or no_choice(arguments)
         if fault is None:
             raise
         sys.exit(f"error: {fault}")

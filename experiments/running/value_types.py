@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from dolens.errors import InputError
+from dolens.experiments.running.schedules import check_schedule
 from dolens.experiments.running.target_keys import (
     REFERENCE,
     Target,
@@ -38,18 +39,24 @@ def refuse_wrong_types(plain: Mapping[str, Any], parts: Sequence[str]) -> None:
                 check_type(value, hints[key], path)
         if isinstance(make, type) and issubclass(make, torch.optim.Optimizer):
             _try_optimizer(plain, target, make)
+        if isinstance(make, type) and issubclass(make, torch.optim.lr_scheduler.LRScheduler):
+            check_schedule(target.path, _known(plain, target))
 
 
 def _try_optimizer(plain: Mapping[str, Any], target: Target, make: type) -> None:
-    """Make one of torch's own optimizers of a number, which checks its settings before any work."""
-    if not make.__module__.startswith("torch.optim"):
+    """Make an optimizer of torch or of dolens of a number: it checks its settings before work."""
+    if not make.__module__.startswith(("torch.optim", "dolens.optimize")):
         return
-    values = {key: _followed(plain, key, value)[1] for key, value in target.values.items()}
-    known = {key: value for key, value in values.items() if not _is_open(value)}
     try:
-        make([torch.nn.Parameter(torch.zeros(1))], **known)
+        make([torch.nn.Parameter(torch.zeros(1))], **_known(plain, target))
     except (ValueError, TypeError, RuntimeError) as error:
         raise InputError(f"{target.path}: {error}") from None
+
+
+def _known(plain: Mapping[str, Any], target: Target) -> dict[str, Any]:
+    """Return the values of a target that are known before anything is made."""
+    values = {key: _followed(plain, key, value)[1] for key, value in target.values.items()}
+    return {key: value for key, value in values.items() if not _is_open(value)}
 
 
 def _followed(plain: Mapping[str, Any], path: str, value: Any) -> tuple[str, Any]:

@@ -38,6 +38,8 @@ WRONG = {
     ),
     "lens.sensor.distance=-5": "lens.sensor.distance: -5 mm; the sensor must stand behind",
     "ckpt_path=true": "ckpt_path: True; allowed: a text, or null",
+    "scheduler.T_max=0": "scheduler.T_max: 0; allowed: an integer of 1 or more",
+    "scheduler.eta_min=-1": "scheduler.eta_min: -1; allowed: a number of 0 or more",
 }
 
 

@@ -4,6 +4,7 @@ A number (the seed) gives the same mutated file back.
 """
 
 import codecs
+import contextlib
 import json
 import random
 import re
@@ -262,7 +263,8 @@ def _change(node: Any, key: Any, other: Any, there: Any, rng: random.Random) -> 
         text = json.dumps(other[there])
         node[key] = json.loads(text) if len(text) < 20000 else None
     elif way == 7 and isinstance(value, int | float):
-        node[key] = value * rng.choice((-1, 0, 10, 1e-3, 1e3, 1e10, 1e100, 1.0 + 1e-15, 0.5))
+        with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
+            node[key] = value * rng.choice((-1, 0, 10, 1e-3, 1e3, 1e10, 1e100, 1.0 + 1e-15, 0.5))
     elif isinstance(value, list):
         node[key] = value * rng.choice((2, 3, 50)) if value else [1]
     else:

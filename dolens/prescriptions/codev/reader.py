@@ -185,7 +185,10 @@ def _solved(
     mirrors = [False, *(surface.material == "mirror" for surface in surfaces)]
     for medium, mirror in zip(media, mirrors, strict=True):
         sense = -sense if mirror else sense
-        indices.append(sense * float(parse_material(medium, model).index(wavelength)))
+        try:
+            indices.append(sense * float(parse_material(medium, model).index(wavelength)))
+        except InputError as error:
+            raise InputError(f"{where}: PIM: {error}") from None
     gaps = [
         float(surface.gap + own.shift_after + following.shift_before)
         for surface, own, following in zip(surfaces, axes, axes[1:], strict=False)
