@@ -1,6 +1,7 @@
 """A Ray cluster is started on this machine, or one that runs already is joined."""
 
 import importlib
+import logging
 import os
 import secrets
 import shutil
@@ -20,6 +21,7 @@ from dolens.experiments.environment_variables import environment_variables
 _OBJECT_STORE_BYTES = 512 << 20
 # Ray's sockets lie some 70 characters below its folder, and Linux allows 107 for all.
 _LONGEST_FOLDER = 30
+_MODE = "RAY_AUTH_MODE"
 # What Ray's processes read when they start.
 _PRIVATE: Mapping[str, str] = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -53,11 +55,12 @@ def local_cluster(setting: str, processes: int | None = None) -> Iterator[Module
     if processes is not None:
         own = {"num_cpus": processes, "num_gpus": 0, "object_store_memory": _OBJECT_STORE_BYTES}
         variables["OMP_NUM_THREADS"] = "1"
-    if not {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & set(os.environ):
-        # Else Ray makes a token of its own, and writes it to a file in the home folder.
-        variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
+    if not {_MODE, "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & set(os.environ):
+        # Else Ray makes a token of its own, and writes it to a file in the home folder.  Ray itself
+        # sets RAY_AUTH_MODE, since a module of it that was imported before no longer looks there.
+        variables["RAY_AUTH_TOKEN"] = _token()
     with ExitStack() as closing:
-        with environment_variables(variables):
+        with environment_variables(variables), _own_mode(), _only_errors():
             ray = ray_module(setting)
             if not ray.is_initialized():
                 folder = tempfile.mkdtemp(prefix="dolens-", dir=_short_folder())
@@ -129,6 +132,29 @@ def _short_folder() -> str:
     """Return a folder for temporary files whose name leaves room for those of sockets."""
     folder = tempfile.gettempdir()
     return folder if len(folder) <= _LONGEST_FOLDER else "/tmp"
+
+
+@contextmanager
+def _own_mode() -> Iterator[None]:
+    """Put RAY_AUTH_MODE back, which Ray sets when it starts a cluster."""
+    before = os.environ.get(_MODE)
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(_MODE, None)
+
+
+@contextmanager
+def _only_errors() -> Iterator[None]:
+    """Keep Ray's remarks about its start out of the log."""
+    ray_s = logging.getLogger("ray")
+    before = ray_s.level
+    ray_s.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        ray_s.setLevel(before)
 
 
 @cache
