@@ -1,5 +1,6 @@
 """Independent tasks on workers: the same bits anywhere, in order, and no failure without a line."""
 
+import importlib
 import os
 import signal
 import subprocess
@@ -84,6 +85,7 @@ def same(one, other):
 @RAY
 def test_a_local_cluster_of_two(triplet_and_spots, tmp_path, monkeypatch):
     """One cluster for all that takes one: to start it takes most of the time."""
+    importlib.import_module("ray")  # who imported it before has settled its mode of authentication
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     (tmp_path / "home").mkdir()
     with workers_of(0).open() as own:
