@@ -147,7 +147,7 @@ def machine_lines(experiments: Sequence[Experiment], assumed: Mapping[str, float
             crops = processes * e.batch / total
             longest = max(parts, key=parts.__getitem__)
             lines.append(
-                f"| {e.name}, {what} | {1e3 * total:.0f} | {crops:.1f} | {1e6 / crops / 3600:.2g} "
+                f"| {e.name}, {what} | {1e3 * total:.0f} | {crops:.1f} | {_hours(1e6 / crops / 3600)} "
                 f"| {longest}, {100 * parts[longest] / total:.0f} % |"
             )
     return lines
@@ -174,5 +174,10 @@ def search_lines(experiments: Sequence[Experiment], assumed: Mapping[str, float]
             rounds = -(-trials // at_once)
             hours = rounds * (1000.0 * step + e.start + assumed["overhead"]) / 3600.0
             base = base or hours
-            lines.append(f"| {e.name}, {what} | {at_once} | {hours:.2g} | {base / hours:.3g} |")
+            lines.append(f"| {e.name}, {what} | {at_once} | {_hours(hours)} | {base / hours:.3g} |")
     return lines
+
+
+def _hours(hours: float) -> str:
+    """Return hours with two digits, and all digits before the point."""
+    return f"{hours:.0f}" if hours >= 10.0 else f"{hours:.2g}"
