@@ -148,7 +148,8 @@ def machine_lines(experiments: Sequence[Experiment], assumed: Mapping[str, float
             longest = max(parts, key=parts.__getitem__)
             lines.append(
                 f"| {e.name}, {what} | {1e3 * total:.0f} | {crops:.1f} "
-                f"| {_hours(1e6 / crops / 3600)} | {longest}, {100 * parts[longest] / total:.0f} % |"
+                f"| {_hours(1e6 / crops / 3600)} "
+                f"| {longest}, {100 * parts[longest] / total:.0f} % |"
             )
     return lines
 
