@@ -33,7 +33,7 @@ from tests.experiments.tiny_experiment import TINY, TINY_NETWORK
 ROOT = Path(__file__).resolve().parents[1]
 _JOB = ("experiment=asphere",)
 _RADII = "lens.surfaces.1.radius=20.8,20.9,21.0,21.1"
-_SEARCH = ("search=optuna", "optimizer=adam", "optimizer.lr=tag(log,interval(1e-4,10))")
+_SEARCH = ("search=optuna", "optimizer=adam", "optimizer.lr=tag(log,interval(1e-3,0.1))")
 _AT_ONCE = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweeper.batch=2")
 _LENSES = ("experiment=cooke_sensitivity", "callbacks.pictures=null")
 # The main job; and a camera of 24×24 pixels, of which a step is next to nothing.
@@ -145,7 +145,7 @@ def search(tiny: bool) -> dict[str, Measurement]:
     }
 
 
-KINDS = {f.__name__: f for f in (launchers, workers, training, search)}
+KINDS = {f.__name__: f for f in (training, launchers, workers, search)}
 
 
 def unique(settings: Sequence[str], others: Sequence[str]) -> list[str]:
