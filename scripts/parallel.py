@@ -1,7 +1,7 @@
 """Time what runs at once: sweeps by every launcher, workers, trainings, and a search.
 
-    python scripts/parallel.py                      # some 7 minutes on two quiet cores
-    python scripts/parallel.py launchers search --rounds 2
+    python scripts/parallel.py                      # some 11 minutes on two quiet cores
+    python scripts/parallel.py training launchers   # 5 minutes
     python scripts/parallel.py --tiny               # whether it works, at a size that tells nothing
 
 Kernels are compiled before.  Seconds are wall clock from the start of a command to its end, the
@@ -119,7 +119,7 @@ def workers(tiny: bool) -> dict[str, Measurement]:
 
 
 def training(tiny: bool) -> dict[str, Measurement]:
-    """Seconds of a training step by threads and by processes, batch of four crops."""
+    """Seconds of a training step by threads and by processes, batches of four crops."""
     found = {}
     for size, settings in _TRAININGS.items():
         if tiny and size == "main job":
