@@ -1,13 +1,14 @@
-"""Threads wait without sleeping, unless other work needs the processors that this takes.
+"""Threads wait for each other without sleeping only while no other work needs their processors.
 
 PyTorch's threads belong to OpenMP.  Between two operations they look some milliseconds long whether
 there is more to do (they spin), which saves a fifth of a short step.  Where other programs want the
 same processors, the thread that is waited for may be one that cannot run, and a step takes a
 multiple of its time.
 
-GNU's OpenMP spins next to nothing while a process has more of its threads than there are
-processors, and asks for that at every wait.  So a process that waits for processors is given some
-threads more, which sleep, until the processors are its own again.  Nothing that computes changes.
+GNU's OpenMP does not spin while a process has more of its threads than there are processors, and
+looks at their number at every wait.  So a process that waits for processors gets some threads more,
+which sleep, until its processors are its own again.  The threads that compute stay as they are, and
+their results do too.
 """
 
 import ctypes
@@ -20,37 +21,141 @@ from typing import Protocol
 
 from dolens.processors import ThreadClock, ThreadTimes, processors
 
-# Without more threads than processors GNU's OpenMP spins so often (its default), and with them not
-# at all; others' threads sleep at once.
+# GNU's OpenMP looks so often (its default), and with too many threads not at all.  Others know the
+# first word alone, and have threads sleep at once.
 POLICY = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "300000"}
+# Where nobody tells how long threads wait for processors: some 20 µs.
+_FIXED_POLICY = POLICY | {"GOMP_SPINCOUNT": "1000"}
+_OF_USERS = (*POLICY, "KMP_BLOCKTIME", "KMP_LIBRARY")
 
-_LAP_S = 0.5
+_NAME = "dolens spinning"
+# Looking takes no more than this part of the time (some 9 µs for each thread of the process).
+_LAP_S, _COST = 0.5, 5e-4
+# Alone, threads wait for one or two percent of the time in which they could run, and beside one
+# busy program on two processors for a third of it.
+_PRESSED, _FREE = 0.1, 0.05
+# Laps that say no more than this many seconds were run or waited for, say nothing.
+_LEAST_S = 0.05
+# Free laps, one after the other, before threads spin again; and laps before they try it anyway.  A
+# lap of spinning beside other work may cost a lap or two of time.
+_FREE_LAPS, _SHORTEST, _LONGEST = 3, 4, 128
+# A user who has few threads on a machine of many processors needs no thread for each of the others.
+_MOST_SLEEPING = 64
+
+
+def choose_waiting() -> None:
+    """Set how threads wait in this process, and in those that it starts; a user's choice stays.
+
+    This must come before PyTorch is imported.
+    """
+    if "torch" not in sys.modules and not any(name in os.environ for name in _OF_USERS):
+        os.environ.update(_FIXED_POLICY if ThreadClock().lap() is None else POLICY)
+    follow_other_work()
+
+
+def follow_other_work() -> None:
+    """Have a thread watch this process, where the policy is this module's and threads are many."""
+    ours = all(os.environ.get(name) == value for name, value in POLICY.items())
+    watched = any(thread.name == _NAME for thread in threading.enumerate())
+    if ours and not watched and os.environ.get("OMP_NUM_THREADS") != "1":
+        threading.Thread(target=_follow, name=_NAME, daemon=True).start()
 
 
 class Clock(Protocol):
-    """Tells how long threads ran and waited since they were asked about last."""
+    """Tells how long threads ran and waited since it was asked last."""
 
     def lap(self) -> ThreadTimes | None:
         """Return the times."""
 
 
-class SleepingTeam:
-    """Threads of OpenMP's that sleep until they are ended."""
+class Team(Protocol):
+    """Threads that sleep."""
 
-    def __init__(self, openmp: ctypes.CDLL, threads: int) -> None:
+    def end(self) -> None:
+        """End them."""
+
+
+class SpinControl:
+    """Decides from lap to lap whether threads may spin.
+
+    Args:
+        clock: of this process.
+        sleeping_team: starts threads that keep all others from spinning until they end.
+    """
+
+    def __init__(self, clock: Clock, sleeping_team: Callable[[], Team]) -> None:
+        self._clock, self._sleeping_team = clock, sleeping_team
+        self._team: Team | None = None
+        self._free = self._laps = 0
+        self._patience = _SHORTEST
+
+    @property
+    def spins(self) -> bool:
+        """Whether threads may spin."""
+        return self._team is None
+
+    def look(self) -> None:
+        """Take the times of another lap, and decide."""
+        times = self._clock.lap()
+        if times is None or times.ran + times.waited < _LEAST_S:
+            return
+        self._laps += 1
+        self._free = self._free + 1 if times.share_waited < _FREE else 0
+        if self._team is None:
+            if times.share_waited >= _PRESSED:
+                # A try that failed at once has the next one wait for longer.
+                failed = self._laps <= _FREE_LAPS
+                self._patience = min(2 * self._patience, _LONGEST) if failed else _SHORTEST
+                self._team, self._laps = self._sleeping_team(), 0
+        elif self._free >= _FREE_LAPS or self._laps >= self._patience:
+            self._team.end()
+            self._team, self._laps = None, 0
+
+
+class SleepingTeam:
+    """A team of OpenMP's that has nothing to do.
+
+    Args:
+        openmp: of GNU.
+        torch_threads: says how many threads torch has.
+    """
+
+    def __init__(self, openmp: ctypes.CDLL, torch_threads: Callable[[], int]) -> None:
+        self._openmp, self._torch_threads = openmp, torch_threads
         self._over = threading.Event()
-        self._openmp, self._threads = openmp, threads
-        self._thread = threading.Thread(target=self._hold, daemon=True, name="dolens idle team")
+        # A team belongs to the thread that first calls for it, and ends with it.
+        self._thread = threading.Thread(target=self._hold, daemon=True)
         self._thread.start()
 
     def _hold(self) -> None:
-        # A team belongs to the thread that has first called for it, and ends with it.  What it runs
-        # here takes no argument and writes nothing.
-        nothing = ctypes.cast(self._openmp.omp_get_thread_num, ctypes.c_void_p)
-        self._openmp.GOMP_parallel(nothing, None, self._threads, 0)
+        # Torch tells its number to a thread that is new.  This thread is not one of those counted.
+        threads = max(0, processors() - self._torch_threads()) + 2
+        if threads <= _MOST_SLEEPING:
+            # A function that takes nothing, and does nothing.
+            nothing = ctypes.cast(self._openmp.omp_get_thread_num, ctypes.c_void_p)
+            self._openmp.GOMP_parallel(nothing, None, threads, 0)
         self._over.wait()
 
     def end(self) -> None:
-        """Let the threads end."""
+        """Let the threads go."""
         self._over.set()
         self._thread.join()
+
+
+def _follow() -> None:
+    while "torch" not in sys.modules:
+        time.sleep(_LAP_S)
+    import torch
+
+    from dolens.openmp import torchs_openmp
+
+    openmp = torchs_openmp()
+    if openmp is None or hasattr(openmp, "kmp_set_blocktime"):  # of Intel or LLVM: they sleep
+        return
+    control = SpinControl(ThreadClock(), lambda: SleepingTeam(openmp, torch.get_num_threads))
+    lap = _LAP_S
+    while True:
+        time.sleep(lap)
+        began = time.thread_time()
+        control.look()
+        lap = max(_LAP_S, (time.thread_time() - began) / _COST)
