@@ -12,6 +12,7 @@ their results do too.
 """
 
 import ctypes
+import logging
 import os
 import sys
 import threading
@@ -20,6 +21,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 from dolens.processors import ThreadClock, ThreadTimes, processors
+
+logger = logging.getLogger(__name__)
 
 # GNU's OpenMP looks so often (its default), and with too many threads not at all.  Others know the
 # first word alone, and have threads sleep at once.
@@ -31,14 +34,15 @@ _OF_USERS = (*POLICY, "KMP_BLOCKTIME", "KMP_LIBRARY")
 _NAME = "dolens spinning"
 # Looking takes no more than this part of the time (some 9 µs for each thread of the process).
 _LAP_S, _COST = 0.5, 5e-4
-# Alone, threads wait for one or two percent of the time in which they could run, and beside one
-# busy program on two processors for a third of it.
-_PRESSED, _FREE = 0.1, 0.05
+# Beside one busy program on two processors, threads wait for a third of the time in which they could
+# run.  Alone they wait for one or two percent where they spin, and for up to an eighth where they
+# sleep, since they wait to be woken.
+_PRESSED, _FREE = 0.1, 0.15
 # Laps that say no more than this many seconds were run or waited for, say nothing.
 _LEAST_S = 0.05
-# Free laps, one after the other, before threads spin again; and laps before they try it anyway.  A
-# lap of spinning beside other work may cost a lap or two of time.
-_FREE_LAPS, _SHORTEST, _LONGEST = 3, 4, 128
+# Laps before sleeping threads try to spin.  A try beside other work may cost a lap or two of time:
+# where it ends at once, the next one comes after twice as many.  A free lap counts for several.
+_SHORTEST, _LONGEST, _WORTH = 4, 128, 8
 # A user who has few threads on a machine of many processors needs no thread for each of the others.
 _MOST_SLEEPING = 64
 
@@ -86,8 +90,7 @@ class SpinControl:
     def __init__(self, clock: Clock, sleeping_team: Callable[[], Team]) -> None:
         self._clock, self._sleeping_team = clock, sleeping_team
         self._team: Team | None = None
-        self._free = self._laps = 0
-        self._patience = _SHORTEST
+        self._laps, self._patience = _SHORTEST, _SHORTEST
 
     @property
     def spins(self) -> bool:
@@ -99,17 +102,19 @@ class SpinControl:
         times = self._clock.lap()
         if times is None or times.ran + times.waited < _LEAST_S:
             return
-        self._laps += 1
-        self._free = self._free + 1 if times.share_waited < _FREE else 0
         if self._team is None:
+            self._laps += 1
             if times.share_waited >= _PRESSED:
-                # A try that failed at once has the next one wait for longer.
-                failed = self._laps <= _FREE_LAPS
+                failed = self._laps < _SHORTEST
                 self._patience = min(2 * self._patience, _LONGEST) if failed else _SHORTEST
                 self._team, self._laps = self._sleeping_team(), 0
-        elif self._free >= _FREE_LAPS or self._laps >= self._patience:
+                logger.debug("threads sleep: %.0f %% waited", 100.0 * times.share_waited)
+            return
+        self._laps += _WORTH if times.share_waited < _FREE else 1
+        if self._laps >= self._patience:
             self._team.end()
             self._team, self._laps = None, 0
+            logger.debug("threads spin: %.0f %% waited", 100.0 * times.share_waited)
 
 
 class SleepingTeam:
