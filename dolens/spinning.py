@@ -34,9 +34,9 @@ _OF_USERS = (*POLICY, "KMP_BLOCKTIME", "KMP_LIBRARY")
 _NAME = "dolens spinning"
 # Looking takes no more than this part of the time (some 9 µs for each thread of the process).
 _LAP_S, _COST = 0.5, 5e-4
-# Beside one busy program on two processors, threads wait for a third of the time in which they could
-# run.  Alone they wait for one or two percent where they spin, and for up to an eighth where they
-# sleep, since they wait to be woken.
+# Beside one busy program on two processors, threads wait for a third of the time in which they
+# could run.  Alone they wait for one or two percent where they spin, and for up to an eighth where
+# they sleep, since they wait to be woken.
 _PRESSED, _FREE = 0.1, 0.15
 # Laps that say no more than this many seconds were run or waited for, say nothing.
 _LEAST_S = 0.05
