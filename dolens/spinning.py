@@ -43,8 +43,9 @@ _LEAST_S = 0.05
 # Laps before sleeping threads try to spin.  A try beside other work may cost a lap or two of time:
 # where it ends at once, the next one comes after twice as many.  A free lap counts for several.
 _SHORTEST, _LONGEST, _WORTH = 4, 128, 8
-# A user who has few threads on a machine of many processors needs no thread for each of the others.
-_MOST_SLEEPING = 64
+# Few threads on many processors, as by the quota of a container, need one for each of the others.
+# OpenMP ends the process where the system refuses a thread.
+_MOST_SLEEPING = 256
 
 
 def choose_waiting() -> None:
