@@ -42,25 +42,24 @@ SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block
 TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in COMMANDS]
 
 
-# Runs what follows on its command line as `python` runs it, one after the other, in one process:
-# to start Python with PyTorch and Lightning takes longer than most of them.
-IN_ONE_PROCESS = """
-import json, runpy, sys
+# Runs what follows on its command line as `python` runs it, each in a process of its own, and
+# leaves how they ended.  They are copies of one that has imported PyTorch and Lightning, which
+# takes longer than most of them.
+IN_PROCESSES = """
+import json, os, runpy, sys
+import dolens.experiments.running.main
+ends = []
 for arguments in json.loads(sys.argv[1]):
-    sys.argv = arguments
-    runpy.run_path(arguments[0], run_name="__main__")
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        sys.argv = arguments
+        runpy.run_path(arguments[0], run_name="__main__")
+        sys.exit()
+    ends.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+with open("ends.json", "w") as file:
+    json.dump(ends, file)
 """
-
-
-def run_in_one_process(folder, *commands):
-    done = subprocess.run(
-        [sys.executable, "-c", IN_ONE_PROCESS, json.dumps(commands)],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": "mine", "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
 
 
 @pytest.fixture(scope="module")
@@ -76,18 +75,26 @@ def checkout(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(checkout):
-    """The folder of the runs of all commands.
-
-    What is registered in one serves no other: each is of a section, whose files it alone uses.
-    """
-    commands = []
+def ended(checkout):
+    """How all scripts and commands ended, and what they said on their way."""
+    names = [f"script{number}.py" for number in range(len(SCRIPTS))]
+    for name, block in zip(names, SCRIPTS, strict=True):
+        (checkout / name).write_text(block.text, encoding="utf-8")
+    commands = [[name] for name in names]
     for block in COMMANDS:
         paths, python, *arguments = shlex.split(block.text)
         assert (paths, python, arguments[0]) == ("PYTHONPATH=mine", "python", "train.py")
         commands.append(arguments)
-    run_in_one_process(checkout, *commands)
-    return checkout / "outputs"
+    done = subprocess.run(
+        [sys.executable, "-c", IN_PROCESSES, json.dumps(commands)],
+        cwd=checkout,
+        env={**os.environ, "PYTHONPATH": "mine", "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    said = done.stdout[-2000:] + done.stderr[-4000:]
+    assert done.returncode == 0, said
+    return json.loads((checkout / "ends.json").read_text()), said
 
 
 def table(path):
@@ -145,16 +152,15 @@ PROMISES = {
 @pytest.mark.parametrize(
     ("block", "experiment"), TRAININGS, ids=[block.section for block in COMMANDS]
 )
-def test_a_command_leaves_what_the_text_promises(trained, block, experiment):
-    (folder,) = (trained / experiment).iterdir()
+def test_a_command_leaves_what_the_text_promises(checkout, ended, block, experiment):
+    assert ended[0][len(SCRIPTS) + COMMANDS.index(block)] == 0, ended[1]
+    (folder,) = (checkout / "outputs" / experiment).iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
     PROMISES[block.section, experiment](folder, metrics)
 
 
-def test_the_scripts_run(checkout):
-    for number, block in enumerate(SCRIPTS):
-        (checkout / f"script{number}.py").write_text(block.text, encoding="utf-8")
-    run_in_one_process(checkout, *([f"script{number}.py"] for number in range(len(SCRIPTS))))
+def test_the_scripts_run(ended):
+    assert ended[0][: len(SCRIPTS)] == [0] * len(SCRIPTS), ended[1]
 
 
 def test_every_command_has_a_promise():
