@@ -117,6 +117,7 @@ def dolens_train(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str]
     def train(folder: Path, *arguments: str) -> str:
         folders.append(folder)
         monkeypatch.chdir(folder)
+        GlobalHydra.instance().clear()
         done = CliRunner().invoke(app, ["train", *arguments])
         if done.exception is not None and not isinstance(done.exception, SystemExit):
             raise done.exception
@@ -132,6 +133,6 @@ def dolens_train(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str]
     GlobalHydra.instance().clear()
     HydraConfig.instance().cfg = None
     for name in {*sys.modules} - modules:
-        file = getattr(sys.modules[name], "__file__", None)
-        if file is not None and any(Path(file).is_relative_to(folder) for folder in folders):
+        file = Path(getattr(sys.modules[name], "__file__", None) or ROOT)
+        if not file.is_relative_to(ROOT) and any(file.is_relative_to(f) for f in folders):
             del sys.modules[name]
