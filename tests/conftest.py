@@ -19,6 +19,13 @@ ROOT = Path(__file__).resolve().parents[1]
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else min(2, os.cpu_count() or 1))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Those of whole commands and documents first: none of them is left over at the end, when one
+    process would wait for the other.
+    """
+    items.sort(key=lambda item: item.path.parent != ROOT / "tests")
+
+
 def pytest_collection_finish():
     """The garbage collector looks no more at the modules and tests, which stay to the end."""
     gc.freeze()
