@@ -117,7 +117,7 @@ def dolens_train(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str]
 
     log = logging.getLogger()
     handlers, level, modules = log.handlers[:], log.level, {*sys.modules}
-    monkeypatch.setattr(sys, "argv", [])
+    monkeypatch.setattr(sys, "argv", [*sys.argv])
     monkeypatch.setattr(sys, "path", [*sys.path])
     folders = []
 

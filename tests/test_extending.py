@@ -42,23 +42,28 @@ SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block
 TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in COMMANDS]
 
 
-# Runs what follows on its command line as `python` runs it, each in a process of its own, and
-# leaves how they ended.  They are copies of one that has imported PyTorch and Lightning, which
-# takes longer than most of them.
-IN_PROCESSES = """
-import json, os, runpy, sys
+# Runs lists of command lines as `python` runs them, and leaves how they ended: each list in one
+# process, a copy of one that has imported PyTorch and Lightning, which takes longer than most.
+IN_TWO_PROCESSES = """
+import json, os, runpy, sys, traceback
 import dolens.experiments.running.main
-ends = []
-for arguments in json.loads(sys.argv[1]):
+for number, commands in enumerate(json.loads(sys.argv[1])):
     sys.stdout.flush()
-    child = os.fork()
-    if child == 0:
-        sys.argv = arguments
-        runpy.run_path(arguments[0], run_name="__main__")
-        sys.exit()
-    ends.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-with open("ends.json", "w") as file:
-    json.dump(ends, file)
+    if os.fork():
+        os.wait()
+        continue
+    ends = []
+    for sys.argv in commands:
+        try:
+            runpy.run_path(sys.argv[0], run_name="__main__")
+            ends.append(None)
+        except SystemExit as end:
+            ends.append(end.code)
+        except Exception as error:
+            ends.append(traceback.format_exc())
+    with open(f"ends{number}.json", "w") as file:
+        json.dump(ends, file)
+    sys.exit()
 """
 
 
@@ -76,17 +81,21 @@ def checkout(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def ended(checkout):
-    """How all scripts and commands ended, and what they said on their way."""
-    names = [f"script{number}.py" for number in range(len(SCRIPTS))]
-    for name, block in zip(names, SCRIPTS, strict=True):
+    """How all scripts ended, and all commands, and what they said on their way.
+
+    What is registered in one serves no other: each is of a section, whose files it alone uses.
+    """
+    scripts = [f"script{number}.py" for number in range(len(SCRIPTS))]
+    for name, block in zip(scripts, SCRIPTS, strict=True):
         (checkout / name).write_text(block.text, encoding="utf-8")
-    commands = [[name] for name in names]
+    commands = []
     for block in COMMANDS:
         paths, python, *arguments = shlex.split(block.text)
         assert (paths, python, arguments[0]) == ("PYTHONPATH=mine", "python", "train.py")
         commands.append(arguments)
+    lists = [[[name] for name in scripts], commands]
     done = subprocess.run(
-        [sys.executable, "-c", IN_PROCESSES, json.dumps(commands)],
+        [sys.executable, "-c", IN_TWO_PROCESSES, json.dumps(lists)],
         cwd=checkout,
         env={**os.environ, "PYTHONPATH": "mine", "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -94,7 +103,7 @@ def ended(checkout):
     )
     said = done.stdout[-2000:] + done.stderr[-4000:]
     assert done.returncode == 0, said
-    return json.loads((checkout / "ends.json").read_text()), said
+    return *(json.loads((checkout / f"ends{n}.json").read_text()) for n in (0, 1)), said
 
 
 def table(path):
@@ -153,14 +162,16 @@ PROMISES = {
     ("block", "experiment"), TRAININGS, ids=[block.section for block in COMMANDS]
 )
 def test_a_command_leaves_what_the_text_promises(checkout, ended, block, experiment):
-    assert ended[0][len(SCRIPTS) + COMMANDS.index(block)] == 0, ended[1]
+    _, commands, said = ended
+    assert not commands[COMMANDS.index(block)], said
     (folder,) = (checkout / "outputs" / experiment).iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
     PROMISES[block.section, experiment](folder, metrics)
 
 
 def test_the_scripts_run(ended):
-    assert ended[0][: len(SCRIPTS)] == [0] * len(SCRIPTS), ended[1]
+    scripts, _, said = ended
+    assert scripts and not any(scripts), said
 
 
 def test_every_command_has_a_promise():
