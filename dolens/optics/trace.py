@@ -111,11 +111,12 @@ def meet(
     if from_the_side:
         nearest = distance_to_nearest(ray)
         moved = transfer(ray, nearest)
-        moved = Components(*(c.clamp(-limit, limit) for c in moved[:3]), *moved[3:])
+        x, y, z = (c.clamp(-limit, limit) for c in moved[:3])
+        moved = moved._replace(x=x, y=y, z=z)
         found = shape.intersect_from(surface.parameters, moved, sense)
         if found is not None:
             t, met = found[0].clamp(-limit, limit), found[1]
-            for length in (*moved[:3], t):
+            for length in (x, y, z, t):
                 met = torch.minimum(met, limit - length.detach().abs())
             return Meeting(transfer(moved, t), nearest, t, met)
     to_plane, towards = distance_to_plane(ray, 0.0, sense)
