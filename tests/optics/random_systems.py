@@ -130,4 +130,6 @@ def any_rays(lens: Lens, draw: Draw, count: int, sense: float) -> Rays:
     position[odd == 56, 1] = -math.inf
     direction[odd == 57] *= -1.0
     direction[odd == 58, 2] = 0.0  # along the vertex plane
+    # Of a direction of another length, each backend has derivatives of its own.
+    direction[odd == 58] = torch.nn.functional.normalize(direction[odd == 58])
     return Rays(position, direction, rays.wavelength)
