@@ -134,14 +134,14 @@ def test_a_broken_ray_spoils_no_other(root):
     """All else is as if those rays passed the lens by."""
     lens = LENSES["posed"](root)
     broken = torch.zeros(40, dtype=torch.bool)
-    broken[[3, 5, 8, 11]] = True
+    broken[[3, 5, 8, 11, 12]] = True
     rays = bundle(lens, 40)
     passing = rays.position.clone()
     passing[broken, 0] = 900.0
     rays = Rays(passing, rays.direction, 550.0)
     position, direction = passing.clone(), rays.direction.clone()
     position[3, 0], position[5, 2], position[8] = float("nan"), float("inf"), 1e300
-    direction[11, 1] = float("nan")
+    direction[11, 1], direction[12, 2] = float("nan"), float("inf")
     spoilt = Rays(position, direction, 550.0)
     found, expected = interpreted(lens, spoilt), interpreted(lens, rays)
     assert not found.valid[broken].any()
