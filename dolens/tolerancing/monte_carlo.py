@@ -90,7 +90,8 @@ def trace_perturbed(
     moments = _Moments(lens, tuple(names), ray, wavelength, shares, means, spots.weight)
     if chunk_size is None:
         chunk_size = max(1, RAYS_AT_A_TIME // len(spots.weight))
-    chunks = (start + errors.to(start)).split(chunk_size)
+    # Copies: a part of a tensor brings all of it where a task runs in another process.
+    chunks = [chunk.clone() for chunk in (start + errors.to(start)).split(chunk_size)]
     parts = (map_tasks or _in_threads)(moments, chunks, "batches of lenses")
     sums, failed, vignetted = (torch.cat(part) for part in zip(*parts, strict=True))
     x, y, u, v, square, product, slope_square = sums.unbind(1)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -70,7 +70,8 @@ def _mapped(
         TaskError: a task raised anything else, or no process brought it to its end.
     """
     remote = ray.remote(num_cpus=1, max_retries=retries)(_run)
-    shared, precision = ray.put(function), torch.get_float32_matmul_precision()
+    # In a tuple Ray hands over the reference: a worker fetches the function once, not for each task.
+    shared, precision = (ray.put(function),), torch.get_float32_matmul_precision()
     count, handed, done = len(tasks), 0, 0
     places: dict[int, Any] = {}  # task → reference to its result
     running: list[Any] = []
@@ -102,8 +103,16 @@ def _mapped(
             ray.cancel(reference, force=True)
 
 
-def _run(function: Callable[[Any], Any], task: Any, precision: str) -> Any:
+def _run(shared: tuple[Any], task: Any, precision: str) -> Any:
     """Run a task as every worker does, and as `workers=0` does: in one thread."""
     torch.set_num_threads(1)
     torch.set_float32_matmul_precision(precision)
-    return function(task)
+    return _fetched(*shared)(task)
+
+
+@lru_cache(maxsize=1)
+def _fetched(reference: Any) -> Callable[[Any], Any]:
+    """Return a function that all tasks of a map share; what it keeps, as a lens, it keeps here."""
+    import ray
+
+    return ray.get(reference)
