@@ -1,5 +1,6 @@
 """The wavefront in the exit pupil: exact paths to a sphere about a point of the sensor."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -101,7 +102,9 @@ class Wavefront:
     @property
     def rms(self) -> Tensor:
         """(N,), mm, root mean square of the OPD, weighted by amplitude; NaN without light."""
-        return (_share(self.weight) * self.opd.square()).sum((-2, -1)).sqrt()
+        square = (_share(self.weight) * self.opd.square()).sum((-2, -1))
+        # A root of nothing would send NaN backwards, to the lens and so to all points.
+        return self._with_light(torch.where(self.flux > 0.0, square, 1.0).sqrt())
 
     @property
     def strehl_ratio(self) -> Tensor:
@@ -111,7 +114,10 @@ class Wavefront:
         """
         phase, share = (2.0 * torch.pi) * self.waves, _share(self.weight)
         real, imaginary = (share * phase.cos()).sum((-2, -1)), (share * phase.sin()).sum((-2, -1))
-        return real.square() + imaginary.square()
+        return self._with_light(real.square() + imaginary.square())
+
+    def _with_light(self, value: Tensor) -> Tensor:
+        return torch.where(self.flux > 0.0, value, math.nan)
 
 
 def pupil_wavefront(
@@ -189,7 +195,8 @@ def pupil_wavefront(
     # Light that is parallel at an infinite sphere has no area there.
     area = torch.where(valid, cell_areas(direction).clamp(min=_SMALLEST), 1.0)
     cell = (2.0 / samples) ** 2 * half_width.prod(-1) / axial_flux(system, points, waves)
-    amplitude = (flux_density(points, _inner(q), _inner(ray.n)) * cell[:, None, None] / area).sqrt()
+    density = flux_density(points, _inner(q), _inner(ray.n)) * cell[:, None, None] / area
+    amplitude = torch.where(valid, density, 1.0).sqrt()
 
     inside = Rays(_inner(rays.position), _inner(rays.direction), every)
     crossings, share = {}, (valid & beam.lit[:, None, None]).to(opd.dtype)
@@ -198,7 +205,7 @@ def pupil_wavefront(
         crossings[number] = torch.stack((x, y), -1)
         surface = system.surfaces[number - 1]
         share = torch.minimum(share, coverage(surface.aperture, x, y, surface.edge))
-    piston = (_share((amplitude * area * share).detach()).nan_to_num(0.0) * opd).sum((-2, -1))
+    piston = (_share((amplitude * area * share).detach()) * opd).sum((-2, -1))
     return Wavefront(
         opd=torch.where(valid, opd - piston[:, None, None], 0.0),
         direction=_inner(direction),
@@ -258,7 +265,9 @@ def _inner(values: Tensor) -> Tensor:
 
 
 def _share(weight: Tensor) -> Tensor:
-    return weight / weight.sum((-2, -1), keepdim=True)
+    """Return each ray's share of all that passes; zero where nothing does."""
+    whole = weight.sum((-2, -1), keepdim=True)
+    return weight / torch.where(whole > 0.0, whole, 1.0)
 
 
 def _one_each(

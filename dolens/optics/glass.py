@@ -71,7 +71,7 @@ class Glass:
         Raises:
             InputError: a wavelength lies outside the catalogue's range, or the formula gives no
                 index at a number.  Tensors are checked too,
-                also within vmap, jvp and grad (on CUDA that waits for the device once), but not
+                also within vmap, jvp and grad (on CUDA that waits for the device), but not
                 while torch.compile traces or a CUDA graph is captured.
         """
         self._require_within_range(wavelength)
@@ -131,4 +131,5 @@ def _extremes(wavelength: float | Tensor) -> list[float]:
         return []
     # The values beneath vmap and the like: read once, and never part of the result.
     plain = torch.func.debug_unwrap(wavelength.detach(), recurse=True)
-    return torch.stack(torch.aminmax(plain)).tolist()
+    # What is computed from them within vjp is wrapped again: PyTorch 2.9 gives no list of it.
+    return [value.item() for value in torch.aminmax(plain)]

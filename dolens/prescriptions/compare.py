@@ -94,6 +94,8 @@ def _flat(prescription: Mapping[str, Any], medium: Callable[[str], str]) -> dict
                 )
         elif key == "sensor":
             flat.update(((key, k), v) for k, v in _sensor(value).items())
+        elif key == "fields" and isinstance(value, Mapping):
+            flat[(key,)] = _fields(value)
         elif value is not None and value not in ({}, [], ""):
             flat[(key,)] = _plain(value)
     if ("wavelengths",) in flat:
@@ -111,6 +113,13 @@ def _sensor(row: Mapping[str, Any]) -> dict[str, Any]:
         plain.pop("conic", None)
     del plain["type"]
     return plain
+
+
+def _fields(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields; numbers of the vignetting that are zero may be left out."""
+    plain = {str(key): _plain(entry) for key, entry in value.items() if key != "vignetting"}
+    cut = [{key: v for key, v in row.items() if v} for row in _plain(value.get("vignetting") or [])]
+    return plain | ({"vignetting": cut} if any(cut) else {})
 
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
 from omegaconf import OmegaConf
@@ -27,6 +26,7 @@ from dolens.experiments.running.finished_run import (
     load_recorded,
     working_folder_importable,
 )
+from dolens.experiments.running.matmul_precision import set_matmul_precision
 from dolens.experiments.running.recorded_run import read_record
 from dolens.experiments.running.run_files import (
     INFO,
@@ -188,7 +188,7 @@ def _tested(
     settings = run.settings
     set_threads(settings.threads)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
-    torch.set_float32_matmul_precision(settings.matmul_precision)
+    set_matmul_precision(settings.matmul_precision)
     with working_folder_importable():
         callbacks = [instantiate(c) for c in (settings.callbacks or {}).values() if c]
     unwanted: tuple[type, ...] = (ModelCheckpoint,)

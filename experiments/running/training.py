@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import ProgressBar
@@ -34,6 +33,7 @@ from dolens.experiments.running.compared_settings import all_settings, choices_o
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.extensions import import_extensions
 from dolens.experiments.running.made_trainer import made_trainer
+from dolens.experiments.running.matmul_precision import set_matmul_precision
 from dolens.experiments.running.objectives import returned
 from dolens.experiments.running.processes import all_processes
 from dolens.experiments.running.resolvers import register_resolvers
@@ -75,7 +75,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     set_threads(settings.threads)
     # The basic launcher runs a sweep's jobs in one process: seed at each start.
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
-    torch.set_float32_matmul_precision(settings.matmul_precision)
+    set_matmul_precision(settings.matmul_precision)
     lens = build_lens(settings)
     module = instantiate(settings.module)(lens=lens)
     check_experiment(module, settings.train)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from dolens.experiments.ray_cluster import joined_cluster, local_cluster
+from dolens.experiments.running.matmul_precision import set_matmul_precision
 from dolens.stages import stage
 from dolens.tasks import TaskError, TaskMap, error_of_task, task_label
 
@@ -106,7 +107,7 @@ def _mapped(
 def _run(shared: tuple[Any], task: Any, precision: str) -> Any:
     """Run a task as every worker does, and as `workers=0` does: in one thread."""
     torch.set_num_threads(1)
-    torch.set_float32_matmul_precision(precision)
+    set_matmul_precision(precision)
     return _fetched(*shared)(task)
 
 

@@ -154,7 +154,7 @@ def _fields(fields: Mapping[str, Any], where: str) -> list[str]:
             )
             cut["U"].append(str(part - shift))
             cut["L"].append(str(part + shift))
-        lines += [f"V{end}{axis}   {' '.join(values)}" for end, values in cut.items()]
+        lines += [f"V{end}{letter}   {' '.join(values)}" for end, values in cut.items()]
     return lines
 
 
