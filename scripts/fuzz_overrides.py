@@ -60,7 +60,8 @@ def main() -> int:
     """Print the table; the exit status is 1 where a run ended in a traceback."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--overrides", type=int, default=1000, help="how many runs are tried")
-    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--first", type=int, default=0, help="the seed of their order")
+    parser.add_argument("--skip", type=int, default=0, help="so many of this order, tried before")
     parser.add_argument("--experiment", action="append", help="this one alone")
     parser.add_argument("--override", action="append", help="this one alone, of each experiment")
     parser.add_argument("--key", default="", help="settings whose names begin so")
@@ -73,8 +74,15 @@ def main() -> int:
         cases = [(name, one) for name in names for one in options.override or ()]
         cases = cases or _cases(names, options.key, Path(folder))
         random.Random(options.first).shuffle(cases)
+        # The same override of another experiment comes when all others were tried.
+        tried: Counter[str] = Counter()
+        turns = []
+        for case in cases:
+            turns.append(tried[case[1]])
+            tried[case[1]] += 1
+        cases = [cases[n] for n in sorted(range(len(cases)), key=lambda number: turns[number])]
         # Those of one experiment follow each other: it is composed once.
-        cases = sorted(cases[: options.overrides])
+        cases = sorted(cases[options.skip :][: options.overrides])
         begin, found, kept = time.monotonic(), Counter(), defaultdict(list)
 
         def check(number: int) -> str:
@@ -112,14 +120,20 @@ def _changed(folder: Path, experiment: str, overrides: tuple[str, ...]) -> DictC
     cfg = copy.deepcopy(_composed(folder, experiment))
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         OmegaConf.update(cfg, override.key_or_group, override.value(), merge=False)
+    # As they would be typed: a setting that nothing reads is named by them.
+    OmegaConf.update(cfg, "hydra.overrides.task", [*cfg.hydra.overrides.task, *overrides])
     HydraConfig.instance().set_config(cfg)
     return cfg
 
 
 @cache
 def _composed(folder: Path, experiment: str) -> DictConfig:
-    # The published settings need the paper's photographs.
-    more = [f"data.root={folder}"] if experiment.endswith("_paper") else []
+    # The published settings need the paper's photographs, and weights that are to be downloaded.
+    more = []
+    if experiment.endswith("_paper"):
+        more = [f"data.root={folder}", "loss.perceptual=none"]
+    if experiment == "large_fov_doublet_paper":
+        more.append("network.weights=none")
     with composing(ROOT, folder) as build:
         return build(f"experiment={experiment}", *more)
 

@@ -73,6 +73,12 @@ class PoseAccuracyModule(Analysis):
         InputError: a setting that is unknown or out of range.
     """
 
+    metrics = (
+        "pose_error/reference_over_bound",
+        "pose_error/over_bound/*",
+        "basin/converged/*",
+    )
+
     def __init__(
         self,
         lens: Lens,

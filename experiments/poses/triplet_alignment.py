@@ -62,6 +62,18 @@ class TripletAlignmentModule(Analysis):
 
     digits: ClassVar[int] = 9
 
+    metrics = (
+        "alignment/named_right",
+        "alignment/converged",
+        "alignment/chi_squared/mean",
+        "alignment/*_over_noise*",
+        "alignment/*/*",
+        "pose_error/*",
+        "pose_bound/*",
+        "sensor_error/*",
+        "sensor_bound/*",
+    )
+
     def __init__(
         self,
         lens: Lens,
