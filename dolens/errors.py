@@ -111,11 +111,16 @@ def call_with_settings(
         first: arguments that are not the user's; they stand for the first parameters.
 
     Raises:
-        InputError: a key that is no parameter, or a parameter without a default that is missing.
+        InputError: a key that is no parameter, a parameter without a default that is missing, or a
+            value that the parameter's type hint does not allow.
     """
+    # PyTorch is among the hints, and need not be there for all that has messages.
+    from dolens.typed_values import check_types
+
     parameters = list(inspect.signature(make).parameters.values())[len(first) :]
     check_keys(settings, [parameter.name for parameter in parameters], where)
     for parameter in parameters:
         if parameter.default is parameter.empty and parameter.name not in settings:
             raise InputError(f"{where}: '{parameter.name}' is missing")
+    check_types(make, settings, where)
     return make(*first, **settings)

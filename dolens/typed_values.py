@@ -17,7 +17,7 @@ from torch import Tensor
 from dolens.errors import InputError
 
 # What plain data is made of; anything else in the place of a value was made of it before.
-_PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
+_PLAIN = (bool, int, float, str, Sequence, Mapping, type(None))
 _LISTS = (list, tuple, Sequence, set, frozenset)
 _WORDS: dict[Any, str] = {
     bool: "true or false",
@@ -34,6 +34,9 @@ _WORDS: dict[Any, str] = {
 def hints_of(make: Callable[..., Any]) -> dict[str, Any]:
     """Return the type hints of the parameters that a class or a function takes; none where they
     cannot be found out.
+
+    What it takes as `**options` is for the classes that it derives from, or, where it is a class
+    method, for its class.
     """
     call: Any = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     try:
@@ -41,7 +44,12 @@ def hints_of(make: Callable[..., Any]) -> dict[str, Any]:
         hints = get_type_hints(call)
     except Exception:  # hints of others' classes may name what is not installed
         return {}
-    return {name: hint for name, hint in hints.items() if name in names}
+    found: dict[str, Any] = {}
+    if any(one.kind is one.VAR_KEYWORD for one in names.values()):
+        own = getattr(make, "__self__", None)
+        for parent in (own,) if isinstance(own, type) else getattr(make, "__bases__", ()):
+            found |= hints_of(parent)
+    return found | {name: hint for name, hint in hints.items() if name in names}
 
 
 def check_type(value: object, hint: Any, where: str) -> None:
@@ -99,9 +107,11 @@ def _fits(value: object, hint: Any) -> bool:
         return value is None
     base = origin or hint
     if base in _LISTS:
-        return isinstance(value, list | tuple) and _entries_fit(value, base, inner)
+        listed = isinstance(value, Sequence) and not isinstance(value, str)
+        return listed and _entries_fit(value, base, inner)
     if base in (dict, Mapping):
-        return isinstance(value, dict) and all(_fits(v, inner[1]) for v in value.values() if inner)
+        mapped = isinstance(value, Mapping)
+        return mapped and all(_fits(v, inner[1]) for v in value.values() if inner)
     if base is Tensor:
         return not isinstance(value, str)
     return not (_is_made(base) and isinstance(value, str | int | float))

@@ -107,7 +107,10 @@ class Evaluation:
         found = []
         for judge in judges:
             for stage in (f"val{judge}", f"test{judge}"):
-                found += [f"{stage}/loss", *(f"{stage}/{s}{view}" for s in scores for view in views)]
+                found += [
+                    f"{stage}/loss",
+                    *(f"{stage}/{s}{view}" for s in scores for view in views),
+                ]
         if camera.network.needs_point_spread_function:
             wrong = [f"psnr_db_miscalibrated/{kind}" for kind in self.miscalibrations]
             found += [f"test/{name}{view}" for name in wrong for view in views]

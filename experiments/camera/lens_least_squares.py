@@ -34,7 +34,7 @@ class CameraOptimizer:
         least_squares: settings of `LensLeastSquares`.
 
     Raises:
-        InputError: an unknown choice.
+        InputError: an unknown choice, or a setting that least squares cannot have.
     """
 
     def __init__(
@@ -45,10 +45,10 @@ class CameraOptimizer:
     ) -> None:
         check_choice(lens, ("adam", "dls"), "optimizer.lens")
         self.network = network
-        self.lens_steps = None
-        if lens == "dls":
-            where = "optimizer.least_squares"
-            self.lens_steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
+        # Settings of what another choice would use are checked as well.
+        where = "optimizer.least_squares"
+        steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
+        self.lens_steps = steps if lens == "dls" else None
 
     def __call__(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
         """Return the optimizer of parameter groups."""

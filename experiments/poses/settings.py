@@ -8,6 +8,7 @@ from typing import Any
 
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.experiments.checks import check_not_negative
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
 
@@ -147,8 +148,10 @@ def fit_plan(
         dict(imager or {}),
         float(centroid_weight),
     )
-    if not plan.stages or not plan.fits:
-        raise InputError("misalignment: give at least one fit and one stage")
+    check_not_negative("centroid_weight", centroid_weight)
+    for key, given in (("fits", plan.fits), ("stages", plan.stages)):
+        if not given:
+            raise InputError(f"{key}: none is given; allowed: one or more")
     for number, fit in enumerate(plan.fits):
         earlier = [before.name for before in plan.fits[:number]]
         if fit.held_from is not None and fit.held_from not in earlier:

@@ -21,6 +21,7 @@ from dolens.experiments.callbacks.logged_objectives import LoggedObjectives
 from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
 from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
 from dolens.experiments.callbacks.starvation import StarvationWarning
+from dolens.experiments.checks import check_sensor_distance
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
@@ -182,12 +183,7 @@ def build_lens(settings: RunSettings) -> Lens:
         settings.prescription(), settings.dtype, where=where, backend=settings.backend
     )
     lens = lens.in_state(settings.state)
-    distance = float(lens.sensor_distance.detach())
-    if lens.system().senses[-1] * distance < 0.0:
-        raise InputError(
-            f"lens.sensor.distance: {distance:g} mm; the sensor must stand behind the last surface "
-            "as light travels (negative where it travels towards -z)"
-        )
+    check_sensor_distance(lens, "lens")
     return lens
 
 

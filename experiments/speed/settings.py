@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from dolens.errors import call_with_settings, check_keys
-from dolens.experiments.checks import check_count
+from dolens.experiments.checks import check_count, check_sensor_distance, numbers_of
 from dolens.experiments.speed.renders import Subject
 from dolens.optics.parameter_units import to_lens_units
 from dolens.prescriptions import lens_from_prescription
@@ -75,11 +75,13 @@ def subject_of(name: str, settings: Mapping[str, Any]) -> Subject:
     """
     check_keys(settings, _SCENE_KEYS, f"scenes.{name}")
     lens = lens_from_prescription(settings["lens"], torch.float32, where=f"scenes.{name}.lens")
+    check_sensor_distance(lens, f"scenes.{name}.lens")
     with torch.no_grad():
         for pattern, value in (settings.get("values") or {}).items():
             for key, parameter in lens.variables([pattern]).items():
                 parameter.fill_(to_lens_units(key, value))
-    scene = PlanarScene(settings["depths"], settings["wavelengths"])
+    numbers = {k: numbers_of(f"scenes.{name}.{k}", settings[k]) for k in ("depths", "wavelengths")}
+    scene = PlanarScene(**numbers)
     sensor = call_with_settings(Sensor, settings["sensor"], f"scenes.{name}.sensor")
     names = tuple(lens.variables(list(settings["variables"])))
     return Subject(name, lens.requires_grad_(False), scene, sensor, names)
