@@ -29,8 +29,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from lightning.pytorch.loops.evaluation_loop import _EvaluationLoop
 from lightning.pytorch.loops.fit_loop import _FitLoop
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -122,13 +123,30 @@ def outcome(folder: Path, experiment: str, *overrides: str) -> str:
 def _changed(folder: Path, experiment: str, overrides: tuple[str, ...]) -> DictConfig:
     """Return an experiment's configuration with some values changed."""
     cfg = copy.deepcopy(_composed(folder, experiment))
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        OmegaConf.update(cfg, override.key_or_group, override.value(), merge=False)
-    # As they would be typed: a setting that nothing reads is named by them.
     OmegaConf.set_readonly(cfg.hydra, False)
-    cfg.hydra.overrides.task = [*cfg.hydra.overrides.task, *overrides]
+    for override in overrides:
+        key, _, text = override.partition("=")
+        (parsed,) = OverridesParser.create().parse_overrides([f"value={text}"])
+        if _put(cfg, key.lstrip("+"), parsed.value()):
+            # As it would be typed: a setting that nothing reads is named by it.
+            cfg.hydra.overrides.task = [*cfg.hydra.overrides.task, override]
     HydraConfig.instance().set_config(cfg)
     return cfg
+
+
+def _put(node: DictConfig, key: str, value: Any) -> bool:
+    """Set a value; return whether the grammar of overrides can name it.
+
+    Names of parameters have dots and stars in them, and are set with the mapping around them.
+    """
+    found = [name for name in node if key == name or key.startswith(f"{name}.")]
+    name = max(found, key=len, default=key)
+    if len(name) < len(key):
+        inside = _put(node[name], key[len(name) + 1 :], value)
+        return inside and "." not in name
+    with open_dict(node):
+        node[name] = value
+    return "." not in name
 
 
 @cache
@@ -136,6 +154,8 @@ def _composed(folder: Path, experiment: str) -> DictConfig:
     # The published settings need the paper's photographs, and weights that are to be downloaded.
     more = []
     if experiment.endswith("_paper"):
+        for number in range(12):
+            Image.new("RGB", (64, 64)).save(folder / f"{number}.png")
         more = [f"data.root={folder}", "loss.perceptual=none"]
     if experiment == "large_fov_doublet_paper":
         more.append("network.weights=none")

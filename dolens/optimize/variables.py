@@ -98,8 +98,8 @@ class DesignVariables(nn.Module):
                 for start in starts:
                     if not low <= start <= high:
                         raise InputError(
-                            f"variables.{name}: initial value {start:g} is outside its bounds, "
-                            f"lower {low:g} and upper {high:g}"
+                            f"variable '{name}': initial value {start:g} is outside its bounds "
+                            f"[{low:g}, {high:g}] (lower, upper)"
                         )
                 self.names.append(name)
                 self._shapes.append(parameter.shape)

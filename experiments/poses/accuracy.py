@@ -41,6 +41,7 @@ from dolens.plotting.layout import lens_title
 from dolens.rendering.spot_image import SpotImager
 from dolens.stages import stage as named_stage
 from dolens.tasks import TaskMap
+from dolens.typed_values import check_types
 
 logger = logging.getLogger(__name__)
 
@@ -114,6 +115,7 @@ class PoseAccuracyModule(Analysis):
         }
         self.imager = next(iter(self.imagers.values()))
         check_keys(images.slopes, SpotImager.__dataclass_fields__, "slopes")
+        check_types(SpotImager, images.slopes, "slopes")
         self.slopes = replace(self.imager, **images.slopes)
         place = bench.pose(copy.deepcopy(lens))
         place.put(truth)

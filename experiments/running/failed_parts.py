@@ -12,6 +12,8 @@ from dolens.experiments.running.target_keys import REFERENCE, targets
 
 _TARGET = re.compile(r"call to target '(?P<name>[^']*)'")
 _KEY = re.compile(r"full_key: (?P<key>\S+)")
+# A part of a text, as `test/${score}`.
+_WITHIN = re.compile(r"\$\{([\w.]+)\}")
 _NAME = re.compile(r"[\w.]+")
 # A message begins with what it is about: a part's name and a setting's.
 _SUBJECT = 3
@@ -55,6 +57,8 @@ def _with_setting(message: str, cfg: DictConfig | None) -> str:
 
 def _referred(plain: Mapping[str, Any], names: list[str]) -> Iterator[str]:
     """Yield the settings that arguments of these names are given by."""
+    for name in names:
+        yield from _WITHIN.findall(str(plain.get(name, "")))
     asked = {name.rpartition(".")[2] for name in names}
     for target in targets(plain, tuple(str(key) for key in plain)):
         for key in asked.intersection(target.keys):
