@@ -12,7 +12,7 @@ from dolens.errors import InputError, did_you_mean
 logger = logging.getLogger(__name__)
 
 _COSTS = ("cost/wall_s", "cost/step_s", "cost/rays", "cost/peak_memory_mb", "cost/*")
-# Parts by their authors log nothing but what `Experiment.metric_names` names.
+# Parts of these packages log nothing but what `Experiment.metric_names` names.
 _KNOWN = ("dolens.", "torch.", "lightning.pytorch.callbacks.ModelCheckpoint")
 
 
