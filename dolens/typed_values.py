@@ -10,11 +10,13 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
+
+T = TypeVar("T")
 
 # What plain data is made of; anything else in the place of a value was made of it before.
 _PLAIN = (bool, int, float, str, Sequence, Mapping, type(None))
@@ -84,6 +86,30 @@ def check_types(make: Callable[..., Any], settings: Mapping[str, Any], where: st
             check_type(value, hints[name], f"{where}.{name}")
 
 
+def call_with_settings(
+    make: Callable[..., T], settings: Mapping[str, Any], where: str, *first: object
+) -> T:
+    """Call a class or a function with settings that a user wrote.
+
+    Args:
+        make: what is called; the settings' keys are the names of its parameters.
+        settings: name → value.
+        where: what the settings are of; messages begin with it.
+        first: arguments that are not the user's; they stand for the first parameters.
+
+    Raises:
+        InputError: a key that is no parameter, a parameter without a default that is missing, or a
+            value that the parameter's type hint does not allow.
+    """
+    parameters = list(inspect.signature(make).parameters.values())[len(first) :]
+    check_keys(settings, [parameter.name for parameter in parameters], where)
+    for parameter in parameters:
+        if parameter.default is parameter.empty and parameter.name not in settings:
+            raise InputError(f"{where}: '{parameter.name}' is missing")
+    check_types(make, settings, where)
+    return make(*first, **settings)
+
+
 def _fits(value: object, hint: Any) -> bool:
     if not isinstance(value, _PLAIN):
         return True
@@ -113,7 +139,7 @@ def _fits(value: object, hint: Any) -> bool:
         mapped = isinstance(value, Mapping)
         return mapped and all(_fits(v, inner[1]) for v in value.values() if inner)
     if base is Tensor:
-        return not isinstance(value, str)
+        return not isinstance(value, str | bool)
     return not (_is_made(base) and isinstance(value, str | int | float))
 
 

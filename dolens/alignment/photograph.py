@@ -13,9 +13,9 @@ from PIL import Image
 from torch import Tensor
 
 from dolens.alignment.measurement import Measurement
-from dolens.errors import InputError, call_with_settings
+from dolens.errors import InputError
 from dolens.sensor.pixels import Sensor
-from dolens.typed_values import check_type
+from dolens.typed_values import call_with_settings, check_type
 
 
 def read_measurements(

@@ -66,11 +66,11 @@ class Pose(DesignVariables):
         super().__init__(lens, variables, others)
         self.register_buffer("sources", places)
         self.register_buffer("shift", offset, persistent=False)
+        if not planes:
+            raise InputError("planes: none is given; allowed: one or more places of the sensor, mm")
         self.planes = _numbers(planes)
         if not self.planes:
-            raise InputError(
-                f"planes: {planes!r}; allowed: a list of one or more places of the sensor, mm"
-            )
+            raise InputError(f"planes: {planes!r}; allowed: places of the sensor, mm")
         if self.best_focus:
             raise InputError("variable 'sensor_distance': solve 'best_focus' is of merit functions")
         for name, shape in zip(self.names, self._shapes, strict=True):

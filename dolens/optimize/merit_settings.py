@@ -13,7 +13,7 @@ from dolens.analysis.pupil_quadrature import (
     square_grid,
     with_chief_rays,
 )
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
 from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality
@@ -25,7 +25,7 @@ from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
-from dolens.typed_values import check_types
+from dolens.typed_values import call_with_settings, check_types
 
 SAMPLINGS: dict[str, Callable[..., SpotRays]] = {
     "gaussian_quadrature": gaussian_quadrature,

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError, call_with_settings, check_choice
+from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.optics.lens import Lens
 from dolens.optimize.trust_region_step import ray_moves, trust_region_step
 from dolens.optimize.variables import DesignVariables
+from dolens.typed_values import call_with_settings
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.information import fisher_information
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.experiment import Figures
 from dolens.experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
@@ -41,7 +41,7 @@ from dolens.plotting.layout import lens_title
 from dolens.rendering.spot_image import SpotImager
 from dolens.stages import stage as named_stage
 from dolens.tasks import TaskMap
-from dolens.typed_values import check_types
+from dolens.typed_values import call_with_settings, check_types
 
 logger = logging.getLogger(__name__)
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dolens.alignment.measurement import Measurement
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.experiments.checks import check_finite, check_not_negative
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
-from dolens.typed_values import check_type
+from dolens.typed_values import call_with_settings, check_type
 
 OPTIMIZERS = ("adam", "dls")
 LOSSES = ("s21", "noise_weighted")

@@ -58,7 +58,8 @@ def _with_setting(message: str, cfg: DictConfig | None) -> str:
 def _referred(plain: Mapping[str, Any], names: list[str]) -> Iterator[str]:
     """Yield the settings that arguments of these names are given by."""
     for name in names:
-        yield from _WITHIN.findall(str(plain.get(name, "")))
+        value = plain.get(name)
+        yield from _WITHIN.findall(value) if isinstance(value, str) else ()
     asked = {name.rpartition(".")[2] for name in names}
     for target in targets(plain, tuple(str(key) for key in plain)):
         for key in asked.intersection(target.keys):

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from dolens.errors import InputError, call_with_settings, check_keys
+from dolens.errors import InputError, check_keys
 from dolens.experiments.checks import (
     check_count,
     check_finite,
@@ -18,6 +18,7 @@ from dolens.optics.parameter_units import to_lens_units
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
+from dolens.typed_values import call_with_settings
 
 _SCENE_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
 
