@@ -71,7 +71,7 @@ def job(cfg: DictConfig) -> float | tuple[float, ...]:
         logger.info("Pruned: %s", pruned)
     except (InputError, HydraException, OmegaConfBaseException) as error:
         told = report_failure(error.__cause__ or error)
-        line = reason_of(error)
+        line = reason_of(error, cfg)
         _record(line, to_all=swept)
         if not swept:
             # Exiting here, within the job, keeps Hydra from adding lines of its own.
