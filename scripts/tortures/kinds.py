@@ -81,3 +81,20 @@ MEASURED = {
     ],
 }
 KINDS = {name: [*overrides, *COMMON] for name, overrides in {**TRAINED, **MEASURED}.items()}
+# Tasks for workers: fits from many starts, some seconds of them.
+MANY_TASKS = [
+    "experiment=pose_accuracy",
+    "parts=[basin]",
+    *_SMALL_SENSOR,
+    "photons=100000",
+    "imagers.narrow.rays=20000",
+    "imagers.wide.rays=20000",
+    "basin.along={elements.lens.tilt_x: [-2.0, 0.0, 1.0, 2.0, 3.0, 4.0],"
+    " elements.lens.decenter_y: [-0.5, 0.0, 0.5, 1.0]}",
+    "basin.centroid_weights=[1.0]",
+    "basin.photons=1e5",
+    "basin.imager.rays=4000",
+    "basin.stages=[{optimizer: dls, iterations: 12}]",
+    "objective=basin/converged/centroid_weight_1",
+    _QUIET,
+]
