@@ -6,9 +6,7 @@ from collections.abc import Iterable, Sequence
 from dolens.experiments.comparison.run import Run
 from dolens.experiments.running.command_line import command
 from dolens.experiments.running.run_files import overrides_of
-from dolens.experiments.search.directions import MAXIMIZE, MINIMIZE, direction_of
-
-_DIRECTIONS = {"max": MAXIMIZE, "min": MINIMIZE}
+from dolens.experiments.search.directions import BY_MODE, MAXIMIZE, direction_of
 
 
 def best_lines(runs: Sequence[Run]) -> list[str]:
@@ -17,7 +15,7 @@ def best_lines(runs: Sequence[Run]) -> list[str]:
     Args:
         runs: that are finished; of several objectives, each has a line of its own.
     """
-    names = dict.fromkeys(name for run in runs for name in _objectives(run))
+    names = dict.fromkeys(name for run in runs for name in run.objectives)
     return [line for name in names for line in _line(name, runs)]
 
 
@@ -25,7 +23,7 @@ def _line(objective: str, runs: Iterable[Run]) -> Iterable[str]:
     own = [
         run
         for run in runs
-        if objective in _objectives(run) and math.isfinite(run.metrics.get(objective, math.nan))
+        if objective in run.objectives and math.isfinite(run.metrics.get(objective, math.nan))
     ]
     if not own:
         return
@@ -42,11 +40,6 @@ def _line(objective: str, runs: Iterable[Run]) -> Iterable[str]:
     )
 
 
-def _objectives(run: Run) -> tuple[str, ...]:
-    named = run.values.get("objective")
-    return tuple(map(str, named)) if isinstance(named, list) else (str(named),)
-
-
 def _of_checkpoints(objective: str, run: Run) -> str | None:
     """Return the direction by which the run chose its best checkpoint, if that is the same score.
 
@@ -54,4 +47,4 @@ def _of_checkpoints(objective: str, run: Run) -> str | None:
     """
     monitor = str(run.values.get("callbacks.best.monitor", ""))
     same = objective.partition("/")[2] == monitor.partition("/")[2] != ""
-    return _DIRECTIONS.get(str(run.values.get("callbacks.best.mode"))) if same else None
+    return BY_MODE.get(str(run.values.get("callbacks.best.mode"))) if same else None

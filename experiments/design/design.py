@@ -335,11 +335,13 @@ class DesignModule(Experiment):
 
     def test_step(self, batch: Any, batch_idx: int) -> None:
         """Log RMS spot radii before and after the design, and those of the published one."""
-        others = {"initial": self.initial}
-        if self.published is not None:
-            others["published"] = self.published
         metrics = state_metrics if self.evaluation.states_of(self.lens) else spot_metrics
-        self.log_dict(metrics(self.lens, others, self.evaluation))
+        self.log_dict(metrics(self.lens, self._others(), self.evaluation))
+
+    def _others(self) -> dict[str, Lens]:
+        """Return the lenses that the design is compared with, by their names in metrics."""
+        published = {} if self.published is None else {"published": self.published}
+        return {"initial": self.initial, **published}
 
     def summary(self) -> dict[str, float]:
         """Return the merit of the best round, and costs."""
@@ -373,10 +375,7 @@ class DesignModule(Experiment):
                 unit,
                 self.initial_merit,
             )
-        others = {"initial": self.initial}
-        if self.published is not None:
-            others["published"] = self.published
-        found = state_figures(self.lens, others, self.evaluation, self.mtf_max_frequency)
+        found = state_figures(self.lens, self._others(), self.evaluation, self.mtf_max_frequency)
         return {**found, **history_figures(self.lens, self.history, self.initial_merit, unit)}
 
     # ---------------------------------------------------------------- checkpoints

@@ -93,18 +93,15 @@ def state_metrics(
     for kind, other in {**others, "final": lens}.items():
         if not set(weights) <= set(other.state_names):
             continue
-        tables = {
-            name: spot_table(there, settings) for name, there in views(other, settings).items()
-        }
+        by_state = views(other, settings)
+        tables = {name: spot_table(there, settings) for name, there in by_state.items()}
         numbers[f"rms_spot_um/{kind}"] = _mean(tables, weights, "mean")
         numbers[f"light/{kind}"] = _mean(tables, weights, "light")
         for name, table in tables.items():
             numbers[f"rms_spot_um/{kind}/{name}"] = table.mean
         text[kind] = ", ".join(f"{name} {table.mean:.4g}" for name, table in tables.items())
         if kind == "published":
-            own = {
-                name: _refocused(there, settings) for name, there in views(other, settings).items()
-            }
+            own = {name: _refocused(there, settings) for name, there in by_state.items()}
             numbers[f"rms_spot_um/{kind}_refocused"] = sum(weights[n] * own[n] for n in own)
             numbers |= {f"rms_spot_um/{kind}_refocused/{name}": rms for name, rms in own.items()}
     error = 0.0

@@ -5,7 +5,6 @@ the system's temporary ones, which goes with them.  Where others start all proce
 and Slurm do, nothing is started here.
 """
 
-import json
 import logging
 import os
 import signal
@@ -26,6 +25,7 @@ import torch
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from dolens.errors import InputError, one_line
+from dolens.experiments.running.run_files import read_json, write_json
 
 logger = logging.getLogger(__name__)
 
@@ -67,10 +67,7 @@ def report_failure(error: BaseException) -> bool:
         "lost": _has_lost_another(error),
         "trace": "" if mistake else "".join(traceback.format_exception(error)),
     }
-    path = Path(folder) / f"{rank_zero_only.rank}.json"
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(report), encoding="utf-8")
-    temporary.replace(path)
+    write_json(Path(folder) / f"{rank_zero_only.rank}.json", report)
     return True
 
 
@@ -173,7 +170,7 @@ class _Started:
         for number in self.failed():
             path = self.folder / f"{number}.json"
             if path.is_file():
-                report = json.loads(path.read_text(encoding="utf-8"))
+                report = read_json(path)
                 if not report["lost"]:
                     if report["trace"]:
                         logger.error("process %d: %s", number, report["trace"])

@@ -20,10 +20,11 @@ def check_schedule(path: str, settings: Mapping[str, Any]) -> None:
     Raises:
         InputError: a length that is no positive integer, or a rate that is negative or no number.
     """
-    for keys, check in ((_COUNTS, check_count), (_RATES, check_not_negative)):
+    for keys, check in (
+        (_COUNTS, check_count),
+        (_RATES, check_not_negative),
+        (_POSITIVE, check_positive),
+    ):
         for key in keys:
             if settings.get(key) is not None and not isinstance(settings[key], list):
                 check(f"{path}.{key}", settings[key])
-    for key in _POSITIVE:
-        if settings.get(key) is not None and not isinstance(settings[key], list):
-            check_positive(f"{path}.{key}", settings[key])

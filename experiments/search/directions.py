@@ -7,6 +7,8 @@ from dolens.errors import InputError, check_choice
 
 MAXIMIZE, MINIMIZE = "maximize", "minimize"
 DIRECTIONS = (MAXIMIZE, MINIMIZE)
+# As Lightning's checkpoints have them.
+BY_MODE = {"max": MAXIMIZE, "min": MINIMIZE}
 # Words of the last parts of metrics' names.  An error of a quality, or a cost, is an error or a
 # cost first: those stand above.
 _SMALLER = {

@@ -12,13 +12,11 @@ from hydra.types import RunMode
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from dolens.errors import InputError
-from dolens.experiments.search.directions import MAXIMIZE, MINIMIZE, direction_of
+from dolens.experiments.search.directions import BY_MODE, direction_of
 from dolens.experiments.search.pruned import TrialPruned
 from dolens.experiments.search.settings import SearchSettings
 
 logger = logging.getLogger(__name__)
-
-_MODES = {"max": MAXIMIZE, "min": MINIMIZE}
 
 
 class PruneTrial(lightning.Callback):
@@ -120,7 +118,7 @@ class PruneTrial(lightning.Callback):
 
     def _monitored(self, trainer: lightning.Trainer) -> tuple[str, str]:
         checkpoints = [c for c in trainer.checkpoint_callbacks if isinstance(c, ModelCheckpoint)]
-        modes = {c.monitor: _MODES[c.mode] for c in checkpoints if c.monitor is not None}
+        modes = {c.monitor: BY_MODE[c.mode] for c in checkpoints if c.monitor is not None}
         wanted = self.settings.monitor or next(iter(modes), None)
         if wanted is None:
             raise InputError("hydra.sweeper.monitor: must name the metric by which to prune")

@@ -13,6 +13,7 @@ from optuna.exceptions import ExperimentalWarning
 
 from dolens.errors import InputError
 from dolens.experiments.running.objectives import objective_names
+from dolens.experiments.running.override_text import override_text
 from dolens.experiments.search.directions import directions_of
 from dolens.experiments.search.report import write_report
 from dolens.experiments.search.search import Launch, Result, Search
@@ -102,5 +103,4 @@ def _choices(distribution: Any) -> Sequence[Any]:
 
 def _for_jobs(journal: Path) -> list[str]:
     """Return the override that tells a job, wherever it runs, which search it is of."""
-    path = str(journal.resolve()).replace("\\", "\\\\").replace("'", "\\'")
-    return [f"hydra.sweeper.storage='{path}'"]
+    return [f"hydra.sweeper.storage={override_text(str(journal.resolve()))}"]

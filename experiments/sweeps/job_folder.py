@@ -19,6 +19,7 @@ from dolens.experiments.running.plain_values import flat
 from dolens.experiments.running.run_files import (
     CONFIG,
     INFO,
+    METRICS,
     RESOLVED,
     metrics_of,
     read_yaml,
@@ -30,7 +31,7 @@ _LAST = Path("checkpoints", "last.ckpt")
 # How a run is made, not what comes of it.
 _FREE = ("hydra", "threads")
 # What a run writes before its first checkpoint; log.txt stays.
-_LEFT = ("checkpoints", "tensorboard", "figures", "lens", INFO, "metrics.json", "metrics.csv")
+_LEFT = ("checkpoints", "tensorboard", "figures", "lens", INFO, METRICS, "metrics.csv")
 # So many differences are named where a folder is refused.
 _NAMED = 3
 

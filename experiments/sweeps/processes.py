@@ -49,10 +49,6 @@ def in_processes(
     if not jobs:
         return
     share = share_of(jobs, n_jobs, cpu_count())
-    logger.info(
-        "%d jobs, %d at once, of %d thread%s each",
-        *(len(jobs), share.jobs, share.threads, "s" if share.threads > 1 else ""),
-    )
 
     def executor() -> Any:
         return ProcessPoolExecutor(

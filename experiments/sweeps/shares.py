@@ -66,4 +66,8 @@ def share_of(jobs: Sequence[SweepJob], n_jobs: int, available: int) -> Share:
             "Leave out threads or hydra.launcher.n_jobs, and the other follows",
             *(share.jobs, share.threads, available),
         )
+    logger.info(
+        "%d jobs, %d at once, of %d thread%s each",
+        *(len(jobs), share.jobs, share.threads, "s" if share.threads > 1 else ""),
+    )
     return share

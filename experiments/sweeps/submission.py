@@ -1,7 +1,6 @@
 """Jobs of Slurm's, or processes in the way of Slurm's jobs, by submitit."""
 
 import logging
-import os
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +12,7 @@ from dolens.errors import InputError, one_line
 from dolens.experiments.environment_variables import environment_variables
 from dolens.experiments.sweeps.job import Elsewhere, SweepJob
 from dolens.experiments.sweeps.shares import share_of
+from dolens.processors import allowed_processors
 
 logger = logging.getLogger(__name__)
 
@@ -37,11 +37,7 @@ def in_local_submissions(
     if not jobs:
         return
     executor = _executor("local", folder, {"timeout_min": timeout_min})
-    share = share_of(jobs, n_jobs, len(os.sched_getaffinity(0)))
-    logger.info(
-        "%d jobs, %d at once, of %d thread%s each",
-        *(len(jobs), share.jobs, share.threads, "s" if share.threads > 1 else ""),
-    )
+    share = share_of(jobs, n_jobs, allowed_processors())
     waiting = deque(jobs)
     running: list[tuple[SweepJob, Any]] = []
     while waiting or running:
