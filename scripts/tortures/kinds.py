@@ -64,11 +64,11 @@ MEASURED = {
     "triplet alignment": [
         "experiment=triplet_alignment",
         "fields=[[0,0],[0,14],[-14,0],[14,-6]]",
-        "misalignments=12",
+        "misalignments=3",
         "module.spots.pupil.arms=16",
         "module.simulation_pupil.rings=5",
         "module.simulation_pupil.arms=20",
-        "module.iterations=12",
+        "module.iterations=3",
         _QUIET,
     ],
     "bounds of a pose": [
@@ -77,6 +77,8 @@ MEASURED = {
         "photons=100000",
         "imager.rays=4000",
         "imager.rim=0.01",
+        "~arrangements.five_sources_three_planes",
+        "objective=knowledge/three_planes/worst",
         _QUIET,
     ],
 }

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 from scripts.tortures.ends import line_of, log, whole_run
@@ -12,10 +13,13 @@ from scripts.tortures.run_folders import differences, faults_of
 
 _TITLE = b"ray::_run"  # of a process that has a task
 _ORPHANS_S = 20.0  # Ray's processes end when they miss their run
+_ABSENT = ["skipped: Ray is not installed"]
 
 
 def worker_killed(folder: Path) -> list[str]:
     """Kill a process of Ray in the middle of its tasks: others do them, to the same bits."""
+    if find_spec("ray") is None:
+        return _ABSENT
     run = folder / "run"
     process = _started(run)
     victim = _at_work(process)
@@ -29,6 +33,8 @@ def worker_killed(folder: Path) -> list[str]:
 
 def run_and_workers_killed(folder: Path) -> list[str]:
     """Kill a run with workers: its workers end too, and the run can be made once more."""
+    if find_spec("ray") is None:
+        return _ABSENT
     run = folder / "run"
     process = _started(run)
     if _at_work(process) is None:
