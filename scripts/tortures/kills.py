@@ -10,7 +10,7 @@ import shutil
 import signal
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from dolens.whole_files import UNFINISHED
@@ -59,7 +59,7 @@ class Kills:
 
     def keep(self, path: Path) -> None:
         """Write it to a file."""
-        path.write_text(json.dumps(asdict(self)))
+        path.write_text(json.dumps(vars(self)))
 
 
 def killed(
