@@ -210,7 +210,8 @@ def _seeds(folders: list[str]) -> dict[str, list[bytes]]:
     found: dict[str, list[bytes]] = {kind: [] for kind in SHARES}
     for name in (*lens_names(), *published_lens_names()):
         found[".yaml"].append(find_lens(name).read_bytes())
-        plain = load_prescription(name)
+        # What is published of a lens, other formats cannot hold.
+        plain = {k: v for k, v in load_prescription(name).items() if k != "published"}
         for kind in (".json", ".zmx", ".seq", ".txt"):
             try:
                 found[kind].append(encode_prescription(plain, f"lens{kind}"))

@@ -49,7 +49,7 @@ _STEPS = 12
 _WARM_UP = 4
 # Between these marks a page has the tables.
 _BEGIN, _END = "<!-- tables -->", "<!-- end of tables -->"
-_QUICK = [
+QUICK = [
     *("trainer.max_epochs=1", f"data.steps_per_epoch={_STEPS}", "+trainer.limit_val_batches=0"),
     *("test=false", "objective=train/loss", "callbacks.pictures=null"),
     *("callbacks.validation_pictures=null", "+trainer.enable_progress_bar=false"),
@@ -129,7 +129,9 @@ class Parts(lightning.Callback):
                 mode.__exit__(None, None, None)
 
     def on_train_end(self, trainer: lightning.Trainer, module: Any) -> None:
-        """Write what was found."""
+        """Write what was found, by the first process alone."""
+        if not trainer.is_global_zero:
+            return
         low, _, high = statistics.quantiles(self.steps["loop"], n=4)
         parameters = sum(p.numel() for p in module.network.parameters())
         flops, operators = self._modes or (None, None)
@@ -170,7 +172,7 @@ class _Run:
 def _started(experiment: str, threads: int, folder: Path, name: str) -> _Run:
     path = folder / f"{experiment}_{name}.json"
     command = [
-        *(sys.executable, str(ROOT / "train.py"), f"experiment={experiment}", *_QUICK),
+        *(sys.executable, str(ROOT / "train.py"), f"experiment={experiment}", *QUICK),
         *EXPERIMENTS[experiment],
         *(f"threads={threads}", f"hydra.run.dir={path.with_suffix('')}"),
         f"+callbacks.parts={{_target_: scripts.scaling.Parts, path: {path}}}",

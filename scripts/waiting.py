@@ -1,12 +1,13 @@
 """Measure how OpenMP's threads should wait: alone, and beside other programs.
 
-    python scripts/waiting.py                # some three minutes
+    python scripts/waiting.py                # some eight minutes
     python scripts/waiting.py --rounds 3 --policies default passive
 
 A program of two threads beside a busy one shares two cores.  A thread that waits without sleeping
 then uses the core that the one it waits for needs.  A training, a trace with its gradient, and
 a convolution are run by turns under every policy, alone, beside a busy Python loop, and beside
-another program that convolves.  Times are medians in ms; in brackets, the shortest.
+another program that convolves.  Before each turn some seconds are not counted, since `dolens`
+follows what else runs.  Times are medians in ms; in brackets, the shortest.
 """
 
 import argparse
@@ -67,9 +68,12 @@ class Probe:
         threads: of torch.
         variables: of its environment.
         folder: its run folder.
+        overrides: of the training that is here.
     """
 
-    def __init__(self, threads: int, variables: dict[str, str], folder: Path) -> None:
+    def __init__(
+        self, threads: int, variables: dict[str, str], folder: Path, overrides: Sequence[str] = ()
+    ) -> None:
         answers, written = os.pipe()
         # A policy of the caller's own must not stand beside those that are compared.
         environment = {
@@ -79,9 +83,9 @@ class Probe:
         }
         environment |= variables | {"DOLENS_ANSWERS": str(written)}
         environment["PYTHONPATH"] = str(ROOT / "scripts")
-        program = [sys.executable, str(ROOT / "train.py"), *TRAINING, f"threads={threads}"]
+        program = [sys.executable, str(ROOT / "train.py"), *TRAINING, *overrides]
         self._process = subprocess.Popen(
-            [*program, f"hydra.run.dir={folder}"],
+            [*program, f"threads={threads}", f"hydra.run.dir={folder}"],
             env=environment, pass_fds=[written], stdin=subprocess.PIPE, text=True, cwd=ROOT,
             stdout=subprocess.DEVNULL,
         )  # fmt: skip
@@ -128,14 +132,16 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--works", nargs="+", choices=WORKS, default=list(WORKS))
     parser.add_argument("--beside", nargs="+", choices=BESIDE, default=list(BESIDE))
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--settle", type=float, default=1.5, help="seconds before each turn")
     parser.add_argument("--seconds", type=float, default=0.4, help="of each work in each round")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="beside one alone")
+    parser.add_argument("--overrides", nargs="+", default=[], help="of the training's settings")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch, neighbours() as others:
-        probes = {"1 thread": Probe(1, {}, Path(scratch, "one"))}
+        probes = {"1 thread": Probe(1, {}, Path(scratch, "one"), options.overrides)}
         for name in options.policies:
             folder = Path(scratch, name.replace(" ", "_"))
-            probes[name] = Probe(options.threads, POLICIES[name], folder)
+            probes[name] = Probe(options.threads, POLICIES[name], folder, options.overrides)
         for probe in probes.values():  # compiled, and warm
             for work in options.works:
                 probe.ask(work, 1.0)
@@ -144,8 +150,9 @@ def main(arguments: Sequence[str]) -> None:
             for beside in options.beside:
                 if beside in others:
                     others[beside].send_signal(signal.SIGCONT)
-                for work in options.works:
-                    for name, probe in probes.items():
+                for name, probe in probes.items():
+                    probe.ask("step", options.settle)
+                    for work in options.works:
                         seconds[beside, name, work] += probe.ask(work, options.seconds)["seconds"]
                 if beside in others:
                     others[beside].send_signal(signal.SIGSTOP)

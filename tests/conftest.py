@@ -1,9 +1,11 @@
 import copy
 import gc
 import json
+import logging
 import os
 import random
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy
@@ -15,6 +17,13 @@ from dolens import Lens, load_lens
 ROOT = Path(__file__).resolve().parents[1]
 # One thread in each of pytest-xdist's processes, two where there is only one process.
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else min(2, os.cpu_count() or 1))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Those of whole commands and documents first: none of them is left over at the end, when one
+    process would wait for the other.
+    """
+    items.sort(key=lambda item: item.path.parent != ROOT / "tests")
 
 
 def pytest_collection_finish():
@@ -92,3 +101,45 @@ def triplet(root: Path, backend: str) -> Lens:
     lens = load_lens(root / "conf/lens/cooke_triplet.yaml").requires_grad_(False)
     lens.backend = backend
     return lens
+
+
+@pytest.fixture
+def dolens_train(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., str]]:
+    """Run `dolens train` in a folder, and return what it says.
+
+    In this process: another would import PyTorch and Lightning for longer than most runs take.
+    """
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.hydra_config import HydraConfig
+    from typer.testing import CliRunner
+
+    from dolens.cli.app import app
+
+    log = logging.getLogger()
+    handlers, level, modules = log.handlers[:], log.level, {*sys.modules}
+    monkeypatch.setattr(sys, "argv", [*sys.argv])
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    folders = []
+
+    def train(folder: Path, *arguments: str) -> str:
+        folders.append(folder)
+        monkeypatch.chdir(folder)
+        GlobalHydra.instance().clear()
+        done = CliRunner().invoke(app, ["train", *arguments])
+        if done.exception is not None and not isinstance(done.exception, SystemExit):
+            raise done.exception
+        assert done.exit_code == 0, done.output[-3000:]
+        return done.output
+
+    yield train
+    # What Hydra has set for the runs, and a user's own modules.
+    for handler in {*log.handlers} - {*handlers}:
+        handler.close()
+    log.handlers[:] = handlers
+    log.setLevel(level)
+    GlobalHydra.instance().clear()
+    HydraConfig.instance().cfg = None
+    for name in {*sys.modules} - modules:
+        file = Path(getattr(sys.modules[name], "__file__", None) or ROOT)
+        if not file.is_relative_to(ROOT) and any(file.is_relative_to(f) for f in folders):
+            del sys.modules[name]

@@ -42,25 +42,29 @@ SCRIPTS = [block for block in BLOCKS if block.language == "python" and not block
 TRAININGS = [(block, re.search(r"experiment=(\w+)", block.text)[1]) for block in COMMANDS]
 
 
-# Runs what follows on its command line as `python` runs it, one after the other, in one process:
-# to start Python with PyTorch and Lightning takes longer than most of them.
-IN_ONE_PROCESS = """
-import json, runpy, sys
-for arguments in json.loads(sys.argv[1]):
-    sys.argv = arguments
-    runpy.run_path(arguments[0], run_name="__main__")
+# Runs lists of command lines as `python` runs them, and leaves how they ended: each list in one
+# process, a copy of one that has imported PyTorch and Lightning, which takes longer than most.
+IN_TWO_PROCESSES = """
+import json, os, runpy, sys, traceback
+import dolens.experiments.running.main
+for number, commands in enumerate(json.loads(sys.argv[1])):
+    sys.stdout.flush()
+    if os.fork():
+        os.wait()
+        continue
+    ends = []
+    for sys.argv in commands:
+        try:
+            runpy.run_path(sys.argv[0], run_name="__main__")
+            ends.append(None)
+        except SystemExit as end:
+            ends.append(end.code)
+        except Exception as error:
+            ends.append(traceback.format_exc())
+    with open(f"ends{number}.json", "w") as file:
+        json.dump(ends, file)
+    sys.exit()
 """
-
-
-def run_in_one_process(folder, *commands):
-    done = subprocess.run(
-        [sys.executable, "-c", IN_ONE_PROCESS, json.dumps(commands)],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": "mine", "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
 
 
 @pytest.fixture(scope="module")
@@ -76,18 +80,30 @@ def checkout(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(checkout):
-    """The folder of the runs of all commands.
+def ended(checkout):
+    """How all scripts ended, and all commands, and what they said on their way.
 
     What is registered in one serves no other: each is of a section, whose files it alone uses.
     """
+    scripts = [f"script{number}.py" for number in range(len(SCRIPTS))]
+    for name, block in zip(scripts, SCRIPTS, strict=True):
+        (checkout / name).write_text(block.text, encoding="utf-8")
     commands = []
     for block in COMMANDS:
         paths, python, *arguments = shlex.split(block.text)
         assert (paths, python, arguments[0]) == ("PYTHONPATH=mine", "python", "train.py")
         commands.append(arguments)
-    run_in_one_process(checkout, *commands)
-    return checkout / "outputs"
+    lists = [[[name] for name in scripts], commands]
+    done = subprocess.run(
+        [sys.executable, "-c", IN_TWO_PROCESSES, json.dumps(lists)],
+        cwd=checkout,
+        env={**os.environ, "PYTHONPATH": "mine", "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    said = done.stdout[-2000:] + done.stderr[-4000:]
+    assert done.returncode == 0, said
+    return *(json.loads((checkout / f"ends{n}.json").read_text()) for n in (0, 1)), said
 
 
 def table(path):
@@ -145,16 +161,17 @@ PROMISES = {
 @pytest.mark.parametrize(
     ("block", "experiment"), TRAININGS, ids=[block.section for block in COMMANDS]
 )
-def test_a_command_leaves_what_the_text_promises(trained, block, experiment):
-    (folder,) = (trained / experiment).iterdir()
+def test_a_command_leaves_what_the_text_promises(checkout, ended, block, experiment):
+    _, commands, said = ended
+    assert not commands[COMMANDS.index(block)], said
+    (folder,) = (checkout / "outputs" / experiment).iterdir()
     metrics = json.loads((folder / "metrics.json").read_text())
     PROMISES[block.section, experiment](folder, metrics)
 
 
-def test_the_scripts_run(checkout):
-    for number, block in enumerate(SCRIPTS):
-        (checkout / f"script{number}.py").write_text(block.text, encoding="utf-8")
-    run_in_one_process(checkout, *([f"script{number}.py"] for number in range(len(SCRIPTS))))
+def test_the_scripts_run(ended):
+    scripts, _, said = ended
+    assert scripts and not any(scripts), said
 
 
 def test_every_command_has_a_promise():

@@ -1,10 +1,7 @@
 """Tutorials with files of a user's own work as printed, in a folder of that user."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
@@ -18,7 +15,7 @@ FILE = re.compile(r"^`my_\w+/([\w./]+)`:\n\n(?:```python\n((?s:.*?))^```|((?:   
 
 
 @pytest.fixture
-def trained(tmp_path):
+def trained(tmp_path, dolens_train):
     """Write a tutorial's files and train its experiment; return the folder of the run."""
 
     def train(document, experiment, *overrides):
@@ -26,14 +23,7 @@ def trained(tmp_path):
         for path, fenced, indented in FILE.findall(text):
             (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / path).write_text(fenced or textwrap.dedent(indented), encoding="utf-8")
-        done = subprocess.run(
-            [sys.executable, "-m", "dolens.cli", "train", f"experiment={experiment}", *overrides],
-            cwd=tmp_path,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr[-3000:]
+        dolens_train(tmp_path, f"experiment={experiment}", *overrides)
         (run,) = (tmp_path / "outputs" / experiment).iterdir()
         return run
 

@@ -18,9 +18,10 @@ from dolens.cli.export import export
 from dolens.cli.report import HELP as REPORT_HELP
 from dolens.cli.report import report
 from dolens.cli.show import show
-from dolens.cli.threads import let_threads_sleep, limit_threads
+from dolens.cli.threads import limit_threads
 from dolens.cli.train import PassedOn, train
 from dolens.errors import InputError, one_line
+from dolens.spinning import choose_waiting
 
 app = typer.Typer(
     name="dolens",
@@ -33,7 +34,7 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command; a user's mistake ends it with one line and exit status 1."""
-    let_threads_sleep()
+    choose_waiting()
     try:
         app()
     except InputError as error:

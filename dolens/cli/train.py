@@ -8,8 +8,8 @@ import typer
 from typer.core import TyperCommand
 
 from dolens.cli.extras import import_extra
-from dolens.cli.threads import let_threads_sleep
 from dolens.errors import InputError
+from dolens.spinning import choose_waiting
 
 
 class PassedOn(TyperCommand):
@@ -51,7 +51,7 @@ def run_training(arguments: Sequence[str], program: str) -> None:
         return
     if {"-sc", "--shell-completion"} & set(arguments) and not program.endswith(".py"):
         sys.exit("error: dolens --install-completion installs the completion of this command")
-    let_threads_sleep()
+    choose_waiting()
     try:
         main = import_extra("dolens.experiments.running.main", "train", "dolens train").main
     except InputError as error:

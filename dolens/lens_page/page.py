@@ -24,7 +24,7 @@ from dolens.lens_page.sections import PageSections
 from dolens.lens_page.tables import number
 from dolens.optics.fields import field_label
 from dolens.optics.lens import Lens
-from dolens.plotting.export import save_figure
+from dolens.plotting.export import laid_out, save_figures
 
 Progress = Callable[[str, int, int], None]
 
@@ -137,14 +137,14 @@ def _body(
     parts: list[Child] = [note_html(content.note), content.html]
     for name, figure in content.figures.items():
         written.figures += 1
-        if drawn:
-            label = f"{section.title}: {name.replace('_', ' ')}"
-            svg = inline_svg(figure, re.sub(r"\W", "", name), label)
-            parts.append(figure_html(svg, holds_pictures(figure)))
-        if folder is not None:
-            rasterise(figure)
-            for suffix in (".png", ".svg"):
-                save_figure(figure, Path(folder) / f"{name}{suffix}", dpi=200)
+        with laid_out(figure):
+            if drawn:
+                label = f"{section.title}: {name.replace('_', ' ')}"
+                svg = inline_svg(figure, re.sub(r"\W", "", name), label)
+                parts.append(figure_html(svg, holds_pictures(figure)))
+            if folder is not None:
+                rasterise(figure)
+                save_figures(figure, Path(folder) / name, ("png", "svg"))
     written.problems += [(section.title, problem) for problem in content.problems]
     parts += [problem_html(problem) for problem in content.problems]
     parts += [table_html(table) for table in content.tables]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, check_keys
-from dolens.optics.rays import Components
+from dolens.optics.rays import OUT_OF_REACH, Components
 
 # Smallest cosine to the axis that is divided by when a ray is carried to a tilted element.
 _GRAZING = 1e-9
@@ -219,7 +219,8 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
     step, turn = (found.to(n.dtype) for found in relative_axes(now, then))
     along = n.abs() <= _GRAZING
     below = step[2] - z
-    distance = (below / n.masked_fill(along, 1.0)).masked_fill(along, 0.0)
+    distance = (below / n.masked_fill(along, 1.0)).clamp(-OUT_OF_REACH, OUT_OF_REACH)
+    distance = distance.masked_fill(along, 0.0)
     near = (torch.addcmul(x - step[0], distance, l), torch.addcmul(y - step[1], distance, m))
     # Now (near, 0) counts from the next vertex, still along the axes `now`.
     position = _turn(turn, near[0], near[1], -below.masked_fill(~along, 0.0))

@@ -21,6 +21,15 @@ class Status(IntEnum):
     MISSED = 3
 
 
+# No unit vector has a larger component; refraction holds directions there too.
+LONGEST = 2.0
+# mm; nothing that can be seen is farther away.
+FARTHEST = 1e30
+# mm; distances along rays are held there, since infinity times zero is NaN.  A ray that meets a
+# surface comes nowhere near it, and sums of several stay in single precision.
+OUT_OF_REACH = 1e35
+
+
 class Components(NamedTuple):
     """Rays as six tensors of one broadcast shape: position in mm and direction cosines.
 
@@ -44,6 +53,9 @@ class Rays:
         position: (..., 3), mm, in the lens's axes (first vertex at z = 0, light towards +z).
         direction: (..., 3), unit vectors; they are used as given, not normalised.
         wavelength: nm, a number or a tensor that broadcasts with the leading shape.
+
+    A ray with a number that is not finite, a position beyond ±1e30 mm, or a direction cosine beyond
+    ±2 misses the lens.
     """
 
     position: Tensor
@@ -68,13 +80,14 @@ class Rays:
 
 
 def finite_rays(rays: Rays, dtype: torch.dtype) -> Rays:
-    """Return rays of which those with a number that `dtype` cannot hold stand still at 0.
+    """Return rays of which those that cannot be light stand still at 0: with NaN, a position beyond
+    ±1e30 mm, or a direction cosine beyond ±2, in the precision `dtype`.
 
     Without a direction they miss every surface.  NaN itself would pass through a mask into the
-    gradients of all rays together, since 0·NaN is NaN.
+    gradients of all rays together, since 0·NaN is NaN, and what overflows ends as NaN.
     """
     position, direction = (v.detach().to(dtype) for v in (rays.position, rays.direction))
-    known = position.isfinite().all(-1) & direction.isfinite().all(-1)
+    known = (position.abs() <= FARTHEST).all(-1) & (direction.abs() <= LONGEST).all(-1)
     return replace(
         rays,
         position=rays.position.where(known[..., None], 0.0),

@@ -8,7 +8,14 @@ import torch
 from torch import Tensor
 
 from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
-from dolens.optics.rays import Components, Rays, Status, TracedRays, finite_rays
+from dolens.optics.rays import (
+    OUT_OF_REACH,
+    Components,
+    Rays,
+    Status,
+    TracedRays,
+    finite_rays,
+)
 from dolens.optics.surfaces.deflection import Media, Travel
 from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay
 from dolens.optics.surfaces.state import SurfaceState
@@ -63,7 +70,8 @@ def distance_to_plane(ray: Components, z: Tensor | float, sense: float) -> tuple
     misses it.  The distance of rays that do not travel towards it is finite and means nothing.
     """
     cosine = (ray.n if sense > 0.0 else -ray.n).clamp(min=GRAZING)
-    return sense * (z - ray.z) / cosine, cosine.detach() - GRAZING
+    distance = (sense * (z - ray.z) / cosine).clamp(-OUT_OF_REACH, OUT_OF_REACH)
+    return distance, cosine.detach() - GRAZING
 
 
 def distance_to_nearest(ray: Components) -> Tensor:
@@ -99,18 +107,19 @@ def meet(
         sense: of the light.
         from_the_side: whether rays may come along the vertex plane or from behind it.
     """
-    shape = surface.shape
+    shape, limit = surface.shape, FAR * surface.semi_diameter
     if from_the_side:
         nearest = distance_to_nearest(ray)
         moved = transfer(ray, nearest)
+        x, y, z = (c.clamp(-limit, limit) for c in moved[:3])
+        moved = moved._replace(x=x, y=y, z=z)
         found = shape.intersect_from(surface.parameters, moved, sense)
         if found is not None:
-            limit = FAR * surface.semi_diameter
             t, met = found[0].clamp(-limit, limit), found[1]
-            met = torch.minimum(met, limit - torch.maximum(t, -t).detach())
+            for length in (x, y, z, t):
+                met = torch.minimum(met, limit - length.detach().abs())
             return Meeting(transfer(moved, t), nearest, t, met)
     to_plane, towards = distance_to_plane(ray, 0.0, sense)
-    limit = FAR * surface.semi_diameter
     l, m, n = ray[3:]  # noqa: E741
     x = torch.addcmul(ray.x, to_plane, l).clamp(-limit, limit)
     y = torch.addcmul(ray.y, to_plane, m).clamp(-limit, limit)

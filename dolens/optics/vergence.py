@@ -25,7 +25,8 @@ def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tenso
 
     Vergences are functions of the lens in front, and have its gradients.  Where the axial beam is
     focused on an ideal lens (a field lens), its vergence is held at 1e9/mm: the lens then changes
-    the beam's path by rounding only.
+    the beam's path by rounding only.  A cusp (an axicon's), which has no paraxial curvature, counts
+    as a plane.
 
     Args:
         system: the lens; itself where it has no ideal lens.
@@ -40,10 +41,9 @@ def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tenso
     near = torch.as_tensor(near, dtype=system.dtype, device=system.device)
     one = torch.ones_like(near)
     ray = TwoRays(one, 0.0 * one, index[0] * near, 0.0 * one)
+    curvatures = [_or_plane(curvature) for curvature in curvatures_of(system)]
     behind = list(
-        through_surfaces(
-            ray, curvatures_of(system), system.thicknesses, index, powers_of(system, wavelength)
-        )
+        through_surfaces(ray, curvatures, system.thicknesses, index, powers_of(system, wavelength))
     )
     surfaces = list(system.surfaces)
     for i in lenses:
@@ -58,3 +58,10 @@ def with_vergences(system: OpticalSystem, wavelength: float, near: float | Tenso
         surfaces[i] = replace(surfaces[i], deflection=replace(law, parameters=own))
     found = replace(system, surfaces=surfaces)
     return found.traced_by("reference") if near.numel() > 1 else found
+
+
+def _or_plane(curvature: Tensor | float) -> Tensor | float:
+    """Return a curvature (1/mm), or zero where there is none."""
+    if not isinstance(curvature, Tensor):
+        return curvature
+    return torch.where(curvature.isnan(), torch.zeros_like(curvature), curvature)

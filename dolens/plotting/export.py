@@ -1,6 +1,7 @@
 """Figures are written to files or converted to image tensors."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = _DPI) -> None:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with rc_context(_SETTINGS):
-        # Tick labels are known once axes have their size: labels at the edge fit after two passes.
-        if (engine := figure.get_layout_engine()) is not None:
-            engine.execute(figure)
+    with rc_context(_SETTINGS), laid_out(figure):
         figure.savefig(path, dpi=dpi, metadata=_DATES.get(path.suffix.removeprefix(".").lower()))
 
 
@@ -60,9 +58,35 @@ def save_figures(
     for name in formats:
         check_choice(name, FORMATS, "formats")
     paths = [Path(f"{path}.{name}") for name in formats]
-    for written in paths:
-        save_figure(figure, written, dpi)
+    with laid_out(figure):
+        for written in paths:
+            save_figure(figure, written, dpi)
     return paths
+
+
+@contextmanager
+def laid_out(figure: Figure) -> Iterator[None]:
+    """Lay a figure out for all that is drawn of it within the context.
+
+    A layout takes as long as a drawing, and Matplotlib would make one, and a drawing that nobody
+    sees, for each file.
+
+    Args:
+        figure: any figure; it has its layout engine again afterwards.
+    """
+    engine = figure.get_layout_engine()
+    if engine is None:
+        yield
+        return
+    # Tick labels are known once axes have their size: labels at the edge fit after two passes.
+    for _ in range(2):
+        engine.execute(figure)
+    with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+        figure.set_layout_engine(None)
+    try:
+        yield
+    finally:
+        figure.set_layout_engine(engine)
 
 
 def figure_to_image(figure: Figure, dpi: float = 80) -> Tensor:

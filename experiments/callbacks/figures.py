@@ -12,7 +12,7 @@ from dolens.errors import InputError, check_choice
 from dolens.experiments.experiment import Experiment, Figures
 from dolens.experiments.loggers.protocol import TakesPictures
 from dolens.plotting import figure_to_image, save_figures
-from dolens.plotting.export import FORMATS
+from dolens.plotting.export import FORMATS, laid_out
 from dolens.stages import stage
 
 logger = logging.getLogger(__name__)
@@ -67,9 +67,10 @@ class SaveFigures(lightning.Callback):
         """Save and log the figures of the test."""
 
         def keep(name: str, figure: Figure) -> None:
-            save_figures(figure, self.folder / name, self.formats, self.dpi)
             of_training = name in pl_module.training_figures()
-            _log(trainer, f"test_{name}" if of_training else name, figure)
+            with laid_out(figure):
+                save_figures(figure, self.folder / name, self.formats, self.dpi)
+                _log(trainer, f"test_{name}" if of_training else name, figure)
 
         _keep(pl_module.figures, keep)
 

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, NamedTuple
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -229,11 +230,16 @@ def _moved_with(path: str, value: Any, renamed: Renamed) -> Change | None:
 
 def _new_path(key: Key, path: str) -> str | None:
     """The path now: empty where the setting is gone, None where the key is another one."""
-    before, star, after = key.old.partition("*")
-    found = re.fullmatch(re.escape(before) + "(.*)" * bool(star) + re.escape(after), path)
+    found = _pattern(key.old).fullmatch(path)
     if found is None:
         return None
-    return (key.new or "").replace("*", found[1] if star else "*")
+    return (key.new or "").replace("*", found[1] if "*" in key.old else "*")
+
+
+@cache
+def _pattern(old: str) -> re.Pattern[str]:
+    before, star, after = old.partition("*")
+    return re.compile(re.escape(before) + "(.*)" * bool(star) + re.escape(after))
 
 
 def _is_taken(path: str, holder: Mapping[str, Any]) -> bool:

@@ -2,7 +2,8 @@
 
 Whether a setting is read is tried out: the parts of the configuration that a run reads (the fields
 of `RunSettings`) are resolved with it and without it.  A setting whose absence changes nothing is
-not read, whichever way an interpolation might have led to it.
+not read, whichever way an interpolation might have led to it.  To resolve takes long: what these
+parts name plainly, as in `${network}`, is not tried out.
 """
 
 import copy
@@ -19,6 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError
+from dolens.experiments.running.references import References
 
 # Resolved to this where a part cannot be resolved at all.
 _BROKEN = object()
@@ -43,11 +45,13 @@ def refuse_unread(cfg: DictConfig, taken: Sequence[str]) -> None:
     before = _resolved(own, taken)
     if any(part is _BROKEN for part in before):
         return  # what is wrong with it is said where it is used
-    named_by_hydra = str(OmegaConf.to_container(HydraConfig.instance().cfg.hydra, resolve=False))
+    references = References.of(OmegaConf.to_container(own, resolve=False), taken)
     choices = HydraConfig.get().runtime.choices
     for path in (*_set_by_command_line(), *_set_by_experiment(own)):
         top = path.split(".")[0]
-        if top in taken or f"${{{path}" in named_by_hydra or not _has_content(own, path):
+        if top in taken or references.need(path):
+            continue
+        if f"${{{path}" in _text_of_hydra() or not _has_content(own, path):
             continue
         without = copy.deepcopy(own)
         _delete(without, path)
@@ -71,6 +75,11 @@ def _resolved(cfg: DictConfig, taken: Sequence[str]) -> list[Any]:
         except OmegaConfBaseException:
             found.append(_BROKEN)
     return found
+
+
+def _text_of_hydra() -> str:
+    """Return Hydra's own settings as they are written."""
+    return str(OmegaConf.to_container(HydraConfig.instance().cfg.hydra, resolve=False))
 
 
 def _set_by_command_line() -> Iterator[str]:

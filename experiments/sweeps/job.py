@@ -21,6 +21,7 @@ from dolens.experiments.sweeps.job_folder import (
     log_in,
     recorded_objective,
 )
+from dolens.spinning import follow_other_work
 
 logger = logging.getLogger(__name__)
 
@@ -138,6 +139,7 @@ class Elsewhere:
 
     def __call__(self) -> JobReturn:
         """Give the process what it needs to know, and run the job."""
+        follow_other_work()
         setup_globals()
         Singleton.set_state(self.job.singletons)
         sys.argv = list(self.job.arguments)

@@ -2,11 +2,19 @@ import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_repository import ConfigRepository
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins.importlib_resources_config_source import (
+    ImportlibResourcesConfigSource,
+)
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.object_type import ObjectType
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from dolens.errors import InputError
@@ -23,6 +31,25 @@ def composed(root: Path, tmp_path: Path) -> Iterator[Callable[..., DictConfig]]:
         yield build
 
 
+load_config, parsed = ConfigRepository.load_config, {}
+
+
+def load_once(repository: ConfigRepository, config_path: str) -> ConfigResult | None:
+    """Load a file of the configuration, which is parsed once for all tests.
+
+    Hydra itself keeps what it has parsed for one composition, and changes nothing in it.
+    """
+    source = repository._find_object_source(config_path, ObjectType.CONFIG)
+    if not isinstance(source, FileConfigSource | ImportlibResourcesConfigSource):
+        return load_config(repository, config_path)
+    file = Path(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
+    written = file.stat().st_mtime_ns if isinstance(source, FileConfigSource) else 0
+    key = (file, written)
+    if key not in parsed:
+        parsed[key] = load_config(repository, config_path)
+    return parsed[key]
+
+
 @contextmanager
 def composing(root: Path, parent: Path) -> Iterator[Callable[..., DictConfig]]:
     """A function that composes an experiment with its run folder under a parent."""
@@ -37,7 +64,10 @@ def composing(root: Path, parent: Path) -> Iterator[Callable[..., DictConfig]]:
         HydraConfig.instance().set_config(cfg)
         return cfg
 
-    with initialize_config_dir(str(root / "conf"), version_base="1.3"):
+    with (
+        mock.patch.object(ConfigRepository, "load_config", load_once),
+        initialize_config_dir(str(root / "conf"), version_base="1.3"),
+    ):
         yield build
     GlobalHydra.instance().clear()
     HydraConfig.instance().cfg = None

@@ -23,6 +23,7 @@ from dolens.experiments.running.made_trainer import made_trainer
 from dolens.experiments.running.processes import _Started
 from dolens.experiments.running.run_settings import RunSettings
 from dolens.experiments.running.training import build_lens, run
+from dolens.rendering.auto.choice import Choice
 from dolens.rendering.psf_renderer import PsfRenderer
 from dolens.rendering.ray_renderer import RayRenderer
 from dolens.scene.planar import PlanarScene
@@ -198,6 +199,29 @@ def test_optics_know_nothing_of_half_precision(composed, dtype):
     for one, other in zip(alone, mixed, strict=True):
         assert one.dtype == dtype and torch.equal(one, other)
     assert rows[0].dtype == torch.bfloat16 and restored.dtype == torch.float32
+
+
+class _Second:
+    """What a module of the second process sees of its trainer."""
+
+    is_global_zero, current_epoch = False, 0
+
+    def __init__(self, plan):
+        self.strategy = SimpleNamespace(broadcast=lambda own: plan)
+
+
+def test_processes_render_by_the_plan_of_the_first(composed, monkeypatch):
+    """What each found by itself might differ: a plan is a choice between models."""
+    rays = "renderer=rays", "renderer.pupil_samples=2"
+    settings = [entry for entry in CAMERA if entry not in rays]
+    settings = RunSettings.of(checked(composed(*settings, "renderer=auto")))
+    module = instantiate(settings.module)(lens=build_lens(settings))
+    chosen = PsfRenderer(module.views.sensor, (1, 1), 6, 33)
+    plan = Choice(chosen, torch.float64, (), {"": 0.5}, 0.1, 1.0).state()
+    monkeypatch.setattr("dolens.experiments.camera.camera.processes", lambda: 2)
+    module.trainer = second = _Second(plan)  # of which a module has a weak reference
+    module.on_train_epoch_start()
+    assert module.views.state() == plan and not second.is_global_zero
 
 
 REFUSED = {

@@ -1,6 +1,7 @@
 """A setting that has another name now says so, and an old run's overrides are translated."""
 
 import runpy
+import subprocess
 import sys
 
 import pytest
@@ -132,9 +133,12 @@ def test_the_rate_that_nothing_read_names_the_one_that_is(composed):
 
 
 def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(
-    composed, root, tmp_path, monkeypatch, capfd
+    composed, root, tmp_path, monkeypatch, capfd, dolens_train
 ):
-    """The script, on a run folder whose overrides have the names of before."""
+    """The script, on a run folder whose overrides have the names of before.
+
+    What it starts by another process runs in this one.
+    """
     kept = [
         "experiment=cooke_sensitivity",
         "fields=[[0,0]]",
@@ -148,6 +152,15 @@ def test_an_old_run_is_repeated_from_its_overrides_as_they_are_now(
     old = [*kept, "module.rings=3", "+module.arms=6"]
     (folder / ".hydra/overrides.yaml").write_text("\n".join(f"- '{text}'" for text in old))
     script = root / "scripts/reproduce.py"
+    started = subprocess.run
+
+    def run_here(command, **options):
+        if command[:2] != [sys.executable, str(root / "train.py")]:
+            return started(command, **options)
+        dolens_train(options["cwd"], *command[2:])
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(subprocess, "run", run_here)
     monkeypatch.setattr(sys, "argv", [str(script), str(folder)])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(script), run_name="__main__")

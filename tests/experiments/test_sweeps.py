@@ -54,6 +54,9 @@ def test_a_failed_job_and_a_killed_one_leave_the_others(tmp_path, launcher, monk
     """Both are recorded where a comparison finds them; a killed one is repeated first."""
     if launcher in PACKAGES:
         pytest.importorskip(PACKAGES[launcher])
+    if launcher == "submitit_local":
+        # It waits for results that a slow network folder may hide for some seconds.
+        monkeypatch.setattr("submitit.Job._results_timeout_s", 1)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     (tmp_path / "home").mkdir()

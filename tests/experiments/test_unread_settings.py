@@ -1,9 +1,14 @@
 """Settings that nothing reads are errors; defaults that are not used are none."""
 
+import copy
+
 import pytest
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from dolens.errors import InputError
 from dolens.experiments.running.configuration import checked
+from dolens.experiments.running.references import References
 from dolens.experiments.running.run_settings import RunSettings
 
 UNREAD = {
@@ -54,6 +59,40 @@ def test_a_key_of_an_experiment_whose_module_does_not_take_it(composed):
     cfg = composed("experiment=large_fov_doublet_spots", "~module.merit")
     with pytest.raises(InputError, match=r"^merit: nothing in experiment="):
         checked(cfg)
+
+
+INTERPOLATED = """
+module: {views: "${views}", name: "a ${light.name}", text: '\\${quoted}', all: ["${seeds}"]}
+views: {renderer: "${renderer}", depth: "${.renderer.rays}", by_name: "${oc.select:chosen,1}"}
+renderer: {rays: "${counts.rays}", size: "${oc.dict.values:sizes}"}
+counts: {rays: 3, others: 4}
+light: {name: lamp, power: 2.0}
+seeds: [1, 2]
+chosen: 5
+sizes: {a: 1}
+quoted: 6
+unread: {renderer: "${renderer}"}
+"""
+SURE = {"views", "renderer", "renderer.rays", "counts", "counts.rays", "light", "light.name"}
+
+
+def test_what_is_named_plainly_is_needed_and_nothing_else_is_said_to_be():
+    """Against resolving without each setting in turn."""
+    whole = OmegaConf.create(INTERPOLATED)
+    references = References.of(OmegaConf.to_container(whole), ["module"])
+    for path in (*SURE, "views.depth", "seeds", "counts.others", "light.power", "chosen", "sizes",
+                 "quoted", "unread", "unread.renderer"):  # fmt: skip
+        without = copy.deepcopy(whole)
+        parent, _, last = path.rpartition(".")
+        (OmegaConf.select(without, parent) if parent else without).pop(last, None)
+        try:
+            same = OmegaConf.to_container(without.module, resolve=True) == OmegaConf.to_container(
+                whole.module, resolve=True
+            )
+        except OmegaConfBaseException:
+            same = False
+        assert not (same and references.need(path)), path
+        assert path not in SURE or references.need(path), path
 
 
 UNKNOWN = {

@@ -39,18 +39,6 @@ def test_in_tritons_interpreter_the_kernels_are_the_reference(root):
     assert " passed" in run.stdout
 
 
-def test_a_lens_on_the_cpu_does_not_load_these_kernels(root):
-    program = (
-        "import sys, torch, dolens\n"
-        "lens = dolens.load_lens('conf/lens/asphere.yaml', backend='cpu')\n"
-        "ray = torch.tensor([[0.0, 1.0, -5.0]]), torch.tensor([[0.0, 0.0, 1.0]])\n"
-        "lens.trace(dolens.Rays(*ray))\n"
-        "sys.exit(any(name.startswith('dolens.kernels.cuda') for name in sys.modules))\n"
-    )
-    run = python(root, "-c", program)
-    assert run.returncode == 0, run.stderr
-
-
 @compiled
 def test_rays_on_the_cpu_are_refused(root):
     from dolens.kernels.cuda import backend

@@ -122,8 +122,14 @@ def any_rays(lens: Lens, draw: Draw, count: int, sense: float) -> Rays:
     position[odd == 24] *= 1e9
     position[odd == 32] -= 1e12 * direction[odd == 32]
     position[odd == 40, 0] = math.nan
+    position[odd == 41] -= 1e28 * direction[odd == 41]
+    position[odd == 42] -= 1e34 * direction[odd == 42]
     direction[odd == 48, 2] = math.nan
+    direction[odd == 49, 2] = math.inf
+    direction[odd == 50] *= 1e25
     position[odd == 56, 1] = -math.inf
     direction[odd == 57] *= -1.0
     direction[odd == 58, 2] = 0.0  # along the vertex plane
+    # Of a direction of another length, each backend has derivatives of its own.
+    direction[odd == 58] = torch.nn.functional.normalize(direction[odd == 58])
     return Rays(position, direction, rays.wavelength)

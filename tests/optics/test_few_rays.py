@@ -1,25 +1,10 @@
 """A few rays never wait for a compiler, and nothing of that shows in their last digits."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
 
 import dolens
 from dolens.optics.backend import FEW, is_few
-
-PROGRAM = """
-import sys, torch, dolens
-from dolens.plotting import layout_figure
-lens = dolens.load_lens("conf/lens/nikon.yaml")
-rays = dolens.Rays(torch.zeros(20, 3) - 1.0, torch.tensor([0.0, 0.0, 1.0]), 550.0)
-lens.trace(rays).position.sum().backward()
-lens.first_order(), lens.seidel(10.0)
-assert "sympy" not in sys.modules
-lens.chief_ray((0.0, 10.0)), layout_figure(lens)
-assert "numba" not in sys.modules
-"""
 
 
 @pytest.fixture
@@ -31,14 +16,6 @@ def rays(count):
     position = torch.zeros(count, 3, dtype=torch.float64)
     position[:, 0], position[:, 2] = torch.linspace(-4.0, 4.0, count), -1.0
     return dolens.Rays(position, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 550.0)
-
-
-def test_a_few_rays_and_a_drawing_need_no_compiler(root):
-    """Nor do rays need SymPy, which some functions of PyTorch import: half a second."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=root, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
 
 
 def test_few_is_a_number_of_rays_and_surfaces_and_of_nothing_else(lens):

@@ -184,10 +184,12 @@ def test_rays_with_numbers_that_no_light_has_are_missed_and_spoil_no_gradient(
     """0·NaN is NaN: one such ray among 1e6 would make all gradients of the lens NaN."""
     lens = asphere(elements={"1": {"surfaces": [2, 2], "tilt_x": 1.0}}).to(lens_dtype)
     lens.backend = backend
-    position = torch.tensor([[1.0, 2.0, -1.0]], dtype=dtype).repeat(7, 1)
-    direction = torch.tensor([[0.0, 0.0, 1.0]], dtype=dtype).repeat(7, 1)
+    position = torch.tensor([[1.0, 2.0, -1.0]], dtype=dtype).repeat(10, 1)
+    direction = torch.tensor([[0.0, 0.0, 1.0]], dtype=dtype).repeat(10, 1)
     position[1, 0], position[2, 2], position[3, 1] = math.nan, math.inf, -math.inf
     direction[4, 2], direction[5, 0], direction[6] = math.nan, math.inf, 0.0
+    # Such a one crosses a plane at once, where it is.
+    direction[7, 2], direction[8, 2], direction[9] = math.inf, -math.inf, math.inf
     position.requires_grad_()
     direction.requires_grad_()
     results = []
@@ -197,7 +199,10 @@ def test_rays_with_numbers_that_no_light_has_are_missed_and_spoil_no_gradient(
         assert outputs.isfinite().all()
         inputs = [position, direction, *lens.parameters()]
         results.append(torch.autograd.grad(outputs.sum(), inputs, allow_unused=True))
-        assert hit.status.tolist() == [Status.OK, *[Status.MISSED] * 6][some]
+        assert hit.status.tolist() == [Status.OK, *[Status.MISSED] * 9][some]
+        given = Rays(position[some].detach(), direction[some].detach())
+        jacobian = ray_jacobian(lens, given, ["thicknesses.*"])
+        assert jacobian.valid.tolist() == hit.valid.tolist()
     for found, alone in zip(*results, strict=True):
         if alone is not None:
             torch.testing.assert_close(found, alone)

@@ -17,6 +17,7 @@ from dolens.plotting import (
     save_figure,
     save_figures,
 )
+from dolens.plotting.export import laid_out
 
 
 def test_an_image_tensor_has_the_figures_size_and_colours():
@@ -65,6 +66,23 @@ def test_a_figure_is_written_in_every_format_that_is_asked_for(tmp_path):
     assert again == svg
     with pytest.raises(InputError, match="gif"):
         save_figures(figure, tmp_path / "history", ("gif",))
+
+
+def test_a_figure_is_laid_out_for_all_its_files_at_once(tmp_path, monkeypatch):
+    """And keeps its layout engine, whatever goes wrong."""
+    figure = history_figure([1.0, 0.1, 0.01])
+    engine, passes = figure.get_layout_engine(), []
+    execute = engine.execute
+    monkeypatch.setattr(engine, "execute", lambda *a: passes.append(a) or execute(*a))
+    with laid_out(figure):
+        save_figures(figure, tmp_path / "history", ("png", "svg"))
+        figure_to_image(figure)
+    assert len(passes) == 2
+    assert figure.get_layout_engine() is engine
+    (tmp_path / "a folder.png").mkdir()
+    with pytest.raises(IsADirectoryError):
+        save_figure(figure, tmp_path / "a folder.png")
+    assert figure.get_layout_engine() is engine
 
 
 def test_no_label_is_cut_at_the_edge_of_a_saved_layout(root, tmp_path):

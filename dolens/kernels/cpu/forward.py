@@ -71,7 +71,7 @@ def real_at(real: types.Type) -> Any:
 def streams(real: types.Type) -> Streams:
     """Compile functions that load rays, fill in the indices, and run a step, for one real type."""
     at = real_at(real)
-    zero = real(0.0)
+    zero, longest, farthest = real(0.0), real(2.0), real(1e30)
 
     @njit(**OPTIONS)
     def find_wavelength(job, lanes):  # noqa: ANN001, ANN202
@@ -84,6 +84,26 @@ def streams(real: types.Type) -> Streams:
             for i in range(BLOCK):
                 different += 1 if which[lanes[i]] != first else 0
             job[jobs.WAVELENGTH] = 0 if different > 0 else types.int64(first) + 1
+
+    @njit(**OPTIONS)
+    def stop_unphysical(state):  # noqa: ANN001, ANN202
+        """Let rays that are none of light stand still at 0, as `finite_rays` does."""
+        out, stopped = carray(state, STATE), 0
+        for i in range(BLOCK):
+            x, y, z = math.fabs(out[X + i]), math.fabs(out[Y + i]), math.fabs(out[Z + i])
+            l, m, n = math.fabs(out[L + i]), math.fabs(out[M + i]), math.fabs(out[N + i])  # noqa: E741
+            known = (x <= farthest) & (y <= farthest) & (z <= farthest)
+            known &= (l <= longest) & (m <= longest) & (n <= longest)
+            stopped += 0 if known else 1
+        if stopped == 0:
+            return
+        for i in range(BLOCK):
+            known = True
+            for k in range(3):
+                known &= math.fabs(out[X + BLOCK * k + i]) <= farthest
+                known &= math.fabs(out[L + BLOCK * k + i]) <= longest
+            for k in range(6):
+                out[BLOCK * k + i] = out[BLOCK * k + i] if known else zero
 
     @njit(**OPTIONS)
     def load(job, start, count, state, lanes):  # noqa: ANN001, ANN202
@@ -127,6 +147,7 @@ def streams(real: types.Type) -> Streams:
             lane = carray(shifted(state, BLOCK * k), BLOCK)
             for i in range(count, BLOCK):
                 lane[i] = lane[0]
+        stop_unphysical(state)
 
     @njit(**OPTIONS)
     def set_indices(job, codes, lanes, work):  # noqa: ANN001, ANN202

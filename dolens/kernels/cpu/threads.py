@@ -10,20 +10,17 @@ Drivers run without Python's lock.
 """
 
 import ctypes
-import logging
 import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from functools import cache
 
 import numpy as np
 import torch
 
 from dolens.kernels.cpu import compiler, team
-
-logger = logging.getLogger("dolens.kernels")
+from dolens.openmp import torchs_openmp
 
 # Fewer rays than this are traced sooner than another thread is woken.
 SMALL = 1 << 14
@@ -106,34 +103,6 @@ def run_in_pool(task: np.ndarray, threads: int) -> None:
         # Whatever stops this thread (Ctrl-C), nobody may write to memory that is given back.
         task[team.SHARES] = 0
         _wait([other for other in others if not other.cancel()])
-
-
-@cache
-def torchs_openmp() -> ctypes.CDLL | None:
-    """Return the OpenMP that torch runs on; None where it cannot be found, or has not gcc's
-    interface.
-
-    Torch loads its libraries for all to see, and the OpenMP that obeys its setting is its own.
-    """
-    try:
-        symbols = ctypes.CDLL(None)
-        symbols.omp_get_max_threads.restype = ctypes.c_int
-        symbols.GOMP_parallel.restype = None
-        symbols.GOMP_parallel.argtypes = (
-            ctypes.c_void_p,
-            ctypes.c_void_p,
-            ctypes.c_uint,
-            ctypes.c_uint,
-        )
-        if symbols.omp_get_max_threads() == torch.get_num_threads():
-            return symbols
-        reason = "another OpenMP is in the way"
-    except (AttributeError, OSError, TypeError) as error:
-        reason = str(error)
-    logger.info(
-        "kernels have a pool of threads of their own: torch's OpenMP not found (%s)", reason
-    )
-    return None
 
 
 def is_forked() -> bool:

@@ -10,6 +10,7 @@ from dolens.kernels.cuda.rays import (
     load_columns,
     load_media,
     load_vectors,
+    stop_unphysical,
     store_vectors,
 )
 from dolens.kernels.cuda.step import step
@@ -52,6 +53,7 @@ def forward_kernel(
     x, y, z = load_vectors(position, position_row, position_column, rays, mask, 0.0)
     sense = first_sense(values, steps)
     l, m, n = load_vectors(direction, direction_row, direction_column, rays, mask, sense)
+    x, y, z, l, m, n = stop_unphysical(x, y, z, l, m, n)
     columns = load_columns(which, rays, mask)
     path = tl.zeros_like(x)
     ended, vignetted = tl.zeros([BLOCK], tl.int32), tl.zeros([BLOCK], tl.int32)

@@ -5,6 +5,9 @@ import triton.language as tl
 
 from dolens.kernels.cuda.layout import SENSE
 
+# Bounds of a position (mm) and of a direction cosine; see `dolens.optics.rays`.
+FARTHEST, LONGEST = tl.constexpr(1e30), tl.constexpr(2.0)
+
 
 @triton.jit
 def load_vectors(pointer, row, column, rays, mask, third):
@@ -14,6 +17,21 @@ def load_vectors(pointer, row, column, rays, mask, third):
         tl.load(place, mask=mask, other=0.0),
         tl.load(place + column, mask=mask, other=0.0),
         tl.load(place + 2 * column, mask=mask, other=third),
+    )
+
+
+@triton.jit
+def stop_unphysical(x, y, z, l, m, n):
+    """Let rays that are none of light stand still at 0, as `finite_rays` does."""
+    known = (tl.abs(x) <= FARTHEST) & (tl.abs(y) <= FARTHEST) & (tl.abs(z) <= FARTHEST)
+    known &= (tl.abs(l) <= LONGEST) & (tl.abs(m) <= LONGEST) & (tl.abs(n) <= LONGEST)
+    return (
+        tl.where(known, x, 0.0),
+        tl.where(known, y, 0.0),
+        tl.where(known, z, 0.0),
+        tl.where(known, l, 0.0),
+        tl.where(known, m, 0.0),
+        tl.where(known, n, 0.0),
     )
 
 

@@ -1,0 +1,43 @@
+"""Nothing is imported before it is needed: seconds of every start, and compilers that may fail."""
+
+import subprocess
+import sys
+
+# In this order: each part imports what the one before must not.
+PROGRAM = """
+import sys
+
+def loaded(*names):
+    return [m for m in sys.modules for name in names if m == name or m.startswith(name + ".")]
+
+# The views of a lens import the floors above when they are called.
+import dolens.optics.lens
+assert loaded("dolens.optics.lens_views")
+above = loaded("dolens.analysis", "dolens.diffraction", "dolens.plotting")
+assert not above, above
+
+# A few rays and a drawing need no compiler, and rays no SymPy, which some functions of PyTorch
+# import: half a second.
+import torch, dolens
+from dolens.plotting import layout_figure
+lens = dolens.load_lens("conf/lens/nikon.yaml")
+rays = dolens.Rays(torch.zeros(20, 3) - 1.0, torch.tensor([0.0, 0.0, 1.0]), 550.0)
+lens.trace(rays).position.sum().backward()
+lens.first_order(), lens.seidel(10.0)
+assert not loaded("sympy")
+lens.chief_ray((0.0, 10.0)), layout_figure(lens)
+assert not loaded("numba")
+
+# A lens on the CPU loads no kernels for GPUs.
+lens = dolens.load_lens("conf/lens/asphere.yaml", backend="cpu")
+ray = torch.tensor([[0.0, 1.0, -5.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+lens.trace(dolens.Rays(*ray))
+assert loaded("numba") and not loaded("dolens.kernels.cuda")
+"""
+
+
+def test_each_part_imports_no_more_than_it_needs(root):
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=root, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
