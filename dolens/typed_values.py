@@ -133,11 +133,13 @@ def _fits(value: object, hint: Any) -> bool:
         return value is None
     base = origin or hint
     if base in _LISTS:
-        listed = isinstance(value, Sequence) and not isinstance(value, str)
-        return listed and _entries_fit(value, base, inner)
+        if isinstance(value, str) or not isinstance(value, Sequence):
+            return False
+        return _entries_fit(value, base, inner)
     if base in (dict, Mapping):
-        mapped = isinstance(value, Mapping)
-        return mapped and all(_fits(v, inner[1]) for v in value.values() if inner)
+        if not isinstance(value, Mapping):
+            return False
+        return all(_fits(v, inner[1]) for v in value.values() if inner)
     if base is Tensor:
         return not isinstance(value, str | bool)
     return not (_is_made(base) and isinstance(value, str | int | float))
