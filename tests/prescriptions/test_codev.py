@@ -264,7 +264,7 @@ def test_the_paraxial_image_of_a_near_object(tmp_path):
 
 
 def test_a_solve_whose_numbers_overflow_is_refused(tmp_path):
-    lens = system(SINGLET[0], "S 4.9e-324 0\n CIR 5\n PIM")
+    lens = system(SINGLET[0], "S 4.9e-324 1 NBK7_SCHOTT\n CIR 5", "S -50 1\n CIR 5\n PIM")
     require_refused(tmp_path / "lens.seq", lens, "PIM: numbers are too large")
 
 
