@@ -413,7 +413,7 @@ class DesignModule(Experiment):
     # ---------------------------------------------------------------- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return the history of iterations, the merit before the first one, and the last round's."""
+        """Return the history of iterations, the first merit, and those about the last round."""
         return {
             "history": self.history,
             "initial_merit": self.initial_merit,
