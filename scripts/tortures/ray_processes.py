@@ -12,7 +12,7 @@ from scripts.tortures.processes import PATIENCE_S, Process, start, trust
 from scripts.tortures.run_folders import differences, faults_of
 
 _TITLE = b"ray::_run"  # of a process that has a task
-_ORPHANS_S = 20.0  # Ray's processes end when they miss their run
+_ORPHANS_S = 60.0  # Ray's processes end when they miss their run, and look for it now and then
 _ABSENT = ["skipped: Ray is not installed"]
 
 
@@ -45,7 +45,7 @@ def run_and_workers_killed(folder: Path) -> list[str]:
     end = time.monotonic() + _ORPHANS_S
     while (left := [pid for pid in family if _command(pid)]) and time.monotonic() < end:
         time.sleep(0.1)
-    wrong = [f"{_command(pid).decode()[:60]} goes on" for pid in left] + faults_of(run)
+    wrong = [f"goes on: {_command(pid).decode()[:150]}" for pid in left] + faults_of(run)
     process = _started(run)
     if process.wait(600.0):
         return [*wrong, f"the run that begins anew fails: {line_of(process)}"]
@@ -87,6 +87,6 @@ def _descendants(pid: int) -> list[int]:
 def _command(pid: int) -> bytes:
     """Return the command line of a process; nothing where it has ended."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
     except OSError:
         return b""
