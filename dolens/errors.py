@@ -5,11 +5,7 @@ message has the same form and offers the nearest allowed name.
 """
 
 import difflib
-import inspect
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, TypeVar
-
-T = TypeVar("T")
+from collections.abc import Iterable
 
 # Letters of a message, and of a word that is worth comparing with others.
 _LONGEST = 500
@@ -97,25 +93,3 @@ def did_you_mean(word: str, allowed: Iterable[str]) -> str:
     """Return the end of a message about an unknown word: `; did you mean 'x'?`, or nothing."""
     near = difflib.get_close_matches(word[:_LONGEST_WORD], list(allowed), n=1)
     return f"; did you mean '{near[0]}'?" if near else ""
-
-
-def call_with_settings(
-    make: Callable[..., T], settings: Mapping[str, Any], where: str, *first: object
-) -> T:
-    """Call a class or a function with settings that a user wrote.
-
-    Args:
-        make: what is called; the settings' keys are the names of its parameters.
-        settings: name → value.
-        where: what the settings are of; messages begin with it.
-        first: arguments that are not the user's; they stand for the first parameters.
-
-    Raises:
-        InputError: a key that is no parameter, or a parameter without a default that is missing.
-    """
-    parameters = list(inspect.signature(make).parameters.values())[len(first) :]
-    check_keys(settings, [parameter.name for parameter in parameters], where)
-    for parameter in parameters:
-        if parameter.default is parameter.empty and parameter.name not in settings:
-            raise InputError(f"{where}: '{parameter.name}' is missing")
-    return make(*first, **settings)

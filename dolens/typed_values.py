@@ -10,14 +10,16 @@ import types
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from torch import Tensor
 
-from dolens.errors import InputError
+from dolens.errors import InputError, check_keys
+
+T = TypeVar("T")
 
 # What plain data is made of; anything else in the place of a value was made of it before.
-_PLAIN = (bool, int, float, str, list, tuple, dict, type(None))
+_PLAIN = (bool, int, float, str, Sequence, Mapping, type(None))
 _LISTS = (list, tuple, Sequence, set, frozenset)
 _WORDS: dict[Any, str] = {
     bool: "true or false",
@@ -34,6 +36,9 @@ _WORDS: dict[Any, str] = {
 def hints_of(make: Callable[..., Any]) -> dict[str, Any]:
     """Return the type hints of the parameters that a class or a function takes; none where they
     cannot be found out.
+
+    What it takes as `**options` is for the classes that it derives from, or, where it is a class
+    method, for its class.
     """
     call: Any = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
     try:
@@ -41,7 +46,12 @@ def hints_of(make: Callable[..., Any]) -> dict[str, Any]:
         hints = get_type_hints(call)
     except Exception:  # hints of others' classes may name what is not installed
         return {}
-    return {name: hint for name, hint in hints.items() if name in names}
+    found: dict[str, Any] = {}
+    if any(one.kind is one.VAR_KEYWORD for one in names.values()):
+        own = getattr(make, "__self__", None)
+        for parent in (own,) if isinstance(own, type) else getattr(make, "__bases__", ()):
+            found |= hints_of(parent)
+    return found | {name: hint for name, hint in hints.items() if name in names}
 
 
 def check_type(value: object, hint: Any, where: str) -> None:
@@ -76,6 +86,30 @@ def check_types(make: Callable[..., Any], settings: Mapping[str, Any], where: st
             check_type(value, hints[name], f"{where}.{name}")
 
 
+def call_with_settings(
+    make: Callable[..., T], settings: Mapping[str, Any], where: str, *first: object
+) -> T:
+    """Call a class or a function with settings that a user wrote.
+
+    Args:
+        make: what is called; the settings' keys are the names of its parameters.
+        settings: name → value.
+        where: what the settings are of; messages begin with it.
+        first: arguments that are not the user's; they stand for the first parameters.
+
+    Raises:
+        InputError: a key that is no parameter, a parameter without a default that is missing, or a
+            value that the parameter's type hint does not allow.
+    """
+    parameters = list(inspect.signature(make).parameters.values())[len(first) :]
+    check_keys(settings, [parameter.name for parameter in parameters], where)
+    for parameter in parameters:
+        if parameter.default is parameter.empty and parameter.name not in settings:
+            raise InputError(f"{where}: '{parameter.name}' is missing")
+    check_types(make, settings, where)
+    return make(*first, **settings)
+
+
 def _fits(value: object, hint: Any) -> bool:
     if not isinstance(value, _PLAIN):
         return True
@@ -99,11 +133,15 @@ def _fits(value: object, hint: Any) -> bool:
         return value is None
     base = origin or hint
     if base in _LISTS:
-        return isinstance(value, list | tuple) and _entries_fit(value, base, inner)
+        if isinstance(value, str) or not isinstance(value, Sequence):
+            return False
+        return _entries_fit(value, base, inner)
     if base in (dict, Mapping):
-        return isinstance(value, dict) and all(_fits(v, inner[1]) for v in value.values() if inner)
+        if not isinstance(value, Mapping):
+            return False
+        return all(_fits(v, inner[1]) for v in value.values() if inner)
     if base is Tensor:
-        return not isinstance(value, str)
+        return not isinstance(value, str | bool)
     return not (_is_made(base) and isinstance(value, str | int | float))
 
 

@@ -35,6 +35,7 @@ def written_whole(path: Path) -> Iterator[Path]:
     except BaseException as error:
         with suppress(OSError):
             aside.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename == str(aside):
-            error.filename, error.filename2 = str(path), None  # what the user asked for
+        # What the user asked for; an error as of a full disk, amid writing, has no name at all.
+        if isinstance(error, OSError) and error.filename in (None, str(aside)):
+            error.filename, error.filename2 = str(path), None
         raise

@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 from dolens.errors import InputError
+from dolens.optics.lens import Lens
 
 
 def numbers_of(key: str, values: Any, count: int | None = None) -> list[float]:
@@ -54,3 +55,33 @@ def check_not_negative(key: str, number: Any) -> None:
     """
     if not (isinstance(number, int | float) and 0.0 <= number < math.inf):
         raise InputError(f"{key}: {number!r}; allowed: a number of 0 or more")
+
+
+def check_finite(key: str, number: Any) -> None:
+    """Refuse what is no finite number.
+
+    Raises:
+        InputError: it is none.
+    """
+    if isinstance(number, bool) or not (
+        isinstance(number, int | float) and -math.inf < number < math.inf
+    ):
+        raise InputError(f"{key}: {number!r}; allowed: a number")
+
+
+def check_sensor_distance(lens: Lens, key: str) -> None:
+    """Refuse a lens with the sensor in front of its last surface, where no light comes to.
+
+    Args:
+        lens: the lens.
+        key: of its prescription.
+
+    Raises:
+        InputError: it has one.
+    """
+    distance = float(lens.sensor_distance.detach())
+    if lens.system().senses[-1] * distance < 0.0:
+        raise InputError(
+            f"{key}.sensor.distance: {distance:g} mm; the sensor must stand behind the last "
+            "surface as light travels (negative where it travels towards -z)"
+        )

@@ -1,6 +1,6 @@
 """The contract between a run and the Lightning module that it trains and tests."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,6 +25,7 @@ class Experiment(lightning.LightningModule):
 
     - `lens` is written to lens/initial.yaml before the work and to lens/final.yaml after it.
     - `summary()` adds numbers to metrics.json.
+    - `metric_names()` says what will stand there, so that a wrong objective is met before the work.
     - `figures()` are drawn after the test, `training_figures()` during training.
     - `identity()` is stored in each checkpoint, and a checkpoint with another one is refused.
     - `checkpoint_state()` is stored in each checkpoint beside the weights.
@@ -36,9 +37,11 @@ class Experiment(lightning.LightningModule):
 
     Attributes:
         trains: whether there is anything to train; False makes `train=true` an error.
+        metrics: names of the metrics that a run can have beside its costs; see `metric_names`.
     """
 
     trains: ClassVar[bool] = True
+    metrics: ClassVar[tuple[str, ...] | None] = None
 
     def __init__(self, lens: Lens, experiment: str, folder: str | Path | None = None) -> None:
         super().__init__()
@@ -49,6 +52,14 @@ class Experiment(lightning.LightningModule):
     def summary(self) -> dict[str, float]:
         """Return numbers about the whole run for metrics.json; called once, when it is done."""
         return {}
+
+    def metric_names(self) -> Collection[str] | None:
+        """Return the names of all metrics that a run can have beside its costs, `cost/...`.
+
+        `*` stands for anything in them.  None: they are not known before; an objective that is none
+        of them is met at the first validation or at the end then.
+        """
+        return self.metrics
 
     def figures(self) -> Figures:
         """Return the figures of a finished test: name of the file without suffix → function."""

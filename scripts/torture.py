@@ -2,6 +2,7 @@
 
     python scripts/torture.py kills --count 50    # of each kind
     python scripts/torture.py kills --kind poses --count 5
+    python scripts/torture.py kills --folder F --minutes 5   # again and again, until all are done
     python scripts/torture.py faults              # full disks and the like; some need root
 
 The exit status is 1 where anything fell.  What fell is kept in the folder, with its logs.
@@ -11,6 +12,7 @@ import argparse
 import os
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # before torch: forked processes have one thread
@@ -25,8 +27,10 @@ from scripts.tortures.processes import warm_up
 def kill(options: argparse.Namespace, folder: Path) -> int:
     """Kill runs of each kind, and print the table."""
     results = []
-    for number, kind in enumerate(options.kind or KINDS):
-        found = killed(kind, KINDS[kind], options.count, folder / str(number), options.first)
+    end = time.monotonic() + 60.0 * options.minutes
+    for kind in options.kind or KINDS:
+        place = folder / str(list(KINDS).index(kind))
+        found = killed(kind, KINDS[kind], options.count, place, options.first, end)
         results.append(found)
         print(
             "\n".join([*table([found])[2:], *(f"    {fault}" for fault in found.faults)]),
@@ -55,6 +59,7 @@ def main() -> int:
     parser.add_argument("what", choices=("kills", "faults"))
     parser.add_argument("--count", type=int, default=50, help="kills of each kind")
     parser.add_argument("--first", type=int, default=0, help="number of the first kill")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="for kills, about")
     parser.add_argument("--kind", action="append", choices=list(KINDS), help="of experiment")
     parser.add_argument("--fault", action="append", choices=list(FAULTS), help="that is done")
     parser.add_argument("--folder", type=Path, help="for the runs; else a temporary one")

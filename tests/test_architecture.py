@@ -36,7 +36,10 @@ ALLOWED = {
     },
     "optimize": {"errors", "typed_values", "optics", "analysis", "rendering"},
     "tolerancing": {"errors", "tasks", "optics", "analysis"},
-    "alignment": {"errors", "optics", "sensor", "rendering", "analysis", "diffraction", "optimize"},
+    "alignment": {
+        *("errors", "typed_values", "optics", "sensor", "rendering", "analysis", "diffraction"),
+        "optimize",
+    },
     "reconstruction": {"errors", "optics", "sensor"},
     "plotting": {"errors", "optics", "analysis", "diffraction", "sensor", "rendering"},
     # A page about a lens shows what all of these find out.

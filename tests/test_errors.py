@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
+from dolens.typed_values import call_with_settings
 
 
 @dataclass(frozen=True)

@@ -31,3 +31,10 @@ def test_an_error_names_the_file_that_was_asked_for(tmp_path):
     with pytest.raises(FileNotFoundError) as caught, written_whole(path) as aside:
         aside.write_text("after")
     assert caught.value.filename == str(path)
+
+
+def test_a_disk_that_is_full_amid_writing_names_the_file_too(tmp_path):
+    with pytest.raises(OSError) as caught, written_whole(tmp_path / "lens.yaml") as aside:
+        aside.write_text("aft")
+        raise OSError(errno.ENOSPC, "No space left on device")  # as `write` raises it
+    assert caught.value.filename == str(tmp_path / "lens.yaml")

@@ -15,6 +15,7 @@ from torch import Tensor
 from dolens.alignment.measurement import Measurement
 from dolens.errors import InputError
 from dolens.sensor.pixels import Sensor
+from dolens.typed_values import call_with_settings, check_type
 
 
 def read_measurements(
@@ -29,13 +30,14 @@ def read_measurements(
     Raises:
         InputError: another count, or photographs whose pixels or read noise differ.
     """
+    check_type(settings, Mapping[str, Any] | Sequence[Mapping[str, Any]], "measurement")
     entries = [settings] if isinstance(settings, Mapping) else list(settings)
     if len(entries) != count:
         raise InputError(
             f"measurement: {len(entries)} photographs; allowed: {count}, one of each source on "
             "each plane"
         )
-    read = [read_measurement(**entry) for entry in entries]
+    read = [call_with_settings(read_measurement, entry, "measurement") for entry in entries]
     if any((each.sensor, each.read_noise) != (read[0].sensor, read[0].read_noise) for each in read):
         raise InputError("measurement: photographs differ in their pixels or in their read noise")
     return replace(
@@ -88,17 +90,23 @@ def read_measurement(
         Image.DecompressionBombError,
     ) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"data.measurement: {path} cannot be read ({reason})") from error
+        raise InputError(f"measurement: {path} cannot be read ({reason})") from error
     if values.ndim != 2 or values.dtype.kind not in "ui":
         raise InputError(
-            f"data.measurement: {path} has {values.dtype} of shape {values.shape}; allowed: one "
+            f"measurement: {path} has {values.dtype} of shape {values.shape}; allowed: one "
             "channel of integers"
         )
     if downsample < 1 or not 0.0 < pixel_pitch < math.inf:
         raise InputError(
-            f"data: downsample {downsample} and pixel_pitch {pixel_pitch}; allowed: 1 or more, "
-            "and above 0 (mm)"
+            f"measurement: downsample {downsample} and pixel_pitch {pixel_pitch}; allowed: 1 or "
+            "more, and above 0 (mm)"
         )
+    for key, number, least in (
+        ("read_noise", read_noise, "0 or more"),
+        ("electrons_per_count", electrons_per_count, "above 0"),
+    ):
+        if not 0.0 <= number < math.inf or (number == 0.0 and least == "above 0"):
+            raise InputError(f"measurement.{key}: {number}; allowed: {least}")
     if saturation is None:
         # Pillow gives 16 bits as int32.
         saturation = 255.0 if values.dtype.itemsize == 1 else 65535.0

@@ -1,7 +1,8 @@
 """A pose holds a lens, point sources and the sensor's planes, and varies some of their numbers."""
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -55,7 +56,7 @@ class Pose(DesignVariables):
     ) -> None:
         require_plane_sensor(lens.system(), "poses")
         options: dict[str, Any] = {"dtype": torch.float64, "device": lens.device}
-        places = torch.tensor(sources, **options).reshape(-1, 3)
+        places = torch.tensor(_places(sources), **options).reshape(-1, 3)
         offset = torch.tensor(shift, **options)
         others = {f"sources.*.{c}": offset[axis] for axis, c in enumerate(_COORDINATES)}
         for number, place in enumerate(places, 1):
@@ -65,9 +66,11 @@ class Pose(DesignVariables):
         super().__init__(lens, variables, others)
         self.register_buffer("sources", places)
         self.register_buffer("shift", offset, persistent=False)
-        self.planes = tuple(float(z) for z in planes)
-        if not self.planes:
+        if not planes:
             raise InputError("planes: none is given; allowed: one or more places of the sensor, mm")
+        self.planes = _numbers(planes)
+        if not self.planes:
+            raise InputError(f"planes: {planes!r}; allowed: places of the sensor, mm")
         if self.best_focus:
             raise InputError("variable 'sensor_distance': solve 'best_focus' is of merit functions")
         for name, shape in zip(self.names, self._shapes, strict=True):
@@ -183,3 +186,20 @@ def _source(name: str, count: int) -> tuple[int | None, int] | None:
             "sources.*.x, .y and .z"
         )
     return int(parts[1]) - 1, _COORDINATES.index(parts[2])
+
+
+def _places(sources: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
+    """Return the places of sources, three finite numbers each."""
+    for source in sources:
+        if len(_numbers(source)) != 3:
+            raise InputError(f"sources: {source!r}; allowed: (x, y, z) each, mm")
+    return [_numbers(source) for source in sources]
+
+
+def _numbers(values: object) -> tuple[float, ...]:
+    """Return numbers; none where something else is among them, or what is not finite."""
+    try:
+        numbers = tuple(float(value) for value in cast(Any, values))
+    except (TypeError, ValueError):
+        return ()
+    return numbers if all(map(math.isfinite, numbers)) else ()

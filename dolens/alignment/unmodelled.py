@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.errors import InputError, call_with_settings
+from dolens.errors import InputError
 from dolens.optics.lens import Lens
 from dolens.optics.materials import Medium, is_glass
+from dolens.typed_values import call_with_settings
 
 
 @dataclass(frozen=True)

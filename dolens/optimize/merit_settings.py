@@ -13,10 +13,10 @@ from dolens.analysis.pupil_quadrature import (
     square_grid,
     with_chief_rays,
 )
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.optics.lens import Lens
 from dolens.optics.lens_states import check_state
-from dolens.optimize.image_quality import ImageQuality
+from dolens.optimize.image_quality import REFERENCES, SPECTRA, ImageQuality
 from dolens.optimize.loss_residuals import LossResiduals, RayInterceptLoss
 from dolens.optimize.merit import MeritFunction
 from dolens.optimize.operands import Operand, operand
@@ -25,7 +25,7 @@ from dolens.optimize.ray_intercept_residuals import RayInterceptResiduals
 from dolens.optimize.states import StatesMerit, VariablesInState, weights_of_states
 from dolens.optimize.variables import DesignVariables
 from dolens.optimize.wavefront_residuals import WavefrontResiduals
-from dolens.typed_values import check_types
+from dolens.typed_values import call_with_settings, check_types
 
 SAMPLINGS: dict[str, Callable[..., SpotRays]] = {
     "gaussian_quadrature": gaussian_quadrature,
@@ -81,6 +81,17 @@ class MeritSettings:
     states: Sequence[str] | None = None
     state_weights: Sequence[float] | None = None
 
+    def __post_init__(self) -> None:
+        check_choice(self.sampling, SAMPLINGS, "merit.sampling")
+        if self.quality is not None and not callable(self.quality):
+            check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
+        check_choice(self.reference, REFERENCES, "merit.reference")
+        check_choice(self.reference_spectrum, SPECTRA, "merit.reference_spectrum")
+        if not 0.0 <= self.max_vignetting <= 1.0:
+            raise InputError(f"merit.max_vignetting: {self.max_vignetting}; allowed: 0 to 1")
+        where = "merit.sampling_options"
+        check_types(SAMPLINGS[self.sampling], _given(self.sampling_options), where)
+
     def fields_of(self, lens: Lens) -> Sequence[Sequence[float]]:
         """Return (x, y) of every field that counts, degrees or mm.
 
@@ -117,7 +128,6 @@ class MeritSettings:
         Raises:
             InputError: no fields or wavelengths, or an unknown sampling or option.
         """
-        check_choice(self.sampling, SAMPLINGS, "merit.sampling")
         fields, wavelengths = self.fields_of(lens), self.wavelengths_of(lens)
         options = _given(self.sampling_options)
         if self.sampling == "gaussian_quadrature":
@@ -133,7 +143,6 @@ class MeritSettings:
             )
         sampling = SAMPLINGS[self.sampling]
         where = "merit.sampling_options"
-        check_types(sampling, options, where)
         rays = call_with_settings(sampling, options, where, lens, fields, wavelengths)
         if self.reference == "chief":
             return with_chief_rays(lens, rays, lens.object_distance)
@@ -192,10 +201,6 @@ class MeritSettings:
             return None
         own_loss = None if isinstance(self.quality, str) else self.quality
         name = self.quality if isinstance(self.quality, str) else ""
-        if own_loss is None:
-            check_choice(name, (*RESIDUALS, *LOSSES), "merit.quality")
-        if not 0.0 <= self.max_vignetting <= 1.0:
-            raise InputError(f"merit.max_vignetting: {self.max_vignetting}; allowed: 0 to 1")
         rays = self.rays(lens)
         common = (
             rays,
@@ -209,7 +214,6 @@ class MeritSettings:
             return call_with_settings(RESIDUALS[name], options, where, *common)
         curvature = options.pop("curvature", "directions")
         if own_loss is None:
-            check_types(LOSSES[name], options, where)
             loss = call_with_settings(LOSSES[name], options, where)
             return LossResiduals(*common, loss, curvature)
         check_keys(options, ("curvature",), where)

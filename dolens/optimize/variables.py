@@ -93,13 +93,13 @@ class DesignVariables(nn.Module):
                 ]
                 low = _setting(settings, "lower", -math.inf, pattern)
                 high = _setting(settings, "upper", math.inf, pattern)
-                if not s > 0.0:
+                if not 0.0 < s < math.inf:
                     raise InputError(f"variable '{name}': scale must be positive, not {s:g}")
                 for start in starts:
                     if not low <= start <= high:
                         raise InputError(
                             f"variable '{name}': initial value {start:g} is outside its bounds "
-                            f"[{low:g}, {high:g}]"
+                            f"[{low:g}, {high:g}] (lower, upper)"
                         )
                 self.names.append(name)
                 self._shapes.append(parameter.shape)
@@ -239,7 +239,11 @@ def _setting(settings: Mapping[str, Any], key: str, default: float, pattern: str
     value = settings.get(key)
     if value is None:
         return default
+    # A bool is a number to Python, and none to a user; NaN bounds nothing.
     try:
-        return float(value)
+        number = math.nan if isinstance(value, bool | str) else float(value)
     except (TypeError, ValueError):
-        raise InputError(f"variable '{pattern}': {key} must be a number, not {value!r}") from None
+        number = math.nan
+    if math.isnan(number):
+        raise InputError(f"variable '{pattern}': {key} must be a number, not {value!r}")
+    return number

@@ -1,5 +1,6 @@
 """The paraxial image of a file's surfaces, for programs that leave the last gap to a solve."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -36,7 +37,7 @@ def paraxial_image(
         place: name in messages.
 
     Raises:
-        InputError: the light leaves the last surface parallel to the axis.
+        InputError: the light leaves the last surface parallel to the axis, or a number overflows.
     """
     height, reduced = _behind(curvatures, gaps, indices, 1.0, 0.0)
     power = -reduced
@@ -45,8 +46,11 @@ def paraxial_image(
         height, reduced = _behind(curvatures, gaps, indices, start, 1.0)
     if reduced == 0.0:
         raise InputError(f"{place}: the paraxial image is at infinity, and no solve can place it")
-    focal_length = indices[-1] / power if power else float("inf")
-    return ParaxialImage(-height * indices[-1] / reduced, focal_length)
+    distance = -height * indices[-1] / reduced
+    if not math.isfinite(distance):
+        raise InputError(f"{place}: numbers are too large to find the paraxial image")
+    focal_length = indices[-1] / power if power else math.inf
+    return ParaxialImage(distance, focal_length)
 
 
 def _behind(

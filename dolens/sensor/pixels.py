@@ -7,6 +7,9 @@ from torch import Tensor
 
 from dolens.errors import InputError
 
+# Along one side; the largest detectors have a tenth of it.
+MOST_PIXELS = 1_000_000
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -32,6 +35,11 @@ class Sensor:
     centre_column: float = 0.0
 
     def __post_init__(self) -> None:
+        if max(self.height, self.width) > MOST_PIXELS:
+            raise InputError(
+                f"sensor: height and width must be at most {MOST_PIXELS} pixels, not "
+                f"{self.height} and {self.width}"
+            )
         if self.height < 1 or self.width < 1 or not 0.0 < self.pixel_pitch < math.inf:
             raise InputError(
                 "sensor: height and width must be at least 1 pixel and pixel_pitch positive (mm), "

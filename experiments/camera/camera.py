@@ -27,6 +27,23 @@ from dolens.reconstruction import psnr_db
 from dolens.reconstruction.processes import mean_over_processes, processes
 from dolens.stages import stage as named_stage
 
+# Beside the scores.
+_METRICS = (
+    "train/loss",
+    "train/psnr_db",
+    "train/*",
+    "test*/photographs",
+    "test*/crops",
+    "error/test*",
+    "variables/*",
+    "operand/*",
+    "lens_step/*",
+    "lens_steps/*",
+    "auto/*",
+    "network/pretrained",
+    "loss/perceptual_available",
+)
+
 
 class CameraModule(Camera):
     """Trains a lens and the network that restores its images, end to end.
@@ -277,6 +294,10 @@ class CameraModule(Camera):
         numbers["cost/rays"] = float(self.views.rays())
         numbers |= self.views.numbers() | self.evaluation.costs()
         return numbers | self.lens_steps.numbers() | self.costs.numbers()
+
+    def metric_names(self) -> list[str]:
+        """Return the names of scores, and what others begin with."""
+        return [*self.evaluation.names(self), *_METRICS]
 
     def figures(self) -> Figures:
         """Return the first test crop, point spread functions, and the layout."""

@@ -99,6 +99,23 @@ class Evaluation:
             found[stage] = scores_by_photograph(crops, of_crops, labels)
         return found
 
+    def names(self, camera: Camera) -> list[str]:
+        """Return the names of all means, of validation and test."""
+        judges = ("", *(f"_{name}" for name in camera.views.reference_renderers()))
+        scores = ("psnr_db", "ssim", "raw_psnr_db", "raw_ssim")
+        views = ("", *(f"/{label}" for label in (*camera.views.labels(), "worst")))
+        found = []
+        for judge in judges:
+            for stage in (f"val{judge}", f"test{judge}"):
+                found += [
+                    f"{stage}/loss",
+                    *(f"{stage}/{s}{view}" for s in scores for view in views),
+                ]
+        if camera.network.needs_point_spread_function:
+            wrong = [f"psnr_db_miscalibrated/{kind}" for kind in self.miscalibrations]
+            found += [f"test/{name}{view}" for name in wrong for view in views]
+        return found
+
     def costs(self) -> dict[str, float]:
         """Return the seconds that a batch takes each judge, as `cost/judge_<name>_s`."""
         return {

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from dolens.analysis.pupil_quadrature import SpotRays
-from dolens.errors import InputError, call_with_settings, check_choice
+from dolens.errors import InputError, check_choice
 from dolens.experiments.camera.operands import CameraOperands
 from dolens.optics.lens import Lens
 from dolens.optimize.trust_region_step import ray_moves, trust_region_step
 from dolens.optimize.variables import DesignVariables
+from dolens.typed_values import call_with_settings
 
 logger = logging.getLogger(__name__)
 
@@ -34,7 +35,7 @@ class CameraOptimizer:
         least_squares: settings of `LensLeastSquares`.
 
     Raises:
-        InputError: an unknown choice.
+        InputError: an unknown choice, or a setting that least squares cannot have.
     """
 
     def __init__(
@@ -45,10 +46,10 @@ class CameraOptimizer:
     ) -> None:
         check_choice(lens, ("adam", "dls"), "optimizer.lens")
         self.network = network
-        self.lens_steps = None
-        if lens == "dls":
-            where = "optimizer.least_squares"
-            self.lens_steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
+        # Settings of what another choice would use are checked as well.
+        where = "optimizer.least_squares"
+        steps = call_with_settings(LensLeastSquares, least_squares or {}, where)
+        self.lens_steps = steps if lens == "dls" else None
 
     def __call__(self, groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
         """Return the optimizer of parameter groups."""

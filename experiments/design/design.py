@@ -84,6 +84,19 @@ class DesignModule(Experiment):
         InputError: a setting that is out of range, or no variables.
     """
 
+    metrics = (
+        "rms_spot_um/initial",
+        "rms_spot_um/final",
+        "rms_spot_um/published",
+        "rms_spot_um/published_refocused",
+        "rms_spot_um/*/*",
+        "light/*",
+        "train/merit",
+        "train/*",
+        "val/merit",
+        "error/sampling_um",
+    )
+
     def __init__(
         self,
         lens: Lens,

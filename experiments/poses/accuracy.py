@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dolens.alignment.information import fisher_information
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.experiment import Figures
 from dolens.experiments.poses.accuracy_figures import basin_figure, photons_figure, rays_figure
@@ -41,6 +41,7 @@ from dolens.plotting.layout import lens_title
 from dolens.rendering.spot_image import SpotImager
 from dolens.stages import stage as named_stage
 from dolens.tasks import TaskMap
+from dolens.typed_values import call_with_settings, check_types
 
 logger = logging.getLogger(__name__)
 
@@ -72,6 +73,12 @@ class PoseAccuracyModule(Analysis):
     Raises:
         InputError: a setting that is unknown or out of range.
     """
+
+    metrics = (
+        "pose_error/reference_over_bound",
+        "pose_error/over_bound/*",
+        "basin/converged/*",
+    )
 
     def __init__(
         self,
@@ -108,6 +115,7 @@ class PoseAccuracyModule(Analysis):
         }
         self.imager = next(iter(self.imagers.values()))
         check_keys(images.slopes, SpotImager.__dataclass_fields__, "slopes")
+        check_types(SpotImager, images.slopes, "slopes")
         self.slopes = replace(self.imager, **images.slopes)
         place = bench.pose(copy.deepcopy(lens))
         place.put(truth)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dolens.errors import InputError
-from dolens.experiments.checks import check_count, check_positive
+from dolens.experiments.checks import check_count, check_not_negative, check_positive
 from dolens.sensor.pixels import Sensor
 
 
@@ -29,6 +29,7 @@ class ComparedImages:
     def __post_init__(self) -> None:
         if not self.imagers:
             raise InputError("imagers: give at least one")
+        check_not_negative("centroid_weight", self.centroid_weight)
 
 
 @dataclass(frozen=True)
@@ -103,3 +104,5 @@ class BasinSettings:
 
     def __post_init__(self) -> None:
         check_positive("photons", self.photons)
+        for weight in self.centroid_weights:
+            check_not_negative("basin.centroid_weights", weight)

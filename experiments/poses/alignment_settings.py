@@ -12,7 +12,7 @@ from dolens.alignment.element_fit import POSE
 from dolens.alignment.pixel_moments import Pixels
 from dolens.alignment.spot_moments import SENSOR
 from dolens.errors import InputError, check_choice, check_keys
-from dolens.experiments.checks import check_count, check_positive
+from dolens.experiments.checks import check_count, check_finite, check_positive
 from dolens.optics.parameter_units import unit_factors
 
 
@@ -80,6 +80,8 @@ class Misalignments:
             if not 0.0 <= number < math.inf:
                 raise InputError(f"{key}: {number!r}; allowed: a positive number, or 0 if known")
         check_keys(self.demo, ("element", *POSE), "demo")
+        for name in POSE:
+            check_finite(f"demo.{name}", self.demo.get(name, 0.0))
 
     def unknown_of_sensor(self) -> list[str]:
         """Return the names of the sensor's coordinates that are unknown to the fits."""

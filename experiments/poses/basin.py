@@ -18,7 +18,7 @@ from dolens.errors import InputError
 from dolens.experiments.poses.accuracy_settings import BasinSettings
 from dolens.experiments.poses.bench import Bench, Light, simulate
 from dolens.experiments.poses.iteration import iterate, loss_of, optimizer_of
-from dolens.experiments.poses.settings import Stage, spot_imager, stage_of
+from dolens.experiments.poses.settings import Stage, plain_imager, spot_imager, stage_of
 from dolens.experiments.tables import Row
 from dolens.tasks import TaskMap
 
@@ -62,6 +62,7 @@ class Basin:
         self.bench = replace(bench, sensor=settings.sensor or bench.sensor)
         self.light = Light(int(settings.photons), read_noise)
         self.imager, self.seed = dict(settings.imager), seed
+        plain_imager(self.bench.sensor, bench.wavelength, self.imager)
         self.rows: list[Row] = []
 
     def run(self, map_tasks: TaskMap) -> None:

@@ -62,6 +62,17 @@ class PoseBoundsModule(Analysis):
         InputError: a setting that is unknown or out of range.
     """
 
+    metrics = (
+        "knowledge/*/worst",
+        "knowledge/*/unseen",
+        "pose_bound/*",
+        "pose_spread_over_bound/*",
+        "pose_bias_over_bound/*",
+        "pose_coverage/*",
+        "pose_within_1_bound/*",
+        "pose_within_2_bounds/*",
+    )
+
     def __init__(
         self,
         lens: Lens,

@@ -44,6 +44,12 @@ class PoseCoverageModule(Analysis, MisalignmentModule):
         InputError: a setting that is unknown or out of range, or a fit without a truth.
     """
 
+    metrics = (
+        "coverage/*/*",
+        "pose_rms_error/*",
+        "pose_rms_over_bound/*",
+    )
+
     def __init__(
         self, cases: Mapping[str, Mapping[str, Any] | None], draws: int, **module: Any
     ) -> None:

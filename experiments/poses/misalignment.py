@@ -63,6 +63,20 @@ class MisalignmentModule(Experiment):
         InputError: a setting that is unknown or out of range.
     """
 
+    metrics = (
+        "pose_error/over_bound",
+        "pose_error/*/*",
+        "pose/*",
+        "pose_bound/*",
+        "pose_unsettled/*",
+        "pose_spread_over_bound/*",
+        "pose_bias_over_bound/*",
+        "pose_coverage/*",
+        "pose_within_1_bound/*",
+        "pose_within_2_bounds/*",
+        "train/loss",
+    )
+
     def __init__(
         self,
         lens: Lens,

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dolens.alignment.measurement import Measurement
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
+from dolens.experiments.checks import check_finite, check_not_negative
 from dolens.rendering.spot_image import SpotImager
 from dolens.sensor.pixels import Sensor
+from dolens.typed_values import call_with_settings, check_type
 
 OPTIMIZERS = ("adam", "dls")
 LOSSES = ("s21", "noise_weighted")
@@ -147,8 +149,10 @@ def fit_plan(
         dict(imager or {}),
         float(centroid_weight),
     )
-    if not plan.stages or not plan.fits:
-        raise InputError("misalignment: give at least one fit and one stage")
+    check_not_negative("centroid_weight", centroid_weight)
+    for key, given in (("fits", plan.fits), ("stages", plan.stages)):
+        if not given:
+            raise InputError(f"{key}: none is given; allowed: one or more")
     for number, fit in enumerate(plan.fits):
         earlier = [before.name for before in plan.fits[:number]]
         if fit.held_from is not None and fit.held_from not in earlier:
@@ -245,10 +249,17 @@ def fit_of(name: str, settings: Mapping[str, Any]) -> Fit:
     """Return the fit that a configuration describes.
 
     Raises:
-        InputError: an unknown key.
+        InputError: an unknown key, or a truth that is no number.
     """
-    check_keys(settings, ("variables", "truth", "held"), f"fits.{name}")
+    keys = ("variables", "truth", "held")
+    check_keys(settings, keys, f"fits.{name}")
+    for key in keys:
+        check_type(settings.get(key), Mapping[str, Any] | None, f"fits.{name}.{key}")
+    for key, value in (settings.get("truth") or {}).items():
+        check_finite(f"fits.{name}.truth.{key}", value)
     held = dict(settings.get("held") or {})
+    check_keys(held, ("from", "variables"), f"fits.{name}.held")
+    check_type(held.get("variables", ()), Sequence[str], f"fits.{name}.held.variables")
     return Fit(
         name,
         dict(settings.get("variables") or {}),

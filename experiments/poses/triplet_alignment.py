@@ -21,6 +21,7 @@ from dolens.alignment.moment_noise import MeasuredMoments, simulated_moments
 from dolens.alignment.spot_moments import MomentModel, moment_model, one_thread
 from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
+from dolens.experiments.checks import check_count, check_positive
 from dolens.experiments.experiment import Figures
 from dolens.experiments.poses.alignment_checks import one_exposure_error, sampling_error
 from dolens.experiments.poses.alignment_figures import Setup, alignment_figure
@@ -62,6 +63,18 @@ class TripletAlignmentModule(Analysis):
 
     digits: ClassVar[int] = 9
 
+    metrics = (
+        "alignment/named_right",
+        "alignment/converged",
+        "alignment/chi_squared/mean",
+        "alignment/*_over_noise*",
+        "alignment/*/*",
+        "pose_error/*",
+        "pose_bound/*",
+        "sensor_error/*",
+        "sensor_bound/*",
+    )
+
     def __init__(
         self,
         lens: Lens,
@@ -79,6 +92,8 @@ class TripletAlignmentModule(Analysis):
         if len(self.elements) < 2:
             raise InputError("lens.elements: two or more are needed to tell one from another")
         self.spots, self.simulation_pupil = spots, simulation_pupil
+        check_positive("photons", photons)
+        check_count("iterations", iterations)
         self.photons, self.pixels = float(photons), detector.pixels()
         self.misalignments = misalignments
         self.demo = misalignments.known_case(self.elements)

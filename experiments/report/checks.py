@@ -5,8 +5,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from dolens.errors import InputError, call_with_settings, check_choice
+from dolens.errors import InputError, check_choice
 from dolens.experiments.report.plan import FOLDER, Plan, read_yaml
+from dolens.typed_values import call_with_settings
 
 # kind of an expected value → what it rests on
 SOURCES = {

@@ -8,7 +8,8 @@ from typing import Any
 
 import yaml
 
-from dolens.errors import InputError, call_with_settings, check_choice, check_keys
+from dolens.errors import InputError, check_choice, check_keys
+from dolens.typed_values import call_with_settings
 
 FOLDER = Path(__file__).resolve().parent
 

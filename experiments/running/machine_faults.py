@@ -21,6 +21,10 @@ _FAULTS = {
     errno.ENFILE: "too many open files",
     errno.ENAMETOOLONG: "the name is too long",
 }
+# Of PyTorch's allocators; that of a GPU is a RuntimeError too.
+_MEMORY = re.compile("can't allocate memory|not enough memory|out of memory")
+# So much of their reason is repeated.
+_REASON = 200
 _LOST_WORKER = re.compile(r"DataLoader worker \(pid\(?s?\)? ?[\d, ]+\)")
 
 
@@ -34,6 +38,11 @@ def machine_fault(error: BaseException) -> str | None:
         if isinstance(found, OSError) and found.errno in _FAULTS:
             place = found.filename2 or found.filename
             return one_line(f"{place}: {_FAULTS[found.errno]}" if place else _FAULTS[found.errno])
+        if isinstance(found, MemoryError) or (
+            isinstance(found, RuntimeError) and _MEMORY.search(str(found))
+        ):
+            reason = str(found).rpartition("DefaultCPUAllocator: ")[2]
+            return one_line(f"there is not enough memory ({reason[:_REASON] or 'MemoryError'})")
         if isinstance(found, LostWorkerError) or (
             isinstance(found, RuntimeError) and _LOST_WORKER.search(str(found))
         ):

@@ -20,6 +20,7 @@ from dolens.experiments.running.failed_parts import reason_of
 from dolens.experiments.running.machine_faults import machine_fault
 from dolens.experiments.running.processes import own_arguments, report_failure
 from dolens.experiments.running.renaming import explained
+from dolens.experiments.running.thread_faults import thread_faults_in_one_line
 from dolens.experiments.running.training import run
 from dolens.experiments.running.user_configuration import make_importable, use_working_folder
 from dolens.experiments.search.pruned import TrialPruned
@@ -66,12 +67,13 @@ def job(cfg: DictConfig) -> float | tuple[float, ...]:
     make_importable(Path(HydraConfig.get().runtime.cwd))
     swept = HydraConfig.get().mode == RunMode.MULTIRUN
     try:
-        return run(cfg)
+        with thread_faults_in_one_line():
+            return run(cfg)
     except TrialPruned as pruned:
         logger.info("Pruned: %s", pruned)
     except (InputError, HydraException, OmegaConfBaseException) as error:
         told = report_failure(error.__cause__ or error)
-        line = reason_of(error)
+        line = reason_of(error, cfg)
         _record(line, to_all=swept)
         if not swept:
             # Exiting here, within the job, keeps Hydra from adding lines of its own.

@@ -1,10 +1,31 @@
 """Arithmetic that configurations need, as resolvers of OmegaConf: `${total_steps:6,50}`."""
 
+from typing import Any
+
 from omegaconf import OmegaConf
 
+from dolens.experiments.checks import check_count
+
+
+def total_steps(epochs: Any, batches: Any, batches_of_step: Any = 1) -> int:
+    """Return the steps of a whole training, each of some batches.
+
+    Args:
+        epochs: `trainer.max_epochs`.
+        batches: of an epoch, `data.steps_per_epoch`.
+        batches_of_step: `trainer.accumulate_grad_batches`.
+
+    Raises:
+        InputError: one of them is no number that a schedule could end by.
+    """
+    check_count("trainer.max_epochs", epochs, 0)
+    check_count("data.steps_per_epoch", batches)
+    check_count("trainer.accumulate_grad_batches", batches_of_step)
+    return epochs * batches // batches_of_step
+
+
 _RESOLVERS = {
-    # The steps of a whole training, each of some batches.
-    "total_steps": lambda epochs, batches, batches_of_step=1: epochs * batches // batches_of_step,
+    "total_steps": total_steps,
     # The iterations of all stages together.
     "iterations": lambda stages: sum(stage["iterations"] for stage in stages),
     "count": len,

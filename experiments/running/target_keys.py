@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig, OmegaConf
 
 from dolens.errors import InputError, check_keys
 from dolens.experiments.running.plain_values import walk
@@ -101,6 +101,12 @@ def targets(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[Target]:
         if isinstance(node, dict) and isinstance(node.get("_target_"), str):
             given = {str(key): value for key, value in node.items() if key not in _HYDRAS}
             yield Target(path, node["_target_"], tuple(given), given)
+
+
+def names_of_targets(cfg: DictConfig, parts: Sequence[str]) -> list[str]:
+    """Return the names of all that Hydra makes of some parts, as `torch.optim.Adam`."""
+    plain = OmegaConf.to_container(cfg, resolve=False)
+    return list(dict.fromkeys(target.name for target in targets(plain, parts)))
 
 
 def _settings(plain: Mapping[str, Any], parts: Sequence[str]) -> Iterator[tuple[str, Any]]:

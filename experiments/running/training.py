@@ -16,9 +16,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from dolens.errors import InputError, one_line
 from dolens.experiments.callbacks.interruption import InterruptionNotice
+from dolens.experiments.callbacks.logged_objectives import LoggedObjectives
 from dolens.experiments.callbacks.logs_before_checkpoints import LogsBeforeCheckpoints
 from dolens.experiments.callbacks.resumed_epochs import ResumedEpochs
 from dolens.experiments.callbacks.starvation import StarvationWarning
+from dolens.experiments.checks import check_sensor_distance
 from dolens.experiments.experiment import Experiment, check_experiment
 from dolens.experiments.loggers.history import History
 from dolens.experiments.loggers.protocol import RunSummary, summarise
@@ -34,7 +36,7 @@ from dolens.experiments.running.configuration import checked
 from dolens.experiments.running.extensions import import_extensions
 from dolens.experiments.running.made_trainer import made_trainer
 from dolens.experiments.running.matmul_precision import set_matmul_precision
-from dolens.experiments.running.objectives import returned
+from dolens.experiments.running.objectives import refuse_unknown, returned
 from dolens.experiments.running.processes import all_processes
 from dolens.experiments.running.resolvers import register_resolvers
 from dolens.experiments.running.run_files import INFO, METRICS, RESOLVED, write_json
@@ -44,6 +46,7 @@ from dolens.experiments.running.run_folder import (
     plain_metrics,
 )
 from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.target_keys import names_of_targets
 from dolens.experiments.running.threads import set_threads
 from dolens.experiments.search.pruned import TrialPruned
 from dolens.experiments.search.pruning import trial_callbacks
@@ -52,6 +55,9 @@ from dolens.prescriptions import lens_from_prescription, save_lens
 from dolens.whole_files import written_whole
 
 logger = logging.getLogger(__name__)
+
+# What may log metrics.
+_LOGGING = ("module", "data", "callbacks")
 
 register_resolvers()
 
@@ -79,6 +85,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     lens = build_lens(settings)
     module = instantiate(settings.module)(lens=lens)
     check_experiment(module, settings.train)
+    refuse_unknown(settings.objectives, module.metric_names(), names_of_targets(cfg, _LOGGING))
     checkpoint = settings.ckpt_path
     refuse_untrained(settings, module)
     if checkpoint is not None:
@@ -91,7 +98,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     callbacks.append(InterruptionNotice(folder / "checkpoints", resume_command()))
     callbacks += [ResumedEpochs(), LogsBeforeCheckpoints(), SettingsInCheckpoints(written)]
     starvation = StarvationWarning()
-    callbacks += [starvation, *trial_callbacks()]
+    callbacks += [starvation, LoggedObjectives(settings.objectives), *trial_callbacks()]
     loggers = [instantiate(entry) for entry in (settings.logger or {}).values() if entry]
     loggers.append(History(folder / "metrics.csv"))
     trainer = made_trainer(settings.trainer, callbacks, loggers)
@@ -176,12 +183,7 @@ def build_lens(settings: RunSettings) -> Lens:
         settings.prescription(), settings.dtype, where=where, backend=settings.backend
     )
     lens = lens.in_state(settings.state)
-    distance = float(lens.sensor_distance.detach())
-    if lens.system().senses[-1] * distance < 0.0:
-        raise InputError(
-            f"lens.sensor.distance: {distance:g} mm; the sensor must stand behind the last surface "
-            "as light travels (negative where it travels towards -z)"
-        )
+    check_sensor_distance(lens, "lens")
     return lens
 
 

@@ -6,13 +6,19 @@ from typing import Any
 
 import torch
 
-from dolens.errors import call_with_settings, check_keys
-from dolens.experiments.checks import check_count
+from dolens.errors import InputError, check_keys
+from dolens.experiments.checks import (
+    check_count,
+    check_finite,
+    check_sensor_distance,
+    numbers_of,
+)
 from dolens.experiments.speed.renders import Subject
 from dolens.optics.parameter_units import to_lens_units
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
+from dolens.typed_values import call_with_settings
 
 _SCENE_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
 
@@ -74,12 +80,18 @@ def subject_of(name: str, settings: Mapping[str, Any]) -> Subject:
         InputError: an unknown key, or a bad value.
     """
     check_keys(settings, _SCENE_KEYS, f"scenes.{name}")
+    for key in _SCENE_KEYS:
+        if key != "values" and key not in settings:
+            raise InputError(f"scenes.{name}.{key}: is missing")
     lens = lens_from_prescription(settings["lens"], torch.float32, where=f"scenes.{name}.lens")
+    check_sensor_distance(lens, f"scenes.{name}.lens")
     with torch.no_grad():
         for pattern, value in (settings.get("values") or {}).items():
+            check_finite(f"scenes.{name}.values.{pattern}", value)
             for key, parameter in lens.variables([pattern]).items():
                 parameter.fill_(to_lens_units(key, value))
-    scene = PlanarScene(settings["depths"], settings["wavelengths"])
+    numbers = {k: numbers_of(f"scenes.{name}.{k}", settings[k]) for k in ("depths", "wavelengths")}
+    scene = PlanarScene(**numbers)
     sensor = call_with_settings(Sensor, settings["sensor"], f"scenes.{name}.sensor")
     names = tuple(lens.variables(list(settings["variables"])))
     return Subject(name, lens.requires_grad_(False), scene, sensor, names)

@@ -45,6 +45,11 @@ class SpeedVsErrorModule(Analysis):
         InputError: an unknown part, or a bad setting of a scene.
     """
 
+    metrics = (
+        "error/*/*",
+        "gradient/*/*",
+    )
+
     def __init__(
         self,
         lens: Lens,

@@ -88,6 +88,20 @@ class TolerancesModule(Analysis):
 
     digits: ClassVar[int] = 9
 
+    metrics = (
+        "tolerance/rms_um/*",
+        "tolerance/worst_rms_um/*",
+        "tolerance/yield_at_*",
+        "tolerance/worst_yield_at_*",
+        "tolerance/before_refocus/*",
+        "tolerance/linear/*",
+        "tolerance/linear_before_refocus/*",
+        "tolerance/failed_lenses",
+        "tolerance/vignetted_share",
+        "sensitivity/rms_um/*",
+        "error/linear_p90*",
+    )
+
     def __init__(
         self,
         lens: Lens,

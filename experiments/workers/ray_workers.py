@@ -71,7 +71,7 @@ def _mapped(
         TaskError: a task raised anything else, or no process brought it to its end.
     """
     remote = ray.remote(num_cpus=1, max_retries=retries)(_run)
-    # In a tuple Ray hands over the reference: a worker fetches the function once, not for each task.
+    # In a tuple Ray passes the reference on: a worker fetches the function once, not for each task.
     shared, precision = (ray.put(function),), torch.get_float32_matmul_precision()
     count, handed, done = len(tasks), 0, 0
     places: dict[int, Any] = {}  # task → reference to its result

@@ -7,6 +7,7 @@ from pathlib import Path
 from scripts.tortures.damaged_checkpoints import cut, damaged_checkpoint, flipped, with_code
 from scripts.tortures.disks import file_for_folder, full_disk, odd_names, read_only_disk
 from scripts.tortures.kernel_caches import compiled_at_once, damaged_kernels
+from scripts.tortures.ray_processes import run_and_workers_killed, worker_killed
 from scripts.tortures.trainings import (
     failing_figure,
     failing_tensorboard,
@@ -38,6 +39,8 @@ FAULTS: dict[str, Fault] = {
     "NaN in a loss": nan_in_loss,
     "a worker is killed": lost_worker,
     "a photograph turns unreadable": unreadable_photograph,
+    "a worker of Ray is killed": worker_killed,
+    "a run with workers of Ray is killed": run_and_workers_killed,
     "figures fail": failing_figure,
     "TensorBoard fails": failing_tensorboard,
 }

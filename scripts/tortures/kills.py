@@ -1,5 +1,7 @@
 """Runs that are killed at random moments, and resumed: to the same results, to the bit."""
 
+import json
+import math
 import os
 import random
 import re
@@ -48,22 +50,44 @@ class Kills:
     equal: int = 0
     faults: list[str] = field(default_factory=list)
 
+    @classmethod
+    def kept(cls, path: Path, kind: str) -> "Kills":
+        """Return what a file has of earlier calls; nothing where there is no file."""
+        found = cls(**json.loads(path.read_text())) if path.exists() else cls(kind)
+        found.by_signal = Counter(found.by_signal)
+        return found
 
-def killed(kind: str, overrides: list[str], count: int, folder: Path, first: int) -> Kills:
-    """Kill runs of one kind.
+    def keep(self, path: Path) -> None:
+        """Write it to a file."""
+        path.write_text(json.dumps(vars(self)))
+
+
+def killed(
+    kind: str,
+    overrides: list[str],
+    count: int,
+    folder: Path,
+    first: int,
+    end: float = math.inf,
+) -> Kills:
+    """Kill runs of one kind; called again with a folder, go on where the last call stopped.
 
     Args:
         kind: its name.
         overrides: of the configuration.
         count: of kills, at least.
         folder: for the runs; those that end well are removed.  The run that nobody kills is made
-            once in it.
+            once in it: after a change of the code or of the kind take another one.
         first: number of the first one, which decides its moments.
+        end: no run is begun after it, by `time.monotonic`.
     """
-    found = Kills(kind)
+    kept = folder / "found.json"
+    found = Kills.kept(kept, kind)
     folder.mkdir(parents=True, exist_ok=True)
     whole = folder / "whole"
     timed = folder / "seconds"
+    if not timed.exists() and time.monotonic() >= end:
+        return found
     for prepare in () if timed.exists() else (None, trust):  # the first may compile kernels
         shutil.rmtree(whole, ignore_errors=True)
         began = time.monotonic()
@@ -73,14 +97,15 @@ def killed(kind: str, overrides: list[str], count: int, folder: Path, first: int
             return found
         timed.write_text(str(time.monotonic() - began))
     found.seconds = float(timed.read_text())
-    number = first
-    while found.by_signal.total() < count and found.runs < 3 * count:
-        found.runs += 1
+    while found.by_signal.total() < count and found.runs < 3 * count and time.monotonic() < end:
+        number = first + found.runs
+        shutil.rmtree(folder / str(number), ignore_errors=True)  # of a call that was stopped
         faults = _one(found, overrides, folder / str(number), number, whole)
         found.faults += [f"{number}: {fault}" for fault in faults]
         if not faults:
             shutil.rmtree(folder / str(number))
-        number += 1
+        found.runs += 1
+        found.keep(kept)
     return found
 
 

@@ -64,11 +64,11 @@ MEASURED = {
     "triplet alignment": [
         "experiment=triplet_alignment",
         "fields=[[0,0],[0,14],[-14,0],[14,-6]]",
-        "misalignments=12",
+        "misalignments=3",
         "module.spots.pupil.arms=16",
         "module.simulation_pupil.rings=5",
         "module.simulation_pupil.arms=20",
-        "module.iterations=12",
+        "module.iterations=3",
         _QUIET,
     ],
     "bounds of a pose": [
@@ -77,7 +77,26 @@ MEASURED = {
         "photons=100000",
         "imager.rays=4000",
         "imager.rim=0.01",
+        "~arrangements.five_sources_three_planes",
+        "objective=knowledge/three_planes/worst",
         _QUIET,
     ],
 }
 KINDS = {name: [*overrides, *COMMON] for name, overrides in {**TRAINED, **MEASURED}.items()}
+# Tasks for workers: fits from many starts, some seconds of them.
+MANY_TASKS = [
+    "experiment=pose_accuracy",
+    "parts=[basin]",
+    *_SMALL_SENSOR,
+    "photons=100000",
+    "imagers.narrow.rays=20000",
+    "imagers.wide.rays=20000",
+    "basin.along={elements.lens.tilt_x: [-2.0, 0.0, 1.0, 2.0, 3.0, 4.0],"
+    " elements.lens.decenter_y: [-0.5, 0.0, 0.5, 1.0]}",
+    "basin.centroid_weights=[1.0]",
+    "basin.photons=1e5",
+    "basin.imager.rays=4000",
+    "basin.stages=[{optimizer: dls, iterations: 12}]",
+    "objective=basin/converged/centroid_weight_1",
+    _QUIET,
+]

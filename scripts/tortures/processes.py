@@ -19,6 +19,7 @@ PATIENCE_S = 120.0
 _IMPORTED = (
     *("lightning.pytorch.callbacks", "matplotlib.pyplot", "torch.utils.tensorboard"),
     *("torchmetrics.image", "skimage.io", "torchvision.models"),
+    *("numba", "torch._dynamo", "torch._decomp.decompositions_for_jvp"),
     *("dolens.experiments.camera.camera", "dolens.experiments.design.design"),
     *("dolens.experiments.poses.misalignment", "dolens.experiments.poses.triplet_alignment"),
     *("dolens.experiments.tolerances.tolerances", "dolens.experiments.running.main"),

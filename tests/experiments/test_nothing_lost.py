@@ -4,6 +4,7 @@ import csv
 import errno
 import logging
 import os
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from dolens.experiments.running.checkpoint_files import WholeCheckpoints, read_c
 from dolens.experiments.running.log_file import LogFile
 from dolens.experiments.running.machine_faults import machine_fault
 from dolens.experiments.running.run_files import write_json
+from dolens.experiments.running.thread_faults import thread_faults_in_one_line
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
 CHECKPOINT = {"state_dict": {"weight": torch.arange(4096.0)}, "global_step": 7}
@@ -111,6 +113,27 @@ def test_a_logger_that_fails_is_named_once_and_asked_for_nothing_more(
     board.finalize("success")
     (said,) = caplog.messages
     assert said.startswith("The logger TensorBoard has failed in log_metrics (OSError: ")
+
+
+@pytest.mark.parametrize(
+    ("error", "lines"),
+    [
+        (OSError(errno.ENOSPC, "No space"), ["writer has ended: the disk is full"]),
+        (ZeroDivisionError(), []),
+    ],
+)
+def test_a_full_disk_that_ends_a_thread_is_one_line(error, lines, monkeypatch, caplog):
+    def fail():
+        raise error
+
+    kept = []
+    monkeypatch.setattr(threading, "excepthook", lambda found: kept.append(found.exc_value))
+    with thread_faults_in_one_line():
+        thread = threading.Thread(target=fail, name="writer")
+        thread.start()
+        thread.join()
+    assert caplog.messages == lines
+    assert kept == ([] if lines else [error])
 
 
 def steps_of(path):

@@ -65,7 +65,7 @@ def test_every_photon_behind_the_lens_is_counted_where_the_sensor_is_wide(single
         (lambda: Light(photons=0), "photons: 0; allowed: 1 or more"),
         (lambda: light_of(read_noise=-1.0), r"read_noise: -1\.0; allowed: 0 or more"),
         (lambda: light_of(unmodelled={"radii": 0.1}), "unmodelled: unknown key 'radii'"),
-        (lambda: plan({}), "give at least one fit and one stage"),
+        (lambda: plan({}), "fits: none is given"),
         (lambda: plan({"a": {"truht": {}}}), "unknown key 'truht'; did you mean 'truth'"),
         (
             lambda: plan({"a": {"held": {"from": "b", "variables": [TILT]}}}),

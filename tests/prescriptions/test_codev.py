@@ -8,6 +8,7 @@ import torch
 from dolens import Rays, Status, load_lens, save_lens
 from dolens.prescriptions.codev.reader import read_codev
 from tests.prescriptions.codev_samples import SINGLET, TRIPLET, system
+from tests.prescriptions.samples import require_refused
 from tests.prescriptions.zemax_samples import triplet as zemax_triplet
 
 
@@ -260,6 +261,11 @@ def test_the_paraxial_image_of_a_near_object(tmp_path):
     y = 1e-4
     ray = Rays(torch.tensor([0.0, 0.0, -100.0]), torch.tensor([0.0, y / 100.0, 1.0]), 587.6)
     assert abs(float(lens.trace(ray).position[1])) < 1e-9
+
+
+def test_a_solve_whose_numbers_overflow_is_refused(tmp_path):
+    lens = system(SINGLET[0], "S 4.9e-324 1 NBK7_SCHOTT\n CIR 5", "S -50 1\n CIR 5\n PIM")
+    require_refused(tmp_path / "lens.seq", lens, "PIM: numbers are too large")
 
 
 def test_a_value_that_a_solve_wrote_is_kept():

@@ -138,6 +138,11 @@ REFUSED = [
 ]
 
 
+def test_an_image_without_a_gap_of_its_own():
+    file = changed("AIR\nTH   0.0\nCBK", "AIR\nTH\nCBK")
+    assert read_oslo(file, "lens").prescription["sensor"]["distance"] == 42.208
+
+
 @pytest.mark.parametrize(("old", "new", "said"), REFUSED)
 def test_what_is_not_held_is_refused_by_name(old, new, said, tmp_path):
     require_refused(tmp_path / "lens.len", changed(old, new), said)

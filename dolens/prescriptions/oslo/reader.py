@@ -64,7 +64,8 @@ def read_oslo(text: str, where: str) -> ReadPrescription:
     prescription["surfaces"] = found
     place = f"{where}: the image"
     _refuse_places(image, place)
-    gap = gaps[-1] + (exact(image["TH"].words[0], place) * factor if "TH" in image else 0)
+    behind = _words(image, "TH")
+    gap = gaps[-1] + (exact(behind[0], f"{place}: TH") * factor if behind else 0)
     prescription["sensor"] = {"distance": nearest(gap, where)} | _curved(image, factor, place)
     solves = any("SOLVE" in block for block in blocks)
     return ReadPrescription(prescription, ["solves, whose values are written"] if solves else [])

@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -68,7 +69,7 @@ class AutoRenderer(Renderer):
     model: ClassVar[str] = "auto"
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0.0:
+        if not 0.0 < self.tolerance < math.inf:
             raise InputError(
                 f"renderer: tolerance must be positive (grey levels), not {self.tolerance}"
             )

@@ -1,0 +1,78 @@
+"""An objective that a run will not have is said before the run, or at its first validation."""
+
+import json
+import logging
+from types import SimpleNamespace
+
+import pytest
+from hydra.utils import instantiate
+
+from dolens.errors import InputError
+from dolens.experiments.callbacks.logged_objectives import LoggedObjectives
+from dolens.experiments.design.design import DesignModule
+from dolens.experiments.experiment import Experiment
+from dolens.experiments.running.objectives import is_among, refuse_unknown, returned
+from dolens.experiments.running.run_settings import RunSettings
+from dolens.experiments.running.target_keys import names_of_targets
+from dolens.experiments.running.training import build_lens
+from tests.experiments.conftest import TINY_CAMERA
+
+KNOWN = ("test/psnr_db", "test/psnr_db/worst", "train/*")
+
+
+def test_an_objective_with_a_wrong_letter_is_refused_with_the_name_that_is_near():
+    with pytest.raises(InputError) as error:
+        refuse_unknown(["test/psnr_db/wrst"], KNOWN, ["dolens.a.B", "torch.optim.Adam"])
+    assert str(error.value) == (
+        "objective: 'test/psnr_db/wrst' is no metric of this run; did you mean "
+        "'test/psnr_db/worst'? (there are: test/psnr_db, test/psnr_db/worst)"
+    )
+
+
+def test_an_objective_of_no_kind_that_there_is_is_refused_with_all_kinds():
+    with pytest.raises(InputError, match=r"'foo' is no metric .*test/\.\.\., train/.*cost/"):
+        refuse_unknown(["foo"], KNOWN, [])
+
+
+def test_what_a_run_will_have_or_may_have_is_taken(caplog):
+    refuse_unknown(["test/psnr_db/worst", "train/anything", "cost/step_s"], KNOWN, [])
+    refuse_unknown(["foo"], None, [])  # nothing is known of an experiment of the user's own
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        refuse_unknown(["mine/number"], KNOWN, ["dolens.a.B", "mine.Callback"])
+    assert "'mine/number' is no metric" in caplog.text and "mine.Callback logs it" in caplog.text
+
+
+def test_the_end_of_a_run_names_what_is_near():
+    with pytest.raises(InputError, match="did you mean 'train/merit'"):
+        returned(["train/mert"], {"train/merit": 1.0, "val/merit": 2.0})
+
+
+def test_an_experiment_says_its_metrics_or_that_they_are_not_known():
+    assert Experiment.metrics is None
+    assert is_among("rms_spot_um/final", DesignModule.metrics)
+    assert not is_among("rms_spot_um/finl", DesignModule.metrics)
+
+
+def test_every_metric_of_a_finished_camera_was_named_before(composed, tiny_run):
+    cfg = composed(*TINY_CAMERA)
+    settings = RunSettings.of(cfg)
+    module = instantiate(settings.module)(lens=build_lens(settings))
+    known = module.metric_names()
+    metrics = json.loads((tiny_run / "metrics.json").read_text())
+    own = [name for name in metrics if not name.startswith("cost/")]
+    assert own and [name for name in own if not is_among(name, known)] == []
+    assert settings.objectives[0] in known
+    assert "torch.optim.Adam" in names_of_targets(cfg, ["module"])
+
+
+@pytest.mark.parametrize(("objective", "there"), [("val/psnr", "val/psnr_db"), ("val/x", None)])
+def test_an_objective_that_validation_lacks_ends_the_run_there(objective, there):
+    callback = LoggedObjectives(["test/psnr_db", objective])
+    trainer = SimpleNamespace(
+        sanity_checking=True, callback_metrics={"train/loss": 1.0} | ({there: 2.0} if there else {})
+    )
+    callback.on_validation_end(trainer, None)  # Lightning's trial before the first step
+    trainer.sanity_checking = False
+    with pytest.raises(InputError, match=f"^objective: '{objective}' is no metric of this run"):
+        callback.on_validation_end(trainer, None)
