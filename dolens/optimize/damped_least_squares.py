@@ -137,6 +137,14 @@ class DampedLeastSquares(torch.optim.Optimizer):
         """Return why nothing more can be gained, in words; None while something may be."""
         return self._memory.get("stopped")
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Load a state: PyTorch takes the text of `stopped` for a sequence, and spoils it."""
+        super().load_state_dict(state_dict)
+        first = state_dict["param_groups"][0]["params"][0]
+        stopped = state_dict["state"].get(first, {}).get("stopped")
+        if stopped is not None:
+            self._memory["stopped"] = stopped
+
     def restart(self) -> None:
         """Go on after the problem has changed: forget D and that it was solved, keep ρ."""
         self._memory.pop("stopped", None)

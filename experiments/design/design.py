@@ -153,6 +153,8 @@ class DesignModule(Experiment):
         self.history: list[dict[str, float]] = []
         self.initial_merit = math.nan
         self._stopped: str | None = None
+        # The best merit before the round that ended last, and its own; None within a round.
+        self._ended: tuple[float, float] | None = None
         # Where the round began, so that a resumed one has its rays; and the best round's end.
         for name in ("round_start", "best"):
             self.register_buffer(name, self.variables.scaled.detach().clone())
@@ -210,6 +212,23 @@ class DesignModule(Experiment):
             self.rays_launched,
             float(self.best_merit),
         )
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Go on from a checkpoint as if nothing had been in between: a search that ended ends."""
+        optimizer = self.optimizers().optimizer
+        if self._ended is None:
+            self._stopped = getattr(optimizer, "stopped", None)
+        elif self._is_last(*self._ended):
+            self.trainer.should_stop = True
+        elif hasattr(optimizer, "restart"):  # the tolerance of rounds is another one now
+            optimizer.restart()
+
+    def _is_last(self, before: float, reached: float) -> bool:
+        """Return whether a round gained so little that no other follows."""
+        gained, least = before - reached, self.round_tolerance * before
+        # With pupils of its own a round begins with other edges, and may end worse than the best.
+        return abs(gained) <= least if self._pupils else not gained > least
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> int | None:
         """End the round when nothing is to be gained."""
@@ -218,6 +237,7 @@ class DesignModule(Experiment):
     def training_step(self, batch: Any, batch_idx: int) -> None:
         """Make one iteration of the optimizer."""
         started = time.perf_counter()
+        self._ended = None
         if self._left:
             self._between.append(started - self._left)
         optimizer = self.optimizers()
@@ -260,9 +280,8 @@ class DesignModule(Experiment):
             self.round_start.copy_(self.variables.scaled)
             self.round_start_focus.copy_(foci(self.lens, self._focus_names))
         optimizer = self.optimizers().optimizer
-        gained, least = before - reached, self.round_tolerance * before
-        # With pupils of its own a round begins with other edges, and may end worse than the best.
-        if abs(gained) <= least if self._pupils else not gained > least:
+        self._ended = before, reached
+        if self._is_last(before, reached):
             self.trainer.should_stop = True
         elif hasattr(optimizer, "restart"):
             optimizer.restart()
@@ -394,13 +413,19 @@ class DesignModule(Experiment):
     # ---------------------------------------------------------------- checkpoints
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """Return the history of iterations, and the merit before the first one."""
-        return {"history": self.history, "initial_merit": self.initial_merit}
+        """Return the history of iterations, the first merit, and those about the last round."""
+        return {
+            "history": self.history,
+            "initial_merit": self.initial_merit,
+            "ended": self._ended and list(self._ended),
+        }
 
     def load_checkpoint_state(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on with that history."""
         self.history = list(checkpoint.get("history", []))
         self.initial_merit = float(checkpoint.get("initial_merit", math.nan))
+        before_and_reached = checkpoint.get("ended")
+        self._ended = tuple(before_and_reached) if before_and_reached else None
 
     def identity(self) -> dict[str, Any]:
         """Return the experiment, the lens and the names of the variables."""

@@ -126,6 +126,18 @@ def test_a_resumed_search_repeats_an_uninterrupted_one(composed, tmp_path):
     assert iterations[0] == iterations[1] > 3
 
 
+def test_a_search_that_had_ended_makes_no_step_more_when_it_is_resumed(composed, tmp_path):
+    """As a run that is killed between its last checkpoint and its end."""
+    search = [*ASPHERE, "optimizer=damped_least_squares"]
+    run(composed(*search, folder="whole"))
+    checkpoint = tmp_path / "whole/checkpoints/last.ckpt"
+    state = torch.load(checkpoint, weights_only=True)["optimizer_states"][0]["state"][0]
+    assert state["stopped"]
+    run(composed(*search, f"ckpt_path={checkpoint}", folder="resumed"))
+    for file in ("lens/final.yaml", "history.csv"):
+        assert (tmp_path / "whole" / file).read_text() == (tmp_path / "resumed" / file).read_text()
+
+
 def test_a_checkpoint_of_another_design_is_refused(composed, tmp_path):
     run(composed(*ASPHERE, "data.iterations=1", "trainer.max_epochs=1", folder="first"))
     checkpoint = tmp_path / "first/checkpoints/last.ckpt"

@@ -197,6 +197,13 @@ def test_groups_and_resuming_from_a_checkpoint(tmp_path):
     assert [float(optimizer.step(closure)) for _ in range(5)] == expected
 
 
+def test_a_checkpoint_has_the_words_why_it_stopped():
+    u, optimizer = minimise(rosenbrock, (-1.2, 1.0))
+    resumed = DampedLeastSquares([u])
+    resumed.load_state_dict(optimizer.state_dict())
+    assert resumed.stopped == optimizer.stopped and " " in resumed.stopped
+
+
 def test_float32_variables_reach_their_own_precision():
     u, optimizer = minimise(rosenbrock, (-1.2, 1.0), dtype=torch.float32)
     assert optimizer.stopped
