@@ -83,7 +83,7 @@ class MeritSettings:
 
     def __post_init__(self) -> None:
         check_choice(self.sampling, SAMPLINGS, "merit.sampling")
-        if isinstance(self.quality, str):
+        if self.quality is not None and not callable(self.quality):
             check_choice(self.quality, (*RESIDUALS, *LOSSES), "merit.quality")
         check_choice(self.reference, REFERENCES, "merit.reference")
         check_choice(self.reference_spectrum, SPECTRA, "merit.reference_spectrum")

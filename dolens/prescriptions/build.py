@@ -257,7 +257,7 @@ def _surface(row: Mapping[str, Any], place: str, dtype: torch.dtype) -> Surface:
         }
         values |= {name: curvature_from(row, name) for name in names if name in shape.curvatures}
         if "curvature" not in names and not math.isinf(
-            as_number(row.get("radius", math.inf), "'radius'")
+            as_number(row.get("radius", math.inf), "'radius'", finite=False)
         ):
             raise InputError(f"a surface of type '{kind}' has no 'radius'")
         surface = shape(clear_aperture(row, place), values, dtype)

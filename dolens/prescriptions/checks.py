@@ -8,14 +8,16 @@ from dolens.errors import InputError
 
 
 def as_number(value: object, what: str, finite: bool = True) -> float:
-    """Return a number; raise `InputError`, which names `what`, where the value is none."""
+    """Return a number; raise `InputError`, which names `what`, where the value is none, or an
+    infinite one that has to be finite.
+    """
     try:
         if isinstance(value, bool):
             raise TypeError
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{what} must be a number, not {value!r}") from None
-    if math.isnan(number) or (finite and math.isinf(number) and "radius" not in what):
+    if math.isnan(number) or (finite and math.isinf(number)):
         raise InputError(f"{what} must be a finite number, not {value!r}")
     return number
 

@@ -116,6 +116,7 @@ NESTED = {
         torch.optim.Adam, "adam", {"trust_radius": math.inf}
     ),
     "merit.quality: 'foo'": lambda: MeritSettings(quality="foo"),
+    "merit.quality: '-1.5'": lambda: MeritSettings(quality=-1.5),
     "merit.reference: 'foo'": lambda: MeritSettings(reference="foo"),
     "merit.max_vignetting: -1": lambda: MeritSettings(max_vignetting=-1),
     "merit.sampling_options.rings: 'a'": lambda: MeritSettings(sampling_options={"rings": "a"}),

@@ -80,6 +80,44 @@ def test_a_curved_grating_obeys_the_vector_equation(material):
     assert bool(((hit.direction[ok] * normal).sum(-1) * sense > 0.0).all())
 
 
+def test_a_grating_on_germanium_lets_light_out():
+    """The cosine in front times n/n' is up to 4, beyond any direction's component."""
+    lens = lens_of(grating(100.0), object_material="4.0")
+    d = directions(tilt=0.03)
+    d = d[d[:, :2].norm(dim=-1) < 0.2]
+    hit = lens.trace(Rays(starts(len(d)), d, WAVE))
+    assert bool(hit.valid.all()) and len(d) > 20
+    expected = 4.0 * d[:, :2] + torch.tensor([0.0, WAVE * 100e-6], dtype=F64)
+    assert (hit.direction[:, :2] - expected).abs().max() < 1e-14
+    assert (hit.direction.norm(dim=-1) - 1.0).abs().max() < 1e-14
+
+
+def test_grooves_on_a_steep_slope_turn_light_by_what_lies_along_it():
+    """Most of m·λ·G = 3.5 is along the normal, and leaves the direction a unit vector whose
+    derivatives are those of differences.
+    """
+    lens = lens_of({"type": "conic", "curvature": 1.0, "conic": -1.0, **{
+        "phase": {"type": "grating", "grooves": 3.5e6 / WAVE}}})  # fmt: skip
+    d = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64)
+
+    def direction(y):
+        place = torch.stack((torch.zeros_like(y), y, torch.full_like(y, -3.0)), -1)
+        hit = lens.trace(Rays(place[None], d, WAVE))
+        assert bool(hit.valid)
+        return hit.direction[0]
+
+    y = torch.tensor(-5.0, dtype=F64, requires_grad=True)
+    found = direction(y)
+    normal = torch.tensor([0.0, 5.0, 1.0], dtype=F64) / math.sqrt(26.0)
+    added = torch.tensor([0.0, 3.5, 0.0], dtype=F64)
+    change = torch.linalg.cross(found - d[0] - added, normal)
+    assert change.abs().max() < 1e-14 and abs(float(found.detach().norm()) - 1.0) < 1e-14
+    [slope] = torch.autograd.grad(found[1], y)
+    with torch.no_grad():
+        above, below = direction(y + 1e-5), direction(y - 1e-5)
+    assert float(slope) == pytest.approx(float(above[1] - below[1]) / 2e-5, rel=1e-7)
+
+
 def test_an_evanescent_order_ends_like_total_reflection():
     lens = lens_of(grating(1800.0, thickness=5.0), {"type": "sphere", "radius": 50.0})
     d = torch.tensor([[0.0, 0.0, 1.0], [0.0, -0.6, 0.8]], dtype=F64)

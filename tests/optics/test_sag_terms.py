@@ -308,6 +308,8 @@ ANAMORPHIC = {"radius": None, "radius_x": 20.0, "radius_y": 40.0}
         ({"type": "zernike_fringe", "z38": 0.1, "normalization_radius": 5.0}, "z1 to z37"),
         ({"type": "zernike_standard", "z232": 0.1, "normalization_radius": 5.0}, "z1 to z231"),
         ({"type": "zernike_standard", "normalization_radius": -5.0}, "positive"),
+        ({"type": "zernike_fringe", "normalization_radius": math.inf}, "must be a finite number"),
+        ({"phase": {"type": "radial", "p2": 1.0, "norm_radius": math.inf}}, "a finite number"),
         ({"type": "odd_asphere", "b1": 0.1}, "b1"),
         ({"type": "toroid", **ANAMORPHIC, "a3": 0.1}, "even aspheric coefficients"),
         ({"type": "toroid", "radius": None, "radius_y": 40.0}, "'radius_x' is missing"),

@@ -100,6 +100,14 @@ def test_what_the_format_cannot_hold_is_named(surface, said):
     assert str(error.value).startswith("lens: surface 1")
 
 
+@pytest.mark.parametrize("size", [5e-324, 1e-310, 0.1 + 0.2])
+def test_an_entrance_pupil_is_no_smaller_than_that_of_the_stop(size):
+    surfaces = SINGLET["surfaces"] | {"1": SINGLET["surfaces"]["1"] | {"semi_diameter": size}}
+    _, found = written_and_read(SINGLET | {"surfaces": surfaces})
+    assert found["entrance_pupil_diameter"] == pytest.approx(2.0 * size, rel=1e-8)
+    assert found["entrance_pupil_diameter"] >= 2.0 * size
+
+
 def test_a_break_in_radians_is_refused():
     with pytest.raises(InputError, match="'tilt_x_radians': its angles are in degrees"):
         codev_of(with_break(tilt_x_radians=0.1))

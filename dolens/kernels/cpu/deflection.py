@@ -66,12 +66,14 @@ from dolens.kernels.cpu.records import (
     TAG,
     TOTALLY_REFLECTED,
 )
+from dolens.kernels.phase_limits import LONGEST, STEEPEST
 
 
 def phase_forward(real: types.Type) -> Callable[..., None]:
     """Deflect a block of rays that stand on a surface; an evanescent order ends them."""
     clamp, safe_sqrt, *_ = arithmetic(real)
     zero, one, two = real(0.0), real(1.0), real(2.0)
+    steepest, longest = real(STEEPEST), real(LONGEST)
     totally_reflected = real(TOTALLY_REFLECTED)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
@@ -92,9 +94,10 @@ def phase_forward(real: types.Type) -> Callable[..., None]:
             sx, sy = w[SLOPE_X + i], w[SLOPE_Y + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
             nx, ny = -sx * nz, -sy * nz
-            along = clamp(ax * nx + ay * ny + az * nz, two)
+            along = clamp(ax * nx + ay * ny + az * nz, longest)
             more = gx * (ax + bx) + gy * (ay + by)
             squared = (one - ratio * ratio) - more + along * along
+            squared = squared if math.fabs(gx) + math.fabs(gy) < steepest else -one
             change = sense * safe_sqrt(squared) - along
             dst[X + i], dst[Y + i], dst[Z + i] = src[X + i], src[Y + i], src[Z + i]
             dst[L + i] = clamp(ax + change * nx, two)

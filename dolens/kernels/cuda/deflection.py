@@ -6,9 +6,11 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import clamp, divide, safe_sqrt
+from dolens.kernels.phase_limits import LONGEST, STEEPEST
 
 # No direction of a ray that goes on has a longer component.
-_LONGEST = tl.constexpr(2.0)
+_HELD = tl.constexpr(2.0)
+_STEEPEST, _LONGEST = tl.constexpr(STEEPEST), tl.constexpr(LONGEST)
 
 
 @triton.jit
@@ -23,11 +25,12 @@ def deflect(phase, px, py, l, m, n, nx, ny, nz, index, ratio, per_radian, sense)
     along = clamp(ax * nx + ay * ny + az * nz, _LONGEST)
     more = gx * (ax + bx) + gy * (ay + by)
     squared = (1.0 - ratio * ratio) - more + along * along
+    squared = tl.where(tl.abs(gx) + tl.abs(gy) < _STEEPEST, squared, -1.0)
     change = sense * safe_sqrt(squared) - along
     return (
-        clamp(ax + change * nx, _LONGEST),
-        clamp(ay + change * ny, _LONGEST),
-        clamp(az + change * nz, _LONGEST),
+        clamp(ax + change * nx, _HELD),
+        clamp(ay + change * ny, _HELD),
+        clamp(az + change * nz, _HELD),
         squared,
         per_radian * phase,
     )

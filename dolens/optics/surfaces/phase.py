@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.law_kernel import LawKernel
+from dolens.kernels.phase_limits import LONGEST, STEEPEST
 from dolens.optics.surfaces.base import Parameters, tensor_of
 from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.deflection import (
@@ -42,8 +43,6 @@ from dolens.optics.surfaces.xy_polynomial import monomial_powers
 # Path in mm for a radian of phase, over the wavelength in nm.
 _PATH = 1e-6 / (2.0 * math.pi)
 _TERM = order_pattern("p")
-# An order that would turn light by more than this sine is evanescent.
-_STEEPEST = 1e6
 
 
 class Phase(Law):
@@ -111,14 +110,14 @@ class Phase(Law):
         x, y, _ = point
         with torch.no_grad():
             _, gx, gy = cls.phase_and_gradient(p, x, y)
-            wild = ~((scale * gx).abs() + (scale * gy).abs() < _STEEPEST)
+            wild = ~((scale * gx).abs() + (scale * gy).abs() < STEEPEST)
         # High powers far outside the aperture overflow, and their derivatives are not finite.
         x, y = x.masked_fill(wild, 0.0), y.masked_fill(wild, 0.0)
         phase, gx, gy = cls.phase_and_gradient(p, x, y)
         gx, gy = scale * gx, scale * gy
         (l, m, n), (nx, ny, nz) = direction, normal  # noqa: E741
         ax, ay, az = ratio * l + gx, ratio * m + gy, ratio * n
-        along = (ax * nx + ay * ny + az * nz).clamp(-2.0, 2.0)
+        along = (ax * nx + ay * ny + az * nz).clamp(-LONGEST, LONGEST)
         # 1 - |a|² without the cancellation of |d|² = 1: Snell's law where there is no phase.
         more = gx * (ax + ratio * l) + gy * (ay + ratio * m)
         squared = (1.0 - ratio * ratio) - more + along * along

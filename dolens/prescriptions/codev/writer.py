@@ -131,9 +131,8 @@ def _entrance_pupil(prescription: Mapping[str, Any], where: str) -> str:
             f"{where}: a .seq file needs an aperture, and the stop of this lens has no entrance "
             "pupil of finite size; give 'object_na'"
         )
-    size = lens.surfaces[str(lens.stop)].semi_diameter
     texts = (f"{diameter * (1.0 + margin):.12g}" for margin in (0.0, 1e-11, 1e-9))
-    return next(text for text in texts if size * float(text) / diameter >= size)
+    return next(text for text in texts if float(text) >= diameter)
 
 
 def _fields(fields: Mapping[str, Any], where: str) -> list[str]:
