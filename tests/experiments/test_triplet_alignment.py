@@ -98,7 +98,7 @@ BAD_INPUT = {
     "key": (["+demo.roll=1"], "demo: unknown key 'roll'"),
     "count": (["misalignments=0"], "misalignments: 0; allowed: an integer of 1 or more"),
     "range": (["tilt_range=0"], "tilt_range: 0; allowed: a positive number"),
-    "photons": (["photons=0"], "photons: 0.0; allowed: 1 or more"),
+    "photons": (["photons=0"], "photons: 0; allowed: a positive number"),
     "shift": (
         ["sensor_shift_range=-1"],
         "sensor_shift_range: -1; allowed: a positive number, or 0",
