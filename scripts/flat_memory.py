@@ -161,7 +161,7 @@ def course_of(kind: str, steps: int, folder: Path) -> Course:
         *(f"+callbacks.memory.{key}={value}" for key, value in watch.items()),
         f"+callbacks.memory.every={max(steps // 10, 1)}",
         "test=false",
-        "objective=train/loss",
+        "objective=cost/wall_s",
         f"hydra.run.dir={folder / kind}",
     ]
     environment: Mapping[str, str] = {**os.environ, "PYTHONPATH": str(ROOT)}
