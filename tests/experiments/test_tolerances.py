@@ -144,5 +144,5 @@ def test_bad_input_gives_one_clear_line(refused, case):
 
 
 def test_without_its_test_the_run_has_no_objective(composed):
-    with pytest.raises(InputError, match="objective: 'tolerance/rms_um/p90' is no metric of this run"):
+    with pytest.raises(InputError, match="objective: 'tolerance/rms_um/p90' is no metric"):
         run(composed(*SMALL, "test=false"))
