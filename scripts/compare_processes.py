@@ -181,12 +181,9 @@ def row_of(name: str, case: Case, one: Run, two: Run) -> tuple[str, bool]:
 def main(arguments: Sequence[str]) -> int:
     """Train and compare; print a row for each case."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("cases", nargs="*", metavar="case", help=f"{', '.join(CASES)}; none: all")
+    parser.add_argument("cases", nargs="*", choices=list(CASES), help="none: all")
     parser.add_argument("--folder", type=Path, help="for the runs; default: a temporary one")
     given = parser.parse_args(arguments)
-    for name in given.cases:
-        if name not in CASES:
-            parser.error(f"{name} is no case; allowed: {', '.join(CASES)}")
     held = True
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.folder or Path(temporary)

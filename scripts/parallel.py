@@ -175,14 +175,11 @@ def lines_of(seconds: Mapping[str, list[float]], results: Mapping[str, set[str]]
 def main(arguments: Sequence[str]) -> int:
     """Measure, and print a table for each kind."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("kinds", nargs="*", metavar="kind", help=f"{', '.join(KINDS)}; none: all")
+    parser.add_argument("kinds", nargs="*", choices=list(KINDS), help="none: all")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--tiny", action="store_true", help="sizes that tell nothing")
     parser.add_argument("--folder", type=Path, help="for the runs; default: a temporary one")
     given = parser.parse_args(arguments)
-    for kind in given.kinds:
-        if kind not in KINDS:
-            parser.error(f"{kind} is unknown; allowed: {', '.join(KINDS)}")
     differ = False
     with tempfile.TemporaryDirectory() as temporary:
         for kind in given.kinds or KINDS:

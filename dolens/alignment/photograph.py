@@ -101,12 +101,12 @@ def read_measurement(
             f"measurement: downsample {downsample} and pixel_pitch {pixel_pitch}; allowed: 1 or "
             "more, and above 0 (mm)"
         )
-    for key, number, least in (
-        ("read_noise", read_noise, "0 or more"),
-        ("electrons_per_count", electrons_per_count, "above 0"),
-    ):
-        if not 0.0 <= number < math.inf or (number == 0.0 and least == "above 0"):
-            raise InputError(f"measurement.{key}: {number}; allowed: {least}")
+    if not 0.0 <= read_noise < math.inf:
+        raise InputError(f"measurement.read_noise: {read_noise}; allowed: 0 or more")
+    if not 0.0 < electrons_per_count < math.inf:
+        raise InputError(
+            f"measurement.electrons_per_count: {electrons_per_count}; allowed: above 0"
+        )
     if saturation is None:
         # Pillow gives 16 bits as int32.
         saturation = 255.0 if values.dtype.itemsize == 1 else 65535.0

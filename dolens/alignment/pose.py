@@ -190,10 +190,11 @@ def _source(name: str, count: int) -> tuple[int | None, int] | None:
 
 def _places(sources: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
     """Return the places of sources, three finite numbers each."""
-    for source in sources:
-        if len(_numbers(source)) != 3:
+    places = [_numbers(source) for source in sources]
+    for source, place in zip(sources, places, strict=True):
+        if len(place) != 3:
             raise InputError(f"sources: {source!r}; allowed: (x, y, z) each, mm")
-    return [_numbers(source) for source in sources]
+    return places
 
 
 def _numbers(values: object) -> tuple[float, ...]:

@@ -15,7 +15,7 @@ from dolens.optics.image_surface import TangentPlanes
 from dolens.optics.paraxial import exit_pupil
 from dolens.optics.ray_tracing import trace_rays
 from dolens.optics.rays import TracedRays
-from dolens.optics.surfaces.refraction import GRAZING
+from dolens.optics.surfaces import GRAZING
 from dolens.optics.system import OpticalSystem
 
 

@@ -118,6 +118,8 @@ class Failure:
 
 # Steps of Newton's iteration at most, as in `dolens.optics.surfaces.newton`.
 NEWTON_STEPS = 40
+# After a step of √ε the next is below rounding, but for rays along a tangent, which take some more.
+LAST_STEPS = 2
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError, check_keys
+from dolens.kernels.limits import GRAZING
 from dolens.optics.rays import OUT_OF_REACH, Components
-
-# Smallest cosine to the axis that is divided by when a ray is carried to a tilted element.
-_GRAZING = 1e-9
 
 TILTS = ("tilt_x", "tilt_y", "tilt_z")
 DISPLACEMENTS = ("decenter_x", "decenter_y", "shift_z")
@@ -217,7 +215,7 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
     if now.together(then):
         return Components(x, y, z + (now.z - then.z), l, m, n), None
     step, turn = (found.to(n.dtype) for found in relative_axes(now, then))
-    along = n.abs() <= _GRAZING
+    along = n.abs() <= GRAZING
     below = step[2] - z
     distance = (below / n.masked_fill(along, 1.0)).clamp(-OUT_OF_REACH, OUT_OF_REACH)
     distance = distance.masked_fill(along, 0.0)

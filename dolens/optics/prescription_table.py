@@ -48,7 +48,7 @@ class SurfaceRow:
         terms: further coefficients by name; the lists of numbers of a shape, such as a spline's,
             are left out.  Of a coordinate break its decenters, mm, and tilts, degrees.
         stop: whether it is the stop.
-        element: name of the element with a pose of its own that carries it, or nothing.
+        element: name of the innermost element with a pose of its own that carries it, or nothing.
     """
 
     number: int
@@ -107,6 +107,7 @@ class PrescriptionTable:
         sensor_distance: mm from the last vertex.
         sensor_diameter: mm; None where the prescription gives none.
         elements: name of an element with a pose → its parameters that are not zero, degrees and mm.
+        carried: name of an element with a pose → the first and the last of its surfaces.
         sensor_radius: mm, of a curved sensor; `inf` of a plane one.
         sensor_conic: its conic constant; 0 of a sphere.
     """
@@ -119,6 +120,7 @@ class PrescriptionTable:
     sensor_distance: float
     sensor_diameter: float | None
     elements: dict[str, dict[str, float]]
+    carried: dict[str, tuple[int, int]]
     sensor_radius: float = math.inf
     sensor_conic: float = 0.0
 
@@ -134,10 +136,10 @@ class PrescriptionTable:
         """Return lines about elements with a pose of their own."""
         found = []
         for name, pose in self.elements.items():
-            numbers = [row.number for row in self.surfaces if row.element == name]
+            first, last = self.carried[name]
             values = ", ".join(f"{key} {_number(value)}{_unit(key)}" for key, value in pose.items())
-            carried = f"surfaces {numbers[0]} to {numbers[-1]}"
-            found.append(printable(f"element {name} ({carried}): {values or 'no tilt or shift'}"))
+            which = f"surfaces {first} to {last}"
+            found.append(printable(f"element {name} ({which}): {values or 'no tilt or shift'}"))
         return found
 
     def cells(self) -> list[list[str]]:
@@ -166,9 +168,11 @@ class PrescriptionTable:
 @torch.no_grad()
 def prescription_table(lens: Any) -> PrescriptionTable:
     """Return the prescription of a `Lens` in its present state as plain values."""
+    # An element within another one, which is shorter, is the surface's own.
+    by_length = sorted(lens.elements.items(), key=lambda e: e[1].first - e[1].last)
     carrier = {
         number: name
-        for name, element in lens.elements.items()
+        for name, element in by_length
         for number in range(element.first, element.last + 1)
     }
     gaps = [float(gap) for gap in lens.thicknesses.values()] + [float(lens.sensor_distance)]
@@ -213,6 +217,7 @@ def prescription_table(lens: Any) -> PrescriptionTable:
         gaps[-1],
         lens.sensor_diameter,
         {name: _pose(element) for name, element in lens.elements.items()},
+        {name: (element.first, element.last) for name, element in lens.elements.items()},
         *_sensor_shape(lens),
     )
 

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.kernels.limits import FARTHEST, LONGEST
+
 
 class Status(IntEnum):
     """The end of a ray.
@@ -21,10 +23,6 @@ class Status(IntEnum):
     MISSED = 3
 
 
-# No unit vector has a larger component; refraction holds directions there too.
-LONGEST = 2.0
-# mm; nothing that can be seen is farther away.
-FARTHEST = 1e30
 # mm; distances along rays are held there, since infinity times zero is NaN.  A ray that meets a
 # surface comes nowhere near it, and sums of several stay in single precision.
 OUT_OF_REACH = 1e35

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dolens.kernels.limits import GRAZING
 from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
 from dolens.optics.rays import (
     OUT_OF_REACH,
@@ -17,7 +18,7 @@ from dolens.optics.rays import (
     finite_rays,
 )
 from dolens.optics.surfaces.deflection import Media, Travel
-from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay
+from dolens.optics.surfaces.refraction import FAR, PlaneRay
 from dolens.optics.surfaces.state import SurfaceState
 from dolens.optics.system import OpticalSystem, per_radian
 

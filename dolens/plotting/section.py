@@ -11,8 +11,8 @@ from dolens.optics.aiming import aim
 from dolens.optics.elements import to_lens_axes
 from dolens.optics.paraxial import entrance_pupil
 from dolens.optics.rays import Components
+from dolens.optics.surfaces import GRAZING
 from dolens.optics.surfaces.outlines import Polygons
-from dolens.optics.surfaces.refraction import GRAZING
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import trace_surfaces, trace_to_sensor, transfer
 from dolens.plotting.surface_cut import BISECTIONS, Profile, SurfaceCut, place_of, runs

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import lightning
 
-from dolens.errors import InputError, did_you_mean
+from dolens.experiments.running.objectives import no_metric
 
 
 class LoggedObjectives(lightning.Callback):
@@ -30,8 +30,5 @@ class LoggedObjectives(lightning.Callback):
         there = sorted(name for name in trainer.callback_metrics if name.startswith("val/"))
         for name in self._wanted:
             if name not in there:
-                raise InputError(
-                    f"objective: '{name}' is no metric of this run{did_you_mean(name, there)} "
-                    f"(there are: {', '.join(there) or 'none of the validation'})"
-                )
+                raise no_metric(name, there)
         self._wanted = []

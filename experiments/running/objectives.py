@@ -56,10 +56,9 @@ def refuse_unknown(
     for name in names:
         if is_among(name, known):
             continue
-        message = f"objective: '{name}' is no metric of this run{_near(name, known)}"
         if not own:
-            raise InputError(message)
-        logger.warning("%s, unless %s logs it", message, " or ".join(own))
+            raise no_metric(name, known)
+        logger.warning("%s, unless %s logs it", no_metric(name, known), " or ".join(own))
 
 
 def is_among(name: str, known: Collection[str]) -> bool:
@@ -69,14 +68,19 @@ def is_among(name: str, known: Collection[str]) -> bool:
     )
 
 
-def _near(name: str, known: Collection[str]) -> str:
-    """Return the end of a message: metrics of the same kind, or all kinds that there are."""
+def no_metric(name: str, known: Collection[str]) -> InputError:
+    """Return the error of an objective that is none of the known metrics; it names those of the
+    same kind, or all kinds that there are.
+    """
     kind = name.partition("/")[0]
     plain = [one for one in known if "*" not in one]
     found = [one for one in known if one.startswith(f"{kind}/")]
     kinds = [one.partition("/")[0] for one in known]
     found = found or [f"{one}/..." for one in dict.fromkeys(kinds) if "*" not in one]
-    return f"{did_you_mean(name, plain)} (there are: {', '.join(found)})"
+    return InputError(
+        f"objective: '{name}' is no metric of this run{did_you_mean(name, plain)} "
+        f"(there are: {', '.join(found) or 'none'})"
+    )
 
 
 def returned(names: Sequence[str], numbers: Mapping[str, float]) -> float | tuple[float, ...]:
@@ -87,6 +91,6 @@ def returned(names: Sequence[str], numbers: Mapping[str, float]) -> float | tupl
     """
     for name in names:
         if name not in numbers:
-            raise InputError(f"objective: '{name}' is no metric of this run{_near(name, numbers)}")
+            raise no_metric(name, numbers)
     values = tuple(numbers[name] for name in names)
     return values if len(values) > 1 else values[0]

@@ -47,12 +47,16 @@ def refuse_unread(cfg: DictConfig, taken: Sequence[str]) -> None:
         return  # what is wrong with it is said where it is used
     references = References.of(OmegaConf.to_container(own, resolve=False), taken)
     choices = HydraConfig.get().runtime.choices
-    for path in (*_set_by_command_line(), *_set_by_experiment(own)):
+    unnamed = [
+        path
+        for path in (*_set_by_command_line(), *_set_by_experiment(own))
+        if path.split(".")[0] not in taken and not references.need(path) and _has_content(own, path)
+    ]
+    text_of_hydra = _text_of_hydra() if unnamed else ""
+    for path in unnamed:
+        if f"${{{path}" in text_of_hydra:
+            continue
         top = path.split(".")[0]
-        if top in taken or references.need(path):
-            continue
-        if f"${{{path}" in _text_of_hydra() or not _has_content(own, path):
-            continue
         without = copy.deepcopy(own)
         _delete(without, path)
         if _resolved(without, taken) == before:

@@ -1,7 +1,10 @@
 """Compiled kernels: said once, kept on disk, and no worse off where they cannot be kept."""
 
+import ast
+import enum
 import errno
 import functools
+import importlib
 import io
 import multiprocessing
 import os
@@ -9,6 +12,7 @@ import pickle
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -41,6 +45,20 @@ def run(root, cache, lens="cooke_triplet"):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def test_every_number_that_kernels_freeze_is_in_a_stamped_file():
+    # Another file's number could change, and the kernels on disk would go on with the old one.
+    stamped, seen = set(compiler.stamped_sources()), set()
+    for path in Path(compiler.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module.startswith("dolens."):
+                module = importlib.import_module(node.module)
+                taken = [getattr(module, alias.name, None) for alias in node.names]
+                if any(isinstance(one, int | float | enum.EnumMeta) for one in taken):
+                    seen.add(Path(module.__file__))
+    assert {path.name for path in seen} > {"limits.py", "table.py", "layout.py"}
+    assert seen <= stamped
 
 
 def test_the_first_start_compiles_and_the_second_reads(root, tmp_path):

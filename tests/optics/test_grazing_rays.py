@@ -72,3 +72,42 @@ def test_a_grazing_ray_meets_the_surface_on_its_own_line_or_is_missed(name, back
     far = (crossing[:, :2].abs() > FAR * SEMI_DIAMETER).any(1)
     assert 0.2 < float(far.double().mean()) < 0.8
     assert (hit.status[far] == Status.MISSED).all()
+
+
+def test_a_ray_along_a_tangent_converges_without_others_that_keep_the_iteration_going():
+    """A wave of a mirror, found by random lenses; Newton's last step of √ε left 10⁵ roundings."""
+    lens = lens_from_prescription(
+        {
+            "object_material": "1.5168/64.17",
+            "surfaces": {
+                "1": {
+                    "type": "zernike_standard",
+                    **{"radius": -349.0734772837016, "conic": 1.5099060535430908},
+                    **{"z2": -0.1969477183361349, "z4": 0.19077592837637203},
+                    **{"z37": 0.22211079280155652, "normalization_radius": 14.476516152974444},
+                    **{"semi_diameter": 18.1, "material": "mirror"},
+                }
+            },
+            "elements": {
+                "1": {
+                    "surfaces": [1, 1],
+                    **{"tilt_x": 0.9582710266113281, "tilt_y": 0.22530877590179443},
+                    **{"tilt_z": -2.1251142024993896},
+                    "pivot": [7.433961184125138, 0.47653654934939027, 0.0],
+                }
+            },
+            "sensor": {"distance": -129.2949730593735},
+        },
+        torch.float64,
+        backend="cpu",
+    )
+    place = [[-40.37755586564004, -16.676876015810652, -0.7060404351849476]]
+    along = [[-0.9691810693179199, -0.2463494568205364, 0.0]]
+    place, along = (torch.tensor(vector, dtype=torch.float64) for vector in (place, along))
+    shifts = torch.linspace(-1.0, 1.0, 201, dtype=torch.float64)[:, None]
+    with torch.no_grad():
+        alone = lens.trace(Rays(place, along))
+        others = torch.cat((place.expand(201, 3)[:, :2], place[:, 2:] + shifts), 1)
+        beside = lens.trace(Rays(others, along.expand(201, 3)))
+    assert alone.valid.all() and beside.valid[100]
+    assert float((alone.direction[0] - beside.direction[100]).abs().max()) < 1e-12

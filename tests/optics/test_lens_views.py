@@ -48,6 +48,16 @@ def test_repr_is_the_prescription(singlet):
     assert "\x1b" not in text
 
 
+def test_a_surface_shows_the_innermost_of_the_elements_that_carry_it():
+    inner = {"front": {"surfaces": [1, 1], "decenter_x": 0.1}}
+    for elements in ({**SINGLET["elements"], **inner}, {**inner, **SINGLET["elements"]}):
+        table = lens_from_prescription({**SINGLET, "elements": elements}).prescription()
+        assert [row.element for row in table.surfaces][:2] == ["front", "glass"]
+        notes = "\n".join(table.notes)
+        assert "element front (surfaces 1 to 1): decenter_x 0.1 mm" in notes
+        assert "element glass (surfaces 1 to 2): tilt_x 1.5°" in notes
+
+
 def test_the_table_follows_the_lens(singlet):
     with torch.no_grad():
         singlet.surfaces["2"].curvature.zero_()

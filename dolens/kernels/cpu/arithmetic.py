@@ -12,6 +12,7 @@ from numba import njit, types
 from dolens.kernels.cpu.compiler import OPTIONS
 from dolens.kernels.cpu.layout import ENDED, VIGNETTED
 from dolens.kernels.cpu.records import MISSED, STOPPED, TOTALLY_REFLECTED
+from dolens.kernels.limits import GRAZING, LONGEST, TINY
 
 
 class Arithmetic(NamedTuple):
@@ -30,8 +31,8 @@ def arithmetic(real: types.Type) -> Arithmetic:
     """Compile the functions for a real type; every constant in them has it, so that none is
     promoted.
     """
-    grazing, tiny = real(1e-9), real(1e-18)
-    zero, one, two = real(0.0), real(1.0), real(2.0)
+    grazing, tiny = real(GRAZING), real(TINY)
+    zero, one, longest = real(0.0), real(1.0), real(LONGEST)
     stopped, totally_reflected = real(STOPPED), real(TOTALLY_REFLECTED)
     missed = real(MISSED)
 
@@ -75,13 +76,13 @@ def arithmetic(real: types.Type) -> Arithmetic:
     @njit(**OPTIONS)
     def refract(l, m, n, nx, ny, nz, ratio, sense):  # noqa: ANN001, ANN202, E741
         """Return direction and cos² of the angle behind a surface; it is positive without TIR."""
-        cosine = clamp(l * nx + m * ny + n * nz, two)
+        cosine = clamp(l * nx + m * ny + n * nz, longest)
         squared = (one - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
         along = sense * safe_sqrt(squared) - ratio * cosine
         return (
-            clamp(ratio * l + along * nx, two),
-            clamp(ratio * m + along * ny, two),
-            clamp(ratio * n + along * nz, two),
+            clamp(ratio * l + along * nx, longest),
+            clamp(ratio * m + along * ny, longest),
+            clamp(ratio * n + along * nz, longest),
             squared,
         )
 

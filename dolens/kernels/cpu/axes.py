@@ -61,6 +61,7 @@ from dolens.kernels.cpu.records import (
     TURN_ZY,
     TURN_ZZ,
 )
+from dolens.kernels.limits import GRAZING
 
 
 @cache
@@ -92,7 +93,7 @@ def change_axes_forward(real: types.Type) -> Callable[..., None]:
     Those that run along that level are turned where they are.
     """
     turn, _ = _turns(real)
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)
@@ -119,7 +120,7 @@ def change_axes_forward(real: types.Type) -> Callable[..., None]:
 def change_axes_adjoint(real: types.Type) -> Callable[..., None]:
     """Sweep cotangents back through `change_axes_forward`."""
     _, turn_back = _turns(real)
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)
@@ -208,7 +209,7 @@ def lens_axes_adjoint(real: types.Type) -> Callable[..., None]:
 
 def sensor_forward(real: types.Type) -> Callable[..., None]:
     """Carry rays to the sensor plane; those that do not travel towards it miss it."""
-    zero, missed, grazing = real(0.0), real(MISSED), real(1e-9)
+    zero, missed, grazing = real(0.0), real(MISSED), real(GRAZING)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)

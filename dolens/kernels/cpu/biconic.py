@@ -10,11 +10,12 @@ from typing import Any
 from numba import njit
 
 from dolens.kernels.cpu.scalars import OPTIONS, given_by_scalars
+from dolens.kernels.limits import TINY
 
 
 def biconic(real: Callable[[float], Any]) -> tuple[Any, Any, Any]:
     """Return the functions of one point for a precision, `real`."""
-    zero, half, one, two, tiny = real(0.0), real(0.5), real(1.0), real(2.0), real(1e-18)
+    zero, half, one, two, tiny = real(0.0), real(0.5), real(1.0), real(2.0), real(TINY)
 
     @njit(**OPTIONS)
     def roots(ex, ey, x, y):  # noqa: ANN001, ANN202

@@ -133,15 +133,19 @@ def compile_team(factory: Factory) -> Any:
     return ctypes.CFUNCTYPE(None, ctypes.POINTER(ctypes.c_int64))(address)
 
 
-@cache
-def stamp() -> str:
-    """Return a digest of the kernels' sources: a change in any of them makes all on disk stale.
-
-    Layouts and tables are among these sources: Numba freezes their integers in the kernels.
+def stamped_sources() -> list[Path]:
+    """Return the files whose numbers and functions Numba freezes in kernels: layouts, tables and
+    limits are among them.
     """
     here = Path(__file__).parent
+    return [*sorted(here.rglob("*.py")), here.parent / "limits.py", here.parent / "table.py"]
+
+
+@cache
+def stamp() -> str:
+    """Return a digest of the kernels' sources: a change in any of them makes all on disk stale."""
     digest = hashlib.sha256()
-    for path in (*sorted(here.rglob("*.py")), here.parent / "table.py"):
+    for path in stamped_sources():
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -47,13 +47,14 @@ from dolens.kernels.cpu.records import (
     SHORT_RECORD,
     TAG,
 )
+from dolens.kernels.limits import GRAZING
 
 
 @cache
 def conic_distance(real: types.Type) -> Any:
     """Compile the distance from the vertex plane to a conic, and D; see `optics.surfaces.conic`."""
     _, safe_sqrt, *_ = arithmetic(real)
-    zero, one, grazing, flat = real(0.0), real(1.0), real(1e-9), real(1e-15)
+    zero, one, grazing, flat = real(0.0), real(1.0), real(GRAZING), real(1e-15)
 
     @njit(**OPTIONS)
     def distance(c, a, x, y, l, m, n, sense):  # noqa: ANN001, ANN202, E741
@@ -75,7 +76,7 @@ def conic_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to a conic and through it."""
     clamp, safe_sqrt, arrive, set_status, refract, _ = arithmetic(real)
     distance = conic_distance(real)
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)

@@ -66,14 +66,15 @@ from dolens.kernels.cpu.records import (
     TAG,
     TOTALLY_REFLECTED,
 )
-from dolens.kernels.phase_limits import LONGEST, STEEPEST
+from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
 
 
 def phase_forward(real: types.Type) -> Callable[..., None]:
     """Deflect a block of rays that stand on a surface; an evanescent order ends them."""
     clamp, safe_sqrt, *_ = arithmetic(real)
-    zero, one, two = real(0.0), real(1.0), real(2.0)
-    steepest, longest = real(STEEPEST), real(LONGEST)
+    zero, one = real(0.0), real(1.0)
+    longest, steepest = real(LONGEST), real(STEEPEST)
+    longest_wavevector = real(LONGEST_WAVEVECTOR)
     totally_reflected = real(TOTALLY_REFLECTED)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
@@ -94,15 +95,15 @@ def phase_forward(real: types.Type) -> Callable[..., None]:
             sx, sy = w[SLOPE_X + i], w[SLOPE_Y + i]
             nz = one / math.sqrt(one + sx * sx + sy * sy)
             nx, ny = -sx * nz, -sy * nz
-            along = clamp(ax * nx + ay * ny + az * nz, longest)
+            along = clamp(ax * nx + ay * ny + az * nz, longest_wavevector)
             more = gx * (ax + bx) + gy * (ay + by)
             squared = (one - ratio * ratio) - more + along * along
             squared = squared if math.fabs(gx) + math.fabs(gy) < steepest else -one
             change = sense * safe_sqrt(squared) - along
             dst[X + i], dst[Y + i], dst[Z + i] = src[X + i], src[Y + i], src[Z + i]
-            dst[L + i] = clamp(ax + change * nx, two)
-            dst[M + i] = clamp(ay + change * ny, two)
-            dst[N + i] = clamp(az + change * nz, two)
+            dst[L + i] = clamp(ax + change * nx, longest)
+            dst[M + i] = clamp(ay + change * ny, longest)
+            dst[N + i] = clamp(az + change * nz, longest)
             dst[PATH + i] = src[PATH + i] + per_radian * w[PHASE + i]
             ended = src[ENDED + i]
             dst[ENDED + i] = ended if ended > zero or squared > zero else evanescent

@@ -67,7 +67,8 @@ from dolens.kernels.cpu.records import (
     STARTS_ON_CONIC,
     TAG,
 )
-from dolens.kernels.table import NEWTON_STEPS
+from dolens.kernels.limits import GRAZING
+from dolens.kernels.table import LAST_STEPS, NEWTON_STEPS
 
 
 def explicit_forward(real: types.Type) -> Callable[..., None]:
@@ -78,9 +79,10 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
     """
     clamp, _, arrive, set_status, refract, _ = arithmetic(real)
     distance = conic_distance(real)
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
     epsilon = real(2.0**-23 if real is types.float32 else 2.0**-52)
     close, rounding = real(math.sqrt(float(epsilon))), real(64.0) * epsilon
+    closest = real(float(epsilon) ** 0.875)
     uncertain = real(1e-2)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
@@ -107,6 +109,7 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                     src[L + i], src[M + i], n, sense,
                 )  # fmt: skip
                 w[DISTANCE + i] = clamp(t, limit) if squared > zero else zero
+        moving = zero
         for _ in range(NEWTON_STEPS):
             for i in range(BLOCK):
                 t = w[DISTANCE + i]
@@ -129,11 +132,29 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                 moving += one if far and not src[ENDED + i] > zero else zero
             if moving == zero:
                 break
-        for i in range(BLOCK):
-            t = w[DISTANCE + i]
-            w[POINT_X + i] = dst[X + i] + src[L + i] * t
-            w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
-        call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
+        # Where the loop went on to its end, those that converge have done so long before.
+        more = LAST_STEPS if moving == zero else 0
+        for number in range(more + 1):
+            for i in range(BLOCK):
+                t = w[DISTANCE + i]
+                w[POINT_X + i] = dst[X + i] + src[L + i] * t
+                w[POINT_Y + i] = dst[Y + i] + src[M + i] * t
+            call_block(q[SAG_AND_SLOPES], before, after, cotangents, record, work, codes)
+            if number == more:
+                break
+            moving = zero
+            for i in range(BLOCK):
+                t, n = w[DISTANCE + i], src[N + i]
+                slope = src[L + i] * w[SLOPE_X + i] + src[M + i] * w[SLOPE_Y + i] - n
+                # Compared without a division; one that is far off has not converged at all.
+                residual = math.fabs(w[SAG + i] - n * t)
+                reach = math.fabs(slope) * (math.fabs(t) + scale)
+                again = residual > closest * reach and residual <= close * reach
+                if again and not src[ENDED + i] > zero:
+                    w[DISTANCE + i] = t - (w[SAG + i] - n * t) / slope
+                    moving += one
+            if moving == zero:
+                break
         for i in range(BLOCK):
             l, m, n = src[L + i], src[M + i], src[N + i]  # noqa: E741
             t, sag, sx, sy = w[DISTANCE + i], w[SAG + i], w[SLOPE_X + i], w[SLOPE_Y + i]

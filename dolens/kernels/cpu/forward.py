@@ -51,6 +51,7 @@ from dolens.kernels.cpu.records import (
     STATUS_MASK,
     WAVE,
 )
+from dolens.kernels.limits import FARTHEST, LONGEST
 
 
 class Streams(NamedTuple):
@@ -71,7 +72,7 @@ def real_at(real: types.Type) -> Any:
 def streams(real: types.Type) -> Streams:
     """Compile functions that load rays, fill in the indices, and run a step, for one real type."""
     at = real_at(real)
-    zero, longest, farthest = real(0.0), real(2.0), real(1e30)
+    zero, longest, farthest = real(0.0), real(LONGEST), real(FARTHEST)
 
     @njit(**OPTIONS)
     def find_wavelength(job, lanes):  # noqa: ANN001, ANN202

@@ -34,11 +34,12 @@ from dolens.kernels.cpu.layout import (
     Z,
 )
 from dolens.kernels.cpu.records import CODE_ROW, NUMBERS, SENSE, SHAPE, SHORT_RECORD
+from dolens.kernels.limits import GRAZING
 
 
 def ideal_lens_forward(real: types.Type) -> Callable[..., None]:
     """Change slopes and paths of a block of rays on the lens."""
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)

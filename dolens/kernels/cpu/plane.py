@@ -54,12 +54,13 @@ from dolens.kernels.cpu.records import (
     STOPPED,
     TAG,
 )
+from dolens.kernels.limits import GRAZING
 
 
 def plane_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to a plane and through it."""
     _, safe_sqrt, arrive, set_status, *_ = arithmetic(real)
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)

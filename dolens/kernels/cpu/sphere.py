@@ -44,12 +44,13 @@ from dolens.kernels.cpu.records import (
     SHORT_RECORD,
     TAG,
 )
+from dolens.kernels.limits import GRAZING
 
 
 def sphere_forward(real: types.Type) -> Callable[..., None]:
     """Carry a block of rays to a sphere and through it."""
     clamp, safe_sqrt, arrive, set_status, refract, _ = arithmetic(real)
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
 
     def kernel(before, after, cotangents, record, work, codes):  # noqa: ANN001, ANN202
         src, dst = carray(before, STATE), carray(after, STATE)

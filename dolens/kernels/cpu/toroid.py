@@ -37,6 +37,7 @@ from dolens.kernels.cpu.layout import (
     UNBOUNDED,
 )
 from dolens.kernels.cpu.records import CODE_ROW, COUNT
+from dolens.kernels.limits import GRAZING, TINY
 
 # A work row of its own: x, while the section is evaluated at x = 0.
 KEPT_X, CURVE = FURTHER, FURTHER + BLOCK
@@ -46,7 +47,7 @@ ROWS = 2
 @cache
 def _rotation(real: types.Type) -> tuple[Any, Any, Any]:
     """Compile the step to x = 0 and back, and the roots."""
-    zero, one, grazing, tiny = real(0.0), real(1.0), real(1e-9), real(1e-18)
+    zero, one, grazing, tiny = real(0.0), real(1.0), real(GRAZING), real(TINY)
 
     @njit(**OPTIONS)
     def to_section(w):  # noqa: ANN001, ANN202

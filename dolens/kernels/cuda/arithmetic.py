@@ -7,9 +7,10 @@ precision of the rays they meet.
 import triton
 import triton.language as tl
 
-# Smallest cosine that is divided by, and its square.
-GRAZING = tl.constexpr(1e-9)
-TINY = tl.constexpr(1e-18)
+from dolens.kernels import limits
+
+GRAZING, TINY = tl.constexpr(limits.GRAZING), tl.constexpr(limits.TINY)
+_LONGEST = tl.constexpr(limits.LONGEST)
 
 
 @triton.jit
@@ -62,13 +63,13 @@ def distance_to_plane(z, n, sense):
 @triton.jit
 def refract(l, m, n, nx, ny, nz, ratio, sense):
     """Return the directions behind a surface, and cos² of the angle there: positive without TIR."""
-    cosine = clamp(l * nx + m * ny + n * nz, 2.0)
+    cosine = clamp(l * nx + m * ny + n * nz, _LONGEST)
     squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
     along = sense * safe_sqrt(squared) - ratio * cosine
     return (
-        clamp(ratio * l + along * nx, 2.0),
-        clamp(ratio * m + along * ny, 2.0),
-        clamp(ratio * n + along * nz, 2.0),
+        clamp(ratio * l + along * nx, _LONGEST),
+        clamp(ratio * m + along * ny, _LONGEST),
+        clamp(ratio * n + along * nz, _LONGEST),
         squared,
     )
 

@@ -6,11 +6,10 @@ import triton
 import triton.language as tl
 
 from dolens.kernels.cuda.arithmetic import clamp, divide, safe_sqrt
-from dolens.kernels.phase_limits import LONGEST, STEEPEST
+from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
 
-# No direction of a ray that goes on has a longer component.
-_HELD = tl.constexpr(2.0)
-_STEEPEST, _LONGEST = tl.constexpr(STEEPEST), tl.constexpr(LONGEST)
+_LONGEST, _STEEPEST = tl.constexpr(LONGEST), tl.constexpr(STEEPEST)
+_LONGEST_WAVEVECTOR = tl.constexpr(LONGEST_WAVEVECTOR)
 
 
 @triton.jit
@@ -22,15 +21,15 @@ def deflect(phase, px, py, l, m, n, nx, ny, nz, index, ratio, per_radian, sense)
     gx, gy = scale * px, scale * py
     bx, by, az = ratio * l, ratio * m, ratio * n
     ax, ay = bx + gx, by + gy
-    along = clamp(ax * nx + ay * ny + az * nz, _LONGEST)
+    along = clamp(ax * nx + ay * ny + az * nz, _LONGEST_WAVEVECTOR)
     more = gx * (ax + bx) + gy * (ay + by)
     squared = (1.0 - ratio * ratio) - more + along * along
     squared = tl.where(tl.abs(gx) + tl.abs(gy) < _STEEPEST, squared, -1.0)
     change = sense * safe_sqrt(squared) - along
     return (
-        clamp(ax + change * nx, _HELD),
-        clamp(ay + change * ny, _HELD),
-        clamp(az + change * nz, _HELD),
+        clamp(ax + change * nx, _LONGEST),
+        clamp(ay + change * ny, _LONGEST),
+        clamp(az + change * nz, _LONGEST),
         squared,
         per_radian * phase,
     )

@@ -6,7 +6,7 @@ import triton.language as tl
 from dolens.kernels.cuda.arithmetic import away_from_zero, clamp, divide, safe_sqrt
 from dolens.kernels.cuda.conic import conic_distance
 from dolens.kernels.cuda.functions import ON_CONIC, SAG
-from dolens.kernels.cuda.layout import MAX_STEPS, SHAPE
+from dolens.kernels.cuda.layout import MAX_STEPS, MORE_STEPS, SHAPE
 
 
 @triton.jit
@@ -18,8 +18,9 @@ def explicit_intersect(
     As `Surface.intersect`: the iteration ends when no ray of the block moves any more, or after
     `MAX_STEPS`; whether a ray has converged is read off its residual at the end.
     """
-    # √ε, and 64 ε.
+    # √ε, its power 7/8, and 64 ε.
     close = 2.0**-26 if x.dtype == tl.float64 else 2.0**-11.5
+    closest = 2.0**-45.5 if x.dtype == tl.float64 else 2.0**-20.125
     rounding = 2.0**-46 if x.dtype == tl.float64 else 2.0**-17
     t = tl.zeros_like(x)
     if FORM[ON_CONIC]:
@@ -36,7 +37,19 @@ def explicit_intersect(
         moves = tl.abs(change) > close * (tl.abs(t) + scale)
         moving = tl.max(moves.to(tl.int32), 0)
         steps += 1
+    # Rays along a tangent are not there yet: they take some steps more.  Where the loop went on to
+    # its end, those that converge have done so long before.
     sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+    moving, steps = 1 - moving, tl.full((), 0, tl.int32)
+    while (moving > 0) & (steps < MORE_STEPS):
+        residual, slope = sag - n * t, l * sx + m * sy - n
+        reach = tl.abs(slope) * (tl.abs(t) + scale)
+        again = (tl.abs(residual) > closest * reach) & (tl.abs(residual) <= close * reach)
+        t = tl.where(again, t - divide(residual, away_from_zero(slope)), t)
+        moving = tl.max(again.to(tl.int32), 0)
+        if moving > 0:
+            sag, sx, sy, margin = FORM[SAG](record, codes, extras, x + l * t, y + m * t)
+        steps += 1
     residual = sag - n * t
     slope = l * sx + m * sy - n
     steep = tl.where(tl.abs(slope) > 1.0, tl.abs(slope), 1.0)

@@ -2,7 +2,16 @@
 
 import triton.language as tl
 
-from dolens.kernels.table import NEWTON_STEPS, Code, Failure, Figure, Kind, Outline, Slot
+from dolens.kernels.table import (
+    LAST_STEPS,
+    NEWTON_STEPS,
+    Code,
+    Failure,
+    Figure,
+    Kind,
+    Outline,
+    Slot,
+)
 
 SHIFT = tl.constexpr(int(Slot.SHIFT))
 STEP_X, STEP_Y, STEP_Z = (tl.constexpr(Slot.STEP + k) for k in range(3))
@@ -71,7 +80,7 @@ TOTALLY_REFLECTED = tl.constexpr(int(Failure.TOTALLY_REFLECTED))
 MISSED = tl.constexpr(int(Failure.MISSED))
 STATUS_BITS, STATUS_MASK = tl.constexpr(Failure.BITS), tl.constexpr(Failure.MASK)
 
-MAX_STEPS = tl.constexpr(NEWTON_STEPS)
+MAX_STEPS, MORE_STEPS = tl.constexpr(NEWTON_STEPS), tl.constexpr(LAST_STEPS)
 
 # Rows of a block that the adjoint keeps behind every step: the ray, and the distance there.
 X, Y, Z, L, M, N, TRAVELLED = (tl.constexpr(row) for row in range(7))

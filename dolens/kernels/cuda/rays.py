@@ -3,10 +3,10 @@
 import triton
 import triton.language as tl
 
+from dolens.kernels import limits
 from dolens.kernels.cuda.layout import SENSE
 
-# Bounds of a position (mm) and of a direction cosine; see `dolens.optics.rays`.
-FARTHEST, LONGEST = tl.constexpr(1e30), tl.constexpr(2.0)
+_FARTHEST, _LONGEST = tl.constexpr(limits.FARTHEST), tl.constexpr(limits.LONGEST)
 
 
 @triton.jit
@@ -23,8 +23,8 @@ def load_vectors(pointer, row, column, rays, mask, third):
 @triton.jit
 def stop_unphysical(x, y, z, l, m, n):
     """Let rays that are none of light stand still at 0, as `finite_rays` does."""
-    known = (tl.abs(x) <= FARTHEST) & (tl.abs(y) <= FARTHEST) & (tl.abs(z) <= FARTHEST)
-    known &= (tl.abs(l) <= LONGEST) & (tl.abs(m) <= LONGEST) & (tl.abs(n) <= LONGEST)
+    known = (tl.abs(x) <= _FARTHEST) & (tl.abs(y) <= _FARTHEST) & (tl.abs(z) <= _FARTHEST)
+    known &= (tl.abs(l) <= _LONGEST) & (tl.abs(m) <= _LONGEST) & (tl.abs(n) <= _LONGEST)
     return (
         tl.where(known, x, 0.0),
         tl.where(known, y, 0.0),

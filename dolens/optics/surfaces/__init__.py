@@ -1,5 +1,6 @@
 """A surface shape has a file here, and registers itself under the `type` of a prescription."""
 
+from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.b_spline import BSpline
 from dolens.optics.surfaces.base import PackedShape, Surface
@@ -22,6 +23,7 @@ from dolens.optics.surfaces.zernike_phase import ZernikeFringePhase, ZernikeStan
 
 __all__ = [
     "BREAKS",
+    "GRAZING",
     "PHASES",
     "SURFACES",
     "Aperture",

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor, nn
 
 from dolens.errors import InputError
+from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
-from dolens.optics.surfaces.refraction import FAR, GRAZING, PlaneRay, Refraction, snell
+from dolens.optics.surfaces.refraction import FAR, PlaneRay, Refraction, snell
 
 if TYPE_CHECKING:
     from dolens.optics.surfaces.deflection import Law

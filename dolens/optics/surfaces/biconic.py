@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import Parameters, Surface
 from dolens.optics.surfaces.clear_aperture import Outline, Rectangle
-from dolens.optics.surfaces.refraction import GRAZING, safe_sqrt
+from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 
 

@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.limits import GRAZING, TINY
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
-from dolens.optics.surfaces.refraction import GRAZING, PlaneRay, safe_sqrt
+from dolens.optics.surfaces.refraction import PlaneRay, safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 
 _FLAT = 1e-15  # 1/mm
@@ -163,7 +164,7 @@ class Conic(Surface):
         c, k = p["curvature"], p["conic"]
         nx, ny, nz = -c * x, -c * y, 1.0 - ((1.0 + k) * c) * z
         squared = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
-        inverse = torch.rsqrt(squared.clamp(min=GRAZING * GRAZING))
+        inverse = torch.rsqrt(squared.clamp(min=TINY))
         return nx * inverse, ny * inverse, nz * inverse
 
     @classmethod

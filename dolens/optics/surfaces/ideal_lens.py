@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.law_kernel import LawKernel
+from dolens.kernels.limits import GRAZING
 from dolens.optics.surfaces.base import Parameters
 from dolens.optics.surfaces.deflection import (
     Deflected,
@@ -30,7 +31,6 @@ from dolens.optics.surfaces.deflection import (
     Travel,
     Vector,
 )
-from dolens.optics.surfaces.refraction import GRAZING
 
 
 class IdealLens(Law):

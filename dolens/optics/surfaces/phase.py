@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError
 from dolens.kernels.law_kernel import LawKernel
-from dolens.kernels.phase_limits import LONGEST, STEEPEST
+from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
 from dolens.optics.surfaces.base import Parameters, tensor_of
 from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.deflection import (
@@ -117,16 +117,16 @@ class Phase(Law):
         gx, gy = scale * gx, scale * gy
         (l, m, n), (nx, ny, nz) = direction, normal  # noqa: E741
         ax, ay, az = ratio * l + gx, ratio * m + gy, ratio * n
-        along = (ax * nx + ay * ny + az * nz).clamp(-LONGEST, LONGEST)
+        along = (ax * nx + ay * ny + az * nz).clamp(-LONGEST_WAVEVECTOR, LONGEST_WAVEVECTOR)
         # 1 - |a|² without the cancellation of |d|² = 1: Snell's law where there is no phase.
         more = gx * (ax + ratio * l) + gy * (ay + ratio * m)
         squared = (1.0 - ratio * ratio) - more + along * along
         change = travel.behind * safe_sqrt(squared) - along
         # Directions of rays that ended stay in single precision's range.
         return Deflected(
-            torch.addcmul(ax, change, nx).clamp(-2.0, 2.0),
-            torch.addcmul(ay, change, ny).clamp(-2.0, 2.0),
-            torch.addcmul(az, change, nz).clamp(-2.0, 2.0),
+            torch.addcmul(ax, change, nx).clamp(-LONGEST, LONGEST),
+            torch.addcmul(ay, change, ny).clamp(-LONGEST, LONGEST),
+            torch.addcmul(az, change, nz).clamp(-LONGEST, LONGEST),
             squared.detach().masked_fill(wild, -1.0),
             media.per_radian * phase,
         )

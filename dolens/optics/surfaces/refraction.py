@@ -5,8 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-# Smallest cosine that is divided by.  Its square is far above the smallest float32.
-GRAZING = 1e-9
+from dolens.kernels.limits import LONGEST, TINY
+
 # A ray this many semi-diameters off the axis is invalid, and stays there.
 FAR = 1e3
 
@@ -36,7 +36,7 @@ def safe_sqrt(squared: Tensor) -> Tensor:
     """Return the square root, with a finite derivative everywhere; exact where its argument is
     positive.
     """
-    return torch.sqrt(squared.clamp(min=GRAZING * GRAZING))
+    return torch.sqrt(squared.clamp(min=TINY))
 
 
 def snell(
@@ -61,13 +61,13 @@ def snell(
     nx, ny, nz = normal
     cosine = torch.addcmul(torch.addcmul(l * nx, m, ny), n, nz)
     # Only rays that missed have |cos i| > 1; two keeps them finite and rounding unclipped.
-    cosine = cosine.clamp(-2.0, 2.0)
+    cosine = cosine.clamp(-LONGEST, LONGEST)
     squared = (1.0 - ratio * ratio) + (ratio * ratio) * (cosine * cosine)
     along = sense * safe_sqrt(squared) - ratio * cosine
     # Rays that missed have no unit normal; a direction that grew would overflow float32 later.
     return Refraction(
-        torch.addcmul(ratio * l, along, nx).clamp(-2.0, 2.0),
-        torch.addcmul(ratio * m, along, ny).clamp(-2.0, 2.0),
-        torch.addcmul(ratio * n, along, nz).clamp(-2.0, 2.0),
+        torch.addcmul(ratio * l, along, nx).clamp(-LONGEST, LONGEST),
+        torch.addcmul(ratio * m, along, ny).clamp(-LONGEST, LONGEST),
+        torch.addcmul(ratio * n, along, nz).clamp(-LONGEST, LONGEST),
         squared.detach(),
     )

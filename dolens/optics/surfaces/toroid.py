@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
 from dolens.optics.surfaces.even_asphere import EvenAsphere, even_power
-from dolens.optics.surfaces.refraction import GRAZING, safe_sqrt
+from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 
 

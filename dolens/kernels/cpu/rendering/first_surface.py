@@ -38,6 +38,7 @@ from dolens.kernels.cpu.records import (
     TOTALLY_REFLECTED,
 )
 from dolens.kernels.cpu.rendering.layout import BLOCK
+from dolens.kernels.limits import TINY
 
 # Rows that are kept: the state behind the first step at the first wavelength, with Γ in the row of
 # the path, which a renderer has no use for; then d·N, and N.
@@ -56,7 +57,7 @@ class FirstSurface(NamedTuple):
 def first_surface(real: types.Type) -> FirstSurface:
     """Compile the functions for one real type."""
     at = real_at(real)
-    zero, one, tiny = real(0.0), real(1.0), real(1e-18)
+    zero, one, tiny = real(0.0), real(1.0), real(TINY)
     totally_reflected = real(TOTALLY_REFLECTED)
     # Γ² of a refraction too weak to give the normal.
     weak = real(1e-4)

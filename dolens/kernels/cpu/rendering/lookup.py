@@ -30,6 +30,7 @@ from dolens.kernels.cpu.rendering.layout import (
     TEXTURE_COLUMN,
     TEXTURE_ROW,
 )
+from dolens.kernels.limits import GRAZING
 
 
 class Lookup(NamedTuple):
@@ -80,7 +81,7 @@ def lookup(real: types.Type) -> Lookup:
 
     Textures have at least two texels each way, so that a texel always has neighbours.
     """
-    zero, one, grazing = real(0.0), real(1.0), real(1e-9)
+    zero, one, grazing = real(0.0), real(1.0), real(GRAZING)
 
     @njit(**OPTIONS)
     def arrive(state, scratch):  # noqa: ANN001, ANN202
