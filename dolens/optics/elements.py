@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from dolens.errors import InputError, check_keys
 from dolens.kernels.limits import GRAZING
-from dolens.optics.rays import OUT_OF_REACH, Components
+from dolens.optics.rays import Components, distance_along
 
 TILTS = ("tilt_x", "tilt_y", "tilt_z")
 DISPLACEMENTS = ("decenter_x", "decenter_y", "shift_z")
@@ -217,7 +217,7 @@ def change_axes(ray: Components, now: Axes, then: Axes) -> tuple[Components, Ten
     step, turn = (found.to(n.dtype) for found in relative_axes(now, then))
     along = n.abs() <= GRAZING
     below = step[2] - z
-    distance = (below / n.masked_fill(along, 1.0)).clamp(-OUT_OF_REACH, OUT_OF_REACH)
+    distance = distance_along(below, n.masked_fill(along, 1.0))
     distance = distance.masked_fill(along, 0.0)
     near = (torch.addcmul(x - step[0], distance, l), torch.addcmul(y - step[1], distance, m))
     # Now (near, 0) counts from the next vertex, still along the axes `now`.

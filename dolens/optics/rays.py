@@ -93,6 +93,18 @@ def finite_rays(rays: Rays, dtype: torch.dtype) -> Rays:
     )
 
 
+def distance_along(separation: Tensor, cosine: Tensor) -> Tensor:
+    """Return the distances (mm) along rays that part planes: separation/cosine.
+
+    It is ± 1e35 mm, a constant, where the quotient or its derivative would be out of single
+    precision's range.  The cosine is not zero.
+    """
+    distance = separation.detach() / cosine.detach()
+    lost = ~((distance / cosine.detach()).abs() <= OUT_OF_REACH)
+    held = torch.full_like(distance, OUT_OF_REACH).copysign(distance)
+    return torch.where(lost, held, separation.masked_fill(lost, 0.0) / cosine)
+
+
 @dataclass(frozen=True)
 class TracedRays:
     """Rays after a trace, with the leading shape of the rays that went in.

@@ -10,11 +10,11 @@ from torch import Tensor
 from dolens.kernels.limits import GRAZING
 from dolens.optics.elements import LENS_AXES, Axes, change_axes, from_lens_axes, to_lens_axes
 from dolens.optics.rays import (
-    OUT_OF_REACH,
     Components,
     Rays,
     Status,
     TracedRays,
+    distance_along,
     finite_rays,
 )
 from dolens.optics.surfaces.deflection import Media, Travel
@@ -71,8 +71,7 @@ def distance_to_plane(ray: Components, z: Tensor | float, sense: float) -> tuple
     misses it.  The distance of rays that do not travel towards it is finite and means nothing.
     """
     cosine = (ray.n if sense > 0.0 else -ray.n).clamp(min=GRAZING)
-    distance = (sense * (z - ray.z) / cosine).clamp(-OUT_OF_REACH, OUT_OF_REACH)
-    return distance, cosine.detach() - GRAZING
+    return distance_along(sense * (z - ray.z), cosine), cosine.detach() - GRAZING
 
 
 def distance_to_nearest(ray: Components) -> Tensor:

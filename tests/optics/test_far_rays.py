@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dolens import Rays, Status
+from dolens.optics.rays import distance_along
 from tests.kernels.trace_cases import LENSES
 from tests.optics.ray_facts import BACKENDS, send
 from tests.optics.test_light_from_the_side import ball
@@ -49,3 +50,18 @@ def test_a_ray_along_the_axis_may_begin_at_any_distance_that_can_be_seen(backend
     assert hit.status.tolist() == [Status.OK, Status.OK, Status.MISSED]
     assert torch.equal(hit.position[0], hit.position[1])
     assert math.isclose(float(hit.path_length[1].detach()), 1e30, rel_tol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["f32", "f64"])
+def test_a_distance_out_of_reach_has_no_derivative_that_overflows(dtype):
+    """The derivative in the cosine divides by it twice: 1e28 mm / 1e-9 is held, 1e28 / 1e-9² is
+    not.  All else is the quotient.
+    """
+    cosine = torch.tensor([1e-9, -1e-9, 1e-3, 1.0], dtype=dtype).requires_grad_()
+    separation = torch.tensor([[0.0], [7.0], [-1e10], [1e28]], dtype=dtype).requires_grad_()
+    distance = distance_along(separation, cosine)
+    gradients = torch.autograd.grad(distance.clamp(-1.0, 1.0).sum(), (separation, cosine))
+    assert all(gradient.isfinite().all() for gradient in gradients)
+    assert torch.equal(distance[:3], (separation / cosine)[:3])
+    assert torch.equal(distance[3, 2:], separation[3] / cosine[2:])
+    assert distance[3, :2].tolist() == pytest.approx([1e35, -1e35])
