@@ -27,6 +27,8 @@ _SPLITS_OF_STAGE: dict[str | None, tuple[Split, ...]] = {
 
 # Validation crops among which the most detailed one is looked for.
 _LOOKED_AT = 16
+# Of processes, and of batches that each of them holds: more than any machine has use for.
+_MOST_WORKERS = 1024
 
 
 class CropDataModule(lightning.LightningDataModule):
@@ -105,8 +107,8 @@ class CropDataModule(lightning.LightningDataModule):
         )[0]
         self.flip_horizontal = flip_horizontal
         self.flip_vertical = flip_vertical
-        self.num_workers = _count("data.num_workers", num_workers, 0)
-        self.prefetch = _count("data.prefetch", prefetch, 1)
+        self.num_workers = _count("data.num_workers", num_workers, 0, _MOST_WORKERS)
+        self.prefetch = _count("data.prefetch", prefetch, 1, _MOST_WORKERS)
         self.seed = _count("data.seed", seed, 0)
         self.waiting = Waiting()
         self._photographs: dict[Split, Sequence[Photograph]] = {}
@@ -311,8 +313,10 @@ class CropDataModule(lightning.LightningDataModule):
         }
 
 
-def _count(key: str, value: int, smallest: int) -> int:
+def _count(key: str, value: int, smallest: int, largest: int | None = None) -> int:
     check_count(key, value, smallest)
+    if largest is not None and value > largest:
+        raise InputError(f"{key}: {value}; allowed: an integer of {smallest} to {largest}")
     return value
 
 

@@ -77,6 +77,8 @@ def test_a_stage_loads_only_what_it_needs():
         {"evaluation_crops_per_photograph": 0},
         {"evaluation_scale": 0.0},
         {"num_workers": -1},
+        {"num_workers": 10**12},
+        {"prefetch": 10**12},
         {"seed": -1},
     ],
 )
