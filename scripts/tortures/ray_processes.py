@@ -12,7 +12,8 @@ from scripts.tortures.processes import PATIENCE_S, Process, start, trust
 from scripts.tortures.run_folders import differences, faults_of
 
 _TITLE = b"ray::_run"  # of a process that has a task
-_ORPHANS_S = 60.0  # Ray's processes end when they miss their run, and look for it now and then
+# Ray's workers end when they miss their run; its agents try for a minute to tell somebody first.
+_ORPHANS_S = 90.0
 _ABSENT = ["skipped: Ray is not installed"]
 
 
