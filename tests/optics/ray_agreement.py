@@ -73,9 +73,8 @@ def _parameters_apart(lens: Lens, rays: Rays, sense: float, dtype: torch.dtype) 
         gradients.append(_gradients(lens, given, outputs, slice(None)))
     parameters = [g[1].double() for g in gradients]
     scale = gradients[0][2].double()
-    apart = (parameters[0] - parameters[1]).abs() > QUICK["gradient"] * torch.finfo(
-        dtype
-    ).eps * scale
+    off = (parameters[0] - parameters[1]).abs()
+    apart = off > QUICK["gradient"] * torch.finfo(dtype).eps * scale
     if bool(apart.any()):
         arrived = _spreads(lens, rays, sense, dtype, "value").isfinite()
         if not bool(arrived.all()):
@@ -83,7 +82,7 @@ def _parameters_apart(lens: Lens, rays: Rays, sense: float, dtype: torch.dtype) 
             return _parameters_apart(lens, chosen(rays, arrived), sense, dtype)
         spread = _spreads(lens, rays, sense, dtype, "parameters")
         least = _least_roundings(lens, gradients[0][0].double(), rays, dtype)
-        excused = ((parameters[0] - parameters[1]).abs() <= _TIMES * spread.maximum(least))[apart]
+        excused = (off <= _TIMES * spread.maximum(least))[apart]
         found["parameter's gradient differs, within rounding"] += int(excused.sum())
         found["parameter's gradient differs"] += int((~excused).sum())
     return found
