@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrizations import spectral_norm
 
 from dolens.errors import InputError
+from dolens.reconstruction.padding import check_halvings
 
 _KERNEL = 4
 _WIDEST = 8
@@ -27,7 +28,7 @@ class PatchDiscriminator(nn.Module):
         halvings: how many; 3 gives the usual patch of 70 pixels.
 
     Raises:
-        InputError: `width` or `halvings` below 1.
+        InputError: `width` or `halvings` below 1, or `halvings` above 16.
     """
 
     def __init__(self, width: int = 64, halvings: int = 3) -> None:
@@ -64,7 +65,7 @@ class GlobalDiscriminator(nn.Module):
             suit images of some 100 to 300 pixels.
 
     Raises:
-        InputError: `width` or `halvings` below 1.
+        InputError: `width` or `halvings` below 1, or `halvings` above 16.
     """
 
     def __init__(self, width: int = 64, halvings: int = 5) -> None:
@@ -89,6 +90,7 @@ def _stage_widths(width: int, halvings: int, stages: int) -> list[int]:
     for name, value in (("width", width), ("halvings", halvings)):
         if value < 1:
             raise InputError(f"discriminator {name}={value}: must be a whole number of at least 1")
+    check_halvings("discriminator halvings", halvings)
     return [3, *(width * min(2**stage, _WIDEST) for stage in range(stages))]
 
 

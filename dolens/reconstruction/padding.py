@@ -1,7 +1,26 @@
-"""Images are padded to sides that a network can halve several times."""
+"""Images are padded to sides that a network can halve, which it can do several times."""
 
 from torch import Tensor
 from torch.nn import functional
+
+from dolens.errors import InputError
+
+# They leave one pixel of a side of 65 536.
+_MOST_HALVINGS = 16
+
+
+def check_halvings(what: str, count: int) -> None:
+    """Refuse more halvings than any photograph allows.
+
+    Args:
+        what: of which network, and its argument; the message begins with it.
+        count: of halvings.
+
+    Raises:
+        InputError: more than 16.
+    """
+    if count > _MOST_HALVINGS:
+        raise InputError(f"{what}={count}: must be a whole number of at most {_MOST_HALVINGS}")
 
 
 def pad_to_multiple(image: Tensor, multiple: int, cells: int = 1) -> Tensor:

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dolens.errors import InputError
-from dolens.reconstruction.padding import pad_to_multiple
+from dolens.reconstruction.padding import check_halvings, pad_to_multiple
 
 
 class UNet(nn.Module):
@@ -28,7 +28,7 @@ class UNet(nn.Module):
             residual network that adds it to its input begins as the identity.
 
     Raises:
-        InputError: a number of channels, `width` or `depth` below 1.
+        InputError: a number of channels, `width` or `depth` below 1, or a `depth` above 16.
     """
 
     def __init__(
@@ -49,6 +49,7 @@ class UNet(nn.Module):
         for name, value in sizes.items():
             if value < 1:
                 raise InputError(f"UNet {name}={value}: must be a whole number of at least 1")
+        check_halvings("UNet depth", depth)
         self.depth = depth
         widths = [width * 2**stage for stage in range(depth + 1)]
         self.down = nn.ModuleList(

@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from dolens.errors import InputError
-from dolens.reconstruction import UNet
+from dolens.reconstruction import GlobalDiscriminator, UNet
 
 
 @pytest.fixture(autouse=True)
@@ -88,3 +88,10 @@ def test_sizes_below_one_are_refused_by_name(wrong):
     arguments = {"in_channels": 3, "out_channels": 3, **wrong}
     with pytest.raises(InputError, match=f"{next(iter(wrong))}=0"):
         UNet(**arguments)
+
+
+def test_more_halvings_than_any_photograph_allows_are_refused():
+    with pytest.raises(InputError, match=r"UNet depth=1000000000000: .* at most 16"):
+        UNet(3, 3, depth=10**12)
+    with pytest.raises(InputError, match=r"discriminator halvings=17: .* at most 16"):
+        GlobalDiscriminator(halvings=17)
