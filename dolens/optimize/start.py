@@ -1,5 +1,6 @@
 """A search may begin elsewhere than at the prescription."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -31,7 +32,7 @@ def start_values(
         name → value, of the parameters that a pattern names.
 
     Raises:
-        InputError: an unknown pattern or key, or a value that is no number.
+        InputError: an unknown pattern or key, or a value that is no finite number.
     """
     found: dict[str, Tensor] = {}
     for pattern, change in settings.items():
@@ -57,6 +58,7 @@ def _numbers(pattern: str, change: object) -> dict[str, float]:
     if isinstance(change, Mapping):
         check_keys(change, _KEYS, f"start '{pattern}'")
     for key, value in given.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"start '{pattern}': {key} must be a number, not {value!r}")
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not math.isfinite(value):
+            raise InputError(f"start '{pattern}': {key} must be a finite number, not {value!r}")
     return {key: float(value) for key, value in given.items()}

@@ -18,7 +18,7 @@ from dolens.optics.parameter_units import to_lens_units
 from dolens.prescriptions import lens_from_prescription
 from dolens.scene.planar import PlanarScene
 from dolens.sensor.pixels import Sensor
-from dolens.typed_values import call_with_settings
+from dolens.typed_values import call_with_settings, check_type
 
 _SCENE_KEYS = ("lens", "values", "depths", "wavelengths", "sensor", "variables")
 
@@ -93,5 +93,9 @@ def subject_of(name: str, settings: Mapping[str, Any]) -> Subject:
     numbers = {k: numbers_of(f"scenes.{name}.{k}", settings[k]) for k in ("depths", "wavelengths")}
     scene = PlanarScene(**numbers)
     sensor = call_with_settings(Sensor, settings["sensor"], f"scenes.{name}.sensor")
-    names = tuple(lens.variables(list(settings["variables"])))
+    check_type(settings["variables"], Sequence[str], f"scenes.{name}.variables")
+    try:
+        names = tuple(lens.variables(list(settings["variables"])))
+    except InputError as error:
+        raise InputError(f"scenes.{name}.variables: {error}") from error
     return Subject(name, lens.requires_grad_(False), scene, sensor, names)

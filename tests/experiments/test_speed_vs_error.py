@@ -116,3 +116,9 @@ def test_memory_is_what_tensors_hold_at_once():
 def test_an_unknown_key_of_a_scene_is_an_error(composed):
     with pytest.raises(InputError, match=r"scenes.wavefront_coding: unknown key 'texture'"):
         run(composed(*SMALL, "+scenes.wavefront_coding.texture=none"))
+
+
+@pytest.mark.parametrize(("variables", "said"), [("foo", "allowed: "), ("[abc]", "no parameter")])
+def test_wrong_variables_of_a_scene_are_named_by_their_key(composed, variables, said):
+    with pytest.raises(InputError, match=f"^scenes.wavefront_coding.variables: .*{said}"):
+        run(composed(*SMALL, f"scenes.wavefront_coding.variables={variables}"))

@@ -109,3 +109,9 @@ def test_every_tilt_that_degrees_can_write_is_found_again():
     for degrees in torch.linspace(-40.0, 40.0, 997, dtype=torch.float64).tolist():
         radians = to_lens_units(TILT, degrees)
         assert to_lens_units(TILT, file_value(TILT, radians)) == radians
+
+
+@pytest.mark.parametrize("wrong", [math.inf, "far", {"add": math.nan}, {"relative": True}])
+def test_a_start_that_is_no_finite_number_is_refused_with_its_pattern(wrong):
+    with pytest.raises(InputError, match=f"^start '{TILT}': .* must be a finite number"):
+        start_values(singlet(), {TILT: wrong}, torch.Generator())
