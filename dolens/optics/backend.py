@@ -1,6 +1,7 @@
 """The implementation that traces: PyTorch's operations as the reference, or the fast kernels."""
 
 import logging
+import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from itertools import chain, zip_longest
@@ -19,6 +20,8 @@ logger = logging.getLogger("dolens.kernels")
 BACKENDS = ("auto", "reference", "cpu", "cuda")
 # Rays times surfaces below which a lens of backend `auto` is traced without kernels; see `is_few`.
 FEW = 2048
+# Before, its compiler fails on functions in tuples, or stumbles over them.
+_TRITON = (3, 9)
 _KERNEL_DTYPES = (torch.float32, torch.float64)
 
 
@@ -57,8 +60,8 @@ def choose_backend(
         reason = f"there are no kernels for {device}"
     elif system.dtype not in _KERNEL_DTYPES:
         reason = f"kernels are of float32 and float64, not {system.dtype}"
-    elif device == "cuda" and not _has_triton():
-        reason = "triton is not installed"
+    elif device == "cuda" and (lack := without_triton()) is not None:
+        reason = lack
     elif (
         requested == "auto"
         and reason is None
@@ -160,10 +163,19 @@ def _transformed(tensors: Iterable[Tensor]) -> bool:
 
 
 @cache
-def _has_triton() -> bool:
+def without_triton() -> str | None:
+    """Return why Triton cannot compile the kernels; None where it can."""
     from importlib.util import find_spec
 
-    return find_spec("triton") is not None
+    if find_spec("triton") is None:
+        return "triton is not installed"
+    import triton
+
+    found = tuple(int(part) for part in re.findall(r"\d+", triton.__version__)[:2])
+    if found < _TRITON:
+        least = ".".join(map(str, _TRITON))
+        return f"triton is {triton.__version__}; allowed: {least} or later, as with PyTorch 2.15"
+    return None
 
 
 @cache

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
 from dolens.errors import InputError
@@ -110,7 +111,9 @@ class SpotImager:
         sums = torch.zeros(3, **options)
         for first in range(0, self.rays, self.rays_at_a_time):
             last = min(first + self.rays_at_a_time, self.rays)
-            if torch.is_grad_enabled() and last - first < self.rays:
+            # Forward mode keeps nothing for a way back, and PyTorch 2.9 cannot pass a checkpoint.
+            backward = torch.is_grad_enabled() and forward_ad._current_level < 0
+            if backward and last - first < self.rays:
                 part = checkpoint(self._part, system, source, first, last, use_reentrant=False)
             else:
                 part = self._part(system, source, first, last)

@@ -11,6 +11,7 @@ import torch
 from dolens import InputError, Rays, load_lens
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Kind
+from dolens.optics.backend import without_triton
 from dolens.optics.surfaces import EvenAsphere, XYPolynomial, ZernikeStandard
 from tests.kernels.own_surface.paraboloid import Paraboloid
 
@@ -37,6 +38,15 @@ def test_in_tritons_interpreter_the_kernels_are_the_reference(root):
     run = python(root, "-m", "pytest", *tests, TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
     assert run.returncode == 0, run.stdout[-20000:] + run.stderr[-5000:]
     assert " passed" in run.stdout
+
+
+@pytest.mark.parametrize(("version", "said"), [("3.5.0", "triton is 3.5.0"), ("3.10.0", None)])
+def test_a_triton_that_cannot_compile_the_kernels_is_named(version, said, monkeypatch):
+    import triton
+
+    monkeypatch.setattr(triton, "__version__", version)
+    lack = without_triton.__wrapped__()
+    assert lack is None if said is None else lack.startswith(f"{said}; allowed: 3.9")
 
 
 @compiled
@@ -98,6 +108,7 @@ LENSES = {
 
 
 @compiled
+@pytest.mark.skipif(without_triton() is not None, reason=str(without_triton()))
 @pytest.mark.parametrize(
     "name, real",
     [
