@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from dolens.optics.elements import TILTS, Element
+from dolens.optics.elements import TILTS, Element, carriers
 from dolens.optics.materials import LINE_C, LINE_F, Medium, abbe_number, index_d
 from dolens.optics.mirrors import MIRROR
 from dolens.optics.parameter_units import to_file_units
@@ -168,12 +168,12 @@ class PrescriptionTable:
 @torch.no_grad()
 def prescription_table(lens: Any) -> PrescriptionTable:
     """Return the prescription of a `Lens` in its present state as plain values."""
-    # An element within another one, which is shorter, is the surface's own.
-    by_length = sorted(lens.elements.items(), key=lambda e: e[1].first - e[1].last)
+    carried = {name: (element.first, element.last) for name, element in lens.elements.items()}
+    names, spans = list(carried), list(carried.values())
     carrier = {
-        number: name
-        for name, element in by_length
-        for number in range(element.first, element.last + 1)
+        number: names[inner_first[0]]
+        for number in range(1, len(lens.surfaces) + 1)
+        if (inner_first := carriers(spans, number))
     }
     gaps = [float(gap) for gap in lens.thicknesses.values()] + [float(lens.sensor_distance)]
     rows = []
@@ -217,7 +217,7 @@ def prescription_table(lens: Any) -> PrescriptionTable:
         gaps[-1],
         lens.sensor_diameter,
         {name: _pose(element) for name, element in lens.elements.items()},
-        {name: (element.first, element.last) for name, element in lens.elements.items()},
+        carried,
         *_sensor_shape(lens),
     )
 

@@ -1,4 +1,4 @@
-"""Images are padded to sides that a network can halve, which it can do several times."""
+"""A network halves images several times: they are padded to sides that allow it."""
 
 from torch import Tensor
 from torch.nn import functional

@@ -147,11 +147,11 @@ def explicit_forward(real: types.Type) -> Callable[..., None]:
                 t, n = w[DISTANCE + i], src[N + i]
                 slope = src[L + i] * w[SLOPE_X + i] + src[M + i] * w[SLOPE_Y + i] - n
                 # Compared without a division; one that is far off has not converged at all.
-                residual = math.fabs(w[SAG + i] - n * t)
-                reach = math.fabs(slope) * (math.fabs(t) + scale)
-                again = residual > closest * reach and residual <= close * reach
+                residual = w[SAG + i] - n * t
+                off, reach = math.fabs(residual), math.fabs(slope) * (math.fabs(t) + scale)
+                again = off > closest * reach and off <= close * reach
                 if again and not src[ENDED + i] > zero:
-                    w[DISTANCE + i] = t - (w[SAG + i] - n * t) / slope
+                    w[DISTANCE + i] = t - residual / slope
                     moving += one
             if moving == zero:
                 break
