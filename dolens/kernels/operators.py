@@ -4,6 +4,7 @@
 programs hold no Python objects of ours.  First derivatives only: a second one says so.
 """
 
+from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -20,11 +21,15 @@ from dolens.kernels.registration import (
 from dolens.kernels.table import SurfaceTable
 
 
-def _backend(position: Tensor) -> Any:
+def kernels_of(position: Tensor) -> Any:
     """Return the module that runs kernels where the rays are; it is imported when first needed."""
-    kind = position.device.type
+    return _module(position.device.type)
+
+
+@cache
+def _module(kind: str) -> Any:
     if kind not in ("cpu", "cuda"):
-        raise InputError(f"no kernels for rays on {position.device}; use backend 'reference'")
+        raise InputError(f"no kernels for rays on {kind}; use backend 'reference'")
     return import_module(f"dolens.kernels.{kind}.backend")
 
 
@@ -53,7 +58,7 @@ def trace(
         position and direction (N, 3), path length (N,), status (N,) int8, surface (N,) int16.
     """
     table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
-    return _backend(position).trace(table, position, direction, which)
+    return kernels_of(position).trace(table, position, direction, which)
 
 
 def _trace_shapes(values, indices, position, direction, which, codes, extras):  # noqa: ANN001, ANN202
@@ -87,7 +92,7 @@ def trace_adjoint(
     `wanted`: of position, direction and indices; what is not comes back empty, or zero.
     """
     table = SurfaceTable(values.contiguous(), indices.contiguous(), codes, extras)
-    of_rays = _backend(position).trace_adjoint(
+    of_rays = kernels_of(position).trace_adjoint(
         table,
         position,
         direction,

@@ -14,6 +14,7 @@ from dolens.optics.broken_axes import GlobalAxes
 from dolens.optics.elements import Element, ElementState
 from dolens.optics.fields import Fields
 from dolens.optics.image_surface import image_surface, register_image_surface
+from dolens.optics.kept_system import KeptSystem
 from dolens.optics.lens_checks import check_lens
 from dolens.optics.lens_rays import LensRays
 from dolens.optics.lens_states import InStates, LensStates, at_temperature
@@ -136,6 +137,7 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         self.states, self.state_name = LensStates(), None
         register_image_surface(self, sensor_curvature, sensor_conic, dtype)
         self.to(dtype)
+        self._kept_system = KeptSystem()
         self.reversals: tuple[int, ...] = ()
         self.reversals = reversals(self.system(), self.primary_wavelength)
 
@@ -182,7 +184,12 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
                 `surfaces.<n>.semi_diameter` of a circular aperture, mm, which no lens stores as a
                 parameter.
         """
-        values = dict(values or {})
+        if not values:
+            return self._kept_system.of(self, self._system)
+        return self._system(dict(values))
+
+    def _system(self, values: dict[str, Tensor]) -> OpticalSystem:
+        """Return the lens as pure functions see it; what is used of `values` is taken out."""
         surfaces = []
         for number, surface in self.surfaces.items():
             parameters = _stored_or_given(surface, values, f"surfaces.{number}.")

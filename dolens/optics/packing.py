@@ -5,25 +5,22 @@ gradients flow back through ordinary tensor operations, and derivatives by param
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dolens.cached_tensors import cached_tensors
-from dolens.errors import InputError
 from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import VariableMap
-from dolens.optics.elements import LENS_AXES, relative_axes
+from dolens.optics.lens_numbers import LaidOut, lay_out
 from dolens.optics.materials import Medium
-from dolens.optics.record_structure import BREAK, Form, LawForm, Structure
-from dolens.optics.records import Records, records, tensor
+from dolens.optics.records import Records, tensor
 from dolens.optics.row_jacobian import jacobian_of
-from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.system import OpticalSystem, per_radian
 
 Wavelength = float | Sequence[float] | Tensor
@@ -67,8 +64,8 @@ def pack(
     Raises:
         InputError: a surface without a kernel.
     """
-    layout, scalars, arrays = _lay_out(system, sense, first, last, to_sensor)
-    return _table(layout, system, wavelength, _values(layout, scalars, arrays))
+    found = lay_out(system, sense, first, last, to_sensor)
+    return _table(found, system, wavelength)
 
 
 def pack_with_variables(
@@ -86,99 +83,63 @@ def pack_with_variables(
         The table, without a graph, and the map of all variables, in the order given.
     """
     with torch.enable_grad():
-        layout, scalars, arrays = _lay_out(system, 1.0, 1, len(system.surfaces), True)
+        found = lay_out(system, 1.0, 1, len(system.surfaces), True)
     with torch.no_grad():
-        table = _table(layout, system, tuple(wavelengths), _values(layout, scalars, arrays))
-    return table, _variable_map(layout, [*scalars, *arrays], variables)
+        table = _table(found, system, tuple(wavelengths))
+    return table, _variable_map(found.layout, [*found.scalars, *found.arrays], variables)
 
 
-def _lay_out(
-    system: OpticalSystem, sense: float, first: int, last: int, to_sensor: bool
-) -> tuple[Records, list[Tensor], list[Tensor]]:
-    """Return the layout of the records, and the lens's numbers: scalars, then arrays."""
-    scalars: list[Tensor] = []
-    arrays: list[Tensor] = []
-    of_laws: list[Tensor] = []
-    forms: list[Form] = []
-    apertures: list[ClearAperture] = []
-    laws: list[LawForm | None] = []
-    for number, surface in enumerate(system.surfaces, 1):
-        shape = surface.shape
-        if shape.kernel is None:
-            raise InputError(f"surface {number} ({shape.kind}) has no kernel")
-        code = BREAK if shape.changes_axes else shape.kernel.code
-        numbers, count, columns, degree, extras, data = shape.packed(surface.parameters)
-        for value in numbers:
-            if value is not None:
-                (arrays if value.ndim else scalars).append(value)
-        forms.append(Form(code, count, columns, degree, extras, _sizes(numbers), data))
-        apertures.append(surface.aperture)
-        law = surface.deflection
-        if law is None:
-            laws.append(None)
-        else:
-            own = law.law.packed(law.parameters, sense > 0.0)
-            if law.law.kernel is None:
-                raise InputError(f"surface {number}: a {law.law.kind} has no kernel")
-            laws.append(LawForm(law.law.kernel.code, _sizes(own)))
-            of_laws += [value for value in own if value is not None]
-    scalars += (*of_laws, *system.thicknesses, system.sensor_distance)
-    image = None
-    if to_sensor and system.image is not None:
-        shape = system.image.shape
-        if shape.kernel is None:
-            raise InputError(f"the sensor ({shape.kind}) has no kernel")
-        own = shape.packed(system.image.parameters).numbers
-        image = Form(shape.kernel.code, 0, 0, 0, (), _sizes(own))
-        scalars += [value for value in own if value is not None]
-    layout = records(
-        Structure(
-            tuple(forms),
-            tuple(apertures),
-            tuple(system.materials),
-            tuple((element.first, element.last) for element in system.elements),
-            system.mirrors,
-            system.senses,
-            sense,
-            first,
-            last,
-            to_sensor,
-            tuple(laws),
-            image,
-        )
-    )
-    if layout.turns:
-        axes = (LENS_AXES, *system.all_axes)
-        for now, then in layout.turns:
-            if then:
-                arrays += relative_axes(axes[now], axes[then])
-            else:
-                origin, rotation = axes[now].origin, axes[now].rotation
-                assert origin is not None and rotation is not None  # they turn
-                arrays += (origin, rotation)
-    return layout, scalars, arrays
-
-
-def _sizes(numbers: Iterable[Tensor | None]) -> tuple[torch.Size | None, ...]:
-    return tuple(None if value is None else value.shape for value in numbers)
-
-
-def _values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
-    """Return the records as one tensor."""
+def record_values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
+    """Return the records as one tensor, a function of the numbers."""
     numbers = torch.stack(tuple(scalars))
-    options: dict[str, Any] = {"dtype": numbers.dtype, "device": numbers.device}
     if arrays:
-        numbers = torch.cat([numbers, *(array.to(**options).reshape(-1) for array in arrays)])
-    constants, signs = layout.constants.to(**options), layout.signs.to(**options)
-    places, sources = layout.places.to(numbers.device), layout.sources.to(numbers.device)
-    return constants.index_add(0, places, numbers.index_select(0, sources) * signs)
+        flat = (array.to(device=numbers.device, dtype=numbers.dtype) for array in arrays)
+        numbers = torch.cat([numbers, *(array.reshape(-1) for array in flat)])
+    fixed = _in_precision(layout, numbers.dtype, numbers.device)
+    added = numbers.index_select(0, fixed.sources) * fixed.signs
+    return fixed.constants.index_add(0, fixed.places, added)
 
 
-def _table(
-    layout: Records, system: OpticalSystem, wavelength: Wavelength, values: Tensor
-) -> SurfaceTable:
-    used = tuple(system.materials[k] for k in layout.media)
-    indices = _indices(used, wavelength, layout.waves, system.device)
+def cotangents_of_numbers(
+    layout: Records, of_values: Tensor, numbers: Sequence[Tensor]
+) -> Sequence[Tensor]:
+    """Return the cotangents of the numbers, scalars before arrays, from those of the records."""
+    fixed = _in_precision(layout, of_values.dtype, of_values.device)
+    sizes = [number.numel() for number in numbers]
+    added = of_values.index_select(0, fixed.places) * fixed.signs
+    flat = of_values.new_zeros(sum(sizes)).index_add(0, fixed.sources, added)
+    scalars = sum(number.ndim == 0 for number in numbers)
+    if scalars == len(numbers):
+        return flat.unbind()
+    parts = flat.split([scalars, *sizes[scalars:]])
+    arrays = zip(parts[1:], numbers[scalars:], strict=True)
+    return *parts[0].unbind(), *(part.reshape(array.shape).to(array) for part, array in arrays)
+
+
+class _Fixed(NamedTuple):
+    """A layout's tensors; see `Records`."""
+
+    constants: Tensor
+    places: Tensor
+    sources: Tensor
+    signs: Tensor
+
+
+@cached_tensors(maxsize=256)
+def _in_precision(layout: Records, dtype: torch.dtype, device: torch.device) -> _Fixed:
+    """Return a layout's tensors, the numbers in a precision, on a device."""
+    return _Fixed(
+        layout.constants.to(device=device, dtype=dtype),
+        layout.places.to(device),
+        layout.sources.to(device),
+        layout.signs.to(device=device, dtype=dtype),
+    )
+
+
+def _table(found: LaidOut, system: OpticalSystem, wavelength: Wavelength) -> SurfaceTable:
+    layout = found.layout
+    values = record_values(layout, found.scalars, found.arrays)
+    indices = record_indices(found, wavelength, system.device)
     return SurfaceTable(values, indices, layout.codes, layout.extras)
 
 
@@ -245,13 +206,12 @@ def _derivatives(
     return source[row].numpy(), column.numpy(), jacobian[row, column].double().numpy()
 
 
-def _indices(
-    used: tuple[Medium, ...], wavelength: Wavelength, waves: bool, device: torch.device
-) -> Tensor:
+def record_indices(found: LaidOut, wavelength: Wavelength, device: torch.device) -> Tensor:
     """Return the indices (media, wavelengths), in double precision whatever the lens's.
 
-    With `waves`, a last row holds λ/2π, mm.
+    Of a lens with deflections a last row holds λ/2π, mm.
     """
+    used, waves = found.media, found.layout.waves
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)
         one = torch.ones_like(wavelength)

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dolens.kernels import operators
 from dolens.optics.backend import choose_backend
+from dolens.optics.eager_trace import trace_by_operator, trace_eagerly, traces_eagerly
 from dolens.optics.elements import to_lens_axes
-from dolens.optics.packing import pack
+from dolens.optics.lens_numbers import lay_out
 from dolens.optics.rays import Components, Rays, TracedRays, finite_rays
 from dolens.optics.system import OpticalSystem
 from dolens.optics.trace import enter_lens, trace_surfaces, trace_to_sensor, traced_rays
@@ -58,28 +58,19 @@ def trace_rays(
             traced = trace_to_sensor(system, traced, rays.wavelength)
         return traced_rays(traced, before)
     position, direction, shape = _joined(system, rays, ray, before)
-    table = pack(system, rays.wavelength, sense, first, end, to_sensor)
-    position, direction, path, status, surface = operators.trace(
-        table.values,
-        table.indices,
-        position,
-        direction,
-        _columns(rays.wavelength, shape, system.device),
-        table.codes,
-        table.extras,
-    )
-    path = path.reshape(shape)
+    found = lay_out(system, sense, first, end, to_sensor)
+    which = _columns(rays.wavelength, shape, system.device)
+    run = trace_eagerly if traces_eagerly(found, position, direction) else trace_by_operator
+    traced = run(found, rays.wavelength, position, direction, which)
+    if len(shape) != 1:
+        position, direction, *others = traced
+        ends = (position.reshape(*shape, 3), direction.reshape(*shape, 3))
+        traced = (*ends, *(other.reshape(shape) for other in others))
+    position, direction, path, status, surface = traced
+    valid = status == 0
     if before is not None:
-        path = torch.where(status.reshape(shape) == 0, path + before, path + before.detach())
-    status = status.reshape(shape)
-    return TracedRays(
-        position=position.reshape(*shape, 3),
-        direction=direction.reshape(*shape, 3),
-        valid=status == 0,
-        status=status,
-        surface=surface.reshape(shape),
-        path_length=path,
-    )
+        path = torch.where(valid, path + before, path + before.detach())
+    return TracedRays(position, direction, valid, status, surface, path)
 
 
 def from_sensor(system: OpticalSystem, rays: Rays) -> Rays:

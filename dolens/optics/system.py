@@ -1,9 +1,10 @@
 """A lens as pure functions see it: tensors and names, no state."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -82,6 +83,11 @@ class OpticalSystem:
     def neighbours(self) -> tuple[tuple[int, int], ...]:
         """Return the numbers of surfaces that light meets one after the other."""
         return tuple(zip(self.met, self.met[1:], strict=False))
+
+    @cached_property
+    def derived(self) -> dict[Hashable, Any]:
+        """Hold what functions derive from the structure of this system, by keys of their own."""
+        return {}
 
     def refracts(self, number: int) -> bool:
         """Return whether a surface changes the direction of light, by refraction or reflection."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from dolens.errors import InputError, check_keys
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface, tensor_of
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.registry import register_surface
 from dolens.optics.surfaces.spline_basis import check_knots, clamped_knots, cubic_basis
@@ -117,6 +118,7 @@ class BSpline(Surface):
         return sag, sx, sy, torch.minimum(_inside(p["knots_x"], x), _inside(p["knots_y"], y))
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return knots in x, knots in y, coefficients."""
         rows, columns = p["coefficients"].shape

@@ -17,6 +17,7 @@ from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.rays import Components
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.clear_aperture import Circle, ClearAperture
 from dolens.optics.surfaces.newton import find_root
 from dolens.optics.surfaces.refraction import FAR, PlaneRay, Refraction, snell
@@ -174,6 +175,7 @@ class Surface(nn.Module):
         raise NotImplementedError
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return the numbers that `kernel` takes, in its order.
 

@@ -12,6 +12,7 @@ from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.kernels.table import Kind
 from dolens.optics.rays import Components
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.refraction import PlaneRay, safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
 
@@ -168,6 +169,7 @@ class Conic(Surface):
         return nx * inverse, ny * inverse, nz * inverse
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return c, k."""
         return PackedShape((p["curvature"], p["conic"]))
@@ -222,6 +224,7 @@ class Sphere(Conic):
         return -c * x, -c * y, 1.0 - c * z
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return c."""
         return PackedShape((p["curvature"],))

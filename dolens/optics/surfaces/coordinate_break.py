@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.optics.elements import TILTS, rotation_matrix
 from dolens.optics.surfaces.base import PackedShape, Parameters
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.clear_aperture import ClearAperture, Unlimited
 from dolens.optics.surfaces.plane import Plane
 
@@ -48,6 +49,7 @@ class CoordinateBreak(Plane):
         return list(BREAK)
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return no numbers: kernels see the change of axes alone."""
         return PackedShape(())

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from dolens.errors import InputError
 from dolens.kernels.law_kernel import LawKernel
 from dolens.optics.surfaces.base import Parameters
+from dolens.optics.surfaces.by_names import by_names
 
 Number = float | Tensor
 Vector = tuple[Tensor, Tensor, Tensor]
@@ -103,6 +104,7 @@ class Law(nn.Module):
         raise NotImplementedError
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
         """Return the numbers that `kernel` takes, in its order.
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from dolens.errors import InputError
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.conic import Conic, conic_distance, conic_sag
 from dolens.optics.surfaces.refraction import PlaneRay
@@ -71,6 +72,7 @@ class EvenAsphere(Conic):
         return sag, 2.0 * x * slope, 2.0 * y * slope, exists
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return c, k, a2, and a4, a6, ...: all powers up to the highest, in groups of four."""
         powers = [power for name in p if (power := even_power(name))]

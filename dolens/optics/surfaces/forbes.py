@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.clear_aperture import ClearAperture
 from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.conic import check_reach, conic_distance, conic_sag
@@ -89,6 +90,7 @@ class QCon(ForbesSag):
         return sag + q * q * total, 2.0 * x * slope, 2.0 * y * slope, exists
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return c, k, no a2, the normalisation radius, and q0, q1, ...; columns: how many."""
         count = _count(p)

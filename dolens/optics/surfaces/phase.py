@@ -27,6 +27,7 @@ from dolens.errors import InputError
 from dolens.kernels.law_kernel import LawKernel
 from dolens.kernels.limits import LONGEST, LONGEST_WAVEVECTOR, STEEPEST
 from dolens.optics.surfaces.base import Parameters, tensor_of
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.coefficient_names import order_of, order_pattern
 from dolens.optics.surfaces.deflection import (
     Deflected,
@@ -168,6 +169,7 @@ class Grating(Phase):
         return slope * y, torch.zeros_like(y), slope + torch.zeros_like(y)
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor, ...]:
         """Return order and grooves."""
         return p["order"], p["grooves"]
@@ -225,6 +227,7 @@ class RadialPhase(Phase):
         return p["order"] * (q * h), twice * u, twice * v
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
         """Return order, radius of normalisation, p2, p4, ..."""
         return (p["order"], p["norm_radius"], *cls.coefficients(p))
@@ -298,6 +301,7 @@ class XYPhase(Phase):
         return p["order"] * value, scale * du, scale * dv
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters, forward: bool) -> tuple[Tensor | None, ...]:
         """Return order, radius of normalisation, and the coefficients of `coefficients`."""
         return (p["order"], p["norm_radius"], *cls.coefficients(p))

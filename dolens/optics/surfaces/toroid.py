@@ -9,6 +9,7 @@ from dolens.errors import InputError
 from dolens.kernels.limits import GRAZING
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.even_asphere import EvenAsphere, even_power
 from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
@@ -72,6 +73,7 @@ class Toroid(Surface):
         return sag, sx, df * across, torch.minimum(margin, (1.0 - cx * f).detach())
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return the curve's numbers as an even asphere's, and then c_x."""
         even = EvenAsphere.packed(_curve(p))

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dolens.kernels.surface_kernel import SurfaceKernel
 from dolens.optics.surfaces.base import PackedShape, Parameters, Surface
+from dolens.optics.surfaces.by_names import by_names
 from dolens.optics.surfaces.coefficient_names import checked_order
 from dolens.optics.surfaces.refraction import safe_sqrt
 from dolens.optics.surfaces.registry import register_surface
@@ -64,6 +65,7 @@ class XYPolynomial(Surface):
         return 2.0 * polynomial / (1.0 + root), px / root, py / root, discriminant.detach()
 
     @classmethod
+    @by_names
     def packed(cls, p: Parameters) -> PackedShape:
         """Return b, then the coefficients, and their powers as extras."""
         terms = [(powers, a) for n, a in p.items() if (powers := monomial_powers(n)) is not None]

@@ -1,0 +1,25 @@
+"""Kernels may be called without PyTorch's dispatcher where nothing but autograd listens to it."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+_PLAIN = frozenset((Tensor, nn.Parameter))
+
+
+def is_eager(tensors: Iterable[Tensor]) -> bool:
+    """Return whether operations on these tensors run at once, and for autograd at most.
+
+    Otherwise a compiler, a tracer, a mode, a transform of torch.func or a subclass of tensors looks
+    on, and must see operators.
+    """
+    return not (
+        torch.compiler.is_compiling()
+        or torch._C._is_tracing()
+        or torch._C._len_torch_dispatch_stack()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+        or not _PLAIN.issuperset(map(type, tensors))
+    )

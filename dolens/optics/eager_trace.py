@@ -1,0 +1,130 @@
+"""A trace in eager mode is one node of autograd's graph: from a lens's numbers to its rays.
+
+It gives what packing and `dolens::trace` give, to the bit, forwards and backwards.  These are some
+ten small operations and as many again in the backward pass, which together take longer than ten
+thousand rays.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dolens.kernels import operators
+from dolens.kernels.eager import is_eager
+from dolens.kernels.operators import kernels_of
+from dolens.kernels.table import SurfaceTable
+from dolens.optics.lens_numbers import LaidOut
+from dolens.optics.packing import cotangents_of_numbers, record_indices, record_values
+
+Traced = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def traces_eagerly(found: LaidOut, *rays: Tensor) -> bool:
+    """Return whether `trace_eagerly` can trace these rays: on the CPU, where nobody looks on."""
+    return rays[0].device.type == "cpu" and is_eager((*rays, *found.scalars, *found.arrays))
+
+
+def trace_eagerly(
+    found: LaidOut,
+    wavelength: float | Tensor,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+) -> Traced:
+    """Carry rays through a lens; see `operators.trace`.
+
+    Args:
+        found: the lens.
+        wavelength: nm; of a tensor, in any shape, each is a column of the indices.
+        position: (N, 3), mm, in the lens's precision.
+        direction: (N, 3), unit vectors.
+        which: (N,), int32: each ray's wavelength, or None where there is one.
+    """
+    indices = record_indices(found, wavelength, position.device)
+    inputs = (indices, position, direction, *found.scalars, *found.arrays)
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
+        return _Trace.apply(found, which, *inputs)
+    return kernels_of(position).trace(_table(found, indices), position, direction, which)
+
+
+def trace_by_operator(
+    found: LaidOut,
+    wavelength: float | Tensor,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+) -> Traced:
+    """Carry rays through a lens as `trace_eagerly` does, by operations that PyTorch sees."""
+    values = record_values(found.layout, found.scalars, found.arrays)
+    indices = record_indices(found, wavelength, position.device)
+    codes, extras = found.layout.codes, found.layout.extras
+    return operators.trace(values, indices, position, direction, which, codes, extras)
+
+
+class _Trace(torch.autograd.Function):
+    """A trace and its derivative."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        found: LaidOut,
+        which: Tensor | None,
+        indices: Tensor,
+        position: Tensor,
+        direction: Tensor,
+        *numbers: Tensor,
+    ) -> Traced:
+        """Trace, and keep the rays and the lens's records."""
+        table = _table(found, indices)
+        traced = kernels_of(position).trace(table, position, direction, which)
+        status, surface = traced[3:]
+        ctx.mark_non_differentiable(status, surface)
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(table.values, indices, position, direction, which, status)
+        ctx.found, ctx.numbers = found, numbers
+        return traced
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        """Sweep back through the lens, and from its records to its numbers."""
+        needs = ctx.needs_input_grad
+        cotangents = gradients[:3]
+        given = [cotangent for cotangent in cotangents if cotangent is not None]
+        if not given:
+            return (None,) * len(needs)
+        values, indices, position, direction, which, status = ctx.saved_tensors
+        found, numbers = ctx.found, ctx.numbers
+        wanted = (needs[3], needs[4], needs[2])
+        layout = found.layout
+        if is_eager(given) and not torch.is_grad_enabled():
+            table = SurfaceTable(values, indices, layout.codes, layout.extras)
+            of_position, of_direction, of_values, of_indices = kernels_of(position).trace_adjoint(
+                table, position, direction, which, status, cotangents, wanted
+            )
+        else:
+            # The gradient's own graph: its operator says that it has no derivative.
+            count = len(found.scalars)
+            of_values, of_indices, of_position, of_direction = operators.trace_adjoint(
+                record_values(layout, numbers[:count], numbers[count:]),
+                *(indices, position, direction, which, layout.codes, layout.extras, status),
+                *(*cotangents, list(wanted)),
+            )
+        of_numbers: Sequence[Tensor | None] = [None] * len(numbers)
+        if any(needs[5:]):
+            of_numbers = cotangents_of_numbers(layout, of_values, numbers)
+        return (
+            None,
+            None,
+            of_indices if wanted[2] else None,
+            of_position if wanted[0] else None,
+            of_direction if wanted[1] else None,
+            *of_numbers,
+        )
+
+
+def _table(found: LaidOut, indices: Tensor) -> SurfaceTable:
+    layout = found.layout
+    values = record_values(layout, found.scalars, found.arrays)
+    return SurfaceTable(values, indices.contiguous(), layout.codes, layout.extras)
