@@ -50,10 +50,10 @@ class Contender:
         if self._line() != "ready":
             raise RuntimeError(f"{name} did not start")
 
-    def microseconds(self, call: str, seconds: float) -> float:
+    def microseconds(self, call: str, seconds: float, clock: str) -> float:
         """Return the mean time of one call, repeated for so many seconds."""
         assert self._process.stdin is not None
-        self._process.stdin.write(f"{call} {seconds}\n")
+        self._process.stdin.write(f"{call} {seconds} {clock}\n")
         self._process.stdin.flush()
         return float(self._line())
 
@@ -84,7 +84,9 @@ def main(options: argparse.Namespace) -> None:
             for _ in range(options.turns):
                 for contender in contenders:
                     time.sleep(options.pause)  # threads of the one before go to sleep
-                    taken[contender.name].append(contender.microseconds(call, options.seconds))
+                    taken[contender.name].append(
+                        contender.microseconds(call, options.seconds, options.clock)
+                    )
             row = {"lens": name, "dtype": dtype, "threads": int(threads), "rays": int(float(rays))}
             rows.append(row | {"call": call, "microseconds": taken})
             print(f"{name:14s} {dtype:8s} {threads:>7s} {rays:>8s} {call:9s} {_text(taken)}")
@@ -123,6 +125,9 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--turns", type=int, default=15)
     parser.add_argument("--seconds", type=float, default=0.03, help="of a turn")
     parser.add_argument("--pause", type=float, default=0.005, help="seconds between turns")
+    parser.add_argument(
+        "--clock", default="wall", choices=("wall", "cpu"), help="cpu beside others"
+    )
     parser.add_argument("--output", type=Path, help="a file for all turns, as JSON")
     return parser.parse_args(given)
 

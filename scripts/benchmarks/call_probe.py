@@ -2,8 +2,8 @@
 
 python call_probe.py ROOT BACKEND LENS DTYPE RAYS THREADS
 
-ROOT is the checkout whose dolens is measured.  Every line that comes in is `CALL SECONDS`: the call
-is repeated for so long, and the mean of one is the answer, µs.
+ROOT is the checkout whose dolens is measured.  Every line that comes in is `CALL SECONDS CLOCK`:
+the call is repeated for so long, and the mean of one is the answer, µs of `wall` or `cpu`.
 """
 
 import sys
@@ -11,10 +11,10 @@ import time
 
 sys.path.insert(0, sys.argv[1])
 
-import torch  # noqa: E402
-from benchmarks.cases import load, make_rays  # noqa: E402
+import torch
 
-import dolens  # noqa: E402
+import dolens
+from benchmarks.cases import load, make_rays
 
 if not dolens.__file__.startswith(sys.argv[1]):
     sys.exit(f"dolens comes from {dolens.__file__}")
@@ -50,10 +50,11 @@ for call in calls.values():
     call()
 print("ready", flush=True)
 for line in sys.stdin:
-    call, seconds = calls[line.split()[0]], float(line.split()[1])
+    name, seconds, kind = line.split()
+    call, clock = calls[name], time.process_time if kind == "cpu" else time.perf_counter
     call()
-    count, start = 0, time.perf_counter()
-    while (taken := time.perf_counter() - start) < seconds or count == 0:
+    count, start = 0, clock()
+    while (taken := clock() - start) < float(seconds) or count == 0:
         call()
         count += 1
     print(1e6 * taken / count, flush=True)

@@ -31,8 +31,8 @@ def trace(
     """
     count = position.shape[0]
     out = (
-        torch.empty_like(position, memory_format=torch.contiguous_format),
-        torch.empty_like(direction, memory_format=torch.contiguous_format),
+        position.new_empty((count, 3)),
+        position.new_empty((count, 3)),
         position.new_empty(count),
         torch.empty(count, dtype=torch.int8),
         torch.empty(count, dtype=torch.int16),
@@ -41,8 +41,8 @@ def trace(
         return out
     program = Program(table, derivatives=False)
     program.set_rays(position, direction, which)
-    names = ("OUT_POSITION", "OUT_DIRECTION", "OUT_PATH", "OUT_STATUS", "OUT_SURFACE")
-    program.point(**dict(zip(names, out, strict=True)))
+    # Position, direction, path, status and surface: neighbours in a job.
+    program.job[jobs.OUT_POSITION : jobs.OUT_SURFACE + 1] = [tensor.data_ptr() for tensor in out]
     program.run(forward_driver, -(-count // BLOCK))
     return out
 

@@ -41,13 +41,12 @@ from dolens.kernels.cpu.records import (
     STARTS_ON_CONIC,
     STENCIL,
 )
-from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
+from dolens.kernels.cpu.threads import SMALL, Memory, scratch, spread, thread_count
 from dolens.kernels.law_kernel import law_kernels_of
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
 
 REAL = {torch.float32: "float32", torch.float64: "float64"}
-_ALIGNMENT = 64  # bytes: a line of the cache
 
 # Steps that are no surfaces; the sensor's adjoint is a plane's between equal media.
 _STEPS = {
@@ -120,6 +119,14 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     return Steps(rows, longest, scratch, address)
 
 
+@lru_cache(maxsize=256)
+def _with_extras(codes: bytes, real: str, derivatives: bool, extras: int) -> np.ndarray:
+    """Return the codes of `_steps` with the address of each step's extras; not to be written to."""
+    rows = _steps(codes, real, derivatives).codes.copy()
+    rows[:, EXTRAS_ADDRESS] = extras + 8 * rows[:, Code.EXTRAS]
+    return rows
+
+
 def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
     """Compile a deflection's law, and for a phase the sag of the surface that it stands on."""
     law: LawFunctions = law_kernels_of(int(row[Code.LAW]), "cpu")
@@ -157,20 +164,19 @@ class Program:
         self.real = REAL[table.values.dtype]
         self.table = table
         self.derivatives = derivatives
-        steps = _steps(table.codes.numpy().tobytes(), self.real, derivatives)
+        key = (table.codes.numpy().tobytes(), self.real, derivatives)
+        steps = _steps(*key)
         count = table.codes.shape[0]
-        self.codes = steps.codes.copy()
-        self.codes[:, EXTRAS_ADDRESS] = table.extras.data_ptr() + 8 * self.codes[:, Code.EXTRAS]
-        self.job = np.zeros(jobs.LENGTH, dtype=np.int64)
-        self.job[jobs.STEPS] = count
-        self.job[jobs.CODES] = self.codes.ctypes.data
-        self.job[jobs.VALUES] = table.values.data_ptr()
-        self.job[jobs.VALUES_LENGTH] = table.values.numel()
-        self.job[jobs.INDICES] = table.indices.data_ptr()
-        self.job[jobs.WAVELENGTHS] = table.indices.shape[1]
-        last = table.values.numel() - 1
-        self.job[jobs.EXIT_Z] = table.values.data_ptr() + last * table.values.element_size()
-        self.job[jobs.CLIP] = steps.clip
+        self.codes = _with_extras(*key, table.extras.data_ptr())
+        job = self.job = np.zeros(jobs.LENGTH, dtype=np.int64)
+        job[jobs.STEPS] = count
+        job[jobs.CODES] = self.codes.ctypes.data
+        values, length = table.values.data_ptr(), table.values.numel()
+        job[jobs.VALUES], job[jobs.VALUES_LENGTH] = values, length
+        job[jobs.INDICES] = table.indices.data_ptr()
+        job[jobs.WAVELENGTHS] = table.indices.shape[1]
+        job[jobs.EXIT_Z] = values + (length - 1) * table.values.element_size()
+        job[jobs.CLIP] = steps.clip
         # All of them with derivatives, else two in turn; and some that a driver may keep.
         states = count + 3 if derivatives else 5
         cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
@@ -215,13 +221,12 @@ class Program:
         step = self.table.values.element_size()
         size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
         # Memories are held until the last share is done.
-        memories = [scratch(size + _ALIGNMENT, worker) for worker in range(threads)]
+        memories = [scratch(size, worker) for worker in range(threads)]
         spread(function, [self._job_of(memory, step) for memory in memories], pieces)
 
-    def _job_of(self, memory: np.ndarray, step: int) -> np.ndarray:
+    def _job_of(self, memory: Memory, step: int) -> np.ndarray:
         """Return the job of a worker with this memory; `step` is the bytes of a number."""
-        job = self.job.copy()
-        address = -(-memory.ctypes.data // _ALIGNMENT) * _ALIGNMENT
+        job, address = self.job.copy(), memory.address
         for place, length in self._sizes.items():
             job[place] = address
             address += length * step

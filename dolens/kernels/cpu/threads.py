@@ -15,6 +15,8 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,8 +27,9 @@ from dolens.openmp import torchs_openmp
 # Fewer rays than this are traced sooner than another thread is woken.
 SMALL = 1 << 14
 
-# Memory that a thread keeps for its next task, bytes at most.
+# Memory that a thread keeps for its next task, bytes at most; and a line of the cache.
 _KEPT = 1 << 23
+_LINE = 64
 
 # Runs a task on a number of threads, the calling one among them.
 Runner = Callable[[np.ndarray, int], None]
@@ -41,7 +44,21 @@ def thread_count(rays: int, small: int = SMALL) -> int:
     return 1 if rays < small else max(1, torch.get_num_threads())
 
 
-def scratch(size: int, worker: int) -> np.ndarray:
+class Memory(NamedTuple):
+    """Memory of a worker.
+
+    Attributes:
+        size: bytes from `address` on.
+        address: of a line of the cache.
+        held: what holds it.
+    """
+
+    size: int
+    address: int
+    held: np.ndarray
+
+
+def scratch(size: int, worker: int) -> Memory:
     """Return memory of at least this many bytes for a worker of the task that the calling thread
     runs.
 
@@ -49,8 +66,9 @@ def scratch(size: int, worker: int) -> np.ndarray:
     """
     kept = _own.__dict__.setdefault("memory", {})
     memory = kept.get(worker)
-    if memory is None or memory.nbytes < size:
-        memory = np.empty(size, dtype=np.uint8)
+    if memory is None or memory.size < size:
+        held = np.empty(size + _LINE, dtype=np.uint8)
+        memory = Memory(size, -(-held.ctypes.data // _LINE) * _LINE, held)
         if size <= _KEPT:
             kept[worker] = memory
     return memory
@@ -66,17 +84,24 @@ def spread(driver: int, jobs: Sequence[np.ndarray], pieces: int) -> None:
         pieces: how many.
     """
     threads = min(len(jobs), pieces)
+    if threads == 1:
+        _function_at(driver)(jobs[0].ctypes.data, 0, pieces)
+        return
     bounds = _shares(pieces, threads)
     addresses = np.array([job.ctypes.data for job in jobs], dtype=np.int64)
     task = np.zeros(team.TASK, dtype=np.int64)
     task[team.SHARES], task[team.DRIVER] = len(bounds), driver
     task[team.BOUNDS], task[team.JOBS] = bounds.ctypes.data, addresses.ctypes.data
-    if threads <= 1:
-        run_alone(task)
-    elif (openmp := torchs_openmp()) is not None and not is_forked():
+    if (openmp := torchs_openmp()) is not None and not is_forked():
         run_with_openmp(openmp, task, threads)
     else:
         run_in_pool(task, threads)
+
+
+@lru_cache(maxsize=256)
+def _function_at(driver: int) -> Callable[[int, int, int], None]:
+    """Return the driver at an address as a function of the job's address, first and end."""
+    return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)(driver)
 
 
 def run_alone(task: np.ndarray) -> None:
@@ -114,12 +139,13 @@ def _integers(array: np.ndarray) -> "ctypes._Pointer":
     return array.ctypes.data_as(ctypes.POINTER(ctypes.c_int64))
 
 
+@lru_cache(maxsize=256)
 def _shares(pieces: int, threads: int) -> np.ndarray:
     """Return first and end of neighbouring pieces, (S, 2): large shares first, to end together."""
     shares, first = [], 0
-    least = max(1, pieces // (16 * max(threads, 1)))
+    least = max(1, pieces // (16 * threads))
     while first < pieces:
-        size = pieces if threads <= 1 else max(least, (pieces - first) // (2 * threads))
+        size = max(least, (pieces - first) // (2 * threads))
         shares.append((first, min(first + size, pieces)))
         first += size
     return np.array(shares, dtype=np.int64).reshape(-1, 2)
