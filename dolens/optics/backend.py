@@ -97,7 +97,7 @@ def is_few(system: OpticalSystem, rays: Rays) -> bool:
         system: the lens.
         rays: as users give them.
     """
-    if system.backend != "auto":
+    if system.backend != "auto" or rays.position.numel() >= 3 * FEW:
         return False
     shapes = [rays.position.shape[:-1], rays.direction.shape[:-1]]
     if isinstance(rays.wavelength, Tensor):
@@ -157,6 +157,8 @@ def _transformed(tensors: Iterable[Tensor]) -> bool:
     """Return whether any tensor is seen through torch.func, or carries a tangent."""
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     forward = forward_ad._current_level >= 0
+    if not forward and torch._C._functorch.peek_interpreter_stack() is None:
+        return False
     return any(
         wrapped(t) or (forward and forward_ad.unpack_dual(t).tangent is not None) for t in tensors
     )

@@ -5,7 +5,7 @@ is made anew as soon as anything stands in the place of a tensor, a surface, an 
 that it was made of.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import is_
 from typing import Any
 
@@ -50,33 +50,38 @@ class KeptSystem:
         return system
 
 
-def _parts(lens: nn.Module) -> list[Any]:
-    """Return all that a system is made of: two lists of the same objects make the same system."""
-    own, tables = lens.__dict__, lens._modules
-    parts = [own[name] for name in _ATTRIBUTES]
-    parts += own["materials"]  # which may be a list
-    parts += lens._parameters.values()
-    parts += tables["thicknesses"]._parameters.values()  # type: ignore[union-attr]
-    for surface in tables["surfaces"]._modules.values():  # type: ignore[union-attr]
-        _add(parts, surface, surface.aperture, surface.phase)  # type: ignore[union-attr]
-    for element in tables["elements"]._modules.values():  # type: ignore[union-attr]
-        _add(parts, element, element.first, element.last, element.pivot)  # type: ignore[union-attr]
-    return parts
-
-
+# Of a lens; its materials may be a list, whose entries are looked at.
 _ATTRIBUTES = ("stop", "backend", "reversals", "fields")
 
 
-def _add(parts: list[Any], module: nn.Module, *attributes: Any) -> None:
-    """Add a module, some of its attributes, and its tensors by name."""
-    parts.append(module)
-    parts += attributes
-    for attribute in attributes:
-        if isinstance(attribute, nn.Module):  # the phase on a surface
-            _add(parts, attribute)
-    for table in (module._parameters, module._buffers):
-        parts += table
-        parts += table.values()
+def _parts(lens: nn.Module) -> list[Any]:
+    """Return all that a system is made of: two lists of the same objects make the same system."""
+    own, tables = lens.__dict__, lens._modules
+    parts = [*(own[name] for name in _ATTRIBUTES), *own["materials"], *lens._parameters.values()]
+    parts += _table(tables, "thicknesses")._parameters.values()
+    for surface in _table(tables, "surfaces")._modules.values():
+        parts += (surface, surface.aperture, surface.phase)
+        _add_tensors(parts, surface)
+        if surface.phase is not None:
+            _add_tensors(parts, surface.phase)
+    for element in _table(tables, "elements")._modules.values():
+        parts += (element, element.first, element.last, element.pivot)
+        _add_tensors(parts, element)
+    return parts
+
+
+def _table(tables: Mapping[str, nn.Module | None], name: str) -> Any:
+    return tables[name]
+
+
+def _add_tensors(parts: list[Any], module: nn.Module) -> None:
+    """Add the names and the tensors of a module itself."""
+    parameters, buffers = module._parameters, module._buffers
+    parts += parameters
+    parts += parameters.values()
+    if buffers:
+        parts += buffers
+        parts += buffers.values()
 
 
 def _may_stay(parts: list[Any], system: OpticalSystem) -> bool:

@@ -21,6 +21,8 @@ from dolens.optics.lens_numbers import LaidOut, lay_out
 from dolens.optics.materials import Medium
 from dolens.optics.records import Records, tensor
 from dolens.optics.row_jacobian import jacobian_of
+from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.deflection import Law
 from dolens.optics.system import OpticalSystem, per_radian
 
 Wavelength = float | Sequence[float] | Tensor
@@ -29,6 +31,8 @@ Wavelength = float | Sequence[float] | Tensor
 def unsupported(system: OpticalSystem) -> str | None:
     """Say why the kernels cannot trace a lens, naming the surface; None where they can."""
     device = system.device.type
+    if not any(_lacks_kernel(shape, law, device) for shape, law in system.kinds):
+        return None
     for number, surface in enumerate(system.surfaces, 1):
         kernel = surface.shape.kernel
         if kernel is None:
@@ -41,6 +45,13 @@ def unsupported(system: OpticalSystem) -> str | None:
         if law is not None and surface.shape.arrays:
             return f"surface {number} ({law.law.kind} on {surface.shape.kind}) has no kernel"
     return None
+
+
+def _lacks_kernel(shape: type[Surface], law: type[Law] | None, device: str) -> bool:
+    """Return whether the kernels of a device cannot trace a surface of this shape and law."""
+    if shape.kernel is None or not shape.kernel.serves(device):
+        return True
+    return law is not None and (law.kernel is None or bool(shape.arrays))
 
 
 def pack(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -116,14 +115,17 @@ def _joined(
     """Positions and directions (N, 3), and the leading shape; of `ray` where it was moved."""
     if ray is not None and before is not None:
         position, direction = torch.stack(ray[:3], -1), torch.stack(ray[3:], -1)
-        shape = tuple(ray.x.shape)
-    else:
-        # As the user gave them: views of (..., 3), which a kernel reads in place.
-        options: dict[str, Any] = {"device": system.device, "dtype": system.dtype}
-        shape = _shape(rays)
-        position = rays.position.to(**options).expand(*shape, 3)
-        direction = rays.direction.to(**options).expand(*shape, 3)
-    return position.reshape(-1, 3), direction.reshape(-1, 3), shape
+        return position.reshape(-1, 3), direction.reshape(-1, 3), tuple(ray.x.shape)
+    shape = _shape(rays)
+
+    def flat(vectors: Tensor) -> Tensor:
+        """As the user gave them: a view of (..., 3), which a kernel reads in place."""
+        vectors = vectors.to(system.device, system.dtype)
+        if vectors.shape == (*shape, 3) and len(shape) == 1:
+            return vectors
+        return vectors.expand(*shape, 3).reshape(-1, 3)
+
+    return flat(rays.position), flat(rays.direction), shape
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from torch import Tensor
 from dolens.optics.broken_axes import GlobalAxes, broken_axes
 from dolens.optics.elements import Axes, ElementState, surface_axes
 from dolens.optics.materials import Medium
+from dolens.optics.surfaces.base import Surface
+from dolens.optics.surfaces.deflection import Law
 from dolens.optics.surfaces.state import SurfaceState
 
 
@@ -73,6 +75,13 @@ class OpticalSystem:
     def breaks(self) -> tuple[int, ...]:
         """Return the numbers of the coordinate breaks."""
         return tuple(n for n, s in enumerate(self.surfaces, 1) if s.shape.changes_axes)
+
+    @cached_property
+    def kinds(self) -> frozenset[tuple[type[Surface], type[Law] | None]]:
+        """Return the shapes of the surfaces, each with the law that deflects light there."""
+        laws = (surface.deflection and surface.deflection.law for surface in self.surfaces)
+        shapes = (surface.shape for surface in self.surfaces)
+        return frozenset(zip(shapes, laws, strict=True))
 
     @cached_property
     def met(self) -> tuple[int, ...]:

@@ -41,7 +41,7 @@ from dolens.kernels.cpu.records import (
     STARTS_ON_CONIC,
     STENCIL,
 )
-from dolens.kernels.cpu.threads import SMALL, Memory, scratch, spread, thread_count
+from dolens.kernels.cpu.threads import SMALL, scratch, spread, thread_count
 from dolens.kernels.law_kernel import law_kernels_of
 from dolens.kernels.surface_kernel import kernels_of
 from dolens.kernels.table import Code, Kind, Outline, Slot, SurfaceTable
@@ -119,12 +119,57 @@ def _steps(codes: bytes, real: str, derivatives: bool) -> Steps:
     return Steps(rows, longest, scratch, address)
 
 
+class _Frame(NamedTuple):
+    """What programs of the same steps have in common.
+
+    Attributes:
+        codes: of `Steps`, with the address of each step's extras; not to be written to.
+        address: of the codes.
+        clip: as in `Steps`.
+        cotangents: numbers of a set of cotangents.
+        memory: bytes of a worker.
+        parts: of the memory: the place of each in a job, and where it begins, bytes.
+    """
+
+    codes: np.ndarray
+    address: int
+    clip: int
+    cotangents: int
+    memory: int
+    parts: tuple[tuple[int, int], ...]
+
+
 @lru_cache(maxsize=256)
-def _with_extras(codes: bytes, real: str, derivatives: bool, extras: int) -> np.ndarray:
-    """Return the codes of `_steps` with the address of each step's extras; not to be written to."""
-    rows = _steps(codes, real, derivatives).codes.copy()
-    rows[:, EXTRAS_ADDRESS] = extras + 8 * rows[:, Code.EXTRAS]
-    return rows
+def _frame(
+    key: tuple[bytes, str, bool], extras: int, outputs: int, columns: int, size: int
+) -> _Frame:
+    """Return the frame of programs.
+
+    Args:
+        key: what `_steps` is a function of.
+        extras: the address of the table's.
+        outputs: sets of cotangents that a block holds.
+        columns: further rows of a block that a driver asks for.
+        size: bytes of a number.
+    """
+    steps, derivatives = _steps(*key), key[2]
+    codes = steps.codes.copy()
+    codes[:, EXTRAS_ADDRESS] = extras + 8 * codes[:, Code.EXTRAS]
+    # All of them with derivatives, else two in turn; and some that a driver may keep.
+    states = len(key[0]) // (8 * Code.ROW) + 3 if derivatives else 5
+    cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
+    parts, end = [], 0
+    for place, length in (
+        (jobs.STACK, states * STATE * size),
+        (jobs.COTANGENTS, outputs * cotangents * size),
+        (jobs.WORK, (WORK_ROWS + steps.scratch) * BLOCK * size),
+        (jobs.DRIVER_ROWS, columns * BLOCK * size),
+        (jobs.LANES, BLOCK * 8),
+        (jobs.PENDING, 2 * BLOCK * 8),
+    ):
+        parts.append((place, end))
+        end += length
+    return _Frame(codes, codes.ctypes.data, steps.clip, cotangents, end, tuple(parts))
 
 
 def _compile_law(row: np.ndarray, real: str, derivatives: bool) -> None:
@@ -165,36 +210,32 @@ class Program:
         self.table = table
         self.derivatives = derivatives
         key = (table.codes.numpy().tobytes(), self.real, derivatives)
-        steps = _steps(*key)
-        count = table.codes.shape[0]
-        self.codes = _with_extras(*key, table.extras.data_ptr())
-        job = self.job = np.zeros(jobs.LENGTH, dtype=np.int64)
-        job[jobs.STEPS] = count
-        job[jobs.CODES] = self.codes.ctypes.data
-        values, length = table.values.data_ptr(), table.values.numel()
-        job[jobs.VALUES], job[jobs.VALUES_LENGTH] = values, length
-        job[jobs.INDICES] = table.indices.data_ptr()
-        job[jobs.WAVELENGTHS] = table.indices.shape[1]
-        job[jobs.EXIT_Z] = values + (length - 1) * table.values.element_size()
-        job[jobs.CLIP] = steps.clip
-        # All of them with derivatives, else two in turn; and some that a driver may keep.
-        states = count + 3 if derivatives else 5
-        cotangents = (COTANGENT_HEADER + steps.longest) * BLOCK if derivatives else 0
-        self.job[jobs.COTANGENT_LENGTH] = cotangents
-        self._sizes = {
-            jobs.STACK: states * STATE,
-            jobs.COTANGENTS: outputs * cotangents,
-            jobs.WORK: (WORK_ROWS + steps.scratch) * BLOCK,
-            jobs.DRIVER_ROWS: columns * BLOCK,
-        }
+        values, size = table.values.data_ptr(), table.values.element_size()
+        frame = _frame(key, table.extras.data_ptr(), outputs, columns, size)
+        length = table.values.numel()
+        self.job = np.zeros(jobs.LENGTH, dtype=np.int64)
+        # Neighbours in a job.
+        self.job[jobs.STEPS : jobs.CLIP + 1] = (
+            table.codes.shape[0],
+            frame.address,
+            values,
+            table.indices.data_ptr(),
+            table.indices.shape[1],
+            values + (length - 1) * size,  # the last number, added to z
+            frame.clip,
+        )
+        self.job[jobs.VALUES_LENGTH] = length
+        self.job[jobs.COTANGENT_LENGTH] = frame.cotangents
+        self._frame = frame
 
     def set_rays(self, position: Tensor, direction: Tensor, which: Tensor | None) -> None:
         """Point to rays (N, 3) of any strides, and to their wavelengths' columns (N,), int32."""
-        for place, tensor in ((jobs.POSITION, position), (jobs.DIRECTION, direction)):
-            self.job[place] = tensor.data_ptr()
-            self.job[place + 1 : place + 3] = tensor.stride()
-        self.job[jobs.RAYS] = position.shape[0]
-        self.job[jobs.WHICH] = 0 if which is None else which.data_ptr()
+        self.job[jobs.POSITION : jobs.RAYS + 1] = (
+            *(position.data_ptr(), *position.stride()),
+            *(direction.data_ptr(), *direction.stride()),
+            0 if which is None else which.data_ptr(),
+            position.shape[0],
+        )
 
     def point(self, **tensors: Tensor | None) -> None:
         """Point to contiguous tensors by the name of their place in `jobs`."""
@@ -218,17 +259,13 @@ class Program:
         """
         function = compiler.compile_driver(driver, self.real)
         threads = min(thread_count(int(self.job[jobs.RAYS]) * lenses, small), pieces)
-        step = self.table.values.element_size()
-        size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
         # Memories are held until the last share is done.
-        memories = [scratch(size, worker) for worker in range(threads)]
-        spread(function, [self._job_of(memory, step) for memory in memories], pieces)
+        memories = [scratch(self._frame.memory, worker) for worker in range(threads)]
+        spread(function, [self._job_of(memory.address) for memory in memories], pieces)
 
-    def _job_of(self, memory: Memory, step: int) -> np.ndarray:
-        """Return the job of a worker with this memory; `step` is the bytes of a number."""
-        job, address = self.job.copy(), memory.address
-        for place, length in self._sizes.items():
-            job[place] = address
-            address += length * step
-        job[jobs.LANES], job[jobs.PENDING] = address, address + 8 * BLOCK
+    def _job_of(self, memory: int) -> np.ndarray:
+        """Return the job of a worker with the memory at this address."""
+        job = self.job.copy()
+        for place, begin in self._frame.parts:
+            job[place] = memory + begin
         return job
