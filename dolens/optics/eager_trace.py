@@ -15,6 +15,7 @@ from dolens.kernels import operators
 from dolens.kernels.eager import is_eager
 from dolens.kernels.operators import kernels_of
 from dolens.kernels.table import SurfaceTable
+from dolens.optics.eager_packing import eager_cotangents, eager_values
 from dolens.optics.lens_numbers import LaidOut
 from dolens.optics.packing import cotangents_of_numbers, record_indices, record_values
 
@@ -103,6 +104,7 @@ class _Trace(torch.autograd.Function):
             of_position, of_direction, of_values, of_indices = kernels_of(position).trace_adjoint(
                 table, position, direction, which, status, cotangents, wanted
             )
+            to_numbers = eager_cotangents
         else:
             # The gradient's own graph: its operator says that it has no derivative.
             count = len(found.scalars)
@@ -111,9 +113,11 @@ class _Trace(torch.autograd.Function):
                 *(indices, position, direction, which, layout.codes, layout.extras, status),
                 *(*cotangents, list(wanted)),
             )
+            to_numbers = cotangents_of_numbers
         of_numbers: Sequence[Tensor | None] = [None] * len(numbers)
         if any(needs[5:]):
-            of_numbers = cotangents_of_numbers(layout, of_values, numbers)
+            count = sum(map(Tensor.numel, numbers))
+            of_numbers = _split(to_numbers(layout, of_values, count), found)
         return (
             None,
             None,
@@ -126,5 +130,14 @@ class _Trace(torch.autograd.Function):
 
 def _table(found: LaidOut, indices: Tensor) -> SurfaceTable:
     layout = found.layout
-    values = record_values(layout, found.scalars, found.arrays)
-    return SurfaceTable(values, indices.contiguous(), layout.codes, layout.extras)
+    return SurfaceTable(eager_values(found), indices.contiguous(), layout.codes, layout.extras)
+
+
+def _split(flat: Tensor, found: LaidOut) -> Sequence[Tensor]:
+    """Return a tensor for each of the lens's numbers, scalars before arrays."""
+    if not found.arrays:
+        return flat.unbind()
+    scalars, arrays = len(found.scalars), found.arrays
+    first, *rest = flat.split([scalars, *(array.numel() for array in arrays)])
+    shaped = (part.reshape(a.shape).to(a.dtype) for part, a in zip(rest, arrays, strict=True))
+    return *first.unbind(), *shaped

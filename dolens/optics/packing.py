@@ -111,20 +111,11 @@ def record_values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[T
     return fixed.constants.index_add(0, fixed.places, added)
 
 
-def cotangents_of_numbers(
-    layout: Records, of_values: Tensor, numbers: Sequence[Tensor]
-) -> Sequence[Tensor]:
-    """Return the cotangents of the numbers, scalars before arrays, from those of the records."""
+def cotangents_of_numbers(layout: Records, of_values: Tensor, count: int) -> Tensor:
+    """Return the cotangents (count,) of the numbers from those of the records."""
     fixed = _in_precision(layout, of_values.dtype, of_values.device)
-    sizes = [number.numel() for number in numbers]
     added = of_values.index_select(0, fixed.places) * fixed.signs
-    flat = of_values.new_zeros(sum(sizes)).index_add(0, fixed.sources, added)
-    scalars = sum(number.ndim == 0 for number in numbers)
-    if scalars == len(numbers):
-        return flat.unbind()
-    parts = flat.split([scalars, *sizes[scalars:]])
-    arrays = zip(parts[1:], numbers[scalars:], strict=True)
-    return *parts[0].unbind(), *(part.reshape(array.shape).to(array) for part, array in arrays)
+    return of_values.new_zeros(count).index_add(0, fixed.sources, added)
 
 
 class _Fixed(NamedTuple):
@@ -226,7 +217,7 @@ def record_indices(found: LaidOut, wavelength: Wavelength, device: torch.device)
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)
         one = torch.ones_like(wavelength)
-        found = {medium: medium.index(wavelength) * one for medium in set(used)}
+        found = {medium: medium.index(wavelength) * one for medium in dict.fromkeys(used)}
         last = [torch.as_tensor(per_radian(wavelength, wavelength))] if waves else []
         return torch.stack([*(found[medium] for medium in used), *last])
     several = (wavelength,) if isinstance(wavelength, (int, float)) else tuple(wavelength)
@@ -237,6 +228,8 @@ def record_indices(found: LaidOut, wavelength: Wavelength, device: torch.device)
 def _index_rows(
     media: tuple[Medium, ...], wavelengths: tuple[float, ...], waves: bool
 ) -> np.ndarray:
-    found = {medium: [float(medium.index(w)) for w in wavelengths] for medium in set(media)}
+    found = {
+        medium: [float(medium.index(w)) for w in wavelengths] for medium in dict.fromkeys(media)
+    }
     last = [[w * (1e-6 / (2.0 * math.pi)) for w in wavelengths]] if waves else []
     return np.array([found[medium] for medium in media] + last, dtype=np.float64)

@@ -8,10 +8,12 @@ from dolens.kernels.cpu.adjoint import adjoint_driver
 from dolens.kernels.cpu.forward import forward_driver
 from dolens.kernels.cpu.layout import BLOCK
 from dolens.kernels.cpu.program import Program
+from dolens.kernels.cpu.stored_numbers import read as read
 from dolens.kernels.table import SurfaceTable
 
 # Chunks of rays that sums are kept for: enough for any processor's threads.
 _CHUNKS = 64
+_RAY_GRADIENTS = (jobs.POSITION_GRADIENT, jobs.DIRECTION_GRADIENT)
 
 
 def trace(
@@ -74,7 +76,7 @@ def trace_adjoint(
 
     Returns:
         Gradients of position and direction (None where not wanted), of `values` and of `indices`
-        (zeros where not wanted).
+        (zeros where not wanted); the latter two may share memory.
     """
     count = position.shape[0]
     gradients = [
@@ -87,9 +89,10 @@ def trace_adjoint(
     if count:
         program = Program(table, derivatives=True)
         program.set_rays(position, direction, which)
-        program.point(OUT_STATUS=status, SUMS=sums)
-        program.point(POSITION_GRADIENT=gradients[0], DIRECTION_GRADIENT=gradients[1])
         job = program.job
+        job[jobs.OUT_STATUS], job[jobs.SUMS] = status.data_ptr(), sums.data_ptr()
+        for place, gradient in zip(_RAY_GRADIENTS, gradients, strict=True):
+            job[place] = 0 if gradient is None else gradient.data_ptr()
         job[jobs.SUM_LENGTH], job[jobs.CHUNK] = length, chunk
         job[jobs.INDEX_SUMS] = int(wanted[2])
         of_position, of_direction, of_path = cotangents
@@ -102,10 +105,10 @@ def trace_adjoint(
                 job[place] = tensor.data_ptr()
                 job[place + 1 : place + 1 + tensor.dim()] = tensor.stride()
         program.run(adjoint_driver, chunks)
-    total, cut = sums.sum(0), table.values.numel()
+    total, cut = sums[0] if chunks == 1 else sums.sum(0), table.values.numel()
     return (
         gradients[0],
         gradients[1],
-        total[:cut].to(table.values.dtype, copy=True),
-        total[cut:].reshape(table.indices.shape).clone(),
+        total[:cut].to(table.values.dtype),
+        total[cut:].reshape(table.indices.shape),
     )

@@ -85,7 +85,7 @@ def spread(driver: int, jobs: Sequence[np.ndarray], pieces: int) -> None:
     """
     threads = min(len(jobs), pieces)
     if threads == 1:
-        _function_at(driver)(jobs[0].ctypes.data, 0, pieces)
+        function_at(driver)(jobs[0].ctypes.data, 0, pieces)
         return
     bounds = _shares(pieces, threads)
     addresses = np.array([job.ctypes.data for job in jobs], dtype=np.int64)
@@ -99,7 +99,7 @@ def spread(driver: int, jobs: Sequence[np.ndarray], pieces: int) -> None:
 
 
 @lru_cache(maxsize=256)
-def _function_at(driver: int) -> Callable[[int, int, int], None]:
+def function_at(driver: int) -> Callable[[int, int, int], None]:
     """Return the driver at an address as a function of the job's address, first and end."""
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)(driver)
 
