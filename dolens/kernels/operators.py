@@ -104,8 +104,8 @@ def trace_adjoint(
     empty = position.new_empty((0, 3))
     position_gradient, direction_gradient, of_values, of_indices = of_rays
     return (
-        of_values.clone(),
-        of_indices.clone(),
+        of_values,
+        of_indices,
         empty if position_gradient is None else position_gradient,
         empty.clone() if direction_gradient is None else direction_gradient,
     )

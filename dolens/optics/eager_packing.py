@@ -13,8 +13,11 @@ from torch import Tensor
 
 from dolens.kernels.operators import kernels_of
 from dolens.optics.lens_numbers import LaidOut
-from dolens.optics.packing import record_values
+from dolens.optics.packing import record_indices, record_values
 from dolens.optics.records import Records
+
+# So many wavelengths' indices are kept.
+_WAVELENGTHS = 64
 
 
 class _Fixed(NamedTuple):
@@ -37,12 +40,11 @@ def _in_precision(layout: Records, dtype: np.dtype) -> _Fixed:
     )
 
 
-@torch.no_grad()
 def eager_values(found: LaidOut) -> Tensor:
     """Return what `record_values` does, without a graph."""
     numbers = kernels_of(found.scalars[0]).read(found.scalars)
     if numbers is None:
-        return record_values(found.layout, found.scalars, found.arrays)
+        return record_values(found.layout, found.scalars, found.arrays).detach()
     if found.arrays:
         parts = (array.detach().reshape(-1).numpy() for array in found.arrays)
         numbers = np.concatenate([numbers, *(part.astype(numbers.dtype) for part in parts)])
@@ -52,10 +54,24 @@ def eager_values(found: LaidOut) -> Tensor:
     return torch.from_numpy(values)
 
 
-def eager_cotangents(layout: Records, of_values: Tensor, count: int) -> Tensor:
-    """Return what `cotangents_of_numbers` does, of cotangents without a graph."""
-    given = of_values.numpy()
-    fixed = _in_precision(layout, given.dtype)
-    found = np.zeros(count, given.dtype)
-    np.add.at(found, fixed.sources, given[fixed.places] * fixed.signs)
+def eager_cotangents(layout: Records, of_values: np.ndarray, count: int) -> Tensor:
+    """Return what `cotangents_of_numbers` does."""
+    fixed = _in_precision(layout, of_values.dtype)
+    found = np.zeros(count, of_values.dtype)
+    np.add.at(found, fixed.sources, of_values[fixed.places] * fixed.signs)
     return torch.from_numpy(found)
+
+
+def eager_indices(found: LaidOut, wavelength: float | Tensor) -> Tensor:
+    """Return what `record_indices` does; of a number a tensor that is kept, not to be written to."""
+    if isinstance(wavelength, Tensor):
+        return record_indices(found, wavelength, found.scalars[0].device)
+    known = found.indices.get(wavelength)
+    if known is None:
+        if len(found.indices) >= _WAVELENGTHS:
+            found.indices.clear()
+        # A tensor made in inference mode could never be saved for a backward pass.
+        with torch.inference_mode(False):
+            known = record_indices(found, wavelength, found.scalars[0].device)
+        found.indices[wavelength] = known
+    return known

@@ -15,7 +15,7 @@ from dolens.kernels import operators
 from dolens.kernels.eager import is_eager
 from dolens.kernels.operators import kernels_of
 from dolens.kernels.table import SurfaceTable
-from dolens.optics.eager_packing import eager_cotangents, eager_values
+from dolens.optics.eager_packing import eager_cotangents, eager_indices, eager_values
 from dolens.optics.lens_numbers import LaidOut
 from dolens.optics.packing import cotangents_of_numbers, record_indices, record_values
 
@@ -43,7 +43,7 @@ def trace_eagerly(
         direction: (N, 3), unit vectors.
         which: (N,), int32: each ray's wavelength, or None where there is one.
     """
-    indices = record_indices(found, wavelength, position.device)
+    indices = eager_indices(found, wavelength)
     inputs = (indices, position, direction, *found.scalars, *found.arrays)
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
         return _Trace.apply(found, which, *inputs)
@@ -99,32 +99,29 @@ class _Trace(torch.autograd.Function):
         found, numbers = ctx.found, ctx.numbers
         wanted = (needs[3], needs[4], needs[2])
         layout = found.layout
+        rays = (position, direction, which)
+        count = sum(map(Tensor.numel, numbers))
         if is_eager(given) and not torch.is_grad_enabled():
             table = SurfaceTable(values, indices, layout.codes, layout.extras)
-            of_position, of_direction, of_values, of_indices = kernels_of(position).trace_adjoint(
-                table, position, direction, which, status, cotangents, wanted
+            of_position, of_direction, summed, of_waves = kernels_of(position).sweep(
+                table, *rays, status, cotangents, wanted
             )
-            to_numbers = eager_cotangents
+            flat = eager_cotangents(layout, summed, count) if any(needs[5:]) else None
+            of_indices = torch.from_numpy(of_waves) if wanted[2] else None
         else:
             # The gradient's own graph: its operator says that it has no derivative.
-            count = len(found.scalars)
+            scalars = len(found.scalars)
             of_values, of_indices, of_position, of_direction = operators.trace_adjoint(
-                record_values(layout, numbers[:count], numbers[count:]),
-                *(indices, position, direction, which, layout.codes, layout.extras, status),
-                *(*cotangents, list(wanted)),
+                record_values(layout, numbers[:scalars], numbers[scalars:]),
+                *(indices, *rays, layout.codes, layout.extras, status, *cotangents, list(wanted)),
             )
-            to_numbers = cotangents_of_numbers
-        of_numbers: Sequence[Tensor | None] = [None] * len(numbers)
-        if any(needs[5:]):
-            count = sum(map(Tensor.numel, numbers))
-            of_numbers = _split(to_numbers(layout, of_values, count), found)
+            flat = cotangents_of_numbers(layout, of_values, count)
         return (
-            None,
-            None,
+            *(None, None),
             of_indices if wanted[2] else None,
             of_position if wanted[0] else None,
             of_direction if wanted[1] else None,
-            *of_numbers,
+            *((None,) * len(numbers) if flat is None else _split(flat, found)),
         )
 
 

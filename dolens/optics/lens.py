@@ -297,6 +297,8 @@ class Lens(LensRays, LensViews, InStates, nn.Module):
         return self.system().global_axes()
 
     def _check_range(self, first: int, last: int | None) -> None:
+        if first == 1 and last is None:
+            return
         count = len(self.surfaces)
         if not 1 <= first <= (count if last is None else last) <= count:
             raise InputError(

@@ -1,7 +1,7 @@
 """A lens's numbers stand in an order that its structure gives."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -25,12 +25,14 @@ class LaidOut:
         scalars: tensors of no dimension.
         arrays: further tensors, of any shape.
         media: of the rows of indices.
+        indices: of some wavelengths, nm, as they were asked for; see `record_indices`.
     """
 
     layout: Records
     scalars: tuple[Tensor, ...]
     arrays: tuple[Tensor, ...]
     media: tuple[Medium, ...]
+    indices: dict[float, Tensor] = field(default_factory=dict)
 
 
 def lay_out(system: OpticalSystem, sense: float, first: int, last: int, to_sensor: bool) -> LaidOut:

@@ -66,7 +66,7 @@ def trace_rays(
         ends = (position.reshape(*shape, 3), direction.reshape(*shape, 3))
         traced = (*ends, *(other.reshape(shape) for other in others))
     position, direction, path, status, surface = traced
-    valid = status == 0
+    valid = status.logical_not()  # of OK, which is zero, in half the time of a comparison
     if before is not None:
         path = torch.where(valid, path + before, path + before.detach())
     return TracedRays(position, direction, valid, status, surface, path)

@@ -1,5 +1,6 @@
 """These functions run the CPU kernels on tensors."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -7,7 +8,7 @@ from dolens.kernels.cpu import jobs
 from dolens.kernels.cpu.adjoint import adjoint_driver
 from dolens.kernels.cpu.forward import forward_driver
 from dolens.kernels.cpu.layout import BLOCK
-from dolens.kernels.cpu.program import Program
+from dolens.kernels.cpu.program import REAL, Program
 from dolens.kernels.cpu.stored_numbers import read as read
 from dolens.kernels.table import SurfaceTable
 
@@ -63,6 +64,28 @@ def trace_adjoint(
     cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
     wanted: tuple[bool, bool, bool],
 ) -> tuple[Tensor | None, Tensor | None, Tensor, Tensor]:
+    """Return the cotangents of rays and table; the arguments are those of `sweep`.
+
+    Returns:
+        Gradients of position and direction (None where not wanted), of `values` and of `indices`
+        (zeros where not wanted).
+    """
+    *of_rays, of_values, of_indices = sweep(
+        table, position, direction, which, status, cotangents, wanted
+    )
+    values, indices = torch.from_numpy(of_values.copy()), torch.from_numpy(of_indices.copy())
+    return of_rays[0], of_rays[1], values, indices
+
+
+def sweep(
+    table: SurfaceTable,
+    position: Tensor,
+    direction: Tensor,
+    which: Tensor | None,
+    status: Tensor,
+    cotangents: tuple[Tensor | None, Tensor | None, Tensor | None],
+    wanted: tuple[bool, bool, bool],
+) -> tuple[Tensor | None, Tensor | None, np.ndarray, np.ndarray]:
     """Return the cotangents of rays and table from those of position, direction and path length.
 
     Args:
@@ -75,22 +98,23 @@ def trace_adjoint(
         wanted: whether gradients of position, direction and indices are needed.
 
     Returns:
-        Gradients of position and direction (None where not wanted), of `values` and of `indices`
-        (zeros where not wanted); the latter two may share memory.
+        Gradients of position and direction (None where not wanted), and arrays of those of
+        `values` and of `indices` (zeros where not wanted), which may share memory.
     """
     count = position.shape[0]
     gradients = [
         torch.zeros(count, 3, dtype=position.dtype) if want else None for want in wanted[:2]
     ]
-    length = table.values.numel() + table.indices.numel()
+    cut = table.values.numel()
+    length = cut + table.indices.numel()
     chunk = chunk_size(count)
     chunks = -(-count // chunk)
-    sums = torch.zeros((chunks, length), dtype=torch.float64)
+    sums = np.zeros((chunks, length))
     if count:
         program = Program(table, derivatives=True)
         program.set_rays(position, direction, which)
         job = program.job
-        job[jobs.OUT_STATUS], job[jobs.SUMS] = status.data_ptr(), sums.data_ptr()
+        job[jobs.OUT_STATUS], job[jobs.SUMS] = status.data_ptr(), sums.ctypes.data
         for place, gradient in zip(_RAY_GRADIENTS, gradients, strict=True):
             job[place] = 0 if gradient is None else gradient.data_ptr()
         job[jobs.SUM_LENGTH], job[jobs.CHUNK] = length, chunk
@@ -105,10 +129,7 @@ def trace_adjoint(
                 job[place] = tensor.data_ptr()
                 job[place + 1 : place + 1 + tensor.dim()] = tensor.stride()
         program.run(adjoint_driver, chunks)
-    total, cut = sums[0] if chunks == 1 else sums.sum(0), table.values.numel()
-    return (
-        gradients[0],
-        gradients[1],
-        total[:cut].to(table.values.dtype),
-        total[cut:].reshape(table.indices.shape),
-    )
+    # PyTorch's sum, which adds pairwise.
+    total = sums[0] if chunks == 1 else torch.from_numpy(sums).sum(0).numpy()
+    of_values = total[:cut].astype(REAL[table.values.dtype], copy=False)
+    return gradients[0], gradients[1], of_values, total[cut:].reshape(table.indices.shape)
