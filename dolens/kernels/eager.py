@@ -12,9 +12,10 @@ _PLAIN = frozenset((Tensor, nn.Parameter))
 def is_eager(tensors: Iterable[Tensor]) -> bool:
     """Return whether operations on these tensors run at once, and for autograd at most.
 
-    Otherwise a compiler, a tracer, a mode, a transform of torch.func or a subclass of tensors looks
-    on, and must see operators.
+    Otherwise a compiler, a tracer, a mode, a transform of torch.func, a batch of gradients or a
+    subclass of tensors looks on, and must see operators.
     """
+    tensors = tuple(tensors)
     return not (
         torch.compiler.is_compiling()
         or torch._C._is_tracing()
@@ -22,4 +23,5 @@ def is_eager(tensors: Iterable[Tensor]) -> bool:
         or torch._C._functorch.peek_interpreter_stack() is not None
         or forward_ad._current_level >= 0
         or not _PLAIN.issuperset(map(type, tensors))
+        or any(map(torch._C._functorch.is_legacy_batchedtensor, tensors))
     )
