@@ -84,7 +84,8 @@ class LensFamily:
 
     Args:
         lens: gives the structure, and all that is no variable.  Its apertures clip rays.
-        names: of its parameters, or patterns, as `Lens.variables` takes them.
+        names: of its parameters, or patterns, as `Lens.variables` takes them; columns come in the
+            order of these.
         wavelengths: nm.
 
     Raises:
@@ -92,7 +93,9 @@ class LensFamily:
     """
 
     def __init__(self, lens: Lens, names: Sequence[str], wavelengths: Sequence[float]) -> None:
-        parameters = lens.variables(names)
+        parameters: dict[str, Tensor] = {}
+        for name in names:
+            parameters |= {n: p for n, p in lens.variables([name]).items() if n not in parameters}
         self.lens = lens
         self.wavelengths = tuple(float(w) for w in wavelengths)
         self.columns: dict[str, slice] = {}
