@@ -1,0 +1,1 @@
+"""This package finds lenses from a specification, and tells which of them are different forms."""
