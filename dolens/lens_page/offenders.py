@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+
 from dolens.analysis.conditions import Conditions
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError, check_keys
