@@ -1,1 +1,1 @@
-"""This package finds lenses from a specification, and tells which of them are different forms."""
+"""The search for lenses begins with a specification and ends with a set of different forms."""
