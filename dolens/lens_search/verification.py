@@ -11,6 +11,7 @@ from dolens.analysis.parabasal import parabasal_rays
 from dolens.analysis.rms_curves import rms_against_field
 from dolens.errors import InputError
 from dolens.lens_search.real_beams import FIELDS, RAYS, RealBeams, Space, real_beams, spaces
+from dolens.lens_search.requirements import Requirements
 from dolens.optics.lens import Lens
 
 # What rounding may take from a limit, as a share of it, or of 1 mm, 1° or 1 %.
@@ -18,50 +19,13 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Says what a lens must keep; None leaves a quantity without a limit.
-
-    Attributes:
-        focal_length: mm.
-        focal_length_error: the share by which the focal length may be off.
-        f_number: of the real marginal ray, 1/(2·sin u').
-        f_number_error: the share by which it may be off.
-        total_track: mm, at most, from the first vertex to the sensor.
-        back_focus: mm, at least, from the last vertex to the sensor.
-        glass_centre: mm, least and largest thickness of glass on the axis.
-        glass_edge: mm, the least thickness of glass at its edge.
-        air_centre: mm, least and largest air space on the axis.
-        air_edge: mm, the least air space out to the edge.
-        distortion: per cent of f·tan θ, at most, either way.
-        chief_ray_angle: degrees to the axis at the sensor, at most.
-        vignetting: the share of a field's light that may be clipped.
-        rms_spot_um: µm, of any field from the axis to the edge.
-    """
-
-    focal_length: float | None = None
-    focal_length_error: float = 0.01
-    f_number: float | None = None
-    f_number_error: float = 0.02
-    total_track: float | None = None
-    back_focus: float | None = None
-    glass_centre: tuple[float | None, float | None] = (0.0, None)
-    glass_edge: float | None = 0.0
-    air_centre: tuple[float | None, float | None] = (0.0, None)
-    air_edge: float | None = 0.0
-    distortion: float | None = None
-    chief_ray_angle: float | None = None
-    vignetting: float | None = 0.0
-    rms_spot_um: float | None = None
-
-
-@dataclass(frozen=True)
 class Check:
-    """A `Check` is one quantity of a lens beside its limits.
+    """A `Check` is one quantity of a lens beside its required.
 
     Attributes:
         name: of the quantity.
         value: NaN where it cannot be computed.
-        unit: of the value and its limits.
+        unit: of the value and its required.
         least: None for no limit.
         most: None for no limit.
         place: where the value is found: a field, or numbers of surfaces; may be empty.
@@ -126,8 +90,10 @@ class Verification:
 
 
 @torch.no_grad()
-def verify(lens: Lens, limits: Limits, fields: int = FIELDS, rays: int = RAYS) -> Verification:
-    """Trace the whole field of a lens and compare what is found with its limits.
+def verify(
+    lens: Lens, required: Requirements, fields: int = FIELDS, rays: int = RAYS
+) -> Verification:
+    """Trace the whole field of a lens and compare what is found with its required.
 
     Rays of every wavelength of the lens cross the physical stop everywhere, from fields between the
     axis and the edge; they are aimed at the stop one field at a time, whatever the pupil's
@@ -135,7 +101,7 @@ def verify(lens: Lens, limits: Limits, fields: int = FIELDS, rays: int = RAYS) -
 
     Args:
         lens: centred, in double precision, with stop, fields and wavelengths.
-        limits: what it must keep.
+        required: what it must keep.
         fields: how many, from the axis to the edge.
         rays: of each field and wavelength, a multiple of four.
 
@@ -145,16 +111,18 @@ def verify(lens: Lens, limits: Limits, fields: int = FIELDS, rays: int = RAYS) -
     where = conditions(lens)
     beams = real_beams(lens, fields, rays)
     checks = [
-        *_first_order(lens, where, limits, beams),
-        *_thicknesses(spaces(lens, beams.heights), limits),
+        *_first_order(lens, where, required, beams),
+        *_thicknesses(spaces(lens, beams.heights), required),
         _crossing(lens, beams),
-        *_light(beams, limits),
-        *_image(lens, where, limits, beams, rays),
+        *_light(beams, required),
+        *_image(lens, where, required, beams, rays),
     ]
     return Verification(tuple(checks), beams)
 
 
-def _first_order(lens: Lens, where: Conditions, limits: Limits, beams: RealBeams) -> list[Check]:
+def _first_order(
+    lens: Lens, where: Conditions, required: Requirements, beams: RealBeams
+) -> list[Check]:
     first = lens.first_order(where.reference_wavelength, where.object_distance)
     vertices = lens.system().vertices
     behind = float(lens.materials[-1].index(where.reference_wavelength))
@@ -162,20 +130,24 @@ def _first_order(lens: Lens, where: Conditions, limits: Limits, beams: RealBeams
     number = 0.5 / sine if sine > 0.0 else math.nan
     return [
         _about(
-            "focal length", float(first.efl), "mm", limits.focal_length, limits.focal_length_error
+            "focal length",
+            float(first.efl),
+            "mm",
+            required.focal_length,
+            required.focal_length_error,
         ),
-        _about("F-number", number, "", limits.f_number, limits.f_number_error),
-        Check("total track", float(vertices[-1]), "mm", most=limits.total_track),
-        Check("back focus", float(lens.sensor_distance), "mm", least=limits.back_focus),
+        _about("F-number", number, "", required.f_number, required.f_number_error),
+        Check("total track", float(vertices[-1]), "mm", most=required.total_track),
+        Check("back focus", float(lens.sensor_distance), "mm", least=required.back_focus),
     ]
 
 
-def _thicknesses(found: Sequence[Space], limits: Limits) -> list[Check]:
+def _thicknesses(found: Sequence[Space], required: Requirements) -> list[Check]:
     """Return the thinnest and thickest of glass and air, with the surfaces between which it is."""
     checks = []
     for kind, centre, edge in (
-        ("glass", limits.glass_centre, limits.glass_edge),
-        ("air", limits.air_centre, limits.air_edge),
+        ("glass", required.glass_centre, required.glass_edge),
+        ("air", required.air_centre, required.air_edge),
     ):
         alike = [space for space in found if space.glass == (kind == "glass")]
         if not alike:
@@ -205,11 +177,11 @@ def _crossing(lens: Lens, beams: RealBeams) -> Check:
     return Check("shortest way between surfaces", value, "mm", least=0.0, place=behind)
 
 
-def _light(beams: RealBeams, limits: Limits) -> list[Check]:
+def _light(beams: RealBeams, required: Requirements) -> list[Check]:
     checks = []
     for name, shares, most in (
         ("rays that fail", beams.failed, 0.0),
-        ("vignetting", beams.vignetted, limits.vignetting),
+        ("vignetting", beams.vignetted, required.vignetting),
     ):
         at = int(shares.argmax())
         place = _field(beams, at) if float(shares[at]) > 0.0 else ""
@@ -219,7 +191,7 @@ def _light(beams: RealBeams, limits: Limits) -> list[Check]:
 
 
 def _image(
-    lens: Lens, where: Conditions, limits: Limits, beams: RealBeams, rays: int
+    lens: Lens, where: Conditions, required: Requirements, beams: RealBeams, rays: int
 ) -> list[Check]:
     scan, distance = beams.scan, where.object_distance
     first = lens.first_order(where.reference_wavelength, distance)
@@ -242,9 +214,9 @@ def _image(
         where.weights.tolist(),
     )
     rows = (
-        ("distortion", distortion, "%", limits.distortion),
-        ("chief-ray angle", angle, "°", limits.chief_ray_angle),
-        ("largest RMS spot", 1e3 * spots.polychromatic, "µm", limits.rms_spot_um),
+        ("distortion", distortion, "%", required.distortion),
+        ("chief-ray angle", angle, "°", required.chief_ray_angle),
+        ("largest RMS spot", 1e3 * spots.polychromatic, "µm", required.rms_spot_um),
     )
     checks = []
     for name, values, unit, most in rows:

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from dolens.errors import InputError
+from dolens.plotting.legends import legend_below
 from dolens.plotting.style import PALETTE, SMALL, ruled_axes
 from dolens.plotting.ticks import log_ticks
 from dolens.plotting.titles import draw_axes_title
@@ -66,7 +67,6 @@ def search_course_figure(
     else:
         upper.set_ylim(best[-1] - 0.08 * (max(near) - best[-1] or best[-1]), None)
     upper.set_ylabel(merit_label, fontsize=SMALL + 1)
-    upper.legend(frameon=False, fontsize=SMALL, loc="upper right", ncols=2, borderaxespad=0.0)
     lower.step([*seconds, last], [*forms, forms[-1]], where="post", color=PALETTE[0], linewidth=1.4)
     lower.yaxis.set_major_locator(MaxNLocator(integer=True))
     lower.set_ylim(0.0, 1.1 * max(*forms, 1))
@@ -76,5 +76,7 @@ def search_course_figure(
     ruled_axes(upper)
     ruled_axes(lower)
     figure.align_ylabels()
+    handles, names = upper.get_legend_handles_labels()
+    legend_below(figure, handles, 2, names)
     draw_axes_title(upper, title)
     return figure

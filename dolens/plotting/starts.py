@@ -13,7 +13,7 @@ from dolens.plotting.titles import draw_title
 
 # Forms with a colour of their own; the others share one.
 _OWN = len(PALETTE) - 1
-_OTHERS, _NONE = "0.55", "0.86"
+_OTHERS, _NONE = "0.68", "0.87"
 # The span of the map: this share of the points, so that a few strays do not squeeze all others.
 _SHARE, _ROOM = 0.99, 0.12
 
@@ -59,18 +59,24 @@ def _look(form: int) -> tuple[str, str]:
 
 
 def _draw_map(axes: Axes, points: np.ndarray, reached: np.ndarray, labels: tuple[str, str]) -> None:
-    # The best forms lie on top.
-    for form in sorted(set(np.minimum(reached, _OWN).tolist()), key=lambda n: n if n >= 0 else 99)[
-        ::-1
-    ]:
-        chosen = reached >= _OWN if form == _OWN else reached == form
-        colour, marker = _look(form)
-        size = 8.0 if form < 0 else 20.0
-        axes.scatter(*points[chosen].T, s=size, color=colour, marker=marker, linewidths=0.0)
-    for axis, values in ((axes.set_xlim, points[:, 0]), (axes.set_ylim, points[:, 1])):
+    limits = []
+    for values in points.T:
         low, high = np.quantile(values, [0.5 * (1.0 - _SHARE), 0.5 * (1.0 + _SHARE)])
         room = _ROOM * max(high - low, 1e-12)
-        axis(low - room, high + room)
+        limits.append((low - room, high + room))
+    lows, highs = np.array(limits).T
+    inside = ((points > lows) & (points < highs)).all(1)
+    # The best forms lie on top, and what led nowhere below all.
+    for form in (-1, *range(_OWN, -1, -1)):
+        chosen = inside & (reached >= _OWN if form == _OWN else reached == form)
+        colour, marker = _look(form)
+        size = 20.0 if 0 <= form < _OWN else 7.0
+        axes.scatter(*points[chosen].T, s=size, color=colour, marker=marker, linewidths=0.0)
+    axes.set(xlim=limits[0], ylim=limits[1])
+    outside = int((~inside).sum())
+    if outside:
+        text = f"{outside} start{'s' * (outside > 1)} farther out"
+        axes.set_title(text, fontsize=SMALL - 1, color="0.4", loc="right", pad=3.0)
     axes.set_xlabel(labels[0], fontsize=SMALL + 1)
     axes.set_ylabel(labels[1], fontsize=SMALL + 1)
     ruled_axes(axes)
@@ -78,31 +84,24 @@ def _draw_map(axes: Axes, points: np.ndarray, reached: np.ndarray, labels: tuple
 
 def _draw_counts(axes: Axes, reached: np.ndarray, tried: int) -> None:
     """Draw a bar for each form, as long as the starts that led there."""
-    rows = [
-        (f"form {n + 1}", int((reached == n).sum()), n) for n in range(_OWN) if (reached == n).any()
-    ]
-    others = int((reached >= _OWN).sum())
-    if others:
-        kinds = len(set(reached[reached >= _OWN].tolist()))
-        rows.append((f"{kinds} other{'s' * (kinds > 1)}", others, _OWN))
+    own = [n for n in range(_OWN) if bool((reached == n).any())]
+    rows = [(f"form {n + 1}", int((reached == n).sum()), n) for n in own]
+    others = reached[reached >= _OWN]
+    if len(others):
+        kinds = len(set(others.tolist()))
+        rows.append((f"{kinds} other{'s' * (kinds > 1)}", len(others), _OWN))
+    longest = max((count for _, count, _ in rows), default=1)
     rows.append(("no design", tried - int((reached >= 0).sum()), -1))
-    longest = max(count for name, count, _ in rows if name != "no design") if len(rows) > 1 else 1
-    for place, (name, count, form) in enumerate(rows):
+    for place, (_, count, form) in enumerate(rows):
         colour, marker = _look(form)
-        # What led nowhere is a number: a bar would dwarf all others.
+        # What led nowhere dwarfs all others: its bar is cut, and its number says how long it is.
         length = min(count, 1.18 * longest)
         axes.barh(place, length, height=0.62, color=colour)
-        axes.text(
-            min(count, longest) + 0.03 * longest if form >= 0 else length + 0.03 * longest,
-            place,
-            f"{count}",
-            fontsize=SMALL,
-            va="center",
-        )
+        axes.text(length + 0.04 * longest, place, f"{count}", fontsize=SMALL, va="center")
         axes.plot(-0.07 * longest, place, marker=marker, color=colour, markersize=5, clip_on=False)
     axes.set_yticks(range(len(rows)), [name for name, _, _ in rows], fontsize=SMALL)
     axes.tick_params(axis="y", length=0, pad=14)
-    axes.set_xlim(0.0, 1.5 * longest)
+    axes.set_xlim(0.0, 1.55 * longest)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=4))
     axes.set_xlabel("starts (number)", fontsize=SMALL + 1)
