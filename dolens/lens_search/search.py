@@ -58,6 +58,7 @@ class SearchPlan:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "stages", tuple(self.stages))
         for name in ("starts", "batch", "finish_rounds", "finish_iterations", "rings", "arms"):
             if getattr(self, name) < 1:
                 raise InputError(f"plan.{name} must be 1 or more, not {getattr(self, name)}")
@@ -173,8 +174,6 @@ def search(
     for step in map_tasks(grown, start_tasks(specification, plan), "batches of starts"):
         pool = with_step(pool, step, specification, plan)
         yield step
-    used: set[tuple[Arrangement, int]] = set()
-    del used
     if len(set(specification.element_glasses)) > 1 or specification.elements < 2:
         # An element that is taken out takes its glass with it.
         return
