@@ -4,7 +4,7 @@ Variables u are curvatures times the focal length f, and gaps and the sensor's d
 that one is like the other.  The merit is Σ_fields ω·(RMS spot/f)² + Σ (weight·deviation)².
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -20,6 +20,11 @@ from dolens.optics.lens_family import FamilyRays, FamilySums, LensFamily
 from dolens.optimize.batch_least_squares import BatchModel
 
 
+# Of a relative deviation, beside an RMS spot over the focal length.  A step along a constraint's
+# curved surface leaves it by the step's square: weights near one leave steps no room.
+OPERAND_WEIGHT = 0.03
+
+
 @dataclass(frozen=True)
 class Conditions:
     """What a lens is asked at some stage of its growth.
@@ -28,15 +33,23 @@ class Conditions:
         f_number: (L,).
         field: (L,), factor of the tangents of the field angles.
         field_weights: (L, F), ω.
+        shifts: (L, O), added to the deviations of operands: the multipliers of the augmented
+            Lagrangian over twice the weight, which let operands hold exactly at a small weight.
     """
 
     f_number: Tensor
     field: Tensor
     field_weights: Tensor
+    shifts: Tensor
 
     def chosen(self, which: Tensor) -> "Conditions":
         """Return those of some lenses."""
-        return Conditions(self.f_number[which], self.field[which], self.field_weights[which])
+        return Conditions(
+            self.f_number[which],
+            self.field[which],
+            self.field_weights[which],
+            self.shifts[which],
+        )
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,7 @@ class SearchMerit:
     arrangement: Arrangement
     specification: Specification
     rays: SearchRays
-    operand_weight: float = 1.0
+    operand_weight: float = OPERAND_WEIGHT
 
     @staticmethod
     def of(
@@ -61,6 +74,12 @@ class SearchMerit:
     ) -> "SearchMerit":
         """Return the merit with rays of that many rings and arms."""
         return SearchMerit(arrangement, specification, search_rays(specification, rings, arms))
+
+    def sampled(self, rings: int, arms: int) -> "SearchMerit":
+        """Return the same with other rays."""
+        other = replace(self, rays=search_rays(self.specification, rings, arms))
+        other.__dict__["family"] = self.family
+        return other
 
     @cached_property
     def family(self) -> LensFamily:
@@ -87,7 +106,26 @@ class SearchMerit:
             torch.full((lenses,), self.specification.f_number, dtype=torch.float64),
             torch.ones(lenses, dtype=torch.float64),
             torch.full((lenses, fields), 1.0 / fields, dtype=torch.float64),
+            torch.zeros((lenses, self.operands), dtype=torch.float64),
         )
+
+    @cached_property
+    def operands(self) -> int:
+        """Return the number O of operands."""
+        return len(self.is_limit)
+
+    @cached_property
+    def is_limit(self) -> Tensor:
+        """Return which operands are limits, (O,), bool; the others are to be zero."""
+        u = torch.ones((1, self.arrangement.variables), dtype=torch.float64)
+        one = torch.ones(1, dtype=torch.float64)
+        _, _, limits = self._paraxial_operands(u, one, one)
+        return torch.tensor([*limits, *([True] * self._distortions)])
+
+    @property
+    def _distortions(self) -> int:
+        """Return the number of operands that hold the distortion."""
+        return 0 if self.specification.limits.distortion is None else self.rays.fields - 1
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Return the box of the variables u, (P,) each."""
@@ -123,14 +161,37 @@ class SearchMerit:
         """Return power, entrance pupil, back focus and Petzval sum of lenses u (L, P), times or
         over f.
         """
-        found = paraxial(self.arrangement, numbers_of(self.arrangement, u.unbind(-1), list(self.indices)))
-        return found.power, found.entrance_pupil, found.back_focus, found.petzval
+        numbers = numbers_of(self.arrangement, u.unbind(-1), list(self.indices))
+        found = paraxial(self.arrangement, numbers)
+        pupil = found.entrance_pupil + torch.zeros_like(found.power)
+        return found.power, pupil, found.back_focus, found.petzval
 
     def evaluate(self, u: Tensor, conditions: Conditions) -> BatchModel:
         """Return the models of lenses u (L, P), in units of f; without a merit where a ray fails."""
+        found = self._evaluate(u, conditions)
         f, surfaces = self.specification.focal_length, self.arrangement.surfaces
-        first_order, of_first_order = self._paraxial_operands(u, conditions)
-        pupil, of_pupil = first_order[0], of_first_order[0]
+        shifted = found.deviations + conditions.shifts
+        shifted = torch.where(self.is_limit, shifted.clamp(min=0.0), shifted)
+        rows = torch.where((shifted != 0.0)[..., None], found.derivatives, 0.0)
+        spots = _in_variables(_about_centroids(found.sums), found.of_pupil, f, surfaces)
+        weight = self.operand_weight**2
+        merit = spots.merit / f**2 + weight * shifted.square().sum(-1)
+        return BatchModel(
+            torch.where(found.usable, merit, torch.inf),
+            spots.gradient / f**2 + weight * torch.einsum("lo,lop->lp", shifted, rows),
+            spots.hessian / f**2 + weight * (rows.mT @ rows),
+        )
+
+    def deviations(self, u: Tensor, conditions: Conditions) -> Tensor:
+        """Return the deviations of operands (L, O), relative or over f; see `is_limit`."""
+        return self._evaluate(u, conditions).deviations
+
+    def _evaluate(self, u: Tensor, conditions: Conditions) -> "_Evaluated":
+        f = self.specification.focal_length
+        first_order, of_first_order, _ = self._paraxial_operands(
+            u, 0.5 / conditions.f_number, conditions.field * self.rays.tangent.max()
+        )
+        pupil, of_pupil = first_order[:, 0], of_first_order[:, 0]
         rays, tangent = self._launched(conditions)
         by_group = torch.nn.functional.pad(
             conditions.field_weights, (0, self.rays.fields - 1), value=1.0
@@ -143,28 +204,20 @@ class SearchMerit:
             self.rays.group,
             self.rays.groups,
         )
-        deviations, rows = [first_order[1:]], [of_first_order[1:]]
+        deviations, rows = [first_order[:, 1:]], [of_first_order[:, 1:]]
         limit = self.specification.limits.distortion
-        if limit is not None and self.rays.fields > 1:
+        if limit is not None and self._distortions:
             deviation, row = self._distortion(sums, tangent, of_pupil, limit)
             deviations.append(deviation)
             rows.append(row)
-        deviation, row = torch.cat(deviations), torch.cat(rows)
-        spots = _in_variables(_about_centroids(sums), of_pupil, f, surfaces)
-        weight = self.operand_weight**2
-        merit = spots.merit / f**2 + weight * deviation.square().sum(0)
         usable = (sums.count == tangent.shape[1]) & torch.isfinite(pupil)
-        return BatchModel(
-            torch.where(usable, merit, torch.inf),
-            spots.gradient / f**2 + weight * torch.einsum("ol,olp->lp", deviation, row),
-            spots.hessian / f**2 + weight * torch.einsum("olp,olq->lpq", row, row),
-        )
+        return _Evaluated(sums, torch.cat(deviations, 1), torch.cat(rows, 1), of_pupil, usable)
 
     def spots(self, u: Tensor, conditions: Conditions) -> Tensor:
         """Return the RMS spot radii (L, F), mm, about their centroids; infinite where a ray fails."""
-        first_order, _ = self._paraxial_operands(u, conditions)
+        pupil = self.paraxial_of(u)[1]
         rays, tangent = self._launched(conditions)
-        hit = self.family.trace(self.lens_values(u, first_order[0]), rays)
+        hit = self.family.trace(self.lens_values(u, pupil), rays)
         ideal = self.specification.focal_length * tangent
         found = []
         for field in range(self.rays.fields):
@@ -183,35 +236,45 @@ class SearchMerit:
         position, direction, tangent = launched(self.rays, radius, conditions.field)
         return FamilyRays(position, direction, self.rays.wavelength), tangent
 
-    def _paraxial_operands(self, u: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
-        """Return the entrance pupil and the operands that follow, (1 + O, L), and derivatives."""
-        radius = 0.5 / conditions.f_number
-        field = conditions.field * self.rays.tangent.max()
+    def _paraxial_operands(
+        self, u: Tensor, radius: Tensor, field: Tensor
+    ) -> tuple[Tensor, Tensor, list[bool]]:
+        """Return the entrance pupil's place and the paraxial operands (L, 1 + O), their derivatives
+        (L, 1 + O, P), and which operands are limits.
+        """
         numbers = numbers_of(self.arrangement, Tangents.variables(u), list(self.indices))
         first_order = paraxial(self.arrangement, numbers)
-        operands = paraxial_operands(
+        operands, limits = paraxial_operands(
             self.arrangement, self.specification, numbers, first_order, radius, field
         )
         pupil = first_order.entrance_pupil
         if not isinstance(pupil, Tangents):  # the stop is the first of the sequence
             pupil = 0.0 * numbers.image
         rows = torch.stack([operand.rows for operand in (pupil, *operands)])
-        return rows[:, 0], rows[:, 1:].mT
+        return rows[:, 0].T, rows[:, 1:].permute(2, 0, 1), limits
 
     def _distortion(
         self, sums: FamilySums, tangent: Tensor, of_pupil: Tensor, limit: float
     ) -> tuple[Tensor, Tensor]:
-        """Return excess distortion (F - 1, L) and its derivatives (F - 1, L, P)."""
+        """Return how far distortion exceeds its limit (L, F - 1), and derivatives (L, F - 1, P)."""
         f, s = self.specification.focal_length, self.arrangement.surfaces
         fields = self.rays.fields
-        height = sums.group_residual[:, fields:, 1].T
-        ideal = f * tangent[:, -(fields - 1) :].T
-        share = height / ideal
-        over = share.abs() - limit
-        row = sums.group_jacobian[:, fields:, 1].movedim(1, 0) / ideal[..., None]
-        row = _row_in_variables(row, of_pupil, f, s)
-        sign = torch.where(over > 0.0, share.sign(), 0.0)
-        return over.clamp(min=0.0), sign[..., None] * row
+        ideal = f * tangent[:, -(fields - 1) :]
+        share = sums.group_residual[:, fields:, 1] / ideal
+        row = sums.group_jacobian[:, fields:, 1] / ideal[..., None]
+        row = _row_in_variables(row, of_pupil[:, None], f, s)
+        return share.abs() - limit, share.sign()[..., None] * row
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    """Holds what a model is made of."""
+
+    sums: FamilySums
+    deviations: Tensor
+    derivatives: Tensor
+    of_pupil: Tensor
+    usable: Tensor
 
 
 def _about_centroids(sums: FamilySums) -> BatchModel:

@@ -1,9 +1,9 @@
 """Operands hold lenses of a search to their specification.
 
-Each is zero where the limit is kept.  Lengths are in units of the focal length.
+An operand's deviation is zero where it holds; of a limit it is negative where there is room.  Lengths
+are in units of the focal length.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 
 from torch import Tensor
@@ -24,8 +24,8 @@ def paraxial_operands(
     first_order: Paraxial,
     aperture: Tensor,
     field: Tensor,
-) -> list[Tangents]:
-    """Return the deviations that need no real rays, with their derivatives.
+) -> tuple[list[Tangents], list[bool]]:
+    """Return the deviations that need no real rays, and which of them are limits.
 
     Args:
         arrangement: the order.
@@ -35,28 +35,29 @@ def paraxial_operands(
         aperture: radius of the entrance pupil over the focal length, (L,).
         field: tangent of the greatest field angle, (L,).
     """
-    found = [first_order.power - 1.0]
+    found, is_limit = [first_order.power - 1.0], [False]
     f = specification.focal_length
     limits = specification.limits
     if limits.track is not None:
         # From the first refracting surface: a stop in front of it is no part of the track.
         first = next(i for i, place in enumerate(arrangement.sequence) if place != STOP)
         length = _sum(lenses.gaps[first:]) + lenses.image
-        found.append(_excess(length - limits.track / f))
+        found.append(length - limits.track / f)
     heights = [
         _magnitude(marginal) * aperture + chief.abs() * field
         for marginal, chief in zip(first_order.marginal, first_order.chief, strict=True)
     ]
     for curvature, height in zip(lenses.curvatures, heights, strict=True):
-        found.append(_excess((curvature * height).abs() - limits.aperture_over_radius))
+        found.append((curvature * height).abs() - limits.aperture_over_radius)
     for first, second, medium, thickness in _spaces(arrangement, lenses):
         least = (limits.air_edge if medium == AIR else limits.glass_edge) / f
         height = heights[first].maximum(heights[second])
         edge = thickness + (
             _sag(lenses.curvatures[second], height) - _sag(lenses.curvatures[first], height)
         )
-        found.append(_excess(least - edge))
-    return found
+        found.append(least - edge)
+    is_limit += [True] * (len(found) - 1)
+    return found, is_limit
 
 
 def _spaces(
@@ -79,10 +80,6 @@ def _sum(gaps: Sequence[Tangents]) -> Tangents:
 
 def _magnitude(height: Tangents | float) -> Tangents | float:
     return abs(height) if isinstance(height, float) else height.abs()
-
-
-def _excess(value: Tangents) -> Tangents:
-    return value.clamp(0.0, math.inf)
 
 
 def _sag(curvature: Tangents, height: Tangents) -> Tangents:

@@ -37,6 +37,7 @@ class Paraxial:
         entrance_pupil: from the first of the sequence to the entrance pupil, (L,).
         marginal: heights on the S refracting surfaces of a ray parallel to the axis at height 1.
         chief: heights there of a ray of slope 1 through the middle of the stop.
+        stop_height: height of the first of these rays at the stop.
         petzval: Σ (n' - n)·c/(n·n'), (L,); 0 is a flat field, 1 that of a thin lens with n = 1.
     """
 
@@ -45,6 +46,7 @@ class Paraxial:
     entrance_pupil: Number
     marginal: Sequence[Number]
     chief: Sequence[Number]
+    stop_height: Number
     petzval: Number
 
 
@@ -90,5 +92,6 @@ def paraxial(arrangement: Arrangement, lenses: LensNumbers) -> Paraxial:
         entrance_pupil=-height,
         marginal=[ray.y for ray in met],
         chief=[height * ray.y + ray.y2 for ray in met],
+        stop_height=at_stop.y,
         petzval=petzval,
     )

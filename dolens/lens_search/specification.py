@@ -38,6 +38,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name in ("glass", "air"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
             low, high = getattr(self, name)
             if not 0.0 <= low <= (math.inf if high is None else high):
                 raise InputError(f"limits.{name} must be [least, greatest] in mm, not {low, high}")
@@ -82,6 +83,9 @@ class Specification:
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
+        # Lists, as files give them, become tuples.
+        for name in ("fields", "wavelengths", "groups", "glasses", "stops"):
+            object.__setattr__(self, name, tuple(getattr(self, name) or ()))
         for name in ("focal_length", "f_number"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}")
