@@ -89,8 +89,11 @@ def real_beams(lens: Lens, count: int = FIELDS, rays: int = RAYS) -> RealBeams:
     where = conditions(lens)
     (scan,) = field_scans(lens, where.object_distance, count=count)
     pupil, weight = uniform_pupil_points(rays)
+    # The chief ray weighs nothing, and crosses where surfaces cross on the axis.
+    pupil = torch.cat([pupil.new_zeros(1, 2), pupil])
+    weight = torch.cat([weight.new_zeros(1), weight])
     reference = where.reference_wavelength
-    waves = torch.tensor([*where.wavelengths.tolist()], dtype=torch.float64)
+    waves = where.wavelengths
     launched = launch_through_stop(lens, scan.fields, waves, pupil, where.object_distance)
     hit = trace_rays(system, launched.rays, 1.0, True)
     assert hit.points is not None  # they were recorded
