@@ -139,13 +139,17 @@ def _beams(candidates: Array, rays: PupilRays, part: float, aperture: float):
 
 
 def residuals(
-    candidates: Array, rays: PupilRays = SAMPLE, part: float = 1.0, aperture: float = 1.0
+    candidates: Array,
+    rays: PupilRays = SAMPLE,
+    part: float = 1.0,
+    aperture: float = 1.0,
+    stiffness: float = 1.0,
 ) -> Array:
     """Return rows whose sum of squares a least-squares solver makes small: (lenses, residuals).
 
     The first are transverse aberrations, µm, whose sum of squares is the sum of the squared RMS
-    radii; then the limits: 1 µm for 2 µm of focal length, for 1e-5 of distortion beyond 1 %, for
-    5 µm of a gap or an edge.
+    radii; then the limits, with a stiffness of 1: 1 µm for 20 µm of focal length, for 1e-4 of
+    distortion beyond 0.99 %, for 50 µm of a gap, and of an edge below 5 µm.
     """
     curvature, gap, image, _ = split(candidates)
     traced, distortion = _beams(candidates, rays, part, aperture)
@@ -157,16 +161,21 @@ def residuals(
     focal, _ = first_order(curvature, gap, INDICES)
     inner = np.minimum(traced.height[:, :-1], traced.height[:, 1:])
     edge = np.nan_to_num(gap_at(curvature, gap, inner), nan=-1.0)
+    glass, air = gap[:, ::2], gap[:, 1::2]
     hinge = np.column_stack(
         [
-            1e5 * (np.abs(distortion) - DISTORTION),
-            200.0 * (gap.sum(axis=1) + image - LENGTH),
-            -200.0 * edge,
-            1e4 * traced.lacking,
+            1e4 * (np.abs(distortion) - 0.99 * DISTORTION),
+            20.0 * (gap.sum(axis=1) + image - LENGTH),
+            20.0 * (BACK_FOCUS - image),
+            20.0 * (GLASS[0] - glass),
+            20.0 * (glass - GLASS[1]),
+            20.0 * (AIR - air),
+            20.0 * (0.005 - edge),
+            1e3 * traced.lacking,
         ]
     )
-    apart = 500.0 * (np.clip(focal, -1e4, 1e4) - FOCAL_LENGTH)
-    return np.column_stack([across, along, apart, np.maximum(hinge, 0.0)])
+    apart = stiffness * 50.0 * (np.clip(focal, -1e4, 1e4) - FOCAL_LENGTH)
+    return np.column_stack([across, along, apart, stiffness * np.maximum(hinge, 0.0)])
 
 
 def gap_at(curvature: Array, gap: Array, height: Array) -> Array:
