@@ -1,8 +1,10 @@
 """A search's budget is seconds of one core; what it had found when is kept here."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -68,6 +70,19 @@ class Progress:
             min((merit for spent, _, merit, _ in self.history if spent <= mark), default=np.inf)
             for mark in marks
         ]
+
+    def as_data(self) -> dict[str, Any]:
+        """Return what was found as plain data, for a file."""
+        near, row = self.nearest
+        return {
+            "seconds": self.seconds,
+            "spent": self.spent,
+            "evaluations": self.evaluations,
+            "history": [(s, n, m, list(map(float, x))) for s, n, m, x in self.history],
+            "designs": [(s, m, list(map(float, x))) for s, m, x in self.designs if m < math.inf],
+            "started": len(self.designs),
+            "nearest": None if row is None else [near, list(map(float, row))],
+        }
 
     @property
     def best(self) -> Array | None:
