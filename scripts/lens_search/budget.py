@@ -12,7 +12,7 @@ from lens_search.plain_trace import Array
 from lens_search.quartet import Measured
 
 
-class OutOfTime(Exception):  # noqa: N818
+class OutOfTime(Exception):
     """The seconds are used up."""
 
 

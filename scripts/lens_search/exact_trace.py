@@ -4,14 +4,16 @@ Surfaces are spheres, conics and even aspheres on one axis.  A ray starts in the
 entrance pupil, or is aimed at the stop's own rim by Newton's method.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mpmath import mp
+from mpmath import mp, mpf
 
 from lens_search.plain_lens import PlainLens, entrance_pupil
 from lens_search.plain_trace import PupilRays
 
 mp.dps = 80
+Triple = tuple[mpf, mpf, mpf]
 _SMALL = mp.mpf(10) ** -70
 _STEP = mp.mpf(10) ** -30
 
@@ -20,10 +22,10 @@ _STEP = mp.mpf(10) ** -30
 class Ray:
     """Where a ray meets the image plane and each surface, mm; and its path to each surface."""
 
-    x: mp.mpf
-    y: mp.mpf
-    points: list[tuple[mp.mpf, mp.mpf]]
-    paths: list[mp.mpf]
+    x: mpf
+    y: mpf
+    points: list[tuple[mpf, mpf]]
+    paths: list[mpf]
 
 
 class Fails(ArithmeticError):
@@ -48,7 +50,7 @@ class ExactLens:
         pupil = entrance_pupil(lens, mp.mpf)
         self.pupil, self.diameter, self.focal_length, self.back_focus, self.scale = pupil
 
-    def sag(self, k: int, squared):
+    def sag(self, k: int, squared: mpf) -> tuple[mpf, mpf]:
         """Return the sag at a squared height, and its derivative with respect to it."""
         c, terms = self.curvature[k], self.terms[k]
         inside = 1 - (1 + self.conic[k]) * c * c * squared
@@ -61,7 +63,7 @@ class ExactLens:
             slope += a * (power // 2) * squared ** (power // 2 - 1)
         return value, slope
 
-    def _meet(self, k: int, point, direction):
+    def _meet(self, k: int, point: Triple, direction: Triple) -> mpf:
         """Return the path from a point to surface k."""
         x, y, z = point
         dx, dy, dz = direction
@@ -83,7 +85,7 @@ class ExactLens:
                 return far
         raise Fails
 
-    def trace(self, point, direction, last: int | None = None) -> Ray:
+    def trace(self, point: Triple, direction: Triple, last: int | None = None) -> Ray:
         """Trace a ray, to surface `last` alone where it is given.
 
         Args:
@@ -130,7 +132,7 @@ class ExactLens:
         wanted = (radius * px * sign, radius * py * sign)
         start = [self.diameter / 2 * px, self.diameter / 2 * py]
 
-        def miss(at):
+        def miss(at: Sequence[mpf]) -> tuple[mpf, mpf]:
             met = self.trace((at[0], at[1], self.pupil), direction, stop)
             return met.x - wanted[0], met.y - wanted[1]
 
@@ -148,7 +150,7 @@ class ExactLens:
         raise Fails
 
 
-def _direction(angle: float):
+def _direction(angle: float) -> Triple:
     radians = mp.radians(mp.mpf(angle))
     return mp.mpf(0), mp.sin(radians), mp.cos(radians)
 
@@ -165,10 +167,10 @@ class ExactSpots:
         failed: rays that do not pass; they are left out.
     """
 
-    rms: list[mp.mpf]
-    chief: list[mp.mpf]
-    height: list[mp.mpf]
-    shortest: list[mp.mpf]
+    rms: list[mpf]
+    chief: list[mpf]
+    height: list[mpf]
+    shortest: list[mpf]
     failed: int
 
 
@@ -206,7 +208,7 @@ def spots(lens: PlainLens, rays: PupilRays, aimed: bool = False) -> ExactSpots:
     return ExactSpots(rms, chief, height, shortest, failed)
 
 
-def _rms_um(points):
+def _rms_um(points: Sequence[Triple]) -> mpf:
     total = mp.fsum(w for *_, w in points)
     if total == 0:
         return mp.nan

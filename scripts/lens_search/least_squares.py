@@ -50,9 +50,7 @@ def solve(
     def function(u: Array) -> Array:
         progress.check()
         progress.evaluations += 1
-        return residuals(
-            (u * UNIT)[None], part=part, aperture=aperture, stiffness=stiffness
-        )[0]
+        return residuals((u * UNIT)[None], part=part, aperture=aperture, stiffness=stiffness)[0]
 
     def jacobian(u: Array) -> Array:
         progress.check()

@@ -6,15 +6,18 @@
 The variables are the 17 of `quartet.py`, from the same bounds: reciprocal radii, thicknesses, the
 image distance, and a stop in the entrance pupil in front of the lens.  The operands are the three
 RMS spots, distortion by the chief ray, the edges, the length and the focal length; all but the last
-are registered here and share one call of its tracer, with the rays of `quartet.py`.  It runs in its NumPy backend.  The last part of the time is for its `LeastSquares`.  What
-it finds is measured by `quartet.py` and written to FOLDER/<method>_<seed>.json.
+are registered here and share one call of its tracer, with the rays of `quartet.py`.  It runs
+in its NumPy backend.  The last part of the time is for its `LeastSquares`.  What it finds is
+measured by `quartet.py` and written to FOLDER/optiland_<method>_<seed>.json.
 """
 
 import argparse
 import json
 import sys
 import warnings
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +34,7 @@ NAMES = ("spot_1", "spot_2", "spot_3", "distortion_2", "distortion_3", "edges", 
 SEARCH = 0.9
 
 
-def built(start: quartet.Array):
+def built(start: quartet.Array) -> Any:
     """Return an Optiland lens: a stop in the entrance pupil, eight spheres, the image."""
     import optiland.backend as be
     from optiland.materials import IdealMaterial
@@ -56,7 +59,7 @@ def built(start: quartet.Array):
     return optic
 
 
-def candidate(optic) -> quartet.Array:
+def candidate(optic: Any) -> quartet.Array:
     """Return the 17 variables of an Optiland lens."""
     radii = np.array([float(s.geometry.radius) for s in optic.surfaces.surfaces[2:10]])
     z = np.array([float(s.geometry.cs.z) for s in optic.surfaces.surfaces[1:]])
@@ -75,14 +78,14 @@ class Operands:
         self.at = b""
         self.found = np.empty(0)
 
-    def values(self, optic) -> quartet.Array:
+    def values(self, optic: Any) -> quartet.Array:
         """Return RMS spots (µm), relative distortion, overlap of edges (mm), and length (mm)."""
         row = candidate(optic)
         if row.tobytes() != self.at:
             self.at, self.found = row.tobytes(), self._traced(optic, row[None])
         return self.found
 
-    def _traced(self, optic, row: quartet.Array) -> quartet.Array:
+    def _traced(self, optic: Any, row: quartet.Array) -> quartet.Array:
         rays, fields = self.rays, quartet.ANGLES.size
         where = np.repeat(quartet.ANGLES / quartet.ANGLES[-1], rays.x.size)
         px, py = np.tile(rays.x, fields), np.tile(rays.y, fields)
@@ -107,7 +110,7 @@ class Operands:
             )
 
 
-def problem_of(optic, progress: Progress):
+def problem_of(optic: Any, progress: Progress) -> Any:
     """Return the optimization problem, which counts, keeps the best, and ends in time."""
     from optiland.optimization import OptimizationProblem
 
@@ -117,14 +120,14 @@ def problem_of(optic, progress: Progress):
         part = 1.0
         best = np.inf
 
-        def _seen(self, merit) -> None:
+        def _seen(self, merit: float) -> None:
             progress.evaluations += 1
             if np.isfinite(merit) and merit < self.best:
                 self.best = float(merit)
                 keep(candidate(optic), progress)
             progress.check(self.part)
 
-        def sum_squared(self):
+        def sum_squared(self) -> Any:
             found = super().sum_squared()
             self._seen(float(np.asarray(found)))
             return found
@@ -142,7 +145,7 @@ def problem_of(optic, progress: Progress):
     return problem
 
 
-def add_variables(problem, optic, bounded: bool) -> None:
+def add_variables(problem: Any, optic: Any, bounded: bool) -> None:
     """Give the problem its 17 variables, with their bounds or without."""
 
     def limits(k: int) -> dict[str, float]:
@@ -171,7 +174,7 @@ def search(method: str, progress: Progress, seed: int) -> None:
     from optiland import optimization
     from optiland.optimization.optimizer.custom import CMAES, ParticleSwarm
 
-    np.random.seed(seed)  # noqa: NPY002 - SciPy takes it where Optiland hands on no seed
+    np.random.seed(seed)  # SciPy takes it where Optiland hands on no seed
     start = random_starts(2000, np.random.default_rng(seed))[0]
     optic = built(start)
     problem = problem_of(optic, progress)
@@ -192,10 +195,8 @@ def search(method: str, progress: Progress, seed: int) -> None:
         ),
         "LeastSquares": lambda: None,
     }[method]
-    try:
+    with suppress(OutOfTime):
         run()
-    except OutOfTime:
-        pass
     while True:
         try:
             _polish(progress, start)
@@ -216,7 +217,7 @@ def _polish(progress: Progress, start: quartet.Array) -> None:
     optimizer = LeastSquares(problem)
     residual = optimizer._compute_residuals_vector
 
-    def counted(x):
+    def counted(x: quartet.Array) -> quartet.Array:
         found = residual(x)
         problem._seen(float(np.sum(np.square(found))))
         return found

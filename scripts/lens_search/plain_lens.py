@@ -5,6 +5,7 @@ of dolens; air is 1, and nd/Vd is n = A + B/λ² on the C, d and F lines (index 
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,7 +138,7 @@ def _number(value: Any, path: Path) -> float:
         raise SystemExit(f"{path}: '{value}' is no number") from None
 
 
-def entrance_pupil(lens: PlainLens, number=float):
+def entrance_pupil(lens: PlainLens, number: Callable = float) -> tuple:
     """Return distance from the first vertex and diameter of the entrance pupil, mm.
 
     With them the EFL, the back focus, mm, and the stop's height over the pupil's.  `number` makes
@@ -145,7 +146,7 @@ def entrance_pupil(lens: PlainLens, number=float):
     """
     one, zero = number(1), number(0)
     indices = [number(n) for n in lens.indices(lens.reference)]
-    # y and u of two rays: parallel to the axis at height 1, and through the first vertex at slope 1.
+    # y and u of two rays: parallel to the axis at height 1; through the first vertex at slope 1.
     y, u, before = [one, zero], [zero, one], one
     at_stop = None
     for k, (row, index) in enumerate(zip(lens.rows, indices, strict=True)):

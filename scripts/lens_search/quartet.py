@@ -10,7 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lens_search.plain_trace import Array, PupilRays, first_order, pupil_rays, rms_um, trace
+from lens_search.plain_trace import (
+    Array,
+    PupilRays,
+    Traced,
+    first_order,
+    pupil_rays,
+    rms_um,
+    trace,
+)
 
 INDEX = 1.5168
 INDICES = np.array([INDEX, 1.0] * 4)
@@ -128,7 +136,9 @@ def measure(
     )
 
 
-def _beams(candidates: Array, rays: PupilRays, part: float, aperture: float):
+def _beams(
+    candidates: Array, rays: PupilRays, part: float, aperture: float
+) -> tuple[Traced, Array]:
     """Return traced beams and the relative distortion of the fields off axis."""
     curvature, gap, image, pupil = split(candidates)
     angles = part * ANGLES

@@ -6,6 +6,8 @@ comes near by itself.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
 
 import numpy as np
 from scipy import optimize
@@ -71,7 +73,7 @@ def basin_hopping_least_squares(
     generator = np.random.default_rng(seed)
     space, progress = merit.space, merit.progress
 
-    def local(_, x0: Array, **rest) -> optimize.OptimizeResult:
+    def local(_: Callable, x0: Array, **rest: Any) -> optimize.OptimizeResult:
         candidate, _ = space.candidates(np.clip(x0, 0.0, 1.0)[None])
         candidate = np.clip(candidate[0], LOWER, UPPER)
         value, found = finish(candidate, progress, "lm", most=100)
@@ -88,13 +90,12 @@ def basin_hopping_least_squares(
 
 def direct(merit: ScalarMerit, seed: int, locally_biased: bool = True) -> None:
     """Run it; it is the same for every seed, and takes one point at a time."""
-    try:
+    # Its C code loses the exception that says that the time is out.
+    with suppress(SystemError):
         optimize.direct(
             merit, _CUBE, maxfun=10**8, maxiter=10**6, vol_tol=0.0, len_tol=0.0,
             locally_biased=locally_biased,
         )  # fmt: skip
-    except SystemError:
-        pass  # its C code loses the exception that says that the time is out
 
 
 def shgo(merit: ScalarMerit, seed: int, points: int = 512) -> None:
@@ -102,7 +103,7 @@ def shgo(merit: ScalarMerit, seed: int, points: int = 512) -> None:
     for run in range(100):
         optimize.shgo(
             merit, _CUBE, n=points * 2**run, iters=1,
-            sampling_method=lambda n, d: qmc.Sobol(d, rng=seed + run).random(n),
+            sampling_method=lambda n, d, run=run: qmc.Sobol(d, rng=seed + run).random(n),
             minimizer_kwargs={
                 "method": "L-BFGS-B", "jac": merit.gradient, "options": {"maxiter": 100},
             },
@@ -120,7 +121,9 @@ METHODS: dict[str, Callable[..., None]] = {
 }
 
 
-def search(name: str, progress: Progress, seed: int, space: str = "scaled", **settings) -> None:
+def search(
+    name: str, progress: Progress, seed: int, space: str = "scaled", **settings: Any
+) -> None:
     """Search by one of `METHODS` until the time is out, then by least squares from its best.
 
     Args:
@@ -132,15 +135,11 @@ def search(name: str, progress: Progress, seed: int, space: str = "scaled", **se
     """
     logarithm = settings.pop("logarithm", False)
     merit = ScalarMerit(SPACES[space], progress, SEARCH, logarithm)
-    try:
+    with suppress(OutOfTime):
         METHODS[name](merit, seed, **settings)
-    except OutOfTime:
-        pass
-    try:
+    with suppress(OutOfTime):
         if progress.best is not None:
             finish(np.clip(progress.best, LOWER, UPPER), progress, "lm", most=2000)
-    except OutOfTime:
-        pass
 
 
 def _start(merit: ScalarMerit, generator: np.random.Generator) -> Array:

@@ -5,6 +5,8 @@ first-order optics: a lens is scaled to EFL 100 mm, and the image distance count
 focus.  Optimizers without derivatives then need not find the thin set of lenses that are in focus.
 """
 
+from typing import Any
+
 import numpy as np
 
 from lens_search.budget import Progress
@@ -73,7 +75,9 @@ class ScalarMerit:
         logarithm: whether the logarithm is returned, for optimizers that look at differences.
     """
 
-    def __init__(self, space, progress: Progress, part: float = 1.0, logarithm: bool = False):
+    def __init__(
+        self, space: Any, progress: Progress, part: float = 1.0, logarithm: bool = False
+    ) -> None:
         self.space, self.progress, self.part, self.logarithm = space, progress, part, logarithm
 
     def __call__(self, points: Array) -> Array | float:
