@@ -187,7 +187,7 @@ def search(method: str, progress: Progress, seed: int) -> None:
         "DualAnnealing": lambda: optimization.DualAnnealing(problem).optimize(
             maxiter=10**6, disp=False
         ),
-        "SHGO": lambda: optimization.SHGO(problem).optimize(workers=1, n=256, iters=100),
+        "SHGO": lambda: optimization.SHGO(problem).optimize(workers=1),
         "BasinHopping": lambda: optimization.BasinHopping(problem).optimize(niter=10**6),
         "CMAES": lambda: CMAES(problem).optimize(maxiter=10**6, disp=False, seed=seed),
         "ParticleSwarm": lambda: ParticleSwarm(problem).optimize(
