@@ -22,6 +22,7 @@ class Progress:
 
     Attributes:
         seconds: of processor time that the search has.
+        air_stop: whether the stop must lie in air.
         evaluations: lenses traced so far, those for derivatives too.
         history: (processor seconds, evaluations, merit, candidate) of every new best design that
             keeps all limits.
@@ -31,6 +32,7 @@ class Progress:
     """
 
     seconds: float
+    air_stop: bool = False
     evaluations: int = 0
     history: list[tuple[float, int, float, Array]] = field(default_factory=list)
     designs: list[tuple[float, float, Array]] = field(default_factory=list)
@@ -76,6 +78,7 @@ class Progress:
         near, row = self.nearest
         return {
             "seconds": self.seconds,
+            "air_stop": self.air_stop,
             "spent": self.spent,
             "evaluations": self.evaluations,
             "history": [(s, n, m, list(map(float, x))) for s, n, m, x in self.history],

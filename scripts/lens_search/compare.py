@@ -71,6 +71,7 @@ def main() -> None:
     parser.add_argument("--only", type=int, help="stop after so many runs")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--ours", type=Path, nargs="*", default=[], help="folders of lens files")
+    parser.add_argument("--air-stop", action="store_true", help="the stop must lie in air")
     parser.add_argument("--table", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     if not arguments.table:
@@ -99,9 +100,10 @@ def _run(arguments: argparse.Namespace) -> None:
                 script = str(Path(__file__).with_name("optiland_global.py"))
                 command = [arguments.optiland, script, "--method", name.removeprefix("optiland_")]
                 command += ["--seconds", str(arguments.seconds), "--seed", str(seed)]
+                command += ["--air-stop"] * arguments.air_stop
                 subprocess.run([*command, "--out", str(arguments.out)], check=True)
                 continue
-            progress = Progress(arguments.seconds)
+            progress = Progress(arguments.seconds, arguments.air_stop)
             scipy[name](progress, seed)
             path.write_text(json.dumps(progress.as_data()))
 
@@ -168,7 +170,8 @@ def _own_row(folder: Path) -> list[str]:
         measured = _dense(row.tolist())
         print(f"{path.name}: {measured.mean[0]:.5g} µm; ", end="")
         print("; ".join(measured.broken) or "all limits kept", end="")
-        print(f"; edge out to the larger beam {measured.outer_edge[0].min():.3g} mm")
+        print(f"; edge out to the larger beam {measured.outer_edge[0].min():.3g} mm", end="")
+        print(f"; stop {measured.depth[0]:.3g} mm deep in glass")
         rows.append(row)
         merits.append(float(measured.mean[0]) if measured.feasible[0] else np.inf)
         broken |= {path.name: measured.broken} if measured.broken else {}

@@ -16,10 +16,13 @@ from lens_search.quartet import (
     measure,
     residuals,
 )
+from lens_search.stops import SEGMENTS, room, segment_of, with_stop
 
 # Steps of differences, and units in which variables are alike: 1e-3/mm, and mm.
 UNIT = np.array([1e-3] * 8 + [2.0] * 7 + [0.5, 5.0])
 _STEP = 1e-6
+# A stop in air keeps so far from the vertices beside it, mm.
+_CLEAR = 0.02
 # Parts of f/3's pupil and of 15° at every step: f/8 and 6° first.
 GROWTH = [(3.0 / n, angle / 15.0) for n, angle in ((8, 6), (6, 8), (5, 10), (4, 12.5), (3, 15))]
 
@@ -36,6 +39,8 @@ def solve(
 ) -> OptimizeResult:
     """Fit a start by SciPy's least squares, the Jacobian by differences in one batch.
 
+    A stop that must lie in air stays in its segment of it; its `candidate` has the 17 variables.
+
     Args:
         start: the 17 variables.
         progress: counts and ends the search.
@@ -47,23 +52,35 @@ def solve(
         stiffness: of the limits.
     """
 
+    segment, place = segment_of(start) if progress.air_stop else (None, start[16])
+
+    def rows_of(u: Array) -> Array:
+        found, more = u * UNIT, np.zeros((len(u), 2))
+        if segment is not None:
+            where = np.full(len(u), segment)
+            over = found[:, 16] - room(found, where)
+            beyond = np.column_stack([-found[:, 16], over]) + _CLEAR
+            more = 20.0 * stiffness * np.maximum(beyond, 0.0)
+            found = with_stop(found, where)
+        spots = residuals(found, part=part, aperture=aperture, stiffness=stiffness)
+        return np.column_stack([spots, more])
+
     def function(u: Array) -> Array:
         progress.check()
         progress.evaluations += 1
-        return residuals((u * UNIT)[None], part=part, aperture=aperture, stiffness=stiffness)[0]
+        return rows_of(u[None])[0]
 
     def jacobian(u: Array) -> Array:
         progress.check()
         progress.evaluations += u.size
         step = np.where(u * UNIT > (LOWER + UPPER) / 2.0, -_STEP, _STEP)
-        rows = (np.vstack([u, u + np.diag(step)])) * UNIT
-        found = residuals(rows, part=part, aperture=aperture, stiffness=stiffness)
+        found = rows_of(np.vstack([u, u + np.diag(step)]))
         return ((found[1:] - found[0]) / step[:, None]).T
 
     low, high = LOWER / UNIT, UPPER / UNIT
-    inside = np.clip(start / UNIT, low + 1e-6, high - 1e-6)
+    inside = np.clip(np.append(start[:16], place) / UNIT, low + 1e-6, high - 1e-6)
     bounds = (-np.inf, np.inf) if method == "lm" else (low, high)
-    return least_squares(
+    found = least_squares(
         function,
         inside,
         jacobian,
@@ -74,6 +91,9 @@ def solve(
         x_scale="jac",
         max_nfev=most,
     )
+    row = found.x[None] * UNIT
+    found.candidate = row[0] if segment is None else with_stop(row, np.array([segment]))[0]
+    return found
 
 
 def finish(start: Array, progress: Progress, method: str, most: int = 300) -> tuple[float, Array]:
@@ -81,11 +101,11 @@ def finish(start: Array, progress: Progress, method: str, most: int = 300) -> tu
 
     The lens is scaled to its focal length at the end, which a penalty leaves off by a little.
     """
-    found = solve(start, progress, most=most, method=method).x * UNIT
+    found = solve(start, progress, most=most, method=method).candidate
     found = np.clip(found, LOWER, UPPER)
-    found = solve(found, progress, most=most, method="trf", stiffness=20.0).x * UNIT
+    found = solve(found, progress, most=most, method="trf", stiffness=20.0).candidate
     found = to_focal_length(found)
-    measured = measure(found[None])
+    measured = measure(found[None], air_stop=progress.air_stop)
     progress.see(found[None], measured)
     merit = float(measured.mean[0]) if measured.feasible[0] else np.inf
     progress.designs.append((progress.spent, merit, found))
@@ -126,11 +146,21 @@ def random_starts(count: int, generator: np.random.Generator) -> Array:
     return np.clip(rows[fit], LOWER, UPPER)
 
 
+def in_air(rows: Array, generator: np.random.Generator) -> Array:
+    """Return lenses with their stops anywhere in air: in front of the lens or in its spaces."""
+    segment = generator.integers(0, SEGMENTS, len(rows))
+    rows = rows.copy()
+    rows[:, 16] = generator.random(len(rows)) * room(rows, segment)
+    return with_stop(rows, segment)
+
+
 def screened(
     count: int, share: float, generator: np.random.Generator, progress: Progress, grown: bool
 ) -> Array:
     """Return the better share of random starts by their first merit."""
     rows = random_starts(count, generator)
+    if progress.air_stop:
+        rows = in_air(rows, generator)
     aperture, part = GROWTH[0] if grown else (1.0, 1.0)
     merit = np.concatenate(
         [
@@ -169,7 +199,7 @@ def multi_start(
                     for r in rows
                 ]
                 order = np.argsort([f.cost for f in found])
-                rows = [found[k].x * UNIT for k in order[: max(1, int(halving * len(order)))]]
+                rows = [found[k].candidate for k in order[: max(1, int(halving * len(order)))]]
             kept: list[Array] = []
             for row in rows:
                 if all(apart(row, other) for other in kept):

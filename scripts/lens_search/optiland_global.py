@@ -30,7 +30,7 @@ from lens_search.plain_trace import Traced, pupil_rays, rms_um
 
 WAVELENGTH = 0.5875618
 RINGS, ARMS = 4, 8
-NAMES = ("spot_1", "spot_2", "spot_3", "distortion_2", "distortion_3", "edges", "length")
+NAMES = ("spot_1", "spot_2", "spot_3", "distortion_2", "distortion_3", "edges", "length", "stop")
 SEARCH = 0.9
 
 
@@ -79,7 +79,7 @@ class Operands:
         self.found = np.empty(0)
 
     def values(self, optic: Any) -> quartet.Array:
-        """Return RMS spots (µm), relative distortion, overlap of edges (mm), and length (mm)."""
+        """Return RMS spots (µm), relative distortion, overlap of edges, length, stop's depth."""
         row = candidate(optic)
         if row.tobytes() != self.at:
             self.at, self.found = row.tobytes(), self._traced(optic, row[None])
@@ -98,7 +98,9 @@ class Operands:
         over = np.maximum(0.005 - edge, 0.0).sum()
         rms = rms_um(Traced(x, y, height, edge, edge), rays)[0]
         ideal = quartet.FOCAL_LENGTH * np.tan(np.radians(quartet.ANGLES[1:]))
-        return np.array([*rms, *(y[0, 1:, rays.chief] / ideal - 1.0), over, row[0, 8:16].sum()])
+        distortion = y[0, 1:, rays.chief] / ideal - 1.0
+        depth = quartet.stop_depth(row)[0]
+        return np.array([*rms, *distortion, over, row[0, 8:16].sum(), depth])
 
     def register(self) -> None:
         """Register an operand for each number."""
@@ -141,6 +143,8 @@ def problem_of(optic: Any, progress: Progress) -> Any:
         problem.add_operand(name, min_val=-most, max_val=most, weight=1e4, input_data=data)
     problem.add_operand(NAMES[5], target=0.0, weight=50.0, input_data=data)
     problem.add_operand(NAMES[6], max_val=quartet.LENGTH, weight=20.0, input_data=data)
+    if progress.air_stop:
+        problem.add_operand(NAMES[7], target=0.0, weight=20.0, input_data=data)
     problem.add_operand("f2", target=quartet.FOCAL_LENGTH, weight=50.0, input_data=data)
     return problem
 
@@ -165,7 +169,7 @@ def add_variables(problem: Any, optic: Any, bounded: bool) -> None:
 def keep(row: quartet.Array, progress: Progress) -> None:
     """Measure a lens and keep it if it is the best: not counted again."""
     for found in (row, to_focal_length(row)):
-        progress.see(found[None], quartet.measure(found[None]))
+        progress.see(found[None], quartet.measure(found[None], air_stop=progress.air_stop))
         progress.evaluations -= 1
 
 
@@ -237,12 +241,13 @@ def main() -> None:
     parser.add_argument("--method", required=True)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--air-stop", action="store_true")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     import optiland.optimization  # noqa: F401 - takes seconds, and is no part of the search
 
-    progress = Progress(arguments.seconds)
+    progress = Progress(arguments.seconds, arguments.air_stop)
     search(arguments.method, progress, arguments.seed)
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / f"optiland_{arguments.method}_{arguments.seed}.json"

@@ -3,7 +3,8 @@
 Four lenses of n = 1.5168, EFL 100 mm, f/3, half fields 0, 10.5 and 15°, an infinitely far object.
 The 17 variables of a candidate, a row of an array, are 8 curvatures (1/mm), the 7 gaps between the
 vertices (mm; glass, air, glass, …), the image distance from the last vertex and the distance of the
-entrance pupil from the first (mm): the stop is free, and nothing is vignetted.
+entrance pupil from the first (mm).  Nothing is vignetted.  The stop is free: it may lie where no
+diaphragm can be put, inside a thick lens.  With `air_stop` it must lie in air.
 """
 
 from dataclasses import dataclass
@@ -48,6 +49,7 @@ LIMITS = (
     *(f"thickest glass {k + 1}" for k in range(4)),
     *(f"edge of gap {k + 1}" for k in range(7)),
     "rays that fail",
+    "stop in glass",
 )
 
 
@@ -63,6 +65,7 @@ class Measured:
         distortion: (lenses, 2) relative, at 10.5° and 15°.
         edge: (lenses, 7) gaps where the beam ends on the smaller of both surfaces, mm.
         outer_edge: (lenses, 7) the same where it ends on the larger; NaN where one ends before.
+        depth: (lenses,) of the paraxial stop in glass, mm; 0 in air.
     """
 
     rms: Array
@@ -71,6 +74,7 @@ class Measured:
     distortion: Array
     edge: Array
     outer_edge: Array
+    depth: Array
 
     @property
     def mean(self) -> Array:
@@ -93,18 +97,16 @@ def split(candidates: Array) -> tuple[Array, Array, Array, Array]:
     return candidates[:, :8], candidates[:, 8:15], candidates[:, 15], candidates[:, 16]
 
 
-def measure(
-    candidates: Array, rays: PupilRays = SAMPLE, part: float = 1.0, aperture: float = 1.0
-) -> Measured:
+def measure(candidates: Array, rays: PupilRays = SAMPLE, air_stop: bool = False) -> Measured:
     """Measure candidates.
 
     Args:
         candidates: (lenses, 17).
         rays: of each beam.
-        part: of the field angles, for searches that let the field grow.
-        aperture: part of the pupil's diameter, likewise.
+        air_stop: whether a stop in glass breaks a limit.
     """
-    traced, distortion = _beams(candidates, rays, part, aperture)
+    traced, distortion = _beams(candidates, rays, 1.0, 1.0)
+    depth = stop_depth(candidates)
     curvature, gap, image, _ = split(candidates)
     focal, _ = first_order(curvature, gap, INDICES)
     inner = np.minimum(traced.height[:, :-1], traced.height[:, 1:])
@@ -124,6 +126,7 @@ def measure(
             lens - GLASS[1],
             np.nan_to_num(crossing, nan=1.0),
             traced.lacking,
+            depth * air_stop,
         ]
     )
     return Measured(
@@ -133,6 +136,7 @@ def measure(
         distortion,
         edge,
         gap_at(curvature, gap, outer),
+        depth,
     )
 
 
@@ -186,6 +190,27 @@ def residuals(
     )
     apart = stiffness * 50.0 * (np.clip(focal, -1e4, 1e4) - FOCAL_LENGTH)
     return np.column_stack([across, along, apart, stiffness * np.maximum(hinge, 0.0)])
+
+
+def stop_depth(candidates: Array) -> Array:
+    """Return how deep in glass the stop's place is, mm: 0 in air, or in front of the lens.
+
+    The stop may lie wherever the paraxial chief ray crosses the axis; a pupil whose ray crosses it
+    nowhere from the first vertex to the image has none, and counts as 5 mm deep.
+    """
+    curvature, gap, image, pupil = split(candidates)
+    ahead = np.column_stack([gap, image])
+    depth = np.where(pupil <= 0.0, 0.0, 5.0)
+    y, u, before = -pupil, np.ones(len(candidates)), 1.0
+    for k, index in enumerate(INDICES):
+        u = (before * u - y * curvature[:, k] * (index - before)) / index
+        before = index
+        further = y + ahead[:, k] * u
+        place = -y / np.where(u == 0.0, 1e-300, u)
+        inside = np.minimum(place, ahead[:, k] - place) if index > 1.0 else 0.0
+        depth = np.where(y * further <= 0.0, np.minimum(depth, np.maximum(inside, 0.0)), depth)
+        y = further
+    return depth
 
 
 def gap_at(curvature: Array, gap: Array, height: Array) -> Array:

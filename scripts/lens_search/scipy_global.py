@@ -16,7 +16,7 @@ from lens_search.budget import OutOfTime, Progress
 from lens_search.least_squares import finish
 from lens_search.plain_trace import Array
 from lens_search.quartet import LOWER, UPPER, measure
-from lens_search.spaces import SPACES, ScalarMerit
+from lens_search.spaces import SPACES, ScalarMerit, point
 
 _CUBE = [(0.0, 1.0)] * LOWER.size
 # The rest of a search's time is for least squares.
@@ -70,15 +70,15 @@ def basin_hopping_least_squares(
 ) -> None:
     """Run it with SciPy's least squares as its local search."""
     generator = np.random.default_rng(seed)
-    space, progress = merit.space, merit.progress
+    progress = merit.progress
 
     def local(_: Callable, x0: Array, **rest: Any) -> optimize.OptimizeResult:
-        candidate, _ = space.candidates(np.clip(x0, 0.0, 1.0)[None])
-        candidate = np.clip(candidate[0], LOWER, UPPER)
-        value, found = finish(candidate, progress, "lm", most=100)
+        value, found = finish(merit.candidate(x0), progress, "lm", most=100)
         if not np.isfinite(value):
             value = 1e3 + float(measure(found[None]).mean[0])
-        return optimize.OptimizeResult(x=space.point(found), fun=value, success=True)
+        return optimize.OptimizeResult(
+            x=point(merit.space, found, progress.air_stop), fun=value, success=True
+        )
 
     while True:
         optimize.basinhopping(

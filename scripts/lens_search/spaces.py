@@ -12,11 +12,14 @@ import numpy as np
 from lens_search.budget import Progress
 from lens_search.plain_trace import Array, first_order
 from lens_search.quartet import FOCAL_LENGTH, INDICES, LOWER, UPPER, Measured, measure, split
+from lens_search.stops import SEGMENTS, room, segment_of, with_stop
 
 # So many lenses' rays stay in the processor's cache.
 _BATCH = 64
 # Penalties per limit of `LIMITS`, µm per mm; µm per 1 of distortion; µm per squared cosine.
-_PENALTIES = np.array([50.0, 1e4, 1e4, 20.0, 20.0] + [50.0] * 7 + [20.0] * 4 + [50.0] * 7 + [2e3])
+_PENALTIES = np.array(
+    [50.0, 1e4, 1e4, 20.0, 20.0] + [50.0] * 7 + [20.0] * 4 + [50.0] * 7 + [2e3, 20.0]
+)
 # Focus, mm about the paraxial one.
 _DEFOCUS = 1.5
 _WEAKEST = 400.0
@@ -65,6 +68,16 @@ class Scaled:
 SPACES = {"plain": Plain(), "scaled": Scaled()}
 
 
+def point(space: Any, candidate: Array, air_stop: bool) -> Array:
+    """Return the point of a candidate in a space, its stop in air if it must be."""
+    found = space.point(candidate)
+    if air_stop:
+        segment, place = segment_of(candidate)
+        part = place / room(candidate[None], np.array([segment]))[0]
+        found[16] = (segment + min(max(part, 0.0), 0.999)) / SEGMENTS
+    return found
+
+
 class ScalarMerit:
     """The mean RMS spot and penalties of a point, µm: for one point, or for columns of many.
 
@@ -91,16 +104,33 @@ class ScalarMerit:
 
     def _merit(self, points: Array) -> Array:
         candidates, wrong = self.space.candidates(points)
-        measured = measure(candidates)
+        if self.progress.air_stop:
+            candidates = _stopped(candidates, points[:, 16])
+        measured = measure(candidates, air_stop=self.progress.air_stop)
         self.progress.see(candidates, measured)
         merit = penalised(measured) + wrong
         return np.log(merit) if self.logarithm else merit
+
+    def candidate(self, point: Array) -> Array:
+        """Return the candidate of one point, within bounds."""
+        found, _ = self.space.candidates(np.clip(point, 0.0, 1.0)[None])
+        if self.progress.air_stop:
+            found = _stopped(found, np.clip(point[None, 16], 0.0, 1.0))
+        return np.clip(found[0], LOWER, UPPER)
 
     def gradient(self, point: Array) -> Array:
         """Return forward differences, all 17 in one call; backward at the cube's far sides."""
         step = np.where(point > 0.5, -1e-7, 1e-7)
         found = self(np.column_stack([point[:, None], point[:, None] + np.diag(step)]))
         return (found[1:] - found[0]) / step
+
+
+def _stopped(candidates: Array, part: Array) -> Array:
+    """Return candidates with stops in air: a quarter of the last coordinate for each segment."""
+    segment = np.minimum((part * SEGMENTS).astype(int), SEGMENTS - 1)
+    found = candidates.copy()
+    found[:, 16] = (part * SEGMENTS - segment) * room(candidates, segment)
+    return with_stop(found, segment)
 
 
 def penalised(measured: Measured) -> Array:
