@@ -57,7 +57,9 @@ def runs() -> dict[str, Callable[[Progress, int], None]]:
 
     found = {name: by(name) for name in METHODS}
     found["multi_start"] = lambda progress, seed: multi_start(progress, seed, "lm", grown=False)
-    found["multi_start_growth"] = lambda progress, seed: multi_start(progress, seed, "lm")
+    found["multi_start_growth"] = lambda progress, seed: multi_start(
+        progress, seed, "lm", share=0.1, most=12, stiffness=0.2
+    )
     return found
 
 
