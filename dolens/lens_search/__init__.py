@@ -1,0 +1,1 @@
+"""Lenses are found from a specification."""
