@@ -6,6 +6,21 @@ from torch import Tensor
 
 
 @dataclass(frozen=True, eq=False)
+class IndexMap:
+    """The map is d(indices)/d(variables), for variables that media depend on.
+
+    The derivatives themselves are given beside it, as they change with every step: (E, wavelengths).
+
+    Attributes:
+        rows: (E,), int64: which row of `SurfaceTable.indices`, a medium.
+        columns: (E,), int64: which variable.
+    """
+
+    rows: Tensor
+    columns: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class VariableMap:
     """The map is d(values)/d(variables), a sparse matrix in lists of its entries.
 
@@ -17,9 +32,11 @@ class VariableMap:
         columns: (E,), int64: which variable.
         weights: (E,), float64: the derivative.
         count: of variables.
+        indices: what media depend on; None: they are constant.
     """
 
     places: Tensor
     columns: Tensor
     weights: Tensor
     count: int
+    indices: IndexMap | None = None

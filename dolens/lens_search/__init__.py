@@ -1,1 +1,1 @@
-"""Lenses are found from a specification."""
+"""The search for lenses begins with a specification and ends with a set of different forms."""

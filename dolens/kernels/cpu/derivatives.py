@@ -47,8 +47,8 @@ def ray_jacobian(
     values = position.new_empty((wanted, count))
     jacobian = position.new_empty((wanted, variables.count, count))
     if count:
-        chunk = _chunk(count, 1)
-        derivatives = _Derivatives(table, variables, outputs, rays, chunk, further=0)
+        chunk = rays_of_a_chunk(count, 1)
+        derivatives = Derivatives(table, variables, outputs, rays, chunk, further=0)
         derivatives.program.point(OUT_VALID=valid, OUT_VALUES=values, OUT_JACOBIAN=jacobian)
         derivatives.program.run(jacobian_driver, -(-count // chunk), _SMALL)
     return valid, values, jacobian
@@ -84,11 +84,11 @@ def normal_equations(
     count, wanted, p = rays[0].shape[0], len(outputs), variables.count
     by_group = 2 + wanted * (1 + p)
     length = 2 + p + p * p + groups * by_group
-    chunk = _chunk(count, length)
+    chunk = rays_of_a_chunk(count, length)
     chunks = -(-count // chunk)
     sums = torch.zeros((chunks, length), dtype=torch.float64)
     if count:
-        derivatives = _Derivatives(table, variables, outputs, rays, chunk, further=p + 1 + wanted)
+        derivatives = Derivatives(table, variables, outputs, rays, chunk, further=p + 1 + wanted)
         program = derivatives.program
         program.point(SUMS=sums, TARGET=target, WEIGHT=weight, GROUP=group)
         job = program.job
@@ -114,14 +114,24 @@ def normal_equations(
     return head, right, lower + lower.tril(-1).mT, rest.reshape(groups, by_group)
 
 
-def _chunk(count: int, length: int) -> int:
+def rays_of_a_chunk(count: int, length: int) -> int:
     """Return the rays of a chunk, a multiple of the block; it does not depend on the threads."""
     chunks = max(1, min(_CHUNKS, _NUMBERS // length))
     return max(8 * BLOCK, -(-count // (chunks * BLOCK)) * BLOCK)
 
 
-class _Derivatives:
-    """A program is held together with the arrays that its job points to while it runs."""
+class Derivatives:
+    """A program is held together with the arrays that its job points to while it runs.
+
+    Args:
+        table: as in `ray_jacobian`, and the three that follow.
+        variables: P of them.
+        outputs: K names.
+        rays: N of them.
+        chunk: rays of a chunk.
+        further: rows of a block that the driver needs beside the columns.
+        index_derivatives: (E, wavelengths), float64, contiguous, for `variables.indices`.
+    """
 
     def __init__(
         self,
@@ -131,6 +141,7 @@ class _Derivatives:
         rays: RayTensors,
         chunk: int,
         further: int,
+        index_derivatives: Tensor | None = None,
     ) -> None:
         self.program = Program(
             table,
@@ -151,6 +162,24 @@ class _Derivatives:
         names = ("ENTRIES", "ENTRY_ROWS", "ENTRY_COLUMNS", "ENTRY_WEIGHTS", "ENTRY_FIRST")
         for name, array in zip(names, self._entries.arrays, strict=True):
             job[getattr(jobs, name)] = array.ctypes.data
+        if variables.indices is not None:
+            assert index_derivatives is not None  # they go with the map
+            job[jobs.INDEX_ENTRIES] = len(variables.indices.rows)
+            job[jobs.INDEX_ROWS] = variables.indices.rows.data_ptr()
+            job[jobs.INDEX_COLUMNS] = variables.indices.columns.data_ptr()
+            job[jobs.INDEX_WEIGHTS] = index_derivatives.data_ptr()
+
+    def hold(self, weights: Tensor) -> Tensor:
+        """Take the weights of many lenses, (L, E), in the place of those of the map.
+
+        Returns:
+            The weights as the kernel reads them, which lives as long as this does.
+        """
+        order, end = self._entries.order, len(self._entries.arrays[1])
+        self._weights = torch.zeros((len(weights), end), dtype=torch.float64)
+        self._weights[:, : len(order)] = weights[:, torch.from_numpy(order)]
+        self.program.job[jobs.ENTRY_WEIGHTS] = self._weights.data_ptr()
+        return self._weights
 
 
 class _Entries(NamedTuple):
@@ -161,11 +190,13 @@ class _Entries(NamedTuple):
         spline: for each number of the table its column, or -1; None without splines' coefficients.
         arrays: where the entries of each step begin; then of each entry the row of the cotangents,
             the column, the weight, and whether it is the first that a sweep brings to its column.
+        order: of the entries in `arrays` that come from the map, their places in it.
     """
 
     first_step: int
     spline: np.ndarray | None
     arrays: tuple[np.ndarray, ...]
+    order: np.ndarray
 
 
 @lru_cache(maxsize=256)
@@ -191,10 +222,16 @@ def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
     # By steps; after the last come columns that begin as zero: nothing overwrites them.
     order = np.argsort(steps, kind="stable")
     order = order[~local[order]]
+    taken = np.flatnonzero(kept)[order]
     rows, columns, weights, steps = (a[order] for a in (rows, columns, weights, steps))
     # A sweep takes the entries last first: the last of a column is the one that comes first.
     last = np.full(variables.count, -1, dtype=np.int64)
     last[columns] = np.arange(len(columns))
+    if variables.indices is not None:
+        # What an index brings to a column is added, at any step that the medium touches.
+        last[variables.indices.columns.numpy()] = -1
+        around = codes[:, Code.BEFORE : Code.AFTER + 1, None] == variables.indices.rows.numpy()
+        first_step = min(first_step, int(np.flatnonzero(around.any((1, 2))).min(initial=len(codes))))
     empty = np.flatnonzero(last < 0)
     is_first = np.zeros(len(columns), dtype=np.int64)
     is_first[last[last >= 0]] = 1
@@ -207,4 +244,4 @@ def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
         np.append(weights, padding.astype(np.float64)),
         np.append(is_first, padding + 1),
     )
-    return _Entries(first_step, spline, arrays)
+    return _Entries(first_step, spline, arrays, taken)

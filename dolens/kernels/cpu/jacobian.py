@@ -21,6 +21,7 @@ from dolens.kernels.cpu.compiler import (
     OPTIONS,
     call_block,
     int8_at,
+    int32_at,
     int64_at,
     real64_at,
     shifted,
@@ -38,6 +39,7 @@ from dolens.kernels.cpu.layout import (
 )
 from dolens.kernels.cpu.records import (
     ADJOINT,
+    BEFORE,
     CODE_ROW,
     COLUMNS,
     COUNT,
@@ -142,6 +144,30 @@ def columns(real: types.Type) -> Columns:
                 add_row(target, source, ended, real(weights[e]))
 
     @njit(**OPTIONS)
+    def put_index_entries(job, codes, lanes, cotangents, columns, stride):  # noqa: ANN001, ANN202
+        """Add the derivatives of a step with respect to what the indices around it depend on."""
+        rows = carray(int64_at(job[jobs.INDEX_ROWS]), UNBOUNDED)
+        places = carray(int64_at(job[jobs.INDEX_COLUMNS]), UNBOUNDED)
+        which = carray(int32_at(job[jobs.WHICH]), UNBOUNDED)
+        count = job[jobs.WAVELENGTHS]
+        ended = shifted(at(job[jobs.STACK]), STATE * job[jobs.STEPS] + ENDED)
+        failed = carray(ended, BLOCK)
+        for e in range(job[jobs.INDEX_ENTRIES]):
+            weights = carray(shifted(real64_at(job[jobs.INDEX_WEIGHTS]), e * count), UNBOUNDED)
+            target = shifted(columns, stride * places[e])
+            for side in range(2):
+                if rows[e] != codes[BEFORE + side]:
+                    continue
+                source = shifted(cotangents, OF_FRONT + BLOCK * side)
+                if job[jobs.WAVELENGTH] > 0:
+                    add_row(target, source, ended, real(weights[job[jobs.WAVELENGTH] - 1]))
+                else:
+                    out, lane = carray(target, BLOCK), carray(source, BLOCK)
+                    for i in range(BLOCK):
+                        if failed[i] == zero:
+                            out[i] += real(weights[which[lanes[i]]]) * lane[i]
+
+    @njit(**OPTIONS)
     def add_stencil(job, codes, cotangents, columns, stride):  # noqa: ANN001, ANN202
         """Add the coefficients of a spline: each ray has sixteen of them."""
         begins = codes[OFFSET] + codes[LENGTH] - codes[COUNT] * codes[COLUMNS]
@@ -194,6 +220,8 @@ def columns(real: types.Type) -> Columns:
                 target = shifted(columns, span * output)
                 call_block(codes[ADJOINT], now, then, cotangents, record, work, place)
                 put_entries(job, k, cotangents, target, stride)
+                if job[jobs.INDEX_ENTRIES] != 0:
+                    put_index_entries(job, codes, lanes, cotangents, target, stride)
                 if codes[STENCIL] != 0 and job[jobs.SPLINE_COLUMNS] != 0:
                     add_stencil(job, codes, cotangents, target, stride)
 

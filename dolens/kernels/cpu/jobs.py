@@ -25,4 +25,10 @@ ENTRY_FIRST = 62
 WAVELENGTH = 63
 # Of a renderer: arrays of integers and of numbers; see `rendering.layout`.
 VIEW, LENGTHS = range(64, 66)
-LENGTH = 72  # of a job
+# Variables that indices depend on: how many; row of `indices` and column of each; and their
+# derivatives, a row of wavelengths for each.
+INDEX_ENTRIES, INDEX_ROWS, INDEX_COLUMNS, INDEX_WEIGHTS = range(66, 70)
+# Of many lenses: the driver of one, the pieces of one, and how far the address at a place moves on
+# from one lens to the next: pairs of place and bytes, and how many pairs.
+INNER_DRIVER, INNER_PIECES, STRIDES, STRIDE_PAIRS = range(70, 74)
+LENGTH = 80  # of a job

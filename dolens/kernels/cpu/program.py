@@ -196,11 +196,22 @@ class Program:
             self.job[getattr(jobs, name)] = 0 if tensor is None else tensor.data_ptr()
 
     def run(
-        self, driver: Callable[[Any], Callable[..., None]], pieces: int, small: int = SMALL
+        self,
+        driver: Callable[[Any], Callable[..., None]],
+        pieces: int,
+        small: int = SMALL,
+        lenses: int = 1,
     ) -> None:
-        """Run a driver over all pieces, on torch's number of threads, or on one for few rays."""
+        """Run a driver over all pieces, on torch's number of threads, or on one for few rays.
+
+        Args:
+            driver: the factory that compiles it.
+            pieces: how many.
+            small: fewer rays than this are traced by one thread.
+            lenses: how many the rays of the job are traced through.
+        """
         function = compiler.compile_driver(driver, self.real)
-        threads = min(thread_count(int(self.job[jobs.RAYS]), small), pieces)
+        threads = min(thread_count(int(self.job[jobs.RAYS]) * lenses, small), pieces)
         step = self.table.values.element_size()
         size = sum(self._sizes.values()) * step + 3 * BLOCK * 8
         # Memories are held until the last share is done.

@@ -1,0 +1,304 @@
+"""A family of lenses: many lenses of one structure, traced and differentiated at once.
+
+Search, tolerances and starts of a design ask the same of thousands of lenses that differ in numbers
+alone: curvatures, thicknesses, coefficients, indices.  Their records have one layout, so that a
+kernel goes from lens to lens without Python in between.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.kernels.table import SurfaceTable
+from dolens.kernels.variable_map import IndexMap, VariableMap
+from dolens.optics.lens import Lens
+from dolens.optics.packing import pack_with_variables
+from dolens.optics.rays import TracedRays
+
+OUTPUTS = ("x", "y", "path_length", "l", "m", "n")
+
+
+@dataclass(frozen=True)
+class FamilyRays:
+    """Rays of every lens of a family, in front of its first surface.
+
+    Attributes:
+        position: (L, N, 3), mm, z from the first vertex; an expanded tensor is read where it is.
+        direction: (L, N, 3), unit vectors.
+        wavelength: (N,), int32, which of the family's wavelengths a ray has; None: the first.
+    """
+
+    position: Tensor
+    direction: Tensor
+    wavelength: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class FamilyJacobian:
+    """Derivatives of the rays of L lenses on their sensors.  N rays, K outputs, P columns.
+
+    Attributes:
+        valid: (L, N), bool; values and derivatives of the other rays are zero.
+        values: (L, K, N), mm or direction cosines.
+        derivatives: (L, K, P, N), over the units of the variables.
+    """
+
+    valid: Tensor
+    values: Tensor
+    derivatives: Tensor
+
+
+@dataclass(frozen=True)
+class FamilySums:
+    """Sums over the valid rays of L lenses for least squares, in double precision.
+
+    Attributes:
+        count: (L,), valid rays.
+        sum_of_squares: (L,), Σ w·r², mm².
+        jtr: (L, P), JᵀWr.
+        jtj: (L, P, P), JᵀWJ.
+        group_count: (L, G), rays of each group.
+        group_weight: (L, G), Σ w of each group of rays.
+        group_residual: (L, G, K), Σ w·r.
+        group_jacobian: (L, G, K, P), Σ w·∂r/∂θ.
+    """
+
+    count: Tensor
+    sum_of_squares: Tensor
+    jtr: Tensor
+    jtj: Tensor
+    group_count: Tensor
+    group_weight: Tensor
+    group_residual: Tensor
+    group_jacobian: Tensor
+
+
+class LensFamily:
+    """Traces lenses of one structure: those of a lens whose variables take other values.
+
+    Variables are parameters that the records depend on linearly: curvatures, conics, coefficients,
+    thicknesses and the sensor's distance.  Poses of elements are not.
+
+    Args:
+        lens: gives the structure, and all that is no variable.  Its apertures clip rays.
+        names: of its parameters, or patterns, as `Lens.variables` takes them; columns come in the
+            order of these.
+        wavelengths: nm.
+
+    Raises:
+        InputError: no such parameter, a surface without a kernel, or a pose among the variables.
+    """
+
+    def __init__(self, lens: Lens, names: Sequence[str], wavelengths: Sequence[float]) -> None:
+        parameters: dict[str, Tensor] = {}
+        for name in names:
+            parameters |= {n: p for n, p in lens.variables([name]).items() if n not in parameters}
+        self.lens = lens
+        self.wavelengths = tuple(float(w) for w in wavelengths)
+        self.columns: dict[str, slice] = {}
+        first = 0
+        for name, parameter in parameters.items():
+            self.columns[name] = slice(first, first + parameter.numel())
+            first += parameter.numel()
+        poses = [name for name in parameters if name.startswith("elements.")]
+        if poses:
+            raise InputError(
+                f"'{poses[0]}' cannot vary in a family: its records do not depend on poses linearly"
+            )
+        # At the origin, so that no lens has the rounding of another.
+        leaves = {n: torch.zeros_like(p.detach()).requires_grad_() for n, p in parameters.items()}
+        system = lens.system(leaves)
+        self._table, self.map = pack_with_variables(
+            system, self.wavelengths, list(leaves.values())
+        )
+        self._start = torch.cat([p.detach().reshape(-1) for p in parameters.values()])
+
+    @property
+    def start(self) -> Tensor:
+        """Return the variables of the lens itself, (P,)."""
+        return self._start.clone()
+
+    @property
+    def count(self) -> int:
+        """Return P, the number of variables."""
+        return self.map.count
+
+    def table(self, values: Tensor, indices: Tensor | None = None) -> SurfaceTable:
+        """Return the records of L lenses.
+
+        Args:
+            values: (L, P), in the units of the parameters.
+            indices: (L, media, wavelengths), float64: in front of the first surface and behind each;
+                None: those of the lens.
+        """
+        base = self._table.values
+        values = values.to(base)
+        moved = values[:, self.map.columns] * self.map.weights.to(base)
+        records = base.expand(len(values), -1).clone().index_add_(1, self.map.places, moved)
+        if indices is None:
+            indices = self._table.indices.expand(len(values), -1, -1)
+        return SurfaceTable(records, indices, self._table.codes, self._table.extras)
+
+    def _which(self, rays: FamilyRays) -> Tensor | None:
+        """Return each ray's column of the indices; None where there is but one wavelength."""
+        if len(self.wavelengths) == 1:
+            return None
+        if rays.wavelength is None:
+            return torch.zeros(rays.position.shape[1], dtype=torch.int32)
+        return rays.wavelength
+
+    def with_indices(self, rows: Tensor, columns: Tensor, count: int) -> VariableMap:
+        """Return the map of `count` variables, of which some are those that media depend on.
+
+        Args:
+            rows: (E,), int64, rows of the indices.
+            columns: (E,), int64, the variable of each, from `self.count` on.
+            count: of all variables.
+        """
+        own = self.map
+        return VariableMap(own.places, own.columns, own.weights, count, IndexMap(rows, columns))
+
+    def trace(
+        self, values: Tensor, rays: FamilyRays, indices: Tensor | None = None
+    ) -> TracedRays:
+        """Trace the rays of every lens to its sensor; gradients flow to values, rays and indices.
+
+        Args:
+            values: (L, P).
+            rays: L × N of them.
+            indices: as in `table`.
+
+        Returns:
+            The rays on the sensors, (L, N, ...), as `Lens.trace` returns them.
+        """
+        table = self.table(values, indices)
+        position, direction, path, status, surface = _Trace.apply(
+            table.values, table.indices, rays.position, rays.direction, self._which(rays), table
+        )
+        return TracedRays(
+            position=position,
+            direction=direction,
+            valid=status == 0,
+            status=status,
+            surface=surface,
+            path_length=path,
+        )
+
+    @torch.no_grad()
+    def jacobians(
+        self,
+        values: Tensor,
+        rays: FamilyRays,
+        outputs: Sequence[str] = ("x", "y"),
+        indices: Tensor | None = None,
+        variables: VariableMap | None = None,
+        index_derivatives: Tensor | None = None,
+    ) -> FamilyJacobian:
+        """Return the rays on the sensors and their derivatives with respect to the variables.
+
+        Args:
+            values: (L, P).
+            rays: L × N of them.
+            outputs: some of `OUTPUTS`.
+            indices: as in `table`.
+            variables: with indices among them, see `with_indices`; None: the family's own.
+            index_derivatives: (L, E, wavelengths), of the indices with respect to these.
+        """
+        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
+
+        found = kernels.ray_jacobians(
+            self.table(values, indices),
+            variables or self.map,
+            outputs,
+            (rays.position, rays.direction, self._which(rays)),
+            index_derivatives=index_derivatives,
+        )
+        return FamilyJacobian(*found)
+
+    @torch.no_grad()
+    def normal_equations(
+        self,
+        values: Tensor,
+        rays: FamilyRays,
+        target: Tensor,
+        weight: Tensor | None = None,
+        group: Tensor | None = None,
+        groups: int = 0,
+        outputs: Sequence[str] = ("x", "y"),
+        indices: Tensor | None = None,
+        variables: VariableMap | None = None,
+        index_derivatives: Tensor | None = None,
+    ) -> FamilySums:
+        """Return JᵀWJ, JᵀWr and Σ w·r² of residuals r = output - target, lens by lens.
+
+        Args:
+            values: (L, P).
+            rays: L × N of them.
+            target: mm, (L, N, K), may be expanded.
+            weight: (L, N), may be expanded; None: one.
+            group: (N,), int64, from 0 to `groups` - 1.
+            groups: G.
+            outputs: K of `OUTPUTS`.
+            indices: as in `table`.
+            variables: as in `jacobians`, and the last.
+            index_derivatives: of the media.
+        """
+        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
+
+        head, jtr, jtj, sums = kernels.normal_equations(
+            self.table(values, indices),
+            variables or self.map,
+            outputs,
+            (rays.position, rays.direction, self._which(rays)),
+            target,
+            weight,
+            group,
+            groups,
+            index_derivatives=index_derivatives,
+        )
+        k = len(outputs)
+        return FamilySums(
+            head[:, 0],
+            head[:, 1],
+            jtr,
+            jtj,
+            sums[..., 0],
+            sums[..., 1],
+            sums[..., 2 : 2 + k],
+            sums[..., 2 + k :].unflatten(-1, (k, -1)),
+        )
+
+
+class _Trace(torch.autograd.Function):
+    """Traces many lenses, with the adjoint kernel as its derivative."""
+
+    @staticmethod
+    def forward(ctx, values, indices, position, direction, which, table):  # noqa: ANN001, ANN205
+        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
+
+        position = position.to(values).contiguous()
+        direction = direction.to(values).contiguous()
+        found = kernels.trace(table, (position, direction, which))
+        ctx.save_for_backward(values, indices, position, direction, found[3])
+        ctx.which, ctx.codes, ctx.extras = which, table.codes, table.extras
+        ctx.mark_non_differentiable(found[3], found[4])
+        return found
+
+    @staticmethod
+    def backward(ctx, of_position, of_direction, of_path, *_):  # noqa: ANN001, ANN002, ANN205
+        from dolens.kernels.cpu import lenses as kernels  # compiled when it was traced
+
+        values, indices, position, direction, status = ctx.saved_tensors
+        wanted = ctx.needs_input_grad
+        of_rays, of_directions, of_values, of_indices = kernels.trace_adjoint(
+            SurfaceTable(values.detach(), indices.detach(), ctx.codes, ctx.extras),
+            (position, direction, ctx.which),
+            status,
+            (of_position, of_direction, of_path),
+            (wanted[2], wanted[3], wanted[1]),
+        )
+        return of_values, of_indices if wanted[1] else None, of_rays, of_directions, None, None
+
