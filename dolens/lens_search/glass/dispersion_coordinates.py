@@ -165,9 +165,7 @@ def coordinates_of(nd: float, vd: float, deviation: float = 0.0) -> tuple[float,
     """Return the coordinates of a glass with this nd, Vd and ΔPgF."""
     spread = (nd - 1.0) / vd
     values = (nd, spread, spread * deviation)
-    first, second, third = (
-        (v - c) / u for v, c, u in zip(values, CENTRE, UNIT, strict=True)
-    )
+    first, second, third = ((v - c) / u for v, c, u in zip(values, CENTRE, UNIT, strict=True))
     return first, second, third
 
 

@@ -22,9 +22,7 @@ from dolens.lens_search.glass.designs import (
 from dolens.lens_search.glass.trial_glasses import TrialGlasses
 
 
-def exchanged(
-    work: TrialGlasses, designs: Designs, held: Mapping[int, Sequence[bool]]
-) -> Designs:
+def exchanged(work: TrialGlasses, designs: Designs, held: Mapping[int, Sequence[bool]]) -> Designs:
     """Return the designs after exchanges, the best few of each lens.
 
     A round exchanges single glasses of every design; where that does not help a lens, pairs of

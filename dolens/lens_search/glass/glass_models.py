@@ -15,7 +15,9 @@ from dolens.lens_search.glass.designs import GlassModel
 _RIDGE = 1e-12
 
 
-def glass_models(gram: Tensor, gradient: Tensor, free: Tensor, shape: tuple[int, int]) -> GlassModel:
+def glass_models(
+    gram: Tensor, gradient: Tensor, free: Tensor, shape: tuple[int, int]
+) -> GlassModel:
     """Return the model of each glass of a batch of designs.
 
     Args:

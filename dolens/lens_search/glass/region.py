@@ -116,9 +116,7 @@ def nearest(
     scale = torch.ones_like(glasses[0]) if weights is None else weights.to(glasses)
     flat = (coordinates * scale).reshape(-1, glasses.shape[1])
     # No matrix product: its rounding would blur the zero distance of a glass to itself.
-    distances = torch.cdist(
-        flat, glasses * scale, compute_mode="donot_use_mm_for_euclid_dist"
-    )
+    distances = torch.cdist(flat, glasses * scale, compute_mode="donot_use_mm_for_euclid_dist")
     found = distances.topk(min(count, glasses.shape[0]), largest=False)
     shape = (*coordinates.shape[:-1], found.indices.shape[-1])
     return found.values.reshape(shape), found.indices.reshape(shape)

@@ -79,7 +79,8 @@ def snap_glasses(
         designs = best_of_each_lens(joined([designs.take(~free), far, tried]), work.settings.beam)
         far = far.take(far.trials.lens[:0])
     held = {
-        lens: row.tolist() for lens, row in zip(start.lens.tolist(), start.numbers >= 0, strict=True)
+        lens: row.tolist()
+        for lens, row in zip(start.lens.tolist(), start.numbers >= 0, strict=True)
     }
     final = exchanged(work, designs, held)
     return Snapped(_in_order(final), _in_order(designs), _in_order(continuous), work.count)

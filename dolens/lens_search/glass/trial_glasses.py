@@ -34,7 +34,13 @@ class SnapSettings:
     least_gain: float = 1e-6
 
     def __post_init__(self) -> None:
-        for name, least in (("neighbours", 1), ("beam", 1), ("far", 0), ("pair_neighbours", 0), ("rounds", 0)):
+        for name, least in (
+            ("neighbours", 1),
+            ("beam", 1),
+            ("far", 0),
+            ("pair_neighbours", 0),
+            ("rounds", 0),
+        ):
             if getattr(self, name) < least:
                 raise InputError(f"snapping: {name} must be at least {least}")
         if not self.least_gain >= 0.0:
@@ -79,7 +85,9 @@ class TrialGlasses:
         slope = 0.5 / merit.clamp(min=_SMALLEST)[:, None, None]
         least = (slope * rise + self._cost).argmin(2)
         cost = self._cost[torch.where(held, trials.numbers, least)].sum(1)
-        rise = rise.gather(2, least[..., None])[..., 0] if model else torch.zeros_like(held).to(merit)
+        rise = (
+            rise.gather(2, least[..., None])[..., 0] if model else torch.zeros_like(held).to(merit)
+        )
         risen = (merit**2 + (rise * ~held).sum(1)).clamp(min=0.0).sqrt()
         found = GlassTrials(trials.lens, variables, coordinates, trials.numbers)
         designs = Designs(found, merit, merit + cost, risen + cost, model)
@@ -140,7 +148,9 @@ class TrialGlasses:
         rows = torch.arange(len(slots), device=slots.device)[:, None]
         points = designs.trials.coordinates[rows, slots]
         # The nearest glass of a real one is itself.
-        count = min(count + int(bool((designs.trials.numbers[rows, slots] >= 0).all())), len(self._glasses))
+        count = min(
+            count + int(bool((designs.trials.numbers[rows, slots] >= 0).all())), len(self._glasses)
+        )
         if designs.model is None:
             return nearest(points, self._glasses, count, self._weights)[1]
         close = nearest(points, self._glasses, (count + 1) // 2, self._weights)[1]

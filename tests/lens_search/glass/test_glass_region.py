@@ -20,7 +20,9 @@ def test_a_rectangle_has_four_walls():
     inside = torch.tensor([[1.9, 0.1], [2.1, 0.5], [1.0, -0.25]]).double()
     assert region.contains(inside).tolist() == [True, False, False]
     # How far outside: along the walls' normals.
-    torch.testing.assert_close(region.excess(inside).amax(1)[1:], torch.tensor([0.1, 0.25]).double())
+    torch.testing.assert_close(
+        region.excess(inside).amax(1)[1:], torch.tensor([0.1, 0.25]).double()
+    )
 
 
 def test_all_glasses_are_inside_and_their_doubles_are_not():
@@ -70,7 +72,9 @@ def test_the_nearest_glasses():
     assert (distances.diff(dim=1) >= 0.0).all()
     vector, number = pull(points[5] + 1e-3, points)
     assert int(number) == 5
-    torch.testing.assert_close(vector, torch.full((3,), 1e-3, dtype=torch.float64), atol=1e-15, rtol=0.0)
+    torch.testing.assert_close(
+        vector, torch.full((3,), 1e-3, dtype=torch.float64), atol=1e-15, rtol=0.0
+    )
     # Where only the first coordinate counts, another glass may be the nearest.
     weights = torch.tensor([1.0, 0.0, 0.0]).double()
     closest = (points[:, 0] - 0.3).abs().argmin()

@@ -1,8 +1,8 @@
 """Thin elements in contact whose best curvatures are known in closed form, to test snapping with.
 
 The power Σ κ_i (n_i - 1) shall be 1 at every wavelength, with κ_i the total curvature of element i
-and a price on strong curvatures: merit² = Σ_w (Σ_i κ_i (n_iw - 1) - 1)²/s² + a Σ κ_i².  It is a ridge
-regression, so the best κ of any glasses, and the best glasses of a catalogue, can be written down.
+and a price on strong curvatures: merit² = Σ_w (Σ_i κ_i (n_iw - 1) - 1)²/s² + a² Σ κ_i².  It is a
+ridge regression, so the best κ of any glasses, and the best glasses of a catalogue, are known.
 """
 
 from itertools import combinations
