@@ -81,8 +81,13 @@ class Designs:
     def take(self, chosen: Tensor) -> "Designs":
         """Return some of the designs, or some of them several times."""
         model = self.model and GlassModel(*(part[chosen] for part in self.model))
-        numbers = (part[chosen] for part in (self.merit, self.total, self.expected))
-        return Designs(take(self.trials, chosen), *numbers, model)
+        return Designs(
+            take(self.trials, chosen),
+            self.merit[chosen],
+            self.total[chosen],
+            self.expected[chosen],
+            model,
+        )
 
 
 def take(trials: GlassTrials, chosen: Tensor) -> GlassTrials:

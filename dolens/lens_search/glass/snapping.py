@@ -10,7 +10,6 @@ All trials of a step, of all lenses, are one batch for the caller's `reoptimise`
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from dolens.errors import InputError
