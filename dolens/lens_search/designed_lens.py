@@ -8,6 +8,7 @@ from torch import Tensor
 from dolens.lens_search.arrangement import AIR, STOP, Arrangement
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.paraxial import numbers_of, paraxial
+from dolens.lens_search.real_pupils import stop_radii, with_real_beams
 from dolens.lens_search.specification import Specification
 from dolens.optics.lens import Lens
 from dolens.prescriptions.build import lens_from_prescription
@@ -21,8 +22,8 @@ def designed_lens(
 ) -> Lens:
     """Return a design as a lens with a stop that limits the beam, fields and wavelengths.
 
-    The stop's semi-diameter is that of the axial beam at the reference wavelength, by a paraxial
-    ray.  Other apertures pass the whole beam, by paraxial heights and some room.
+    The stop's semi-diameter is that of the axial beam at the reference wavelength, by a real ray.
+    Other apertures pass the whole beam with some room.
 
     Args:
         arrangement: the order of its elements.
@@ -37,18 +38,20 @@ def designed_lens(
     radius = 0.5 * f / specification.f_number
     field = max(float(t) for t in merit.rays.tangent) * f
     zero = torch.zeros(1, dtype=torch.float64)
+    conditions = with_real_beams(merit, values[None], merit.full(1))
+    stop_radius = float(stop_radii(merit, values[None], conditions)) * f
     surfaces: dict[str, dict[str, Any]] = {}
     gaps = [*(float(gap) * f for gap in numbers.gaps), None]
     media = [*arrangement.gap_media, AIR]
     for place, number in enumerate(arrangement.sequence):
         row: dict[str, Any] = {"type": "aperture"}
         if number == STOP:
-            marginal = abs(float(found.stop_height + zero)) * radius
-            row["semi_diameter"] = marginal
+            row["semi_diameter"] = stop_radius
         else:
             curvature = float(numbers.curvatures[number]) / f
             height = abs(float(found.marginal[number] + zero)) * radius
             height += abs(float(found.chief[number] + zero)) * field
+            height *= float(conditions.beam[0, number])
             row = {"type": "plane"} if curvature == 0.0 else {"type": "sphere"}
             if curvature != 0.0:
                 row["radius"] = 1.0 / curvature

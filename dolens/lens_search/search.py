@@ -48,11 +48,11 @@ class SearchPlan:
     batch: int = 500
     stages: tuple[Stage, ...] = STAGES
     finished: float = 0.5
-    finish_rounds: int = 5
+    finish_rounds: int = 6
     finish_iterations: int = 40
     escapes: int = 2
     parents: int = 16
-    tolerance: float = 1e-3
+    tolerance: float = 3e-4
     rings: int = 4
     arms: int = 8
     seed: int = 0
@@ -137,9 +137,7 @@ def escapes(specification: Specification, plan: SearchPlan, parents: Designs) ->
         values = torch.cat([part[0] for part in made])
         of = torch.cat([part[1] for part in made])
         words = [part[2] for part in made for _ in range(len(part[0]))]
-        done = _finished(
-            merit, plan, _best(grow(merit, values, plan.stages[-2:]), plan.finished)
-        )
+        done = _finished(merit, plan, _best(grow(merit, values, plan.stages[-2:]), plan.finished))
         iterations += done.iterations
         parent = of[done.starts].tolist()
         history = tuple(
@@ -159,9 +157,7 @@ def escapes(specification: Specification, plan: SearchPlan, parents: Designs) ->
     return Step(tuple(found), none, 0, iterations)
 
 
-def search(
-    specification: Specification, plan: SearchPlan, map_tasks: TaskMap
-) -> Iterator[Step]:
+def search(specification: Specification, plan: SearchPlan, map_tasks: TaskMap) -> Iterator[Step]:
     """Search, and yield what each task found as soon as it is known.
 
     Args:

@@ -20,7 +20,7 @@ class Limits:
         glass_edge: least thickness of an element at the edge of the beam.
         air_edge: least air space there.
         back_focus: least distance from the last vertex to the sensor.
-        track: greatest distance from the first vertex to the sensor.
+        track: greatest distance from the first surface, or a stop in front of it, to the sensor.
         distortion: greatest |h/h₀ - 1| of the chief ray's height h at the sensor, h₀ = f·tan θ.
         chief_ray_angle: greatest angle of the chief ray with the sensor's normal, degrees.
         aperture_over_radius: greatest ratio of the beam's height on a surface to its radius.

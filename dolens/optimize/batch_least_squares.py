@@ -177,9 +177,7 @@ class _State:
         return _State(
             self.which[kept],
             self.values[kept],
-            BatchModel(
-                self.model.merit[kept], self.model.gradient[kept], self.model.hessian[kept]
-            ),
+            BatchModel(self.model.merit[kept], self.model.gradient[kept], self.model.hessian[kept]),
             self.weight[kept],
             self.damping[kept],
             self.growth[kept],

@@ -41,9 +41,7 @@ def _forms(finds: Finds, checked: Sequence[Verification], name: str) -> Figure:
 
 def _course(finds: Finds, name: str) -> Figure:
     course = finds.course()
-    found = search_course(
-        course.seconds.tolist(), course.merits.tolist(), course.forms.tolist()
-    )
+    found = search_course(course.seconds.tolist(), course.merits.tolist(), course.forms.tolist())
     return search_course_figure(
         found.seconds, found.merits, found.best, found.forms, "mean RMS spot, µm", title=name
     )
@@ -53,9 +51,7 @@ def _starts(finds: Finds, name: str) -> Figure:
     course = finds.course()
     firsts = sorted(finds.features)
     features = torch.cat([finds.features[first] for first in firsts])
-    number_of = torch.cat(
-        [first + torch.arange(len(finds.features[first])) for first in firsts]
-    )
+    number_of = torch.cat([first + torch.arange(len(finds.features[first])) for first in firsts])
     reached = np.full(len(features), -1)
     places = {number: place for place, number in enumerate(number_of.tolist())}
     order = course.merits.argsort(descending=True)
