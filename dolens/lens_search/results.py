@@ -126,12 +126,42 @@ def write_results(
         for name, figure in figures.items():
             if figure is not None:
                 save_figure(figure, folder / f"{name}.png")
-        page = forms_page(reports, title, facts, pictures, len(forms), folder, merit_label)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+    write_page(reports, folder, title, facts, pictures, len(forms), merit_label)
+    return tuple(reports)
+
+
+def write_page(
+    reports: Sequence[FormReport],
+    folder: str | Path,
+    title: str,
+    facts: Sequence[tuple[str, str]],
+    pictures: Pictures,
+    found: int,
+    merit_label: str = "merit",
+) -> None:
+    """Write `forms.html`; it links to the reports' files, wherever they lie.
+
+    Args:
+        reports: of the forms, the best first.
+        folder: that the page goes to.
+        title: of the page.
+        facts: what and how much, for its heading.
+        pictures: of the search.
+        found: how many forms there are in all.
+        merit_label: of the merit, with its unit.
+
+    Raises:
+        InputError: the page cannot be written.
+    """
+    folder = Path(folder)
+    page = forms_page(reports, title, facts, pictures, found, folder, merit_label)
+    try:
         with written_whole(folder / "forms.html") as aside:
             aside.write_text(page, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
-    return tuple(reports)
 
 
 def sections_figure(reports: Sequence[FormReport], title: str | None = None) -> Figure | None:

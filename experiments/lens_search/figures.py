@@ -1,6 +1,6 @@
 """Figures of a search."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -9,45 +9,36 @@ from matplotlib.figure import Figure
 from dolens.experiments.experiment import Figures
 from dolens.experiments.lens_search.finds import Finds
 from dolens.lens_search.course import search_course
+from dolens.lens_search.form_report import FormReport
+from dolens.lens_search.results import sections_figure
 from dolens.lens_search.start_map import start_map
-from dolens.lens_search.verification import Verification
-from dolens.plotting.forms import FormPicture, form_section, forms_figure
 from dolens.plotting.search_course import search_course_figure
 from dolens.plotting.starts import starts_figure
 
 
-def search_figures(finds: Finds, checked: Sequence[Verification], name: str) -> Figures:
+def search_figures(finds: Finds, reports: Sequence[FormReport], name: str) -> Figures:
     """Return the sections of all forms, the search's course and the map of starts."""
     if not finds.found:
         return {}
-    return {
-        "forms": lambda: _forms(finds, checked, name),
-        "course": lambda: _course(finds, name),
-        "starts": lambda: _starts(finds, name),
+    found: dict[str, Callable[[], Figure]] = {
+        "course": lambda: course_picture(finds, name),
+        "starts": lambda: starts_picture(finds, name),
     }
+    sections = sections_figure(reports, f"{name}: mean RMS spot of each form")
+    return found if sections is None else {"forms": lambda: sections, **found}
 
 
-def _forms(finds: Finds, checked: Sequence[Verification], name: str) -> Figure:
-    pictures = []
-    for number, (found, verification) in enumerate(zip(finds.found, checked, strict=True), 1):
-        broken = ", ".join(check.name for check in verification.broken)
-        pictures.append(
-            FormPicture(
-                form_section(found.lens), str(number), f"{found.mean_rms_spot_um:.2f} µm", broken
-            )
-        )
-    return forms_figure(pictures, title=f"{name}: mean RMS spot of each form")
-
-
-def _course(finds: Finds, name: str) -> Figure:
+def course_picture(finds: Finds, name: str) -> Figure:
+    """Draw merit and forms against time."""
     course = finds.course()
     found = search_course(course.seconds.tolist(), course.merits.tolist(), course.forms.tolist())
     return search_course_figure(
-        found.seconds, found.merits, found.best, found.forms, "mean RMS spot, µm", title=name
+        found.seconds, found.merits, found.best, found.forms, "mean RMS spot (µm)", title=name
     )
 
 
-def _starts(finds: Finds, name: str) -> Figure:
+def starts_picture(finds: Finds, name: str) -> Figure:
+    """Draw which start led where."""
     course = finds.course()
     firsts = sorted(finds.features)
     features = torch.cat([finds.features[first] for first in firsts])

@@ -14,20 +14,19 @@ from dolens.experiments.experiment import Figures
 from dolens.experiments.lens_search.figures import search_figures
 from dolens.experiments.lens_search.finds import Finds
 from dolens.experiments.lens_search.kept_steps import KeptSteps
+from dolens.experiments.lens_search.page import form_reports, write_forms_page
 from dolens.experiments.lens_search.tables import check_rows, form_rows
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.course import WITHIN
 from dolens.lens_search.designed_lens import designed_lens
-from dolens.lens_search.files import write_form
+from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.growth import STAGES
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.requirements import Requirements
 from dolens.lens_search.search import SearchPlan, search
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.starts import random_starts
-from dolens.lens_search.verification import Verification, verify
 from dolens.optics.lens import Lens
 from dolens.stages import stage as named_stage
 
@@ -76,7 +75,7 @@ class LensSearchModule(Analysis):
         self.specification, self.plan, self.forms = specification, plan, forms
         self.workers = workers_of(0 if workers is None else workers)
         self.finds = Finds(specification, plan)
-        self.verifications: list[Verification] = []
+        self.reports: list[FormReport] = []
 
     def analyse(self) -> dict[str, float]:
         """Search, then check and write the best forms."""
@@ -91,24 +90,22 @@ class LensSearchModule(Analysis):
         if not self.finds.found:
             logger.warning("No start became a lens that keeps the specification.")
             return self._numbers()
-        required = Requirements.of(self.specification)
         with named_stage("checks of the best forms"):
-            for number, found in enumerate(self.finds.found, 1):
-                self.verifications.append(verify(found.lens, required))
-                write_form(found.lens, self.folder / "forms", number)
+            self.reports = form_reports(self.finds, self.folder / "forms")
+            write_forms_page(self.finds, self.reports, self.folder, self.experiment)
         self.lens = self.finds.found[0].lens.requires_grad_(False)
         return self._numbers()
 
     def tables(self) -> dict[str, Iterable[Row]]:
         """Return `forms` and `checks`."""
         return {
-            "forms": form_rows(self.finds.found, self.verifications),
-            "checks": check_rows(self.verifications),
+            "forms": form_rows(self.reports),
+            "checks": check_rows(self.reports),
         }
 
     def figures(self) -> Figures:
         """Return the sections of all forms, the search's course and the map of starts."""
-        return search_figures(self.finds, self.verifications, self.experiment)
+        return search_figures(self.finds, self.reports, self.experiment)
 
     def _numbers_of_best(self) -> dict[str, float]:
         best = self.finds.found[0]
@@ -127,7 +124,7 @@ class LensSearchModule(Analysis):
             "search/starts": float(self.plan.starts),
             "search/designs": float(finds.designs),
             "search/lens_iterations": float(finds.iterations),
-            "search/forms_that_hold": float(sum(v.holds for v in self.verifications)),
+            "search/forms_that_hold": float(sum(report.holds for report in self.reports)),
         }
         return numbers | (self._numbers_of_best() if finds.found else {})
 

@@ -3,32 +3,37 @@
 from collections.abc import Iterator, Sequence
 
 from dolens.experiments.tables import Row
-from dolens.lens_search.files import form_name
-from dolens.lens_search.found import FoundLens
-from dolens.lens_search.verification import Verification
+from dolens.lens_search.form_report import FormReport
 
 
-def form_rows(found: Sequence[FoundLens], checked: Sequence[Verification]) -> Iterator[Row]:
+def form_rows(reports: Sequence[FormReport]) -> Iterator[Row]:
     """Yield a row for each form, the best first."""
-    for number, (lens, verification) in enumerate(zip(found, checked, strict=True), 1):
-        spots = {f"rms_spot_um_{n}": spot for n, spot in enumerate(lens.rms_spot_um, 1)}
+    for report in reports:
+        found, made = report.found, report.sensitivity
+        spots = {f"rms_spot_um_{n}": spot for n, spot in enumerate(found.rms_spot_um, 1)}
         yield {
-            "form": form_name(number),
-            "mean_rms_spot_um": lens.mean_rms_spot_um,
+            "form": report.name,
+            "powers": report.powers,
+            "mean_rms_spot_um": found.mean_rms_spot_um,
             **spots,
-            "holds": verification.holds,
-            "broken": "; ".join(check.name for check in verification.broken),
-            "start": lens.start,
-            "history": ", ".join(lens.history),
+            "rms_spot_um_90_percent_as_made": "" if made is None else made.ninety_percent_um,
+            "worst_tolerance": "" if made is None else made.worst,
+            "holds": report.holds,
+            "broken": report.broken,
+            "glasses": report.glasses,
+            "starts": report.starts,
+            "designs": report.designs,
+            "start": found.start,
+            "history": ", ".join(found.history),
         }
 
 
-def check_rows(checked: Sequence[Verification]) -> Iterator[Row]:
+def check_rows(reports: Sequence[FormReport]) -> Iterator[Row]:
     """Yield a row for each quantity of each form."""
-    for number, verification in enumerate(checked, 1):
-        for check in verification.checks:
+    for report in reports:
+        for check in report.verification.checks if report.verification else ():
             yield {
-                "form": form_name(number),
+                "form": report.name,
                 "quantity": check.name,
                 "value": check.value,
                 "unit": check.unit,
