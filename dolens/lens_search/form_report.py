@@ -7,7 +7,7 @@ from pathlib import Path
 from dolens.errors import InputError
 from dolens.lens_search.files import SUFFIXES, WrittenFile, form_name, write_form
 from dolens.lens_search.form_words import glasses_text, powers_text
-from dolens.lens_search.forms import Form
+from dolens.lens_search.found import FoundLens
 from dolens.lens_search.real_beams import with_drawn_heights
 from dolens.lens_search.requirements import Requirements
 from dolens.lens_search.sensitivity import LensSensitivity, lens_sensitivity
@@ -23,19 +23,21 @@ class FormReport:
 
     Attributes:
         number: its rank, from 1.
-        form: with its best lens and all others.
-        lens: the best one, its surfaces drawn as far as its beams go.
+        found: its best lens.
+        lens: the same, its surfaces drawn as far as its beams go.
         powers: signs of its elements' powers: `+ − | +`.
         glasses: of its elements.
         verification: real rays beside what is required; None where they could not be traced.
         sensitivity: to the usual tolerances; None where it could not be found.
         section: drawn; None where it could not be.
         files: one a format.
+        starts: how many starts led to it; None where nobody counted.
+        designs: how many designs are of this form; None where nobody counted.
         problems: what could not be computed, and why, a sentence each.
     """
 
     number: int
-    form: Form
+    found: FoundLens
     lens: Lens
     powers: str
     glasses: str
@@ -43,6 +45,8 @@ class FormReport:
     sensitivity: LensSensitivity | None
     section: SmallSection | None
     files: tuple[WrittenFile, ...]
+    starts: int | None = None
+    designs: int | None = None
     problems: tuple[str, ...] = ()
 
     @property
@@ -64,10 +68,12 @@ class FormReport:
 
 
 def report_form(
-    form: Form,
+    found: FoundLens,
     number: int,
     required: Requirements,
     folder: str | Path,
+    starts: int | None = None,
+    designs: int | None = None,
     suffixes: Sequence[str] = SUFFIXES,
 ) -> FormReport:
     """Check the best lens of a form, find what tolerances do to it, and write its files.
@@ -75,16 +81,18 @@ def report_form(
     What cannot be computed of a lens is a problem of its report, and the rest goes on.
 
     Args:
-        form: a group of found lenses.
+        found: the best lens of the form.
         number: its rank, from 1.
         required: what it must keep.
         folder: for its files; it is made.
+        starts: how many starts led to it.
+        designs: how many designs are of this form.
         suffixes: of the formats.
 
     Raises:
         InputError: a file cannot be written.
     """
-    lens, problems = form.best.lens, []
+    lens, problems = found.lens, []
     verification = sensitivity = section = None
     try:
         verification = verify(lens, required)
@@ -101,7 +109,7 @@ def report_form(
         problems.append(f"section: {error}")
     return FormReport(
         number,
-        form,
+        found,
         lens,
         powers_text(lens),
         glasses_text(lens),
@@ -109,5 +117,7 @@ def report_form(
         sensitivity,
         section,
         write_form(lens, folder, number, suffixes),
+        starts,
+        designs,
         tuple(problems),
     )

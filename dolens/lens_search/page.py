@@ -4,8 +4,11 @@ It is one HTML file that needs no network; the prescriptions that it links to li
 """
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
 
 from matplotlib.figure import Figure
 
@@ -47,6 +50,7 @@ def forms_page(
     facts: Sequence[tuple[str, str]],
     pictures: Pictures,
     found: int,
+    folder: str | Path,
     merit_label: str = "merit",
 ) -> str:
     """Return the page as the text of an HTML file.
@@ -57,16 +61,17 @@ def forms_page(
         facts: what and how much, for its heading.
         pictures: of the search.
         found: how many forms there are in all.
+        folder: that the page will lie in; it links to files from there.
         merit_label: of the merit, with its unit.
     """
-    best = reports[0].form.best
+    best = reports[0].found
     told = [
         *facts,
         ("forms", str(found)),
         ("best mean RMS spot", f"{number(best.mean_rms_spot_um, 4)} µm"),
     ]
     blocks = [
-        Block("forms", "Forms", _cards(reports, found)),
+        Block("forms", "Forms", _cards(reports, found, Path(folder))),
         Block("comparison", "Comparison", _comparison(reports, merit_label)),
         Block("checks", "Checks by real rays", _checks(reports)),
     ]
@@ -78,23 +83,23 @@ def forms_page(
             with laid_out(figure):
                 svg = inline_svg(figure, name, heading)
             blocks.append(Block(name, heading, figure_html(svg, False)))
-    blocks.append(Block("files", "Prescriptions", _files(reports)))
+    blocks.append(Block("files", "Prescriptions", _files(reports, Path(folder))))
     return page_html(title, told, "", blocks, STYLE, GENERATOR)
 
 
-def _cards(reports: Sequence[FormReport], found: int) -> Markup:
+def _cards(reports: Sequence[FormReport], found: int, folder: Path) -> Markup:
     """Return the sections side by side, each with what matters about it."""
     sections = [report.section for report in reports if report.section is not None]
     width = common_size(sections)[0] if sections else 1.0
     note = "All sections are drawn to one scale, with rays of the fields through the whole stop."
     if found > len(reports):
         note += f" These are the best {len(reports)} of {found} forms."
-    cards = (_card(report, width) for report in reports)
+    cards = (_card(report, width, folder) for report in reports)
     return joined(element("p", note), element("div", *cards, class_="cards"))
 
 
-def _card(report: FormReport, width: float) -> Markup:
-    best = report.form.best
+def _card(report: FormReport, width: float, folder: Path) -> Markup:
+    best = report.found
     mark = element("span", f"{_YES} keeps all", class_="good") if report.holds else None
     if mark is None:
         mark = element("span", f"{_NO} {report.broken}", class_="bad")
@@ -114,13 +119,19 @@ def _card(report: FormReport, width: float) -> Markup:
     rows = [("RMS spots", _spots(report)), ("glasses", report.glasses)]
     if report.sensitivity is not None:
         rows.append(("90 % as made", f"≤ {number(report.sensitivity.ninety_percent_um, 3)} µm"))
-    starts = len(report.form.starts)
-    rows.append(("starts", f"{starts}, {len(report.form.members)} designs"))
+    if report.starts is not None and report.designs is not None:
+        starts, designs = (
+            f"{count} {word}{'s' * (count != 1)}"
+            for word, count in (("start", report.starts), ("design", report.designs))
+        )
+        rows.append(("from", f"{starts}, {designs}"))
     if len(best.history) > 1:
         rows.append(("way", ", ".join(best.history)))
     facts = (joined(element("dt", name), element("dd", value)) for name, value in rows)
     links = [
-        element("a", file.path.suffix, href=file.path.name) for file in report.files if file.written
+        element("a", file.path.suffix, href=_address(file.path, folder))
+        for file in report.files
+        if file.written
     ]
     return element(
         "article",
@@ -141,7 +152,7 @@ def _card(report: FormReport, width: float) -> Markup:
 
 
 def _spots(report: FormReport) -> str:
-    best = report.form.best
+    best = report.found
     return ", ".join(number(value, 3) for value in best.rms_spot_um) + " µm"
 
 
@@ -152,12 +163,12 @@ def _comparison(reports: Sequence[FormReport], merit_label: str) -> Markup:
     if lens.fields is not None:
         unit = "°" if lens.fields.kind == "angles" else "mm"
         labels = [field_label(point, unit) for point in lens.fields.points]
-    spots = labels if len(labels) == len(reports[0].form.best.rms_spot_um) else []
+    spots = labels if len(labels) == len(reports[0].found.rms_spot_um) else []
     heads = ("#", "powers", merit_label, "mean", *spots, "track", "back focus", "distortion")
     heads += ("chief ray", "expected", "90 %", "worst tolerance", "checks")
     rows = []
     for report in reports:
-        best, sensitivity = report.form.best, report.sensitivity
+        best, sensitivity = report.found, report.sensitivity
         shown = best.rms_spot_um if len(best.rms_spot_um) == len(spots) else [math.nan] * len(spots)
         values = [number(value, 4, zeros=True) for value in (best.merit, best.mean_rms_spot_um)]
         values += [number(value, 3, zeros=True) for value in shown]
@@ -255,7 +266,12 @@ def _cell(check: Check | None) -> Markup:
     return element("span", number(value, 4), class_=kind, title=check.place or None)
 
 
-def _files(reports: Sequence[FormReport]) -> Markup:
+def _address(path: Path, folder: Path) -> str:
+    """Return where a file lies, seen from a page in a folder."""
+    return quote(Path(os.path.relpath(path, folder)).as_posix())
+
+
+def _files(reports: Sequence[FormReport], folder: Path) -> Markup:
     """Return which formats hold each form, and what those say otherwise that cannot hold all."""
     suffixes = [file.path.suffix for file in reports[0].files]
     rows: list[list[Child]] = []
@@ -267,7 +283,8 @@ def _files(reports: Sequence[FormReport]) -> Markup:
                 row.append(element("span", f"{_NO} not written", class_="bad"))
             else:
                 mark = "" if file.exact else " ≈"
-                row.append(element("a", f"{file.path.suffix}{mark}", href=file.path.name))
+                name = f"{file.path.suffix}{mark}"
+                row.append(element("a", name, href=_address(file.path, folder)))
             for change in file.changes:
                 notes.setdefault(f"{file.path.suffix}: {change}", []).append(report.number)
         rows.append(row)

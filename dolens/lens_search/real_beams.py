@@ -154,7 +154,7 @@ def with_drawn_heights(lens: Lens, heights: Tensor) -> Lens:
         lens: stays as it is.
         heights: (S,), mm, of the beams on its surfaces; NaN leaves a surface as it is.
     """
-    drawn = copy.deepcopy(lens)
+    drawn = copy.deepcopy(lens).requires_grad_(False)
     for surface, height in zip(drawn.surfaces.values(), heights.tolist(), strict=True):
         if not surface.aperture.clips and height > 0.0:
             size = min(_MARGIN * height, surface.reach)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from dolens.analysis.conditions import conditions
@@ -42,6 +43,30 @@ class Starts:
     map: StartMap
     forms: Tensor
     tried: int
+
+    def figure(self) -> Figure:
+        """Draw the map, and how many starts each form has."""
+        share = f"{100.0 * self.map.share:.0f} % of the starts' variance"
+        return starts_figure(
+            self.map.points.numpy(),
+            self.forms.tolist(),
+            self.map.labels,
+            self.tried,
+            f"Which start led where ({share})",
+        )
+
+
+def course_figure(course: SearchCourse, merit_label: str = "merit") -> Figure:
+    """Draw the course of a search; the label of the merit has its unit."""
+    return search_course_figure(
+        course.seconds,
+        course.merits,
+        course.best,
+        course.forms,
+        merit_label,
+        course.within,
+        "Course of the search",
+    )
 
 
 def write_results(
@@ -86,59 +111,76 @@ def write_results(
     chosen = list(forms)[:most]
     for number, form in enumerate(chosen, 1):
         said(f"form {number}", number - 1, len(chosen))
-        reports.append(report_form(form, number, required, folder))
+        counts = len(form.starts), len(form.members)
+        reports.append(report_form(form.best, number, required, folder, *counts))
         for problem in reports[-1].problems:
             logger.warning("form %d: %s", number, problem)
     said("page", len(chosen), len(chosen))
     pictures = Pictures(
-        None
-        if starts is None
-        else starts_figure(
-            starts.map.points.numpy(),
-            starts.forms.tolist(),
-            starts.map.labels,
-            starts.tried,
-            f"Which start led where ({100.0 * starts.map.share:.0f} % of the starts' variance)",
-        ),
-        None
-        if course is None
-        else search_course_figure(
-            course.seconds,
-            course.merits,
-            course.best,
-            course.forms,
-            merit_label,
-            course.within,
-            "Course of the search",
-        ),
+        None if starts is None else starts.figure(),
+        None if course is None else course_figure(course, merit_label),
     )
+    figures = {"starts": pictures.starts, "merit_over_time": pictures.course}
     try:
-        _save_pictures(reports, pictures, folder, title)
-        page = forms_page(reports, title, facts, pictures, len(forms), merit_label)
+        figures["forms"] = sections_figure(reports, title)
+        for name, figure in figures.items():
+            if figure is not None:
+                save_figure(figure, folder / f"{name}.png")
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
+    write_page(reports, folder, title, facts, pictures, len(forms), merit_label)
+    return tuple(reports)
+
+
+def write_page(
+    reports: Sequence[FormReport],
+    folder: str | Path,
+    title: str,
+    facts: Sequence[tuple[str, str]],
+    pictures: Pictures,
+    found: int,
+    merit_label: str = "merit",
+) -> None:
+    """Write `forms.html`; it links to the reports' files, wherever they lie.
+
+    Args:
+        reports: of the forms, the best first.
+        folder: that the page goes to.
+        title: of the page.
+        facts: what and how much, for its heading.
+        pictures: of the search.
+        found: how many forms there are in all.
+        merit_label: of the merit, with its unit.
+
+    Raises:
+        InputError: the page cannot be written.
+    """
+    folder = Path(folder)
+    page = forms_page(reports, title, facts, pictures, found, folder, merit_label)
+    try:
         with written_whole(folder / "forms.html") as aside:
             aside.write_text(page, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror})") from None
-    return tuple(reports)
 
 
-def _save_pictures(
-    reports: Sequence[FormReport], pictures: Pictures, folder: Path, title: str
-) -> None:
+def sections_figure(reports: Sequence[FormReport], title: str | None = None) -> Figure | None:
+    """Draw the sections of all forms that can be drawn; None where there is none.
+
+    Args:
+        reports: of the forms, in their order.
+        title: above all.
+    """
     drawn = [
         FormPicture(
             report.section,
             str(report.number),
-            f"{number_text(report.form.best.mean_rms_spot_um)} µm    {report.powers}",
+            f"{number_text(report.found.mean_rms_spot_um)} µm    {report.powers}",
             report.broken,
         )
         for report in reports
         if report.section is not None
     ]
-    if drawn:
-        unit = conditions(reports[0].lens).field_unit
-        save_figure(forms_figure(drawn, title=title, field_unit=unit), folder / "forms.png")
-    if pictures.starts is not None:
-        save_figure(pictures.starts, folder / "starts.png")
-    if pictures.course is not None:
-        save_figure(pictures.course, folder / "merit_over_time.png")
+    if not drawn:
+        return None
+    return forms_figure(drawn, title=title, field_unit=conditions(reports[0].lens).field_unit)

@@ -6,23 +6,20 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.arrangement import Arrangement
-from dolens.lens_search.course import SearchCourse, search_course
 from dolens.lens_search.designed_lens import designed_lens
 from dolens.lens_search.designs import Designs
+from dolens.lens_search.forms import distinct, form_numbers
 from dolens.lens_search.form_coordinates import form_coordinates
-from dolens.lens_search.forms import Form, distinct, form_numbers
 from dolens.lens_search.found import FoundLens
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.results import Starts
 from dolens.lens_search.search import SearchPlan, Step, with_step
 from dolens.lens_search.specification import Specification
-from dolens.lens_search.start_map import start_map
 
 _UM = 1e3
 
 
 @dataclass(frozen=True)
-class _Every:
+class Course:
     """Times, merits and forms of all designs.
 
     Attributes:
@@ -46,12 +43,14 @@ class Finds:
         plan: of the search.
 
     Attributes:
+        found: the best forms as lenses, the best first; see `rank`.
         features: powers of the elements of every start, by the number of its batch's first start.
         iterations: of all lenses together.
     """
 
     def __init__(self, specification: Specification, plan: SearchPlan) -> None:
         self.specification, self.plan = specification, plan
+        self.found: list[FoundLens] = []
         self.features: dict[int, Tensor] = {}
         self.iterations = 0
         self._pool: dict[Arrangement, Designs] = {}
@@ -95,11 +94,9 @@ class Finds:
             f"{self.forms} forms, {self.forms_within(0.25)} within 25 % of the best"
         )
 
-    def ranked(self, count: int) -> tuple[Form, ...]:
-        """Return the best forms as lenses; lenses of two arrangements may be one form.
-
-        Args:
-            count: of forms of single arrangements that are compared.
+    def rank(self, count: int) -> None:
+        """Make lenses of the best forms; lenses that differ in the place of the stop alone are one
+        form.
         """
         ranked = sorted(
             (float(merit), arrangement.stop, row, arrangement)
@@ -107,7 +104,7 @@ class Finds:
             for row, merit in enumerate(designs.merit)
         )
         lenses = []
-        for merit, _, row, arrangement in ranked[:count]:
+        for merit, _, row, arrangement in ranked[: 2 * count]:
             designs = self._pool[arrangement]
             lens = designed_lens(
                 arrangement, self.specification, designs.values[row], f"form {len(lenses) + 1}"
@@ -115,29 +112,10 @@ class Finds:
             spots = tuple(_UM * float(spot) for spot in designs.spots[row])
             start = int(designs.starts[row])
             lenses.append(FoundLens(lens, _UM * merit, spots, start, designs.history[row]))
-        return distinct(lenses)
+        self.found = [form.best for form in distinct(lenses)][:count]
 
-    def course(self) -> SearchCourse:
-        """Return what was best, and how many forms there were, at each time."""
-        found = self._every
-        return search_course(found.seconds.tolist(), found.merits.tolist(), found.forms.tolist())
-
-    def starts(self) -> Starts:
-        """Return which start led where."""
-        firsts = sorted(self.features)
-        features = torch.cat([self.features[first] for first in firsts])
-        numbers = [first + n for first in firsts for n in range(len(self.features[first]))]
-        place = {number: row for row, number in enumerate(numbers)}
-        found = self._every
-        reached = torch.full((len(features),), -1, dtype=torch.int64)
-        # The best last, which then stands.
-        for row in found.merits.argsort(descending=True).tolist():
-            reached[place[int(found.starts[row])]] = found.forms[row]
-        names = [f"φ{n}" for n in range(1, features.shape[1] + 1)]
-        return Starts(start_map(features, names), reached, self.plan.starts)
-
-    @property
-    def _every(self) -> _Every:
+    def course(self) -> Course:
+        """Return when each design was found, and its form."""
         seconds, merits, starts, numbers = [], [], [], []
         first = 0
         for arrangement in self._pool:
@@ -155,4 +133,4 @@ class Finds:
         best = best.scatter_reduce(0, form, merit_of_all, "amin")
         place = torch.empty(first, dtype=torch.int64)
         place[best.argsort(stable=True)] = torch.arange(first)
-        return _Every(torch.cat(seconds), merit_of_all, place[form], torch.cat(starts))
+        return Course(torch.cat(seconds), merit_of_all, place[form], torch.cat(starts))

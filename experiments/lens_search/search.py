@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import ClassVar
 
 import torch
@@ -14,6 +14,7 @@ from dolens.experiments.experiment import Figures
 from dolens.experiments.lens_search.figures import search_figures
 from dolens.experiments.lens_search.finds import Finds
 from dolens.experiments.lens_search.kept_steps import KeptSteps
+from dolens.experiments.lens_search.page import form_reports, write_forms_page
 from dolens.experiments.lens_search.tables import check_rows, form_rows
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
@@ -23,8 +24,6 @@ from dolens.lens_search.designed_lens import designed_lens
 from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.growth import STAGES
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.requirements import Requirements
-from dolens.lens_search.results import write_results
 from dolens.lens_search.search import SearchPlan, search
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.starts import random_starts
@@ -76,7 +75,7 @@ class LensSearchModule(Analysis):
         self.specification, self.plan, self.forms = specification, plan, forms
         self.workers = workers_of(0 if workers is None else workers)
         self.finds = Finds(specification, plan)
-        self.reports: Sequence[FormReport] = ()
+        self.reports: list[FormReport] = []
 
     def analyse(self) -> dict[str, float]:
         """Search, then check and write the best forms."""
@@ -87,34 +86,29 @@ class LensSearchModule(Analysis):
             for step in search(self.specification, self.plan, kept.map(map_tasks)):
                 self.finds.add(step, kept.seconds_before + time.perf_counter() - started)
                 logger.info("%s", self.finds.report())
-        forms = self.finds.ranked(2 * self.forms)
-        if not forms:
+        self.finds.rank(self.forms)
+        if not self.finds.found:
             logger.warning("No start became a lens that keeps the specification.")
             return self._numbers()
         with named_stage("checks of the best forms"):
-            self.reports = write_results(
-                forms,
-                self.folder / "forms",
-                Requirements.of(self.specification),
-                self.experiment,
-                starts=self.finds.starts(),
-                course=self.finds.course(),
-                merit_label="mean RMS spot, µm",
-                most=self.forms,
-            )
-        self.lens = forms[0].best.lens.requires_grad_(False)
+            self.reports = form_reports(self.finds, self.folder / "forms")
+            write_forms_page(self.finds, self.reports, self.folder, self.experiment)
+        self.lens = self.finds.found[0].lens.requires_grad_(False)
         return self._numbers()
 
     def tables(self) -> dict[str, Iterable[Row]]:
         """Return `forms` and `checks`."""
-        return {"forms": form_rows(self.reports), "checks": check_rows(self.reports)}
+        return {
+            "forms": form_rows(self.reports),
+            "checks": check_rows(self.reports),
+        }
 
     def figures(self) -> Figures:
         """Return the sections of all forms, the search's course and the map of starts."""
         return search_figures(self.finds, self.reports, self.experiment)
 
     def _numbers_of_best(self) -> dict[str, float]:
-        best = self.reports[0].form.best
+        best = self.finds.found[0]
         fields = [(0.0, float(angle)) for angle in self.specification.fields]
         spots = spot_diagram(best.lens, fields, self.specification.wavelengths)
         return {
@@ -132,7 +126,7 @@ class LensSearchModule(Analysis):
             "search/lens_iterations": float(finds.iterations),
             "search/forms_that_hold": float(sum(report.holds for report in self.reports)),
         }
-        return numbers | (self._numbers_of_best() if self.reports else {})
+        return numbers | (self._numbers_of_best() if finds.found else {})
 
 
 def first_start(specification: Specification) -> Lens:

@@ -9,27 +9,29 @@ from dolens.lens_search.form_report import FormReport
 def form_rows(reports: Sequence[FormReport]) -> Iterator[Row]:
     """Yield a row for each form, the best first."""
     for report in reports:
-        best, sensitivity = report.form.best, report.sensitivity
-        spots = {f"rms_spot_um_{n}": spot for n, spot in enumerate(best.rms_spot_um, 1)}
+        found, made = report.found, report.sensitivity
+        spots = {f"rms_spot_um_{n}": spot for n, spot in enumerate(found.rms_spot_um, 1)}
         yield {
             "form": report.name,
-            "mean_rms_spot_um": best.mean_rms_spot_um,
-            **spots,
-            "made_p90_um": "" if sensitivity is None else sensitivity.ninety_percent_um,
             "powers": report.powers,
-            "glasses": report.glasses,
+            "mean_rms_spot_um": found.mean_rms_spot_um,
+            **spots,
+            "rms_spot_um_90_percent_as_made": "" if made is None else made.ninety_percent_um,
+            "worst_tolerance": "" if made is None else made.worst,
             "holds": report.holds,
             "broken": report.broken,
-            "starts": len(report.form.starts),
-            "start": best.start,
-            "history": ", ".join(best.history),
+            "glasses": report.glasses,
+            "starts": report.starts,
+            "designs": report.designs,
+            "start": found.start,
+            "history": ", ".join(found.history),
         }
 
 
 def check_rows(reports: Sequence[FormReport]) -> Iterator[Row]:
     """Yield a row for each quantity of each form."""
     for report in reports:
-        for check in () if report.verification is None else report.verification.checks:
+        for check in report.verification.checks if report.verification else ():
             yield {
                 "form": report.name,
                 "quantity": check.name,

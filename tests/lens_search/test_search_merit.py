@@ -106,20 +106,25 @@ def test_paraxial_numbers_are_those_of_the_lens(merit):
     assert pupil == pytest.approx(first_order.entrance_pupil.z.item(), rel=1e-10)
 
 
-def test_spots_of_real_beams_are_those_of_the_lens_through_its_stop(merit):
-    conditions = merit.full(1)
-    conditions = replace(conditions, f_number=torch.tensor([3.0], dtype=torch.float64))
-    u = lenses(1)
-    conditions = with_real_beams(merit, u, conditions)
-    assert not torch.equal(conditions.pupils, merit.full(1).pupils)
+# A quartet of 6.4 µm, mm: radii, gaps with the stop, image distance.
+RADII = (92.3998, 290.546, -88.7409, -102.231, 54.1515, -127.0626, -37.1968, 320.955)
+GAPS = (4.1945, 6.6717, 65.478, 0.05, 0.05, 75.2021, 3.8137, 2.0, 30.0)
+
+
+def test_spots_of_real_beams_are_those_of_the_lens_through_its_stop():
+    specification = replace(QUARTET, wavelengths=(587.5618,), glasses=("1.5168/64.17",))
+    merit = SearchMerit.of(ARRANGEMENT, specification)
+    numbers = [*(100.0 / radius for radius in RADII), *(gap / 100.0 for gap in GAPS)]
+    u = torch.tensor([numbers], dtype=torch.float64)
+    conditions = with_real_beams(merit, u, merit.full(1))
     spots = merit.spots(u, conditions)[0]
-    lens = designed_lens(ARRANGEMENT, QUARTET, u[0], "made")
-    fields = [(0.0, angle) for angle in QUARTET.fields]
-    exact = spot_diagram(lens, fields, QUARTET.wavelengths).polychromatic_rms
-    torch.testing.assert_close(spots, exact, rtol=0.01, atol=0.0)
+    lens = designed_lens(ARRANGEMENT, specification, u[0], "made")
+    fields = [(0.0, angle) for angle in specification.fields]
+    exact = spot_diagram(lens, fields, specification.wavelengths).polychromatic_rms
+    torch.testing.assert_close(spots, exact, rtol=0.03, atol=0.0)
     # Paraxial circles of the pupil are another beam.
     paraxial_spots = merit.spots(u, merit.full(1))[0]
-    assert float((paraxial_spots / exact - 1.0).abs().max()) > 0.02
+    assert float((paraxial_spots / exact - 1.0).abs().max()) > 0.05
 
 
 @pytest.mark.parametrize(("rings", "arms"), [(2, 4), (3, 6), (4, 8)])
