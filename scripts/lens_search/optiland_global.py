@@ -5,11 +5,12 @@
 
 The variables are the 17 of `quartet.py`, from the same bounds: reciprocal radii, thicknesses, the
 image distance, and a stop in the entrance pupil; with --air-stop, a stop in an air space, the
-middle one for seed 1.  The operands are the three RMS spots, distortion by the chief ray, the edges, the
-length and the focal length; all but the last are registered here and share one call of its tracer,
-with the rays of `quartet.py`.  It runs in its NumPy backend.  The last part of the time is for its
-`LeastSquares`.  What it finds is measured by `quartet.py`, and written to
-FOLDER/optiland_<method>_<seed>.json.  Its SHGO is left out, as SciPy's is.
+middle one for seed 1.  The operands are the three RMS spots, distortion by the chief ray, the
+edges, the length and the focal length; all but the last are registered here and share one call of
+its tracer, with the rays of `quartet.py`.  It runs in its NumPy backend, again from the start when
+it ends before its time, and gives the last part to its `LeastSquares`.  Its SHGO is left out, as
+SciPy's is.  What it finds is measured by `quartet.py`, and written to
+FOLDER/optiland_<method>_<seed>.json.
 """
 
 import argparse
@@ -119,14 +120,17 @@ def search(method: str, progress: Progress, seed: int) -> None:
             maxiter=10**6, disp=False
         ),
         "BasinHopping": lambda: optimization.BasinHopping(problem).optimize(niter=10**6),
-        "CMAES": lambda: CMAES(problem).optimize(maxiter=10**6, disp=False, seed=seed),
-        "ParticleSwarm": lambda: ParticleSwarm(problem).optimize(
-            maxiter=10**6, disp=False, seed=seed
+        "CMAES": lambda: CMAES(problem).optimize(
+            maxiter=10**6, disp=False, seed=seed + progress.evaluations
         ),
-        "LeastSquares": lambda: None,
+        "ParticleSwarm": lambda: ParticleSwarm(problem).optimize(
+            maxiter=10**6, disp=False, seed=seed + progress.evaluations
+        ),
+        "LeastSquares": None,
     }[method]
     with suppress(OutOfTime):
-        run()
+        while method != "LeastSquares":
+            run()
     while True:
         try:
             _polish(progress, start if method == "LeastSquares" else None, start, segment)

@@ -98,11 +98,16 @@ class Operands:
         optic.trace_generic(np.zeros(where.size), where, px, py, WAVELENGTH)
         x = np.asarray(optic.surfaces.x[-1]).reshape(1, fields, -1)
         y = np.asarray(optic.surfaces.y[-1]).reshape(1, fields, -1)
-        height = np.hypot(optic.surfaces.x, optic.surfaces.y)[spheres(optic)].max(axis=1)[None]
+        failed = np.isnan(x + y)
+        x, y = np.where(failed, 0.0, x), np.where(failed, 0.0, y)
+        radii = np.nan_to_num(np.hypot(optic.surfaces.x, optic.surfaces.y)[spheres(optic)])
+        height = radii.max(axis=1)[None]
         inner = np.minimum(height[:, :-1], height[:, 1:])
         edge = quartet.gap_at(row[:, :8], row[:, 8:15], inner)
-        over = np.maximum(0.005 - edge, 0.0).sum()
+        over = np.nan_to_num(np.maximum(0.005 - edge, 0.0), nan=10.0).sum()
         rms = rms_um(Traced(x, y, height, edge, edge), rays)[0]
+        # A population of NaN alone counts as converged: rays that fail cost 10 mm of spot instead.
+        rms = rms + 1e4 * failed.mean(axis=2)[0]
         ideal = quartet.FOCAL_LENGTH * np.tan(np.radians(quartet.ANGLES[1:]))
         distortion = y[0, 1:, rays.chief] / ideal - 1.0
         return np.array([*rms, *distortion, over, row[0, 8:16].sum()])

@@ -2,8 +2,8 @@
 
 All minimise the same merit, the mean RMS spot and penalties, from the same bounds.  Each gives the
 last part of its time to SciPy's least squares from the best point that it found, which none of them
-comes near by itself.  `shgo` is left out: it triangulates the cube of 17 dimensions before its first
-local search, and that does not end in minutes.
+comes near by itself.  `shgo` is left out: it triangulates the cube of 17 dimensions before its
+first local search, and that does not end in minutes.
 """
 
 from collections.abc import Callable
