@@ -1,4 +1,4 @@
-"""Where the starts of a search led is plotted: a map of the starts, and how many each form has."""
+"""A map shows which start of a search led where, and bars show how many led to each form."""
 
 from collections.abc import Sequence
 
