@@ -60,7 +60,7 @@ def test_aberrations_are_those_of_the_traced_lens(schott, names):
         {"name": "thin", "stop": 1, "surfaces": surfaces, "sensor": {"distance": 100.0}},
         dtype=torch.float64,
     )
-    assert float(lens.first_order(D).efl) == pytest.approx(focal, rel=1e-6)
+    assert lens.first_order(D).efl.item() == pytest.approx(focal, rel=1e-6)
     for at, line in enumerate((F, D, C)):
         sums = seidel(lens.system(), line, field)
         spherical = float(sums.spherical.sum()) / height**4 * focal**3
