@@ -83,9 +83,7 @@ class Arrangement:
         return self.sequence.index(STOP)
 
 
-def template(
-    arrangement: Arrangement, specification: Specification, wide: float
-) -> Lens:
+def template(arrangement: Arrangement, specification: Specification, wide: float) -> Lens:
     """Return a lens of planes behind a plane on which rays start, its gaps one millimetre.
 
     Its surface 1 is the plane of the entrance pupil; those of the sequence follow.  Apertures clip

@@ -167,8 +167,16 @@ def lens_arrays(lens: Lens, reverse: bool = False) -> FormArrays:
         curvatures, heights, departures = -curvatures.flip(0), heights.flip(0), -departures.flip(0)
         index, spread, stop = index.flip(0), spread.flip(0), len(curvatures) + 1 - stop
     efl = lens.first_order(wave).efl.detach().double().reshape(1)
-    rows = (each[None] for each in (curvatures, gaps, index, heights))
-    return FormArrays(*rows, efl, spread[None], departures[None], stop)
+    return FormArrays(
+        curvatures[None],
+        gaps[None],
+        index[None],
+        heights[None],
+        efl,
+        spread[None],
+        departures[None],
+        stop,
+    )
 
 
 def is_reversible(lens: Lens) -> bool:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dolens.errors import InputError
 from dolens.lens_search.merit import Conditions, SearchMerit
+from dolens.lens_search.real_pupils import with_real_beams
 from dolens.optimize.batch_least_squares import BatchResult, minimise_batch
 
 
@@ -59,6 +60,10 @@ STAGES = (
     Stage(5.0 / 3.0, 0.7, iterations=20, kept=0.5),
     Stage(1.0, 1.0, iterations=60, kept=0.5),
 )
+
+
+# Of a finish, the last rounds have operands whose weight grows by a factor.
+_FIRM_ROUNDS, _FIRMER = 2, 3.0
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ def grow(merit: SearchMerit, starts: Tensor, stages: Sequence[Stage] = STAGES) -
 
 
 def finish(
-    merit: SearchMerit, grown: Grown, rounds: int = 5, iterations: int = 40, tolerance: float = 1e-4
+    merit: SearchMerit, grown: Grown, rounds: int = 6, iterations: int = 40, tolerance: float = 1e-4
 ) -> Grown:
     """Optimise grown lenses to the end: operands hold, and the mean of the spots is least.
 
@@ -127,14 +132,18 @@ def finish(
         tolerance: as of a stage; the last round's is a hundredth of it.
     """
     values, used = grown.values, grown.iterations
-    conditions = merit.full(len(values))
+    conditions = with_real_beams(merit, values, merit.full(len(values)))
     for number in range(rounds):
         last = number == rounds - 1
+        if number >= rounds - _FIRM_ROUNDS:
+            # Multipliers are known by now: firmer operands leave the valley as it is.
+            merit = replace(merit, operand_weight=_FIRMER * merit.operand_weight)
+            conditions = replace(conditions, shifts=conditions.shifts / _FIRMER**2)
         found = _minimised(merit, values, conditions, iterations, tolerance * (0.01 if last else 1))
         used += int(found.iterations.sum())
         values = found.values
         conditions = _next_conditions(merit, values, conditions)
-    return _described(merit, values, grown.starts, used, grown.survivors)
+    return _described(merit, values, grown.starts, used, grown.survivors, conditions)
 
 
 def _next_conditions(merit: SearchMerit, values: Tensor, conditions: Conditions) -> Conditions:
@@ -145,6 +154,7 @@ def _next_conditions(merit: SearchMerit, values: Tensor, conditions: Conditions)
     inverse = 1.0 / spots.clamp(min=1e-12)
     weights = inverse / inverse.sum(-1, keepdim=True)
     fine = torch.isfinite(spots).all(-1) & torch.isfinite(shifted).all(-1)
+    conditions = with_real_beams(merit, values, conditions)
     return replace(
         conditions,
         shifts=torch.where(fine[:, None], shifted, conditions.shifts),
@@ -172,8 +182,10 @@ def _described(
     starts: Tensor,
     iterations: int,
     survivors: Sequence[int],
+    conditions: Conditions | None = None,
 ) -> Grown:
-    conditions = merit.full(len(values))
+    if conditions is None:
+        conditions = merit.full(len(values))
     spots = merit.spots(values, conditions)
     deviations = merit.deviations(values, conditions)
     violation = torch.where(merit.is_limit, deviations.clamp(min=0.0), deviations.abs())

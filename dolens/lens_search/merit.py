@@ -19,10 +19,11 @@ from dolens.lens_search.tangents import Tangents
 from dolens.optics.lens_family import FamilyRays, FamilySums, LensFamily
 from dolens.optimize.batch_least_squares import BatchModel
 
-
 # Of a relative deviation, beside an RMS spot over the focal length.  A step along a constraint's
 # curved surface leaves it by the step's square: weights near one leave steps no room.
 OPERAND_WEIGHT = 0.03
+# Limits are aimed at from within: the rays that a lens is checked with lie between those here.
+_WITHIN = 0.999
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,18 @@ class Conditions:
         field_weights: (L, F), ω.
         shifts: (L, O), added to the deviations of operands: the multipliers of the augmented
             Lagrangian over twice the weight, which let operands hold exactly at a small weight.
+        pupils: (L, F, 4), where the beam of each field crosses the plane of the entrance pupil;
+            see `dolens.lens_search.real_pupils`.
+        beam: (L, S + 1), the beam's real height on each surface, and that of the axial beam at the
+            stop, over its paraxial one.
     """
 
     f_number: Tensor
     field: Tensor
     field_weights: Tensor
     shifts: Tensor
+    pupils: Tensor
+    beam: Tensor
 
     def chosen(self, which: Tensor) -> "Conditions":
         """Return those of some lenses."""
@@ -49,6 +56,8 @@ class Conditions:
             self.field[which],
             self.field_weights[which],
             self.shifts[which],
+            self.pupils[which],
+            self.beam[which],
         )
 
 
@@ -107,6 +116,8 @@ class SearchMerit:
             torch.ones(lenses, dtype=torch.float64),
             torch.full((lenses, fields), 1.0 / fields, dtype=torch.float64),
             torch.zeros((lenses, self.operands), dtype=torch.float64),
+            torch.tensor([0.0, 1.0, 0.0, 1.0], dtype=torch.float64).expand(lenses, fields, 4),
+            torch.ones((lenses, self.arrangement.surfaces + 1), dtype=torch.float64),
         )
 
     @cached_property
@@ -119,7 +130,8 @@ class SearchMerit:
         """Return which operands are limits, (O,), bool; the others are to be zero."""
         u = torch.ones((1, self.arrangement.variables), dtype=torch.float64)
         one = torch.ones(1, dtype=torch.float64)
-        _, _, limits = self._paraxial_operands(u, one, one)
+        beam = torch.ones((1, self.arrangement.surfaces + 1), dtype=torch.float64)
+        _, _, limits = self._paraxial_operands(u, one, one, beam)
         return torch.tensor([*limits, *([True] * self._distortions)])
 
     @property
@@ -167,7 +179,7 @@ class SearchMerit:
         return found.power, pupil, found.back_focus, found.petzval
 
     def evaluate(self, u: Tensor, conditions: Conditions) -> BatchModel:
-        """Return the models of lenses u (L, P), in units of f; without a merit where a ray fails."""
+        """Return the models of lenses u (L, P), in units of f; no merit where a ray fails."""
         found = self._evaluate(u, conditions)
         f, surfaces = self.specification.focal_length, self.arrangement.surfaces
         shifted = found.deviations + conditions.shifts
@@ -189,7 +201,10 @@ class SearchMerit:
     def _evaluate(self, u: Tensor, conditions: Conditions) -> "_Evaluated":
         f = self.specification.focal_length
         first_order, of_first_order, _ = self._paraxial_operands(
-            u, 0.5 / conditions.f_number, conditions.field * self.rays.tangent.max()
+            u,
+            0.5 / conditions.f_number,
+            conditions.field * self.rays.tangent.max(),
+            conditions.beam,
         )
         pupil, of_pupil = first_order[:, 0], of_first_order[:, 0]
         rays, tangent = self._launched(conditions)
@@ -214,7 +229,7 @@ class SearchMerit:
         return _Evaluated(sums, torch.cat(deviations, 1), torch.cat(rows, 1), of_pupil, usable)
 
     def spots(self, u: Tensor, conditions: Conditions) -> Tensor:
-        """Return the RMS spot radii (L, F), mm, about their centroids; infinite where a ray fails."""
+        """Return the RMS spot radii (L, F), mm, about centroids; infinite where a ray fails."""
         pupil = self.paraxial_of(u)[1]
         rays, tangent = self._launched(conditions)
         hit = self.family.trace(self.lens_values(u, pupil), rays)
@@ -233,11 +248,13 @@ class SearchMerit:
     def _launched(self, conditions: Conditions) -> tuple[FamilyRays, Tensor]:
         """Return the rays of every lens, and the tangents of their field angles (L, N)."""
         radius = 0.5 * self.specification.focal_length / conditions.f_number
-        position, direction, tangent = launched(self.rays, radius, conditions.field)
+        position, direction, tangent = launched(
+            self.rays, radius, conditions.field, conditions.pupils
+        )
         return FamilyRays(position, direction, self.rays.wavelength), tangent
 
     def _paraxial_operands(
-        self, u: Tensor, radius: Tensor, field: Tensor
+        self, u: Tensor, radius: Tensor, field: Tensor, beam: Tensor
     ) -> tuple[Tensor, Tensor, list[bool]]:
         """Return the entrance pupil's place and the paraxial operands (L, 1 + O), their derivatives
         (L, 1 + O, P), and which operands are limits.
@@ -245,12 +262,12 @@ class SearchMerit:
         numbers = numbers_of(self.arrangement, Tangents.variables(u), list(self.indices))
         first_order = paraxial(self.arrangement, numbers)
         operands, limits = paraxial_operands(
-            self.arrangement, self.specification, numbers, first_order, radius, field
+            self.arrangement, self.specification, numbers, first_order, radius, field, beam
         )
         pupil = first_order.entrance_pupil
         if not isinstance(pupil, Tangents):  # the stop is the first of the sequence
             pupil = 0.0 * numbers.image
-        rows = torch.stack([operand.rows for operand in (pupil, *operands)])
+        rows = torch.cat([pupil.rows[None], operands.rows])
         return rows[:, 0].T, rows[:, 1:].permute(2, 0, 1), limits
 
     def _distortion(
@@ -263,7 +280,7 @@ class SearchMerit:
         share = sums.group_residual[:, fields:, 1] / ideal
         row = sums.group_jacobian[:, fields:, 1] / ideal[..., None]
         row = _row_in_variables(row, of_pupil[:, None], f, s)
-        return share.abs() - limit, share.sign()[..., None] * row
+        return share.abs() - _WITHIN * limit, share.sign()[..., None] * row
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,15 @@
 """Operands hold lenses of a search to their specification.
 
-An operand's deviation is zero where it holds; of a limit it is negative where there is room.  Lengths
-are in units of the focal length.
+An operand's deviation is zero where it holds; of a limit it is negative where there is room.
+Lengths are in units of the focal length.
 """
 
 from collections.abc import Iterator, Sequence
 
+import torch
 from torch import Tensor
 
-from dolens.lens_search.arrangement import AIR, STOP, Arrangement
+from dolens.lens_search.arrangement import AIR, Arrangement
 from dolens.lens_search.paraxial import LensNumbers, Paraxial
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.tangents import Tangents
@@ -24,8 +25,9 @@ def paraxial_operands(
     first_order: Paraxial,
     aperture: Tensor,
     field: Tensor,
-) -> tuple[list[Tangents], list[bool]]:
-    """Return the deviations that need no real rays, and which of them are limits.
+    beam: Tensor,
+) -> tuple[Tangents, list[bool]]:
+    """Return the deviations (O, ...) that need no real rays, and which of them are limits.
 
     Args:
         arrangement: the order.
@@ -34,41 +36,45 @@ def paraxial_operands(
         first_order: their paraxial numbers.
         aperture: radius of the entrance pupil over the focal length, (L,).
         field: tangent of the greatest field angle, (L,).
+        beam: (L, S + 1), factor of the beam's paraxial height on each surface, and at the stop.
     """
-    found, is_limit = [first_order.power - 1.0], [False]
-    f = specification.focal_length
-    limits = specification.limits
+    f, limits = specification.focal_length, specification.limits
+    found = [Tangents.stacked([first_order.power - 1.0])]
     if limits.track is not None:
-        # From the first refracting surface: a stop in front of it is no part of the track.
-        first = next(i for i, place in enumerate(arrangement.sequence) if place != STOP)
-        length = _sum(lenses.gaps[first:]) + lenses.image
-        found.append(length - limits.track / f)
-    heights = [
-        _magnitude(marginal) * aperture + chief.abs() * field
-        for marginal, chief in zip(first_order.marginal, first_order.chief, strict=True)
+        found.append(Tangents.stacked([_sum(lenses.gaps) + lenses.image - limits.track / f]))
+    curvatures = Tangents.stacked(lenses.curvatures)
+    zero = 0.0 * lenses.image
+    marginal = Tangents.stacked([zero + height for height in first_order.marginal])
+    chief = Tangents.stacked(first_order.chief)
+    heights = (marginal.abs() * aperture + chief.abs() * field) * beam.T[:-1]
+    found.append((curvatures * heights).abs() - limits.aperture_over_radius)
+    # Neighbouring surfaces do not come too near at the edge of the beam.
+    spaces = list(_spaces(arrangement))
+    before, behind = [n for n, _ in spaces], [n + 1 for n, _ in spaces]
+    height = heights[before].maximum(heights[behind])
+    thickness = Tangents.stacked([_sum([lenses.gaps[g] for g in gaps]) for _, gaps in spaces])
+    edge = thickness + _sag(curvatures[behind], height) - _sag(curvatures[before], height)
+    least = [
+        limits.air_edge if arrangement.media_behind[n] == AIR else limits.glass_edge for n in before
     ]
-    for curvature, height in zip(lenses.curvatures, heights, strict=True):
-        found.append((curvature * height).abs() - limits.aperture_over_radius)
-    for first, second, medium, thickness in _spaces(arrangement, lenses):
-        least = (limits.air_edge if medium == AIR else limits.glass_edge) / f
-        height = heights[first].maximum(heights[second])
-        edge = thickness + (
-            _sag(lenses.curvatures[second], height) - _sag(lenses.curvatures[first], height)
-        )
-        found.append(least - edge)
-    is_limit += [True] * (len(found) - 1)
-    return found, is_limit
+    found.append(torch.tensor(least, dtype=torch.float64)[:, None] / f - edge)
+    # The stop's opening is clear of the surfaces beside it.
+    stop = arrangement.stop_place
+    opening = Tangents.stacked([zero + first_order.stop_height]).abs() * (aperture * beam[:, -1])
+    for neighbour, side in ((stop - 1, -1.0), (stop + 1, 1.0)):
+        if 0 <= neighbour < len(arrangement.sequence):
+            sag = _sag(curvatures[[arrangement.sequence[neighbour]]], opening)
+            gap = Tangents.stacked([lenses.gaps[min(neighbour, stop)]])
+            found.append(limits.air_edge / f - (gap + side * sag))
+    every = Tangents(torch.cat([part.rows for part in found]))
+    return every, [False] + [True] * (len(every.rows) - 1)
 
 
-def _spaces(
-    arrangement: Arrangement, lenses: LensNumbers
-) -> Iterator[tuple[int, int, int, Tangents]]:
-    """Yield two neighbouring surfaces, what is between them, and their distance on the axis."""
-    behind = arrangement.media_behind
+def _spaces(arrangement: Arrangement) -> Iterator[tuple[int, Sequence[int]]]:
+    """Yield each surface but the last, and the gaps between it and the next one."""
     for number in range(arrangement.surfaces - 1):
         first = arrangement.sequence.index(number)
-        second = arrangement.sequence.index(number + 1)
-        yield number, number + 1, behind[number], _sum(lenses.gaps[first:second])
+        yield number, range(first, arrangement.sequence.index(number + 1))
 
 
 def _sum(gaps: Sequence[Tangents]) -> Tangents:
@@ -76,10 +82,6 @@ def _sum(gaps: Sequence[Tangents]) -> Tangents:
     for gap in gaps[1:]:
         total = total + gap
     return total
-
-
-def _magnitude(height: Tangents | float) -> Tangents | float:
-    return abs(height) if isinstance(height, float) else height.abs()
 
 
 def _sag(curvature: Tangents, height: Tangents) -> Tangents:

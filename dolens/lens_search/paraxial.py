@@ -1,6 +1,7 @@
-"""Paraxial numbers of many lenses of one arrangement, differentiable and without a loop over lenses.
+"""Paraxial numbers of many lenses of one arrangement are found without a loop over lenses.
 
-Numbers are tensors (L,), or `Tangents`; lengths are in units of the focal length that is asked for.
+Numbers are tensors (L,), or `Tangents` with derivatives.  Lengths are in units of the focal length
+that is asked for.
 """
 
 from collections.abc import Sequence
@@ -37,6 +38,7 @@ class Paraxial:
         entrance_pupil: from the first of the sequence to the entrance pupil, (L,).
         marginal: heights on the S refracting surfaces of a ray parallel to the axis at height 1.
         chief: heights there of a ray of slope 1 through the middle of the stop.
+        stop_height: height of the first of these rays at the stop.
         petzval: Σ (n' - n)·c/(n·n'), (L,); 0 is a flat field, 1 that of a thin lens with n = 1.
     """
 
@@ -45,6 +47,7 @@ class Paraxial:
     entrance_pupil: Number
     marginal: Sequence[Number]
     chief: Sequence[Number]
+    stop_height: Number
     petzval: Number
 
 
@@ -90,5 +93,6 @@ def paraxial(arrangement: Arrangement, lenses: LensNumbers) -> Paraxial:
         entrance_pupil=-height,
         marginal=[ray.y for ray in met],
         chief=[height * ray.y + ray.y2 for ray in met],
+        stop_height=at_stop.y,
         petzval=petzval,
     )

@@ -89,8 +89,11 @@ def real_beams(lens: Lens, count: int = FIELDS, rays: int = RAYS) -> RealBeams:
     where = conditions(lens)
     (scan,) = field_scans(lens, where.object_distance, count=count)
     pupil, weight = uniform_pupil_points(rays)
+    # The chief ray weighs nothing, and crosses where surfaces cross on the axis.
+    pupil = torch.cat([pupil.new_zeros(1, 2), pupil])
+    weight = torch.cat([weight.new_zeros(1), weight])
     reference = where.reference_wavelength
-    waves = torch.tensor([*where.wavelengths.tolist()], dtype=torch.float64)
+    waves = where.wavelengths
     launched = launch_through_stop(lens, scan.fields, waves, pupil, where.object_distance)
     hit = trace_rays(system, launched.rays, 1.0, True)
     assert hit.points is not None  # they were recorded
@@ -151,7 +154,7 @@ def with_drawn_heights(lens: Lens, heights: Tensor) -> Lens:
         lens: stays as it is.
         heights: (S,), mm, of the beams on its surfaces; NaN leaves a surface as it is.
     """
-    drawn = copy.deepcopy(lens)
+    drawn = copy.deepcopy(lens).requires_grad_(False)
     for surface, height in zip(drawn.surfaces.values(), heights.tolist(), strict=True):
         if not surface.aperture.clips and height > 0.0:
             size = min(_MARGIN * height, surface.reach)

@@ -1,4 +1,4 @@
-"""Rays of a search: half of the pupil in front of a centred lens, for every field and wavelength."""
+"""Rays of a search sample half of the pupil of a centred lens, for every field and wavelength."""
 
 import math
 from dataclasses import dataclass
@@ -23,6 +23,7 @@ class SearchRays:
         weight: (N,), of spots: they sum to one over each group; of chief rays 1.
         group: (N,), int64.
         wavelength: (N,), int32.
+        field: (N,), int64, which of the fields.
         fields: F.
     """
 
@@ -31,6 +32,7 @@ class SearchRays:
     weight: Tensor
     group: Tensor
     wavelength: Tensor
+    field: Tensor
     fields: int
 
     @property
@@ -84,18 +86,20 @@ def search_rays(specification: Specification, rings: int = 4, arms: int = 8) -> 
         tangent.append(slope * one)
         group.append(torch.full((1,), number))
         wavelength.append(torch.full((1,), specification.reference, dtype=torch.int32))
+    every = torch.cat(group)
     return SearchRays(
         torch.cat(pupil),
         torch.cat(tangent),
         torch.cat(weight),
-        torch.cat(group),
+        every,
         torch.cat(wavelength),
+        torch.where(every < fields, every, every - fields + 1),
         fields,
     )
 
 
 def launched(
-    rays: SearchRays, radius: Tensor, field: Tensor
+    rays: SearchRays, radius: Tensor, field: Tensor, pupils: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return positions and directions (L, N, 3) on the plane of the entrance pupil, and the
     tangents of the field angles (L, N).
@@ -104,15 +108,34 @@ def launched(
         rays: N of them.
         radius: of the entrance pupil of each lens, mm, (L,).
         field: factor of the fields' tangents of each lens, (L,).
+        pupils: of each field, (L, F, 4): see `dolens.lens_search.real_pupils`.
     """
     tangent = field[:, None] * rays.tangent
-    position = torch.cat(
-        [
-            radius[:, None, None] * rays.pupil,
-            radius.new_zeros(len(radius), len(rays.tangent), 1),
-        ],
-        -1,
+    shift, scale, bend, across = pupils[:, rays.field].unbind(-1)
+    px, py = rays.pupil.unbind(-1)
+    return (
+        *_rays(
+            radius[:, None] * across * px,
+            radius[:, None] * (shift + py * (scale + py * bend)),
+            tangent,
+        ),
+        tangent,
     )
+
+
+def through_points(points: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions and directions (L, N, 3) of rays through points of the entrance pupil's
+    plane.
+
+    Args:
+        points: (L, N, 2), mm.
+        tangent: of the field angles, (L, N).
+    """
+    return _rays(points[..., 0], points[..., 1], tangent)
+
+
+def _rays(x: Tensor, y: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
     cosine = torch.rsqrt(1.0 + tangent * tangent)
-    direction = torch.stack([torch.zeros_like(cosine), tangent * cosine, cosine], -1)
-    return position, direction, tangent
+    zero = torch.zeros_like(cosine)
+    position = torch.stack([x, y, zero], -1)
+    return position, torch.stack([zero, tangent * cosine, cosine], -1)

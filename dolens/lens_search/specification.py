@@ -20,7 +20,7 @@ class Limits:
         glass_edge: least thickness of an element at the edge of the beam.
         air_edge: least air space there.
         back_focus: least distance from the last vertex to the sensor.
-        track: greatest distance from the first vertex to the sensor.
+        track: greatest distance from the first surface, or a stop in front of it, to the sensor.
         distortion: greatest |h/h₀ - 1| of the chief ray's height h at the sensor, h₀ = f·tan θ.
         chief_ray_angle: greatest angle of the chief ray with the sensor's normal, degrees.
         aperture_over_radius: greatest ratio of the beam's height on a surface to its radius.
@@ -38,6 +38,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         for name in ("glass", "air"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
             low, high = getattr(self, name)
             if not 0.0 <= low <= (math.inf if high is None else high):
                 raise InputError(f"limits.{name} must be [least, greatest] in mm, not {low, high}")
@@ -82,6 +83,9 @@ class Specification:
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
+        # Lists, as files give them, become tuples.
+        for name in ("fields", "wavelengths", "groups", "glasses", "stops"):
+            object.__setattr__(self, name, tuple(getattr(self, name) or ()))
         for name in ("focal_length", "f_number"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be positive, not {getattr(self, name)}")

@@ -10,6 +10,8 @@ from dolens.errors import InputError
 
 # A name with a smaller share of a direction is left out of its label.
 _LEAST = 0.25
+# Parts of a direction that differ by less, as a share, are of one size.
+_TIE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,9 @@ def start_map(features: Tensor, names: Sequence[str]) -> StartMap:
     centred = features.double() - features.double().mean(0)
     _, sizes, directions = torch.linalg.svd(centred, full_matrices=False)
     axes = directions[:2].clone()
-    # The largest part of a direction is positive, so that the map does not depend on the machine.
-    largest = axes.gather(1, axes.abs().argmax(1, keepdim=True))
-    axes = axes * largest.sign()
+    # The first of the largest parts of a direction is positive, whatever the machine.
+    large = axes.abs() >= (1.0 - _TIE) * axes.abs().amax(1, keepdim=True)
+    axes = axes * axes.gather(1, large.long().argmax(1, keepdim=True)).sign()
     square = sizes.square()
     share = float(square[:2].sum() / square.sum()) if float(square.sum()) > 0.0 else 1.0
     first, second = (_label(axis.tolist(), names) for axis in axes)

@@ -4,6 +4,7 @@
 dispatches every operation; the few that paraxial optics needs stand here.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,17 +13,17 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Tangents:
-    """A number of L lenses with its derivatives with respect to P variables.
+    """Numbers of L lenses with their derivatives with respect to P variables.
 
     Attributes:
-        rows: (1 + P, L): the value, then its derivatives.
+        rows: (..., 1 + P, L): the values, then their derivatives.
     """
 
     rows: Tensor
 
     @staticmethod
     def variables(values: Tensor) -> "list[Tangents]":
-        """Return each of the P variables of L lenses, (L, P), with a derivative of one by itself."""
+        """Return the P variables of L lenses, (L, P), each with a derivative of one by itself."""
         lenses, count = values.shape
         found = []
         for column in range(count):
@@ -31,16 +32,25 @@ class Tangents:
             found.append(Tangents(rows))
         return found
 
+    @staticmethod
+    def stacked(numbers: "Sequence[Tangents]") -> "Tangents":
+        """Return several as one, with a leading dimension."""
+        return Tangents(torch.stack([number.rows for number in numbers]))
+
+    def __getitem__(self, places: "Sequence[int]") -> "Tangents":
+        """Return some of several that were stacked."""
+        return Tangents(self.rows[places])
+
     @property
     def value(self) -> Tensor:
-        """Return the value, (L,)."""
-        return self.rows[0]
+        """Return the values, (..., L)."""
+        return self.rows[..., 0, :]
 
     def __add__(self, other: "Tangents | Tensor | float") -> "Tangents":
         if isinstance(other, Tangents):
             return Tangents(self.rows + other.rows)
         rows = self.rows.clone()
-        rows[0] += other
+        rows[..., 0, :] += other
         return Tangents(rows)
 
     __radd__ = __add__
@@ -58,32 +68,32 @@ class Tangents:
 
     def __mul__(self, other: "Tangents | Tensor | float") -> "Tangents":
         if not isinstance(other, Tangents):
-            return Tangents(self.rows * other)
+            return Tangents(self.rows * _beside(other))
         return self._with(self.value * other.value, other.value, other.rows, self.value)
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: "Tangents | Tensor | float") -> "Tangents":
         if not isinstance(other, Tangents):
-            return Tangents(self.rows / other)
+            return Tangents(self.rows / _beside(other))
         inverse = 1.0 / other.value
         value = self.value * inverse
         return self._with(value, inverse, other.rows, -value * inverse)
 
     def _with(self, value: Tensor, own: Tensor, others: Tensor, other: Tensor) -> "Tangents":
         """Return `value` with derivatives own·∂self + other·∂others."""
-        rows = torch.addcmul(self.rows * own, others, other)
-        rows[0] = value
+        rows = torch.addcmul(self.rows * own[..., None, :], others, other[..., None, :])
+        rows[..., 0, :] = value
         return Tangents(rows)
 
     def _of(self, value: Tensor, slope: Tensor) -> "Tangents":
-        rows = self.rows * slope
-        rows[0] = value
+        rows = self.rows * slope[..., None, :]
+        rows[..., 0, :] = value
         return Tangents(rows)
 
     def abs(self) -> "Tangents":
         """Return the magnitude."""
-        return Tangents(self.rows * self.value.sign())
+        return Tangents(self.rows * self.value.sign()[..., None, :])
 
     def sqrt(self) -> "Tangents":
         """Return the square root."""
@@ -97,4 +107,11 @@ class Tangents:
 
     def maximum(self, other: "Tangents") -> "Tangents":
         """Return the greater of two, with its derivative."""
-        return Tangents(torch.where(self.value >= other.value, self.rows, other.rows))
+        return Tangents(
+            torch.where((self.value >= other.value)[..., None, :], self.rows, other.rows)
+        )
+
+
+def _beside(factor: Tensor | float) -> Tensor | float:
+    """Return a factor (..., L) as it multiplies rows (..., 1 + P, L)."""
+    return factor[..., None, :] if isinstance(factor, Tensor) and factor.ndim else factor

@@ -14,8 +14,12 @@ from dolens.lens_search.real_beams import FIELDS, RAYS, RealBeams, Space, real_b
 from dolens.lens_search.requirements import Requirements
 from dolens.optics.lens import Lens
 
-# What rounding may take from a limit, as a share of it, or of 1 mm, 1° or 1 %.
-_ROUNDING = 1e-6
+# A merit function meets limits only nearly.  So much may be missing, as a share of the limit, or of
+# 1 mm, 1° or 1 % where the limit is less.
+_ALLOWED = 1e-3
+# Names of the least and largest thickness on the axis, and of the least one out to the edge.
+_GLASS = ("thinnest glass", "thickest glass", "thinnest edge of glass")
+_AIR = ("smallest air space", "largest air space", "smallest air to the edge")
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Check:
 
     @property
     def holds(self) -> bool | None:
-        """Return whether the limits are kept; None where there are none.
+        """Return whether the limits are kept to a thousandth; None where there are none.
 
         What cannot be computed keeps no limit.
         """
@@ -155,10 +159,11 @@ def _thicknesses(found: Sequence[Space], required: Requirements) -> list[Check]:
         thin = min(alike, key=lambda space: space.centre)
         thick = max(alike, key=lambda space: space.centre)
         sharp = min(alike, key=lambda space: space.edge)
+        names = _GLASS if kind == "glass" else _AIR
         rows = (
-            (f"thinnest {kind}, centre", thin, thin.centre, centre[0], None),
-            (f"thickest {kind}, centre", thick, thick.centre, None, centre[1]),
-            (f"thinnest {kind}, to the edge", sharp, sharp.edge, edge, None),
+            (names[0], thin, thin.centre, centre[0], None),
+            (names[1], thick, thick.centre, None, centre[1]),
+            (names[2], sharp, sharp.edge, edge, None),
         )
         checks += [
             Check(name, value, "mm", least, most, f"surfaces {space.first}–{space.last}")
@@ -174,7 +179,7 @@ def _crossing(lens: Lens, beams: RealBeams) -> Check:
     behind = f"surfaces {at + 1}–{at + 2}" if at + 1 < count else f"surface {count} to sensor"
     least = float(beams.advance[at])
     value = least if math.isfinite(least) else math.nan
-    return Check("shortest way between surfaces", value, "mm", least=0.0, place=behind)
+    return Check("shortest ray segment", value, "mm", least=0.0, place=behind)
 
 
 def _light(beams: RealBeams, required: Requirements) -> list[Check]:
@@ -239,4 +244,4 @@ def _about(name: str, value: float, unit: str, target: float | None, error: floa
 
 
 def _slack(limit: float) -> float:
-    return _ROUNDING * max(abs(limit), 1.0)
+    return _ALLOWED * max(abs(limit), 1.0)

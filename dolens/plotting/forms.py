@@ -29,6 +29,8 @@ _LOW = 0.62
 _MOST_COLUMNS = 4
 # Room about what is drawn, of its height; a share of a cell that the scale's bar may take.
 _ROOM, _BAR = 1.04, 0.4
+# Inches between the two lines above a section, and room behind a sensor, of a cell's width.
+_LINE, _BEHIND = 0.15, 0.02
 # Inches of a section that stands alone.
 ALONE = 4.4
 
@@ -92,7 +94,8 @@ def forms_figure(
                 (left / PAGE, bottom / whole, cell / PAGE, (height - _WORDS) / whole)
             )
             _draw(section, axes, width, half)
-            _write(figure, forms[number * columns + place], left / PAGE, top / whole, whole)
+            words = forms[number * columns + place]
+            _write(figure, words, left / PAGE, top / whole, whole, cell / PAGE)
         top -= height + _GAP
     _scale(figure, cell / width, cell, whole)
     _fields(figure, sections[0], field_unit, whole)
@@ -171,18 +174,28 @@ def _cell(columns: int) -> float:
 
 def _draw(section: SmallSection, axes: Axes, width: float, half_height: float) -> None:
     draw_small_section(axes, section)
-    right = section.z_limits[1]
+    # Sensors of a column stand above one another, where no lens reaches beyond its own.
+    margin = _BEHIND * width
+    behind = max(float(z.max()) for z, _ in section.drawing.profiles if len(z))
+    right = max(float(section.drawing.system.vertices[-1]), behind) + margin
     axes.set(xlim=(right - width, right), ylim=(-half_height, half_height))
 
 
-def _write(figure: Figure, form: FormPicture, left: float, top: float, whole: float) -> None:
+def _write(
+    figure: Figure, form: FormPicture, left: float, top: float, whole: float, width: float
+) -> None:
     """Write two lines above a section: title and words, and what is not kept."""
-    line = 0.15 / whole
     title = figure.text(left, top, form.title, fontsize=SMALL + 1, fontweight="bold", va="top")
     begin = title.get_window_extent().width / figure.bbox.width
     figure.text(left + begin + 0.012, top, form.words, fontsize=SMALL, va="top", color="0.25")
-    if form.problem:
-        figure.text(left, top - line, form.problem, fontsize=SMALL - 1, va="top", color=PALETTE[1])
+    if not form.problem:
+        return
+    y = top - _LINE / whole
+    text = figure.text(left, y, form.problem, fontsize=SMALL - 1, va="top", color=PALETTE[1])
+    words = form.problem.split(" ")
+    while len(words) > 1 and text.get_window_extent().width > width * figure.bbox.width:
+        words.pop()
+        text.set_text(f"{' '.join(words).rstrip(',')} …")
 
 
 def _scale(figure: Figure, inches_a_mm: float, cell: float, whole: float) -> None:

@@ -62,7 +62,7 @@ def draw_small_section(axes: Axes, section: SmallSection) -> None:
     draw_layout(axes, section.drawing, section.z_limits, section.half_height, legend=False)
     for line in axes.lines:
         line.set_linewidth(_LINES * line.get_linewidth())
-    axes.set(xlabel="", ylabel="")
+    axes.set(xlabel="", ylabel="", xticks=[], yticks=[])
     axes.set_axis_off()
 
 

@@ -71,7 +71,8 @@ def _draw_map(axes: Axes, points: np.ndarray, reached: np.ndarray, labels: tuple
         chosen = inside & (reached >= _OWN if form == _OWN else reached == form)
         colour, marker = _look(form)
         size = 20.0 if 0 <= form < _OWN else 7.0
-        axes.scatter(*points[chosen].T, s=size, color=colour, marker=marker, linewidths=0.0)
+        x, y = points[chosen].T
+        axes.scatter(x, y, s=size, color=colour, marker=marker, linewidths=0.0, clip_on=False)
     axes.set(xlim=limits[0], ylim=limits[1])
     outside = int((~inside).sum())
     if outside:
