@@ -1,4 +1,4 @@
-"""Paraxial colour of a batch of lenses: that of each lens traced by itself, with its derivatives."""
+"""Paraxial colour of a batch of lenses: that of each lens by itself, with its derivatives."""
 
 import math
 
