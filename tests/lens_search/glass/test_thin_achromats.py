@@ -44,6 +44,7 @@ def test_powers_and_secondary_spectrum_are_the_textbook_s(schott):
     assert 1.0 / found.secondary_spectrum[0] == pytest.approx(2000.0, rel=0.02)
 
 
+@torch.no_grad()
 @pytest.mark.parametrize("names", [("N-BK7", "F2"), ("N-SF10", "N-BAK4"), ("N-FK51A", "N-KZFS4")])
 def test_aberrations_are_those_of_the_traced_lens(schott, names):
     found = pair(schott, *names)
