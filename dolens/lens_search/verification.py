@@ -117,7 +117,7 @@ def verify(
     checks = [
         *_first_order(lens, where, required, beams),
         *_thicknesses(spaces(lens, beams.heights), required),
-        *_crossing(lens, beams),
+        *_crossing(lens, beams, required.stop_to_glass),
         *_light(beams, required),
         *_image(lens, where, required, beams, rays),
     ]
@@ -172,7 +172,7 @@ def _thicknesses(found: Sequence[Space], required: Requirements) -> list[Check]:
     return checks
 
 
-def _crossing(lens: Lens, beams: RealBeams) -> list[Check]:
+def _crossing(lens: Lens, beams: RealBeams, stop_to_glass: float | None) -> list[Check]:
     """Return the least way that a ray has from one surface to the next, and to a stop between."""
     at = int(beams.advance.argmin())
     ends = [*beams.refracting[1:], None]
@@ -183,9 +183,8 @@ def _crossing(lens: Lens, beams: RealBeams) -> list[Check]:
     value = least if math.isfinite(least) else math.nan
     checks = [Check("shortest ray segment", value, "mm", least=0.0, place=place)]
     if math.isfinite(beams.stop_clearance):
-        # A stop whose plane lies within glass cannot be built there.
-        stop = f"surface {lens.stop}"
-        checks.append(Check("stop to glass", beams.stop_clearance, "mm", least=0.0, place=stop))
+        stop, clear = f"surface {lens.stop}", beams.stop_clearance
+        checks.append(Check("stop to glass", clear, "mm", least=stop_to_glass, place=stop))
     return checks
 
 
