@@ -19,11 +19,10 @@ from dolens.lens_search.tangents import Tangents
 from dolens.optics.lens_family import FamilyRays, FamilySums, LensFamily
 from dolens.optimize.batch_least_squares import BatchModel
 
-
 # Of a relative deviation, beside an RMS spot over the focal length.  A step along a constraint's
 # curved surface leaves it by the step's square: weights near one leave steps no room.
 OPERAND_WEIGHT = 0.03
-# Limits are aimed at from within, since the rays that a lens is checked with lie between those here.
+# Limits are aimed at from within: the rays that a lens is checked with lie between those here.
 _WITHIN = 0.999
 
 
@@ -39,7 +38,8 @@ class Conditions:
             Lagrangian over twice the weight, which let operands hold exactly at a small weight.
         pupils: (L, F, 4), where the beam of each field crosses the plane of the entrance pupil;
             see `dolens.lens_search.real_pupils`.
-        beam: (L, S), the beam's real height on each surface over its paraxial one.
+        beam: (L, S + 1), the beam's real height on each surface, and that of the axial beam at the
+            stop, over its paraxial one.
     """
 
     f_number: Tensor
@@ -117,7 +117,7 @@ class SearchMerit:
             torch.full((lenses, fields), 1.0 / fields, dtype=torch.float64),
             torch.zeros((lenses, self.operands), dtype=torch.float64),
             torch.tensor([0.0, 1.0, 0.0, 1.0], dtype=torch.float64).expand(lenses, fields, 4),
-            torch.ones((lenses, self.arrangement.surfaces), dtype=torch.float64),
+            torch.ones((lenses, self.arrangement.surfaces + 1), dtype=torch.float64),
         )
 
     @cached_property
@@ -130,7 +130,7 @@ class SearchMerit:
         """Return which operands are limits, (O,), bool; the others are to be zero."""
         u = torch.ones((1, self.arrangement.variables), dtype=torch.float64)
         one = torch.ones(1, dtype=torch.float64)
-        beam = torch.ones((1, self.arrangement.surfaces), dtype=torch.float64)
+        beam = torch.ones((1, self.arrangement.surfaces + 1), dtype=torch.float64)
         _, _, limits = self._paraxial_operands(u, one, one, beam)
         return torch.tensor([*limits, *([True] * self._distortions)])
 
@@ -179,7 +179,7 @@ class SearchMerit:
         return found.power, pupil, found.back_focus, found.petzval
 
     def evaluate(self, u: Tensor, conditions: Conditions) -> BatchModel:
-        """Return the models of lenses u (L, P), in units of f; without a merit where a ray fails."""
+        """Return the models of lenses u (L, P), in units of f; no merit where a ray fails."""
         found = self._evaluate(u, conditions)
         f, surfaces = self.specification.focal_length, self.arrangement.surfaces
         shifted = found.deviations + conditions.shifts
@@ -229,7 +229,7 @@ class SearchMerit:
         return _Evaluated(sums, torch.cat(deviations, 1), torch.cat(rows, 1), of_pupil, usable)
 
     def spots(self, u: Tensor, conditions: Conditions) -> Tensor:
-        """Return the RMS spot radii (L, F), mm, about their centroids; infinite where a ray fails."""
+        """Return the RMS spot radii (L, F), mm, about centroids; infinite where a ray fails."""
         pupil = self.paraxial_of(u)[1]
         rays, tangent = self._launched(conditions)
         hit = self.family.trace(self.lens_values(u, pupil), rays)

@@ -1,8 +1,8 @@
 """Designs lead to others: an element is put in where it changes little, or taken out.
 
-A thin shell with both curvatures of the surface that it touches bends nearly no ray.  A minimum with
-such a shell put in is close to a saddle of the problem with one element more, and from it the merit
-falls on two sides, to two minima (Bociort and van Turnhout, Opt. Eng. 48, 063001, 2009).
+A thin shell with both curvatures of the surface that it touches bends nearly no ray.  A minimum
+with such a shell put in is close to a saddle of the problem with one element more, and from it the
+merit falls on two sides, to two minima (Bociort and van Turnhout, Opt. Eng. 48, 063001, 2009).
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Operands hold lenses of a search to their specification.
 
-An operand's deviation is zero where it holds; of a limit it is negative where there is room.  Lengths
-are in units of the focal length.
+An operand's deviation is zero where it holds; of a limit it is negative where there is room.
+Lengths are in units of the focal length.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,7 +36,7 @@ def paraxial_operands(
         first_order: their paraxial numbers.
         aperture: radius of the entrance pupil over the focal length, (L,).
         field: tangent of the greatest field angle, (L,).
-        beam: (L, S), factor of the beam's paraxial height on each surface.
+        beam: (L, S + 1), factor of the beam's paraxial height on each surface, and at the stop.
     """
     f, limits = specification.focal_length, specification.limits
     found = [Tangents.stacked([first_order.power - 1.0])]
@@ -46,7 +46,7 @@ def paraxial_operands(
     zero = 0.0 * lenses.image
     marginal = Tangents.stacked([zero + height for height in first_order.marginal])
     chief = Tangents.stacked(first_order.chief)
-    heights = (marginal.abs() * aperture + chief.abs() * field) * beam.T
+    heights = (marginal.abs() * aperture + chief.abs() * field) * beam.T[:-1]
     found.append((curvatures * heights).abs() - limits.aperture_over_radius)
     # Neighbouring surfaces do not come too near at the edge of the beam.
     spaces = list(_spaces(arrangement))
@@ -60,7 +60,7 @@ def paraxial_operands(
     found.append(torch.tensor(least, dtype=torch.float64)[:, None] / f - edge)
     # The stop's opening is clear of the surfaces beside it.
     stop = arrangement.stop_place
-    opening = Tangents.stacked([zero + first_order.stop_height]).abs() * aperture
+    opening = Tangents.stacked([zero + first_order.stop_height]).abs() * (aperture * beam[:, -1])
     for neighbour, side in ((stop - 1, -1.0), (stop + 1, 1.0)):
         if 0 <= neighbour < len(arrangement.sequence):
             sag = _sag(curvatures[[arrangement.sequence[neighbour]]], opening)

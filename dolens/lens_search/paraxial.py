@@ -1,6 +1,7 @@
-"""Paraxial numbers of many lenses of one arrangement, differentiable and without a loop over lenses.
+"""Paraxial numbers of many lenses of one arrangement are found without a loop over lenses.
 
-Numbers are tensors (L,), or `Tangents`; lengths are in units of the focal length that is asked for.
+Numbers are tensors (L,), or `Tangents` with derivatives.  Lengths are in units of the focal length
+that is asked for.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Real beams: where each field's beam enters so that it fills the stop, and how wide it becomes.
 
-Where the entrance pupil has aberrations the beam of a field does not cross its plane in the paraxial
-circle.  Rays at the middle, the rim above and below and the rim at the side of the stop say where it
-does: the point (px, py) of the stop, in radii, is reached from
+Where the entrance pupil has aberrations the beam of a field does not cross its plane in the
+paraxial circle.  Rays at the middle, the rim above and below and the rim at the side of the stop
+say where it does: the point (px, py) of the stop, in radii, is reached from
 
     x = r·d·px,   y = r·(a + b·py + c·py²)
 
@@ -93,6 +93,7 @@ def with_real_beams(merit: SearchMerit, u: Tensor, conditions: Conditions) -> Co
             first_order.chief[number]
         ) * tangent.amax(-1)
         beam.append(height / expected)
+    beam.append((stop_radius / (radius * (first_order.stop_height + zero))).abs())
     factors = _ROOM * torch.stack(beam, -1)
     found &= ((factors > _LEAST) & (factors < _MOST)).all(-1)
     return replace(

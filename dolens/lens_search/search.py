@@ -7,6 +7,7 @@ process and a search can be taken up again where it was stopped.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -45,7 +46,7 @@ class SearchPlan:
     """
 
     starts: int = 10_000
-    batch: int = 500
+    batch: int = 1000
     stages: tuple[Stage, ...] = STAGES
     finished: float = 0.5
     finish_rounds: int = 6
@@ -89,11 +90,15 @@ class Step:
 def start_tasks(specification: Specification, plan: SearchPlan) -> list[tuple[int, int, int]]:
     """Return the tasks of growth: place of the stop, number of the first start, and how many."""
     stops = specification.places_of_stop
-    tasks = []
-    for number, first in enumerate(range(0, plan.starts, plan.batch)):
-        count = min(plan.batch, plan.starts - first)
-        tasks.append((stops[number % len(stops)], first, count))
-    return tasks
+    # Every place of the stop has its turn; a round of batches goes through them all.
+    rounds = max(1, -(-plan.starts // (plan.batch * len(stops))))
+    count = rounds * len(stops)
+    bounds = [plan.starts * number // count for number in range(count + 1)]
+    return [
+        (stops[number % len(stops)], first, last - first)
+        for number, (first, last) in enumerate(pairwise(bounds))
+        if last > first
+    ]
 
 
 def grown_starts(

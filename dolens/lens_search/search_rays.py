@@ -1,4 +1,4 @@
-"""Rays of a search: half of the pupil in front of a centred lens, for every field and wavelength."""
+"""Rays of a search sample half of the pupil of a centred lens, for every field and wavelength."""
 
 import math
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """Starts of a search are random lenses that are sound by paraxial optics.
 
-Powers of the elements, their bendings, thicknesses and air spaces are drawn; the curvatures are then
-scaled until the focal length is right.  Of many such lenses those are kept whose back focus, beam
-and Petzval sum are within reach, the best of them first.
+Powers of the elements, their bendings, thicknesses and air spaces are drawn; the curvatures are
+then scaled until the focal length is right.  Of many such lenses those are kept whose back focus,
+beam and Petzval sum are within reach, the best of them first.
 """
 
 import math
@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from dolens.lens_search.arrangement import AIR, Arrangement
+from dolens.lens_search.arrangement import AIR
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.paraxial import numbers_of, paraxial
 
@@ -51,10 +51,7 @@ def _drawn(merit: SearchMerit, count: int, generator: torch.Generator) -> Tensor
     previous: Tensor | None = None
     for behind in arrangement.media_behind:
         # An element's back follows from its front by a drawn power; cemented ones share a face.
-        if previous is None:
-            curvature = uniform(-2.5, 2.5)
-        else:
-            curvature = previous + uniform(-4.0, 4.0)
+        curvature = uniform(-2.5, 2.5) if previous is None else previous + uniform(-4.0, 4.0)
         columns.append(curvature)
         previous = None if behind == AIR else curvature
     s = arrangement.surfaces

@@ -23,7 +23,7 @@ class Tangents:
 
     @staticmethod
     def variables(values: Tensor) -> "list[Tangents]":
-        """Return each of the P variables of L lenses, (L, P), with a derivative of one by itself."""
+        """Return the P variables of L lenses, (L, P), each with a derivative of one by itself."""
         lenses, count = values.shape
         found = []
         for column in range(count):

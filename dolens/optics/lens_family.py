@@ -130,8 +130,8 @@ class LensFamily:
 
         Args:
             values: (L, P), in the units of the parameters.
-            indices: (L, media, wavelengths), float64: in front of the first surface and behind each;
-                None: those of the lens.
+            indices: (L, media, wavelengths), float64: in front of the first surface and behind
+                each; None: those of the lens.
         """
         base = self._table.values
         values = values.to(base)

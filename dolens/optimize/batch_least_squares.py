@@ -20,8 +20,8 @@ _LEAST_GAIN = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e10
 # A variable that moves nothing is damped as if it moved this part of what the strongest does.
 _LEAST_COLUMN = 1e-10
-# Solutions with variables on their bounds: so many times variables that leave the box are held.
-_PASSES = 4
+# Turns that exchange whole blocks of variables with their bounds, and all turns.
+_BLOCKS, _TURNS = 3, 24
 
 
 @dataclass(frozen=True)
@@ -221,12 +221,12 @@ def predicted_gain(model: BatchModel, step: Tensor) -> Tensor:
 
 
 def bounded_steps(model: BatchModel, damping: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return damped steps within their boxes, (n, P).
+    """Return damped steps within their boxes, (n, P): each the minimum of a convex problem.
 
-    Variables on a bound that the gradient presses them against stay.  The others are solved for;
-    those that then leave the box are held at its edge, and the rest is solved for again, a few
-    times.  What is still outside in the end is put back.  So the step is the exact minimum in
-    nearly all cases, and always one within the box that the predicted gain can judge.
+    Which variables end on a bound is found by block principal pivoting, as in
+    `dolens.optimize.bounded_step`: guess the set, solve for the rest, and exchange every variable
+    that contradicts the guess; after some turns only the last one of them (Murty's rule).  The rare
+    problem that is not solved within the turns that are allowed has its step put back into the box.
 
     Args:
         model: of n problems.
@@ -235,22 +235,43 @@ def bounded_steps(model: BatchModel, damping: Tensor, lower: Tensor, upper: Tens
         upper: likewise, at least 0.
     """
     matrix = model.hessian + torch.diag_embed(damping)
-    free = ~((lower >= 0.0) & (model.gradient > 0.0) | (upper <= 0.0) & (model.gradient < 0.0))
-    held = torch.zeros_like(lower)
-    step = held
-    for _ in range(_PASSES):
-        both = free[:, :, None] & free[:, None, :]
-        pivots = torch.where(both, matrix, 0.0) + torch.diag_embed(1.0 - free.to(matrix))
-        right = -model.gradient - torch.einsum("npq,nq->np", model.hessian, held)
-        right = torch.where(free, right, 0.0)
-        root, failed = torch.linalg.cholesky_ex(pivots)
-        solved = torch.cholesky_solve(right[:, :, None], root)[:, :, 0]
-        solved = torch.where((failed == 0)[:, None], solved, 0.0)
-        step = torch.where(free, solved, held)
-        clipped = torch.minimum(torch.maximum(step, lower), upper)
-        outside = free & (clipped != step)
-        if not bool(outside.any()):
-            return step
-        held = torch.where(outside, clipped, held)
-        free = free & ~outside
-    return torch.minimum(torch.maximum(step, lower), upper)
+    gradient = model.gradient
+    # Of each variable: -1 on its lower bound, +1 on its upper one, 0 free.
+    low = (lower >= 0.0) & (gradient > 0.0)
+    side = torch.where(low, -1, torch.where((upper <= 0.0) & (gradient < 0.0), 1, 0))
+    found = torch.zeros_like(lower)
+    left = torch.arange(len(lower))
+    for turn in range(_TURNS):
+        step = _with_held(matrix, gradient, lower, upper, side)
+        slope = torch.einsum("npq,nq->np", matrix, step) + gradient
+        scale = 1e-12 * gradient.abs().amax(-1, keepdim=True)
+        free = side == 0
+        wrong = free & ((step < lower) | (step > upper))
+        wrong |= (side < 0) & (slope < -scale) | (side > 0) & (slope > scale)
+        found[left] = torch.minimum(torch.maximum(step, lower), upper)
+        going = wrong.any(-1)
+        if not bool(going.any()):
+            break
+        if turn >= _BLOCKS:
+            last = wrong.shape[1] - 1 - wrong.flip(-1).to(torch.int8).argmax(-1, keepdim=True)
+            wrong &= torch.zeros_like(wrong).scatter_(1, last, True)
+        beyond = torch.where(step < lower, -1, 1)
+        side = torch.where(wrong, torch.where(free, beyond, 0), side)
+        left, matrix, gradient = left[going], matrix[going], gradient[going]
+        lower, upper, side = lower[going], upper[going], side[going]
+    return found
+
+
+def _with_held(
+    matrix: Tensor, gradient: Tensor, lower: Tensor, upper: Tensor, side: Tensor
+) -> Tensor:
+    """Return the steps that minimise with some variables held on their bounds."""
+    free = side == 0
+    held = torch.where(side < 0, lower, torch.where(side > 0, upper, 0.0))
+    right = -gradient - torch.einsum("npq,nq->np", matrix, held)
+    both = free[:, :, None] & free[:, None, :]
+    kept = torch.where(both, matrix, 0.0) + torch.diag_embed(1.0 - free.to(matrix))
+    root, failed = torch.linalg.cholesky_ex(kept)
+    solved = torch.cholesky_solve(torch.where(free, right, 0.0)[:, :, None], root)[:, :, 0]
+    solved = torch.where((failed == 0)[:, None], solved, 0.0)
+    return torch.where(free, solved, held)

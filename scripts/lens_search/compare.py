@@ -41,7 +41,6 @@ _TUNED: dict[str, dict] = {
 OPTILAND = (
     "DifferentialEvolution",
     "DualAnnealing",
-    "SHGO",
     "BasinHopping",
     "CMAES",
     "ParticleSwarm",

@@ -2,7 +2,8 @@
 
 All minimise the same merit, the mean RMS spot and penalties, from the same bounds.  Each gives the
 last part of its time to SciPy's least squares from the best point that it found, which none of them
-comes near by itself.
+comes near by itself.  `shgo` is left out: it triangulates the cube of 17 dimensions before its
+first local search, and that does not end in minutes.
 """
 
 from collections.abc import Callable
@@ -97,27 +98,12 @@ def direct(merit: ScalarMerit, seed: int, locally_biased: bool = True) -> None:
         )  # fmt: skip
 
 
-def shgo(merit: ScalarMerit, seed: int) -> None:
-    """Run it; it is the same for every seed.
-
-    Its cube has 2¹⁷ corners, which it samples one at a time before any local search; Sobol points
-    instead would wait for a triangulation in 17 dimensions, which does not end.
-    """
-    optimize.shgo(
-        merit, _CUBE, n=2**17, sampling_method="simplicial",
-        minimizer_kwargs={
-            "method": "L-BFGS-B", "jac": merit.gradient, "options": {"maxiter": 100},
-        },
-    )  # fmt: skip
-
-
 METHODS: dict[str, Callable[..., None]] = {
     "differential_evolution": differential_evolution,
     "dual_annealing": dual_annealing,
     "basinhopping": basin_hopping,
     "basinhopping_least_squares": basin_hopping_least_squares,
     "direct": direct,
-    "shgo": shgo,
 }
 
 

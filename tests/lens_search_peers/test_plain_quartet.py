@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 import dolens
 
@@ -183,7 +184,8 @@ def test_rays_that_fail_are_counted_and_stay_finite(part):
     found = quartet.LOWER + (quartet.UPPER - quartet.LOWER) * points
     measured = quartet.measure(found)
     assert np.isfinite(measured.mean).all() and np.isfinite(quartet.residuals(found)).all()
-    assert (measured.excess[:, -1] > 0.0).any()
+    failing = quartet.LIMITS.index("rays that fail")
+    assert (measured.excess[:, failing] > 0.0).any()
     assert not measured.feasible.any()
 
 
@@ -205,6 +207,37 @@ def test_a_search_improves_and_ends_with_its_budget(part):
     assert json.loads(json.dumps(progress.as_data()))["started"] == 1
     with pytest.raises(budget.OutOfTime):
         least_squares.finish(QUARTET, budget.Progress(0.0), "lm")
+
+
+def test_a_stop_in_air_makes_the_pupil_that_dolens_sees(part, tmp_path):
+    stops, files, quartet = part("stops"), part("quartet_files"), part("quartet")
+    for segment, place in ((0, 7.0), (1, 0.4), (2, 5.0), (3, 9.0)):
+        row = QUARTET.copy()
+        row[16] = place
+        found = stops.with_stop(row[None], np.array([segment]))[0]
+        assert stops.segment_of(found) == (segment, pytest.approx(place))
+        assert quartet.stop_depth(found[None]) == 0.0
+        path = tmp_path / "stop.yaml"
+        files.write(found, path, "a stop")
+        if segment:
+            text = path.read_text().replace("stop: 1\n", f"stop: {2 * segment + 1}\n")
+            data = yaml.safe_load(text)
+            rows = list(data["surfaces"].values())[1:]
+            gap = rows[2 * segment - 1]["thickness"]
+            rows[2 * segment - 1]["thickness"] = place
+            rows.insert(2 * segment, {"type": "aperture", "semi_diameter": 9.0, "material": "air"})
+            rows[2 * segment]["thickness"] = gap - place
+            data["surfaces"] = {str(k): entry for k, entry in enumerate(rows, 1)}
+            path.write_text(yaml.safe_dump(data, sort_keys=False))
+        assert files.candidate(path) == pytest.approx(found, rel=1e-12)
+        pupil = dolens.load_lens(path, dtype=torch.float64).first_order(587.5618).entrance_pupil
+        first = 0.0 if segment else place
+        assert pupil.z.item() - first == pytest.approx(found[16], rel=1e-9)
+    # Behind the first face, in the middle of a lens: no diaphragm can stand there.
+    inside = QUARTET.copy()
+    inside[16] = 3.0 / 1.5168
+    inside[0] = 0.0
+    assert quartet.stop_depth(inside[None]) == pytest.approx(3.0)
 
 
 def test_both_spaces_give_back_their_points(part):
