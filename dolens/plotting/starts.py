@@ -1,4 +1,4 @@
-"""Where the starts of a search led is plotted: a map of the starts, and how many each form has."""
+"""A map of the starts of a search shows which of them led to which form, and how many did."""
 
 from collections.abc import Sequence
 
