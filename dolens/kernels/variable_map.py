@@ -9,7 +9,7 @@ from torch import Tensor
 class IndexMap:
     """The map is d(indices)/d(variables), for variables that media depend on.
 
-    The derivatives themselves are given beside it, as they change with every step: (E, wavelengths).
+    The derivatives themselves, (E, wavelengths), are given beside it: they change with every step.
 
     Attributes:
         rows: (E,), int64: which row of `SurfaceTable.indices`, a medium.

@@ -40,7 +40,12 @@ class Block:
 
 
 def page_html(
-    title: str, facts: Sequence[tuple[str, str]], command: str, blocks: Sequence[Block]
+    title: str,
+    facts: Sequence[tuple[str, str]],
+    command: str,
+    blocks: Sequence[Block],
+    style: str = "",
+    generator: str = GENERATOR,
 ) -> str:
     """Return a whole page.
 
@@ -49,9 +54,13 @@ def page_html(
         facts: what and how much, in the heading.
         command: what made the page.
         blocks: its sections.
+
+    Rarely needed:
+        style: rules of CSS besides those of every page.
+        generator: by which a page says what it is.
     """
     version = installed_version("dolens") or ""
-    css = (files("dolens.lens_page") / "page.css").read_text(encoding="utf-8")
+    css = (files("dolens.lens_page") / "page.css").read_text(encoding="utf-8") + style
     header = element(
         "header",
         element("h1", title),
@@ -78,8 +87,10 @@ def page_html(
         for block in blocks
     )
     page = element("div", header, contents, element("main", *sections), class_="page")
-    script = element("script", Markup(viewer_script()))
-    return document(title, css, [Markup(_NIGHT), page, script], f"{GENERATOR} {version}")
+    # A view in space is what a lens's own page has.
+    viewer = generator == GENERATOR
+    script = element("script", Markup(viewer_script())) if viewer else None
+    return document(title, css, [Markup(_NIGHT), page, script], f"{generator} {version}")
 
 
 def table_html(shown: Table) -> Markup:

@@ -11,9 +11,7 @@ A file of tolerances is YAML::
     tolerance_factor: 1           # optional; multiplies all of them
 
 An experiment's file does as well: its `lens.elements` and `tolerances` are read.  Without a file,
-every group of cemented glass may tilt by 0.05°, and be moved by 0.02 mm; glass may be 0.02 mm too
-thick, and curvatures 0.1 % too strong.  Of a small lens all lengths are less: 0.25 % of its largest
-clear diameter.
+they are the usual ones of `dolens.tolerancing.usual`.
 """
 
 import copy
@@ -23,15 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from torch import nn
 
 from dolens.analysis.conditions import Conditions
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.errors import InputError, check_keys
 from dolens.lens_page.tables import Table, number
-from dolens.optics.elements import Element
 from dolens.optics.lens import Lens
-from dolens.optics.materials import is_glass
 from dolens.plotting.tolerances import offenders_figure, parameter_label, tolerance_label
 from dolens.prescriptions.checks import require_mapping
 from dolens.prescriptions.files import decode_yaml
@@ -41,15 +36,17 @@ from dolens.tolerancing import (
     Sensitivities,
     Tolerances,
     contributions,
+    fields_all_around,
     linear_spots,
     sensitivities,
     spot_weights,
     tolerances_from,
+    usual_tolerances,
+    usual_tolerances_text,
+    with_glass_elements,
 )
 
 DEFAULT = "default"
-# Half-ranges: degrees, mm, a share of the curvature; and mm as a share of the largest diameter.
-_TILT, _LENGTH, _CURVATURE, _OF_DIAMETER = 0.05, 0.02, 0.001, 0.0025
 _RINGS, _ARMS = 3, 8
 _MOST = 12
 # `drawing` is what `dolens export` writes on drawings besides.
@@ -132,16 +129,17 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         InputError: the file cannot be read or names what the lens does not have, or no light of
             a field passes.
     """
-    lens = copy.deepcopy(lens).requires_grad_(True)
     notes: list[str] = []
     given: Mapping[str, Any]
     if str(source) == DEFAULT:
-        _add_elements(lens)
-        given, factor = _usual(lens, notes), 1.0
+        lens = with_glass_elements(lens)
+        given, factor = usual_tolerances(lens), 1.0
+        notes.append(usual_tolerances_text(lens))
     else:
+        lens = copy.deepcopy(lens).requires_grad_(True)
         given, factor = _read(lens, Path(source), notes)
     tolerances = tolerances_from(lens, given, factor)
-    fields = _all_around(where.fields.tolist())
+    fields = fields_all_around(where.fields.tolist())
     spots = gaussian_quadrature(
         lens,
         fields,
@@ -159,59 +157,6 @@ def offenders(lens: Lens, where: Conditions, source: str | Path) -> Offenders:
         contributions(model, tolerances, weights),
         notes,
     )
-
-
-def _all_around(fields: list[list[float]]) -> list[tuple[float, float]]:
-    """Return fields along y on all four sides of the axis: a perturbed lens has no symmetry."""
-    found: dict[tuple[float, float], None] = {}
-    for x, y in fields:
-        for point in ((x, y), (-x, -y), (y, -x), (-y, x)):
-            found[(point[0] + 0.0, point[1] + 0.0)] = None
-    return list(found)
-
-
-def _add_elements(lens: Lens) -> None:
-    """Make an element of every group of cemented glass that belongs to none."""
-    taken = {n for e in lens.elements.values() for n in range(e.first, e.last + 1)}
-    glass = [is_glass(medium) for medium in lens.materials]
-    first = None
-    for n in range(1, len(lens.surfaces) + 1):
-        if first is None and glass[n]:
-            first = n
-        if first is not None and not glass[n]:
-            if taken.isdisjoint(range(first, n + 1)):
-                lens.elements[_free(f"element {first}–{n}", lens.elements)] = Element(
-                    first, n, dtype=lens.dtype
-                )
-            first = None
-
-
-def _free(name: str, elements: nn.ModuleDict) -> str:
-    return name if name not in elements else _free(f"{name}'", elements)
-
-
-def _usual(lens: Lens, notes: list[str]) -> dict[str, Any]:
-    """Return the tolerances of a lens that no file gives any."""
-    largest = 2.0 * max(surface.semi_diameter for surface in lens.surfaces.values())
-    length = min(_LENGTH, float(f"{_OF_DIAMETER * largest:.1g}"))
-    given: dict[str, Any] = {}
-    if lens.elements:
-        given["elements.*.tilt_[xy]"] = _TILT
-        given["elements.*.decenter_[xy]"] = length
-        given["elements.*.shift_z"] = length
-    for n, medium in enumerate(lens.materials[1:-1], 1):
-        if is_glass(medium):
-            given[f"thicknesses.{n}"] = length
-    for key, surface in lens.surfaces.items():
-        curvature = getattr(surface, "curvature", None)
-        if curvature is not None and float(curvature.detach()) != 0.0:
-            given[f"surfaces.{key}.curvature"] = {"half_range": _CURVATURE, "relative": True}
-    notes.append(
-        f"Usual tolerances, uniform over ± the half-range: elements tilt by {_TILT:g}°, and are "
-        f"decentred and shifted by {length:g} mm; glass thickness {length:g} mm; curvatures "
-        f"{100 * _CURVATURE:g} %."
-    )
-    return given
 
 
 def _read(lens: Lens, path: Path, notes: list[str]) -> tuple[Mapping[str, Any], Any]:

@@ -8,6 +8,8 @@ a keyword of two letters and its numbers:
     ED  expansion from -30 to 70 °C and from 100 to 300 °C (1e-6/K), density, ΔPgF, ...
     CD  coefficients of the dispersion formula (µm), some programs wrap them over several lines
     TD  D0, D1, D2, E0, E1, λtk, reference temperature (°C): see `dolens.optics.thermal`
+    OD  price relative to N-BK7, then CR, FR, SR, AR, PR: resistance to climate, stain, acid, alkali
+        and phosphate in the makers' classes (1, of FR 0, is the best)
     LD  the first and the last wavelength (µm) that the coefficients hold for
     IT  wavelength (µm), internal transmittance, thickness (mm)
 
@@ -27,6 +29,8 @@ _LINE_END = re.compile(r"\r\n|\r|\n")
 _KEYWORD = re.compile(r"[A-Z]{2}")
 # Written where a catalogue has no value.
 _MISSING = ("-", "_", "--")
+# Resistance to climate, stain, acid, alkali and phosphate, in the order of line OD.
+RESISTANCES = ("CR", "FR", "SR", "AR", "PR")
 _STATUS = {
     0: "standard",
     1: "preferred",
@@ -36,6 +40,8 @@ _STATUS = {
     5: "inquiry",
     6: "experimental",
 }
+
+STATUSES = tuple(_STATUS.values())
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,9 @@ class AgfGlass:
         transmittance: (wavelength in µm, internal transmittance, thickness in mm) in their order.
         status: `standard`, `preferred`, `obsolete`, `special`, `melt`, `inquiry`, `experimental`,
             or nothing.
+        density: g/cm³; None where nothing is printed.
+        price: relative to the maker's N-BK7 or its like; None where nothing is printed.
+        resistances: (one of `RESISTANCES`, class) of those that are printed; a low class is good.
     """
 
     name: str
@@ -64,6 +73,9 @@ class AgfGlass:
     expansion: float | None
     transmittance: tuple[tuple[float, float, float], ...]
     status: str
+    density: float | None
+    price: float | None
+    resistances: tuple[tuple[str, float], ...]
 
 
 @dataclass
@@ -153,6 +165,8 @@ def read_entry(entry: AgfEntry) -> AgfGlass:
         None if expansion is None else 1e-6 * expansion,
         _transmittance(entry),
         _STATUS.get(int(status), "") if math.isfinite(status) else "",
+        expansions[2] if len(expansions) > 2 and expansions[2] > 0.0 else None,
+        *_price_and_resistances(entry),
     )
 
 
@@ -194,6 +208,19 @@ def _thermal(entry: AgfEntry) -> ThermalCoefficients | None:
     if len(values) < 7 or not any(values[:5]) or not all(map(math.isfinite, values[:7])):
         return None
     return ThermalCoefficients(*values[:7])
+
+
+def _price_and_resistances(
+    entry: AgfEntry,
+) -> tuple[float | None, tuple[tuple[str, float], ...]]:
+    """Return what line OD gives; -1 and - stand for nothing."""
+    values = _numbers(entry, "OD", optional=True)
+    if len(values) == len(RESISTANCES):
+        # Schott leaves the price of some glasses blank.
+        values = [math.nan, *values]
+    price, *classes = values or [math.nan]
+    pairs = zip(RESISTANCES, classes, strict=False)
+    return price if price > 0.0 else None, tuple((name, v) for name, v in pairs if v >= 0.0)
 
 
 def _transmittance(entry: AgfEntry) -> tuple[tuple[float, float, float], ...]:

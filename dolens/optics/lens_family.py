@@ -6,7 +6,7 @@ kernel goes from lens to lens without Python in between.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from dolens.errors import InputError
 from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import IndexMap, VariableMap
 from dolens.optics.lens import Lens
-from dolens.optics.packing import pack_with_variables
+from dolens.optics.packing import pack, pack_with_variables
 from dolens.optics.rays import TracedRays
 
 OUTPUTS = ("x", "y", "path_length", "l", "m", "n")
@@ -84,7 +84,8 @@ class LensFamily:
 
     Args:
         lens: gives the structure, and all that is no variable.  Its apertures clip rays.
-        names: of its parameters, or patterns, as `Lens.variables` takes them.
+        names: of its parameters, or patterns, as `Lens.variables` takes them; columns come in the
+            order of these.
         wavelengths: nm.
 
     Raises:
@@ -92,7 +93,9 @@ class LensFamily:
     """
 
     def __init__(self, lens: Lens, names: Sequence[str], wavelengths: Sequence[float]) -> None:
-        parameters = lens.variables(names)
+        parameters: dict[str, Tensor] = {}
+        for name in names:
+            parameters |= {n: p for n, p in lens.variables([name]).items() if n not in parameters}
         self.lens = lens
         self.wavelengths = tuple(float(w) for w in wavelengths)
         self.columns: dict[str, slice] = {}
@@ -108,9 +111,8 @@ class LensFamily:
         # At the origin, so that no lens has the rounding of another.
         leaves = {n: torch.zeros_like(p.detach()).requires_grad_() for n, p in parameters.items()}
         system = lens.system(leaves)
-        self._table, self.map = pack_with_variables(
-            system, self.wavelengths, list(leaves.values())
-        )
+        self._table, self.map = pack_with_variables(system, self.wavelengths, list(leaves.values()))
+        self._codes: dict[int, Tensor] = {}
         self._start = torch.cat([p.detach().reshape(-1) for p in parameters.values()])
 
     @property
@@ -128,8 +130,8 @@ class LensFamily:
 
         Args:
             values: (L, P), in the units of the parameters.
-            indices: (L, media, wavelengths), float64: in front of the first surface and behind each;
-                None: those of the lens.
+            indices: (L, media, wavelengths), float64: in front of the first surface and behind
+                each; None: those of the lens.
         """
         base = self._table.values
         values = values.to(base)
@@ -158,9 +160,7 @@ class LensFamily:
         own = self.map
         return VariableMap(own.places, own.columns, own.weights, count, IndexMap(rows, columns))
 
-    def trace(
-        self, values: Tensor, rays: FamilyRays, indices: Tensor | None = None
-    ) -> TracedRays:
+    def trace(self, values: Tensor, rays: FamilyRays, indices: Tensor | None = None) -> TracedRays:
         """Trace the rays of every lens to its sensor; gradients flow to values, rays and indices.
 
         Args:
@@ -183,6 +183,33 @@ class LensFamily:
             surface=surface,
             path_length=path,
         )
+
+    @torch.no_grad()
+    def intercepts(
+        self,
+        values: Tensor,
+        rays: FamilyRays,
+        surface: int,
+        indices: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return x and y of rays on a surface, (L, N, 2), mm, and which rays arrive, (L, N).
+
+        Args:
+            values: (L, P).
+            rays: L × N of them.
+            surface: its number, from 1.
+            indices: as in `table`.
+        """
+        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
+
+        if surface not in self._codes:
+            system = self.lens.system()
+            first = pack(system, self.wavelengths[0], 1.0, 1, surface, False)
+            self._codes[surface] = first.codes
+        table = replace(self.table(values, indices), codes=self._codes[surface])
+        given = (rays.position, rays.direction, self._which(rays))
+        position, _, _, status, _ = kernels.trace(table, given)
+        return position[..., :2], status == 0
 
     @torch.no_grad()
     def jacobians(
@@ -298,4 +325,3 @@ class _Trace(torch.autograd.Function):
             (wanted[2], wanted[3], wanted[1]),
         )
         return of_values, of_indices if wanted[1] else None, of_rays, of_directions, None, None
-

@@ -7,6 +7,12 @@ from dolens.tolerancing.perturbations import Tolerances, scaled_tolerances, tole
 from dolens.tolerancing.prediction import Contributions, contributions
 from dolens.tolerancing.sensitivity import Sensitivities, sensitivities
 from dolens.tolerancing.through_focus import FocusCurves, spot_weights
+from dolens.tolerancing.usual import (
+    fields_all_around,
+    usual_tolerances,
+    usual_tolerances_text,
+    with_glass_elements,
+)
 from dolens.tolerancing.yields import Yield, quantiles, share_within
 
 __all__ = [
@@ -21,6 +27,7 @@ __all__ = [
     "Yield",
     "analyse_tolerances",
     "contributions",
+    "fields_all_around",
     "linear_spots",
     "quantiles",
     "scaled_tolerances",
@@ -29,4 +36,7 @@ __all__ = [
     "spot_weights",
     "tolerances_from",
     "trace_perturbed",
+    "usual_tolerances",
+    "usual_tolerances_text",
+    "with_glass_elements",
 ]

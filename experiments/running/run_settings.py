@@ -25,7 +25,7 @@ class RunSettings:
     (see `refuse_unread`).  A new key of a run is a new field.
 
     Attributes:
-        lens: the prescription.
+        lens: the prescription; None: the module makes a lens of its own.
         module: makes the `Experiment` from its lens.
         data: makes the data module.
         trainer: makes the trainer.
@@ -47,7 +47,7 @@ class RunSettings:
         InputError: a value that is not allowed.
     """
 
-    lens: DictConfig
+    lens: DictConfig | None
     module: DictConfig
     data: DictConfig
     trainer: DictConfig

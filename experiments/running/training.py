@@ -82,8 +82,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     # The basic launcher runs a sweep's jobs in one process: seed at each start.
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     set_matmul_precision(settings.matmul_precision)
-    lens = build_lens(settings)
-    module = instantiate(settings.module)(lens=lens)
+    module = build_module(settings)
     check_experiment(module, settings.train)
     refuse_unknown(settings.objectives, module.metric_names(), names_of_targets(cfg, _LOGGING))
     checkpoint = settings.ckpt_path
@@ -110,7 +109,7 @@ def run(cfg: DictConfig) -> float | tuple[float, ...]:
     (folder / ".hydra").mkdir(exist_ok=True)
     with written_whole(folder / RESOLVED) as aside:
         OmegaConf.save(cfg, aside, resolve=True)
-    save_lens(lens, folder / "lens" / "initial.yaml")
+    save_lens(module.lens, folder / "lens" / "initial.yaml")
     device = str(trainer.strategy.root_device)
     info = describe_run(settings.seed, device, settings.lens_dtype, sys.argv)
     write_json(folder / INFO, {**info, "status": "running"})
@@ -174,6 +173,12 @@ def logged_if(failing: bool) -> Iterator[None]:
         if not failing:
             raise
         logger.error("%s", one_line(error))
+
+
+def build_module(settings: RunSettings) -> Experiment:
+    """Return the experiment with its lens; one without a prescription makes a lens of its own."""
+    make = instantiate(settings.module)
+    return make() if settings.lens is None else make(lens=build_lens(settings))
 
 
 def build_lens(settings: RunSettings) -> Lens:

@@ -138,6 +138,29 @@ def test_the_other_lines():
     assert read_entry(catalogue()["BBO"]).thermal is None
 
 
+@pytest.mark.parametrize(
+    ("line", "price", "resistances"),
+    [
+        ("OD - 1.0 0.0 1.0 2.3 2.3", None, {"CR": 1.0, "FR": 0.0, "SR": 1.0, "AR": 2.3, "PR": 2.3}),
+        ("OD 1.6 2.0 -1 -1 -1 -1", 1.6, {"CR": 2.0}),
+        ("OD  2.0 0.0 1.0 2.3 2.3", None, {"CR": 2.0, "FR": 0.0, "SR": 1.0, "AR": 2.3, "PR": 2.3}),
+        ("OD -1.0 -1.0 -1.0 -1.0 -1.0 -1.0", None, {}),
+        ("OD", None, {}),
+        ("GC nothing", None, {}),
+    ],
+)
+def test_price_and_resistances(line, price, resistances):
+    text = CATALOGUE.replace("OD - 1.0 0.0 1.0 2.3 2.3", line)
+    glass = read_entry(catalogue(text)["N-BK7"])
+    assert (glass.price, dict(glass.resistances)) == (price, resistances)
+
+
+@pytest.mark.parametrize(("word", "density"), [("2.51", 2.51), ("0.0", None), ("-", None)])
+def test_density(word, density):
+    entry = catalogue(CATALOGUE.replace("+00 2.51 -9", f"+00 {word} -9"))["N-BK7"]
+    assert read_entry(entry).density == density
+
+
 def test_transmittance_by_beer_s_law():
     glass = read_entry(catalogue()["N-BK7"])
     assert internal_transmittance(glass, 400.0, 50.0) == pytest.approx(0.992**2, rel=1e-14)

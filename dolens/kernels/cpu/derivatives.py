@@ -231,7 +231,9 @@ def _entries(codes_: bytes, values: int, variables: VariableMap) -> _Entries:
         # What an index brings to a column is added, at any step that the medium touches.
         last[variables.indices.columns.numpy()] = -1
         around = codes[:, Code.BEFORE : Code.AFTER + 1, None] == variables.indices.rows.numpy()
-        first_step = min(first_step, int(np.flatnonzero(around.any((1, 2))).min(initial=len(codes))))
+        first_step = min(
+            first_step, int(np.flatnonzero(around.any((1, 2))).min(initial=len(codes)))
+        )
     empty = np.flatnonzero(last < 0)
     is_first = np.zeros(len(columns), dtype=np.int64)
     is_first[last[last >= 0]] = 1

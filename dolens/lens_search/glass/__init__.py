@@ -1,0 +1,1 @@
+"""Glass is a variable of a search: continuous at first, a catalogue's in the end."""

@@ -1,0 +1,192 @@
+"""Lenses grow: aperture and field begin small and become those of the specification.
+
+At each stage all lenses are optimised for some iterations, and the better part goes on (successive
+halving).  At the end operands are made to hold exactly, by an augmented Lagrangian (Nocedal and
+Wright, Numerical Optimization, ch. 17), and the fields are weighted so that the mean of their RMS
+spots is least rather than its square.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.lens_search.merit import Conditions, SearchMerit
+from dolens.lens_search.real_pupils import with_real_beams
+from dolens.optimize.batch_least_squares import BatchResult, minimise_batch
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of growth.
+
+    Attributes:
+        f_number: factor of the specification's.
+        field: factor of the tangents of its field angles.
+        iterations: of each lens, at most.
+        kept: share of the lenses that go on.
+        rings: of rays in the pupil.
+        arms: azimuths of its half.
+        tolerance: a lens that gains less of its merit, several times in a row, rests.
+
+    Raises:
+        InputError: a number out of range.
+    """
+
+    f_number: float = 1.0
+    field: float = 1.0
+    iterations: int = 60
+    kept: float = 1.0
+    rings: int = 3
+    arms: int = 6
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not self.f_number >= 1.0:
+            raise InputError(f"stage: f_number must be 1 or more, not {self.f_number}")
+        if not 0.0 < self.field <= 1.0:
+            raise InputError(f"stage: field must lie above 0 and to 1, not {self.field}")
+        if not 0.0 < self.kept <= 1.0:
+            raise InputError(f"stage: kept must lie above 0 and to 1, not {self.kept}")
+        if min(self.iterations, self.rings, self.arms) < 1:
+            raise InputError("stage: iterations, rings and arms must be 1 or more")
+
+
+# Of a wide aperture: its starts are grown in three stages.
+STAGES = (
+    Stage(8.0 / 3.0, 0.4, iterations=10),
+    Stage(5.0 / 3.0, 0.7, iterations=20, kept=0.5),
+    Stage(1.0, 1.0, iterations=60, kept=0.5),
+)
+
+
+# Of a finish, the last rounds have operands whose weight grows by a factor.
+_FIRM_ROUNDS, _FIRMER = 2, 3.0
+
+
+@dataclass(frozen=True)
+class Grown:
+    """Lenses at the end of their growth.
+
+    Attributes:
+        values: u, (n, P).
+        starts: (n,), int64, numbers of the starts that they came from.
+        spots: RMS spot radii, mm, (n, F).
+        violation: (n,), by how much the worst operand fails, relative or over the focal length.
+        iterations: of all lenses together.
+        survivors: lenses after each stage, the starts first.
+    """
+
+    values: Tensor
+    starts: Tensor
+    spots: Tensor
+    violation: Tensor
+    iterations: int
+    survivors: tuple[int, ...]
+
+    @property
+    def merit(self) -> Tensor:
+        """Return the mean of the RMS spot radii over the fields, mm, (n,)."""
+        return self.spots.mean(-1)
+
+
+def grow(merit: SearchMerit, starts: Tensor, stages: Sequence[Stage] = STAGES) -> Grown:
+    """Grow starts to the full aperture and field.
+
+    Args:
+        merit: of the lenses; stages sample them with rays of their own.
+        starts: u, (n, P).
+        stages: in their order.
+    """
+    values, numbers = starts, torch.arange(len(starts))
+    survivors, iterations = [len(starts)], 0
+    for stage in stages:
+        sampled = merit.sampled(stage.rings, stage.arms)
+        conditions = sampled.full(len(values))
+        conditions = replace(
+            conditions,
+            f_number=conditions.f_number * stage.f_number,
+            field=conditions.field * stage.field,
+        )
+        found = _minimised(sampled, values, conditions, stage.iterations, stage.tolerance)
+        iterations += int(found.iterations.sum())
+        best = found.merit.argsort()[: max(1, round(stage.kept * len(values)))]
+        best = best[torch.isfinite(found.merit[best])]
+        values, numbers = found.values[best], numbers[best]
+        survivors.append(len(values))
+    return _described(merit, values, numbers, iterations, survivors)
+
+
+def finish(
+    merit: SearchMerit, grown: Grown, rounds: int = 6, iterations: int = 40, tolerance: float = 1e-4
+) -> Grown:
+    """Optimise grown lenses to the end: operands hold, and the mean of the spots is least.
+
+    Args:
+        merit: with the rays that decide.
+        grown: the lenses.
+        rounds: times that the shifts of operands and the weights of fields are set anew.
+        iterations: of each round and lens, at most.
+        tolerance: as of a stage; the last round's is a hundredth of it.
+    """
+    values, used = grown.values, grown.iterations
+    conditions = with_real_beams(merit, values, merit.full(len(values)))
+    for number in range(rounds):
+        last = number == rounds - 1
+        if number >= rounds - _FIRM_ROUNDS:
+            # Multipliers are known by now: firmer operands leave the valley as it is.
+            merit = replace(merit, operand_weight=_FIRMER * merit.operand_weight)
+            conditions = replace(conditions, shifts=conditions.shifts / _FIRMER**2)
+        found = _minimised(merit, values, conditions, iterations, tolerance * (0.01 if last else 1))
+        used += int(found.iterations.sum())
+        values = found.values
+        conditions = _next_conditions(merit, values, conditions)
+    return _described(merit, values, grown.starts, used, grown.survivors, conditions)
+
+
+def _next_conditions(merit: SearchMerit, values: Tensor, conditions: Conditions) -> Conditions:
+    """Return shifts by the deviations that were left, and weights by the spots."""
+    shifted = conditions.shifts + merit.deviations(values, conditions)
+    shifted = torch.where(merit.is_limit, shifted.clamp(min=0.0), shifted)
+    spots = merit.spots(values, conditions)
+    inverse = 1.0 / spots.clamp(min=1e-12)
+    weights = inverse / inverse.sum(-1, keepdim=True)
+    fine = torch.isfinite(spots).all(-1) & torch.isfinite(shifted).all(-1)
+    conditions = with_real_beams(merit, values, conditions)
+    return replace(
+        conditions,
+        shifts=torch.where(fine[:, None], shifted, conditions.shifts),
+        field_weights=torch.where(fine[:, None], weights, conditions.field_weights),
+    )
+
+
+def _minimised(
+    merit: SearchMerit, values: Tensor, conditions: Conditions, iterations: int, tolerance: float
+) -> BatchResult:
+    lower, upper = merit.bounds()
+    return minimise_batch(
+        lambda which, u: merit.evaluate(u, conditions.chosen(which)),
+        values,
+        lower,
+        upper,
+        iterations,
+        tolerance,
+    )
+
+
+def _described(
+    merit: SearchMerit,
+    values: Tensor,
+    starts: Tensor,
+    iterations: int,
+    survivors: Sequence[int],
+    conditions: Conditions | None = None,
+) -> Grown:
+    if conditions is None:
+        conditions = merit.full(len(values))
+    spots = merit.spots(values, conditions)
+    deviations = merit.deviations(values, conditions)
+    violation = torch.where(merit.is_limit, deviations.clamp(min=0.0), deviations.abs())
+    return Grown(values, starts, spots, violation.amax(-1), iterations, tuple(survivors))

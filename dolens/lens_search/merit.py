@@ -1,0 +1,335 @@
+"""The merit of many lenses: RMS spots about their centroids, and operands for the specification.
+
+Variables u are curvatures times the focal length f, and gaps and the sensor's distance over f, so
+that one is like the other.  The merit is Σ_fields ω·(RMS spot/f)² + Σ (weight·deviation)².
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from dolens.lens_search.arrangement import Arrangement, parameter_names, template
+from dolens.lens_search.operands import paraxial_operands
+from dolens.lens_search.paraxial import numbers_of, paraxial
+from dolens.lens_search.search_rays import SearchRays, launched, search_rays
+from dolens.lens_search.specification import Specification
+from dolens.lens_search.tangents import Tangents
+from dolens.optics.lens_family import FamilyRays, FamilySums, LensFamily
+from dolens.optimize.batch_least_squares import BatchModel
+
+# Of a relative deviation, beside an RMS spot over the focal length.  A step along a constraint's
+# curved surface leaves it by the step's square: weights near one leave steps no room.
+OPERAND_WEIGHT = 0.03
+# Limits are aimed at from within: the rays that a lens is checked with lie between those here.
+_WITHIN = 0.999
+
+
+# Shift, scale, bend, dip, scale across and keystone of a circle about the axis.
+PARAXIAL_PUPIL = (0.0, 1.0, 0.0, 0.0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a lens is asked at some stage of its growth.
+
+    Attributes:
+        f_number: (L,).
+        field: (L,), factor of the tangents of the field angles.
+        field_weights: (L, F), ω.
+        shifts: (L, O), added to the deviations of operands: the multipliers of the augmented
+            Lagrangian over twice the weight, which let operands hold exactly at a small weight.
+        pupils: (L, F, 6), where the beam of each field crosses the plane of the entrance pupil;
+            see `dolens.lens_search.real_pupils`.
+        beam: (L, S + 1), the beam's real height on each surface, and that of the axial beam at the
+            stop, over its paraxial one.
+    """
+
+    f_number: Tensor
+    field: Tensor
+    field_weights: Tensor
+    shifts: Tensor
+    pupils: Tensor
+    beam: Tensor
+
+    def chosen(self, which: Tensor) -> "Conditions":
+        """Return those of some lenses."""
+        return Conditions(
+            self.f_number[which],
+            self.field[which],
+            self.field_weights[which],
+            self.shifts[which],
+            self.pupils[which],
+            self.beam[which],
+        )
+
+
+@dataclass(frozen=True)
+class SearchMerit:
+    """Evaluates lenses of one arrangement.
+
+    Args:
+        arrangement: the order of elements.
+        specification: what they must do.
+        rays: that sample them; None: `search_rays` with its own numbers.
+        operand_weight: of deviations, relative or over the focal length.
+    """
+
+    arrangement: Arrangement
+    specification: Specification
+    rays: SearchRays
+    operand_weight: float = OPERAND_WEIGHT
+
+    @staticmethod
+    def of(
+        arrangement: Arrangement, specification: Specification, rings: int = 4, arms: int = 8
+    ) -> "SearchMerit":
+        """Return the merit with rays of that many rings and arms."""
+        return SearchMerit(arrangement, specification, search_rays(specification, rings, arms))
+
+    def sampled(self, rings: int, arms: int) -> "SearchMerit":
+        """Return the same with other rays."""
+        other = replace(self, rays=search_rays(self.specification, rings, arms))
+        other.__dict__["family"] = self.family
+        return other
+
+    @cached_property
+    def family(self) -> LensFamily:
+        """Return what the lenses share."""
+        lens = template(self.arrangement, self.specification, 2.0 * self.specification.focal_length)
+        names = parameter_names(self.arrangement)
+        return LensFamily(lens, names, self.specification.wavelengths)
+
+    @cached_property
+    def indices(self) -> Tensor:
+        """Return the indices in front of the lens and behind each refracting surface at the
+        reference wavelength, (S + 1, 1).
+        """
+        of_glasses = self.family.table(self.family.start[None]).indices[0]
+        column = of_glasses[:, self.specification.reference]
+        # Rows: in front of the pupil's plane, behind it, and behind each of the sequence.
+        behind = [place for place, n in enumerate(self.arrangement.sequence, 2) if n >= 0]
+        return column[[0, *behind]][:, None]
+
+    def full(self, lenses: int) -> Conditions:
+        """Return the conditions of the specification, all fields alike, for so many lenses."""
+        fields = self.rays.fields
+        return Conditions(
+            torch.full((lenses,), self.specification.f_number, dtype=torch.float64),
+            torch.ones(lenses, dtype=torch.float64),
+            torch.full((lenses, fields), 1.0 / fields, dtype=torch.float64),
+            torch.zeros((lenses, self.operands), dtype=torch.float64),
+            torch.tensor(PARAXIAL_PUPIL, dtype=torch.float64).expand(lenses, fields, -1),
+            torch.ones((lenses, self.arrangement.surfaces + 1), dtype=torch.float64),
+        )
+
+    @cached_property
+    def operands(self) -> int:
+        """Return the number O of operands."""
+        return len(self.is_limit)
+
+    @cached_property
+    def is_limit(self) -> Tensor:
+        """Return which operands are limits, (O,), bool; the others are to be zero."""
+        u = torch.ones((1, self.arrangement.variables), dtype=torch.float64)
+        one = torch.ones(1, dtype=torch.float64)
+        beam = torch.ones((1, self.arrangement.surfaces + 1), dtype=torch.float64)
+        _, _, limits = self._paraxial_operands(u, one, one, beam)
+        return torch.tensor([*limits, *([True] * self._distortions)])
+
+    @property
+    def _distortions(self) -> int:
+        """Return the number of operands that hold the distortion."""
+        return 0 if self.specification.limits.distortion is None else self.rays.fields - 1
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Return the box of the variables u, (P,) each."""
+        f, limits = self.specification.focal_length, self.specification.limits
+        a = self.arrangement
+        lower, upper = [-20.0] * a.surfaces, [20.0] * a.surfaces
+        place_of_stop = a.stop_place
+        for gap, medium in enumerate(a.gap_media):
+            low, high = limits.glass if medium >= 0 else limits.air
+            if gap in (place_of_stop - 1, place_of_stop):
+                # Two gaps about the stop make one space; the stop may touch a lens.
+                low = 0.5 * low
+            lower.append(low / f)
+            upper.append(2.0 if high is None else high / f)
+        lower.append(limits.back_focus / f)
+        upper.append(3.0)
+        return (
+            torch.tensor(lower, dtype=torch.float64),
+            torch.tensor(upper, dtype=torch.float64),
+        )
+
+    # ---------------------------------------------------------------- values
+
+    def lens_values(self, u: Tensor, pupil: Tensor) -> Tensor:
+        """Return the family's variables (L, P + 1), mm, of variables u (L, P).
+
+        Args:
+            u: of the lenses.
+            pupil: from the first of the sequence to the entrance pupil over f, (L,).
+        """
+        f, s = self.specification.focal_length, self.arrangement.surfaces
+        return torch.cat([u[:, :s] / f, -pupil[:, None] * f, u[:, s:] * f], 1)
+
+    def paraxial_of(self, u: Tensor) -> "tuple[Tensor, ...]":
+        """Return power, entrance pupil, back focus and Petzval sum of lenses u (L, P), times or
+        over f.
+        """
+        numbers = numbers_of(self.arrangement, u.unbind(-1), list(self.indices))
+        found = paraxial(self.arrangement, numbers)
+        pupil = found.entrance_pupil + torch.zeros_like(found.power)
+        return found.power, pupil, found.back_focus, found.petzval
+
+    def evaluate(self, u: Tensor, conditions: Conditions) -> BatchModel:
+        """Return the models of lenses u (L, P), in units of f; no merit where a ray fails."""
+        found = self._evaluate(u, conditions)
+        f, surfaces = self.specification.focal_length, self.arrangement.surfaces
+        shifted = found.deviations + conditions.shifts
+        shifted = torch.where(self.is_limit, shifted.clamp(min=0.0), shifted)
+        rows = torch.where((shifted != 0.0)[..., None], found.derivatives, 0.0)
+        spots = _in_variables(_about_centroids(found.sums), found.of_pupil, f, surfaces)
+        weight = self.operand_weight**2
+        merit = spots.merit / f**2 + weight * shifted.square().sum(-1)
+        return BatchModel(
+            torch.where(found.usable, merit, torch.inf),
+            spots.gradient / f**2 + weight * torch.einsum("lo,lop->lp", shifted, rows),
+            spots.hessian / f**2 + weight * (rows.mT @ rows),
+        )
+
+    def deviations(self, u: Tensor, conditions: Conditions) -> Tensor:
+        """Return the deviations of operands (L, O), relative or over f; see `is_limit`."""
+        return self._evaluate(u, conditions).deviations
+
+    def _evaluate(self, u: Tensor, conditions: Conditions) -> "_Evaluated":
+        f = self.specification.focal_length
+        first_order, of_first_order, _ = self._paraxial_operands(
+            u,
+            0.5 / conditions.f_number,
+            conditions.field * self.rays.tangent.max(),
+            conditions.beam,
+        )
+        pupil, of_pupil = first_order[:, 0], of_first_order[:, 0]
+        rays, tangent = self._launched(conditions)
+        by_group = torch.nn.functional.pad(
+            conditions.field_weights, (0, self.rays.fields - 1), value=1.0
+        )
+        sums = self.family.normal_equations(
+            self.lens_values(u, pupil),
+            rays,
+            torch.stack([torch.zeros_like(tangent), f * tangent], -1),
+            self.rays.weight * by_group[:, self.rays.group],
+            self.rays.group,
+            self.rays.groups,
+        )
+        deviations, rows = [first_order[:, 1:]], [of_first_order[:, 1:]]
+        limit = self.specification.limits.distortion
+        if limit is not None and self._distortions:
+            deviation, row = self._distortion(sums, tangent, of_pupil, limit)
+            deviations.append(deviation)
+            rows.append(row)
+        usable = (sums.count == tangent.shape[1]) & torch.isfinite(pupil)
+        return _Evaluated(sums, torch.cat(deviations, 1), torch.cat(rows, 1), of_pupil, usable)
+
+    def spots(self, u: Tensor, conditions: Conditions) -> Tensor:
+        """Return the RMS spot radii (L, F), mm, about centroids; infinite where a ray fails."""
+        pupil = self.paraxial_of(u)[1]
+        rays, tangent = self._launched(conditions)
+        hit = self.family.trace(self.lens_values(u, pupil), rays)
+        ideal = self.specification.focal_length * tangent
+        found = []
+        for field in range(self.rays.fields):
+            mine = self.rays.group == field
+            weight = self.rays.weight[mine]
+            x, y = hit.position[:, mine, 0], hit.position[:, mine, 1] - ideal[:, mine]
+            y = y - (weight * y).sum(-1, keepdim=True)
+            square = (weight * (x * x + y * y)).sum(-1)
+            passes = hit.valid[:, mine].all(-1)
+            found.append(torch.where(passes, square.sqrt(), torch.inf))
+        return torch.stack(found, -1)
+
+    def _launched(self, conditions: Conditions) -> tuple[FamilyRays, Tensor]:
+        """Return the rays of every lens, and the tangents of their field angles (L, N)."""
+        radius = 0.5 * self.specification.focal_length / conditions.f_number
+        position, direction, tangent = launched(
+            self.rays, radius, conditions.field, conditions.pupils
+        )
+        return FamilyRays(position, direction, self.rays.wavelength), tangent
+
+    def _paraxial_operands(
+        self, u: Tensor, radius: Tensor, field: Tensor, beam: Tensor
+    ) -> tuple[Tensor, Tensor, list[bool]]:
+        """Return the entrance pupil's place and the paraxial operands (L, 1 + O), their derivatives
+        (L, 1 + O, P), and which operands are limits.
+        """
+        numbers = numbers_of(self.arrangement, Tangents.variables(u), list(self.indices))
+        first_order = paraxial(self.arrangement, numbers)
+        operands, limits = paraxial_operands(
+            self.arrangement, self.specification, numbers, first_order, radius, field, beam
+        )
+        pupil = first_order.entrance_pupil
+        if not isinstance(pupil, Tangents):  # the stop is the first of the sequence
+            pupil = 0.0 * numbers.image
+        rows = torch.cat([pupil.rows[None], operands.rows])
+        return rows[:, 0].T, rows[:, 1:].permute(2, 0, 1), limits
+
+    def _distortion(
+        self, sums: FamilySums, tangent: Tensor, of_pupil: Tensor, limit: float
+    ) -> tuple[Tensor, Tensor]:
+        """Return how far distortion exceeds its limit (L, F - 1), and derivatives (L, F - 1, P)."""
+        f, s = self.specification.focal_length, self.arrangement.surfaces
+        fields = self.rays.fields
+        ideal = f * tangent[:, -(fields - 1) :]
+        share = sums.group_residual[:, fields:, 1] / ideal
+        row = sums.group_jacobian[:, fields:, 1] / ideal[..., None]
+        row = _row_in_variables(row, of_pupil[:, None], f, s)
+        return share.abs() - _WITHIN * limit, share.sign()[..., None] * row
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    """Holds what a model is made of."""
+
+    sums: FamilySums
+    deviations: Tensor
+    derivatives: Tensor
+    of_pupil: Tensor
+    usable: Tensor
+
+
+def _about_centroids(sums: FamilySums) -> BatchModel:
+    """Return the sums about the centroids of spots, without the chief rays.
+
+    x has no centroid: half of the pupil stands for the whole.  A chief ray is alone in its group,
+    and is taken off with its centroid; in x it is zero.
+    """
+    residual, jacobian = sums.group_residual[..., 1], sums.group_jacobian[:, :, 1]
+    inverse = 1.0 / sums.group_weight.clamp(min=1e-300)
+    mean = residual * inverse
+    scaled = jacobian * inverse.sqrt()[..., None]
+    return BatchModel(
+        sums.sum_of_squares - (residual * mean).sum(1),
+        sums.jtr - torch.einsum("lg,lgp->lp", mean, jacobian),
+        sums.jtj - torch.einsum("lgp,lgq->lpq", scaled, scaled),
+    )
+
+
+def _row_in_variables(row: Tensor, of_pupil: Tensor, f: float, surfaces: int) -> Tensor:
+    """Return derivatives (..., L, P) with respect to u from those (..., L, P + 1) with respect to
+    the family's variables.
+    """
+    pupil = row[..., surfaces : surfaces + 1]
+    own = torch.cat([row[..., :surfaces] / f, row[..., surfaces + 1 :] * f], -1)
+    return own - f * pupil * of_pupil
+
+
+def _in_variables(model: BatchModel, of_pupil: Tensor, f: float, surfaces: int) -> BatchModel:
+    """Return the model in u of one in the family's variables, with the pupil's distance following
+    from u.
+    """
+    first = _row_in_variables(model.hessian, of_pupil[:, None], f, surfaces)
+    both = _row_in_variables(first.mT, of_pupil[:, None], f, surfaces)
+    return BatchModel(model.merit, _row_in_variables(model.gradient, of_pupil, f, surfaces), both)

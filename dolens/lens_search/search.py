@@ -1,0 +1,262 @@
+"""The search: starts are grown in batches, and the best forms lead to others.
+
+Each step is a list of tasks whose results depend on the task alone, so that tasks can run in any
+process and a search can be taken up again where it was stopped.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from dolens.errors import InputError
+from dolens.lens_search.arrangement import Arrangement
+from dolens.lens_search.designs import Designs, element_powers
+from dolens.lens_search.growth import STAGES, Grown, Stage, finish, grow
+from dolens.lens_search.merit import SearchMerit
+from dolens.lens_search.neighbours import inserted, taken_out
+from dolens.lens_search.specification import Specification
+from dolens.lens_search.starts import random_starts
+from dolens.tasks import TaskMap
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """Says how much is searched.
+
+    Attributes:
+        starts: random starts, over all places of the stop.
+        batch: of one task.
+        stages: of growth.
+        finished: share of a batch's grown lenses that are optimised to the end.
+        finish_rounds: see `finish`.
+        finish_iterations: of a round.
+        escapes: rounds in which the best forms lead to others.
+        parents: forms of a round that do.
+        tolerance: by how much an operand may fail, relative or over the focal length.
+        rings: of the rays that decide.
+        arms: of these.
+        seed: of the starts.
+
+    Raises:
+        InputError: a number out of range.
+    """
+
+    starts: int = 10_000
+    batch: int = 2000
+    stages: tuple[Stage, ...] = STAGES
+    finished: float = 0.5
+    finish_rounds: int = 6
+    finish_iterations: int = 40
+    escapes: int = 2
+    parents: int = 16
+    tolerance: float = 3e-4
+    rings: int = 4
+    arms: int = 8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stages", tuple(self.stages))
+        for name in ("starts", "batch", "finish_rounds", "finish_iterations", "rings", "arms"):
+            if getattr(self, name) < 1:
+                raise InputError(f"plan.{name} must be 1 or more, not {getattr(self, name)}")
+        for name in ("escapes", "parents"):
+            if getattr(self, name) < 0:
+                raise InputError(f"plan.{name} must be 0 or more, not {getattr(self, name)}")
+        if not 0.0 < self.finished <= 1.0:
+            raise InputError(f"plan.finished must lie above 0 and to 1, not {self.finished}")
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one task found.
+
+    Attributes:
+        designs: of one arrangement each.
+        features: powers of the elements of the starts, (starts, elements); none of an escape.
+        first: number of the first start.
+        iterations: of all lenses together.
+    """
+
+    designs: tuple[Designs, ...]
+    features: Tensor
+    first: int
+    iterations: int
+
+
+def start_tasks(specification: Specification, plan: SearchPlan) -> list[tuple[int, int, int]]:
+    """Return the tasks of growth: place of the stop, number of the first start, and how many."""
+    stops = specification.places_of_stop
+    # Every place of the stop has its turn; a round of batches goes through them all.
+    rounds = max(1, -(-plan.starts // (plan.batch * len(stops))))
+    count = rounds * len(stops)
+    bounds = [plan.starts * number // count for number in range(count + 1)]
+    return [
+        (stops[number % len(stops)], first, last - first)
+        for number, (first, last) in enumerate(pairwise(bounds))
+        if last > first
+    ]
+
+
+def grown_starts(
+    specification: Specification, plan: SearchPlan, task: tuple[int, int, int]
+) -> Step:
+    """Grow one batch of starts, and finish the better ones."""
+    stop, first, count = task
+    arrangement = Arrangement(specification.groups, stop)
+    merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
+    generator = torch.Generator().manual_seed(1_000_003 * plan.seed + first)
+    starts = random_starts(merit, count, generator)
+    grown = grow(merit, starts, plan.stages)
+    done = _finished(merit, plan, _best(grown, plan.finished))
+    history = (("start",),) * len(done.values)
+    designs = Designs(
+        arrangement, done.values, done.spots, done.violation, first + done.starts, history
+    )
+    features = element_powers(arrangement, starts, merit)
+    return Step((designs.keeping(plan.tolerance),), features, first, done.iterations)
+
+
+def escapes(specification: Specification, plan: SearchPlan, parents: Designs) -> Step:
+    """Take an element out of designs and put one in elsewhere; grow and finish what comes of it."""
+    iterations = 0
+    by_arrangement: dict[Arrangement, list[tuple[Tensor, Tensor, str]]] = {}
+    for fewer in taken_out(parents.arrangement, parents.values):
+        less = SearchMerit.of(fewer.arrangement, specification, 3, 6)
+        grown = grow(less, fewer.values, plan.stages[-2:-1])
+        iterations += grown.iterations
+        for more in inserted(fewer.arrangement, grown.values, specification):
+            if more.arrangement.groups != specification.groups:
+                continue
+            if more.arrangement.stop not in specification.places_of_stop:
+                continue
+            of = fewer.parents[grown.starts][more.parents]
+            words = f"{fewer.words}, {more.words}"
+            by_arrangement.setdefault(more.arrangement, []).append((more.values, of, words))
+    found = []
+    for arrangement, made in by_arrangement.items():
+        merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
+        values = torch.cat([part[0] for part in made])
+        of = torch.cat([part[1] for part in made])
+        all_words = [part[2] for part in made for _ in range(len(part[0]))]
+        done = _finished(merit, plan, _best(grow(merit, values, plan.stages[-2:]), plan.finished))
+        iterations += done.iterations
+        parent = of[done.starts].tolist()
+        history = tuple(
+            (*parents.history[p], all_words[row])
+            for p, row in zip(parent, done.starts.tolist(), strict=True)
+        )
+        designs = Designs(
+            arrangement,
+            done.values,
+            done.spots,
+            done.violation,
+            parents.starts[of[done.starts]],
+            history,
+        )
+        found.append(designs.keeping(plan.tolerance))
+    none = torch.zeros((0, specification.elements), dtype=torch.float64)
+    return Step(tuple(found), none, 0, iterations)
+
+
+def search(specification: Specification, plan: SearchPlan, map_tasks: TaskMap) -> Iterator[Step]:
+    """Search, and yield what each task found as soon as it is known.
+
+    Args:
+        specification: of the lens.
+        plan: how much.
+        map_tasks: runs the tasks.
+    """
+    pool: dict[Arrangement, Designs] = {}
+    grown = partial(grown_starts, specification, plan)
+    for step in map_tasks(grown, start_tasks(specification, plan), "batches of starts"):
+        pool = with_step(pool, step, specification, plan)
+        yield step
+    if len(set(specification.element_glasses)) > 1 or specification.elements < 2:
+        # An element that is taken out takes its glass with it.
+        return
+    tried: dict[Arrangement, Tensor] = {}
+    for number in range(plan.escapes):
+        parents = _parents(pool, plan, tried, specification)
+        tasks = [part for group in parents for part in _shares(group)]
+        name = f"escapes of round {number + 1}"
+        for step in map_tasks(partial(escapes, specification, plan), tasks, name):
+            pool = with_step(pool, step, specification, plan)
+            yield step
+
+
+def with_step(
+    pool: dict[Arrangement, Designs],
+    step: Step,
+    specification: Specification,
+    plan: SearchPlan,
+) -> dict[Arrangement, Designs]:
+    """Return the pool of distinct forms with those of a step."""
+    pool = dict(pool)
+    for designs in step.designs:
+        if not len(designs.values):
+            continue
+        merit = SearchMerit.of(designs.arrangement, specification, plan.rings, plan.arms)
+        old = pool.get(designs.arrangement)
+        joined = designs if old is None else Designs.joined([old, designs])
+        pool[designs.arrangement] = joined.of_distinct_forms(merit)
+    return pool
+
+
+def _parents(
+    pool: dict[Arrangement, Designs],
+    plan: SearchPlan,
+    tried: dict[Arrangement, Tensor],
+    specification: Specification,
+) -> list[Designs]:
+    """Return the best forms of all arrangements that have not been parents yet, and note them."""
+    ranked = sorted(
+        (float(merit), arrangement.stop, row, arrangement)
+        for arrangement, designs in pool.items()
+        for row, merit in enumerate(designs.merit)
+    )
+    rows: dict[Arrangement, list[int]] = {}
+    count = 0
+    for _, _, row, arrangement in ranked:
+        values = pool[arrangement].values[row]
+        before = tried.get(arrangement)
+        if before is not None and bool((before - values).abs().amax(-1).lt(1e-3).any()):
+            continue
+        rows.setdefault(arrangement, []).append(row)
+        count += 1
+        if count == plan.parents:
+            break
+    found = []
+    for arrangement, chosen in rows.items():
+        designs = pool[arrangement].chosen(torch.tensor(chosen))
+        before = tried.get(arrangement)
+        tried[arrangement] = (
+            designs.values if before is None else torch.cat([before, designs.values])
+        )
+        found.append(designs)
+    return found
+
+
+def _shares(designs: Designs, size: int = 4) -> Sequence[Designs]:
+    rows = torch.arange(len(designs.values))
+    return [designs.chosen(part) for part in rows.split(size)]
+
+
+def _best(grown: Grown, share: float) -> Grown:
+    """Return the better part of grown lenses."""
+    order = grown.merit.argsort()[: max(1, round(share * len(grown.values)))]
+    return Grown(
+        grown.values[order],
+        grown.starts[order],
+        grown.spots[order],
+        grown.violation[order],
+        grown.iterations,
+        grown.survivors,
+    )
+
+
+def _finished(merit: SearchMerit, plan: SearchPlan, grown: Grown) -> Grown:
+    return finish(merit, grown, plan.finish_rounds, plan.finish_iterations)

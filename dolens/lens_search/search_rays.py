@@ -1,0 +1,136 @@
+"""Rays of a search sample half of the pupil of a centred lens, for every field and wavelength."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dolens.lens_search.specification import Specification
+
+
+@dataclass(frozen=True)
+class SearchRays:
+    """What the rays of all lenses share.  F fields, N rays.
+
+    A group is the light of one field of all wavelengths; then comes a group for the chief ray of
+    each field but the first, at the reference wavelength.
+
+    Attributes:
+        pupil: (N, 2), in radii of the entrance pupil, x ≥ 0.
+        tangent: (N,), of the ray's field angle.
+        weight: (N,), of spots: they sum to one over each group; of chief rays 1.
+        group: (N,), int64.
+        wavelength: (N,), int32.
+        field: (N,), int64, which of the fields.
+        fields: F.
+    """
+
+    pupil: Tensor
+    tangent: Tensor
+    weight: Tensor
+    group: Tensor
+    wavelength: Tensor
+    field: Tensor
+    fields: int
+
+    @property
+    def groups(self) -> int:
+        """Return the number of groups."""
+        return 2 * self.fields - 1
+
+
+def half_pupil(rings: int, arms: int) -> tuple[Tensor, Tensor]:
+    """Return points of the half x ≥ 0 of the unit circle (N, 2) and weights that sum to one.
+
+    Gaussian quadrature in r² (Forbes, J. Opt. Soc. Am. A 5, 1943, 1988): exact for even polynomials
+    of degree up to 4·rings - 2 in r, and of harmonics below 2·arms.
+
+    Args:
+        rings: radii.
+        arms: azimuths of the half.
+    """
+    node, weight = np.polynomial.legendre.leggauss(rings)
+    radius = np.sqrt(0.5 * (node + 1.0))
+    azimuth = -0.5 * math.pi + (np.arange(arms) + 0.5) * math.pi / arms
+    points = radius[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
+    shares = np.repeat(0.5 * weight / arms, arms)
+    return torch.from_numpy(points.reshape(-1, 2)), torch.from_numpy(shares)
+
+
+def search_rays(specification: Specification, rings: int = 4, arms: int = 8) -> SearchRays:
+    """Sample all fields and wavelengths, each wavelength alike.
+
+    Args:
+        specification: its fields and wavelengths.
+        rings: of the pupil.
+        arms: of its half.
+    """
+    points, shares = half_pupil(rings, arms)
+    waves, fields = len(specification.wavelengths), len(specification.fields)
+    pupil, tangent, weight, group, wavelength = [], [], [], [], []
+    tangents = [math.tan(math.radians(angle)) for angle in specification.fields]
+    for number, slope in enumerate(tangents):
+        for wave in range(waves):
+            pupil.append(points)
+            weight.append(shares / waves)
+            tangent.append(torch.full((len(points),), slope, dtype=torch.float64))
+            group.append(torch.full((len(points),), number))
+            wavelength.append(torch.full((len(points),), wave, dtype=torch.int32))
+    middle = torch.zeros((1, 2), dtype=torch.float64)
+    one = torch.ones(1, dtype=torch.float64)
+    for number, slope in enumerate(tangents[1:], fields):
+        pupil.append(middle)
+        weight.append(one)
+        tangent.append(slope * one)
+        group.append(torch.full((1,), number))
+        wavelength.append(torch.full((1,), specification.reference, dtype=torch.int32))
+    every = torch.cat(group)
+    return SearchRays(
+        torch.cat(pupil),
+        torch.cat(tangent),
+        torch.cat(weight),
+        every,
+        torch.cat(wavelength),
+        torch.where(every < fields, every, every - fields + 1),
+        fields,
+    )
+
+
+def launched(
+    rays: SearchRays, radius: Tensor, field: Tensor, pupils: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return positions and directions (L, N, 3) on the plane of the entrance pupil, and the
+    tangents of the field angles (L, N).
+
+    Args:
+        rays: N of them.
+        radius: of the entrance pupil of each lens, mm, (L,).
+        field: factor of the fields' tangents of each lens, (L,).
+        pupils: of each field, (L, F, 6): see `dolens.lens_search.real_pupils`.
+    """
+    tangent = field[:, None] * rays.tangent
+    shift, scale, bend, dip, across, keystone = pupils[:, rays.field].unbind(-1)
+    px, py = rays.pupil.unbind(-1)
+    x = px * (across + py * keystone)
+    y = shift + py * (scale + py * bend) + px * px * dip
+    return (*_rays(radius[:, None] * x, radius[:, None] * y, tangent), tangent)
+
+
+def through_points(points: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions and directions (L, N, 3) of rays through points of the entrance pupil's
+    plane.
+
+    Args:
+        points: (L, N, 2), mm.
+        tangent: of the field angles, (L, N).
+    """
+    return _rays(points[..., 0], points[..., 1], tangent)
+
+
+def _rays(x: Tensor, y: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
+    cosine = torch.rsqrt(1.0 + tangent * tangent)
+    zero = torch.zeros_like(cosine)
+    position = torch.stack([x, y, zero], -1)
+    return position, torch.stack([zero, tangent * cosine, cosine], -1)

@@ -1,0 +1,253 @@
+"""A found lens is checked with real rays over the whole field, against what was asked for."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from dolens.analysis.conditions import Conditions, conditions
+from dolens.analysis.parabasal import parabasal_rays
+from dolens.analysis.rms_curves import rms_against_field
+from dolens.errors import InputError
+from dolens.lens_search.real_beams import FIELDS, RAYS, RealBeams, Space, real_beams, spaces
+from dolens.lens_search.requirements import Requirements
+from dolens.optics.lens import Lens
+
+# A merit function meets limits only nearly.  So much may be missing, as a share of the limit, or of
+# 1 mm, 1° or 1 % where the limit is less.
+_ALLOWED = 1e-3
+# Names of the least and largest thickness on the axis, and of the least one out to the edge.
+_GLASS = ("thinnest glass", "thickest glass", "thinnest edge of glass")
+_AIR = ("smallest air space", "largest air space", "smallest air to the edge")
+
+
+@dataclass(frozen=True)
+class Check:
+    """A `Check` is one quantity of a lens beside its required.
+
+    Attributes:
+        name: of the quantity.
+        value: NaN where it cannot be computed.
+        unit: of the value and its required.
+        least: None for no limit.
+        most: None for no limit.
+        place: where the value is found: a field, or numbers of surfaces; may be empty.
+    """
+
+    name: str
+    value: float
+    unit: str
+    least: float | None = None
+    most: float | None = None
+    place: str = ""
+
+    @property
+    def holds(self) -> bool | None:
+        """Return whether the limits are kept to a thousandth; None where there are none.
+
+        What cannot be computed keeps no limit.
+        """
+        if self.least is None and self.most is None:
+            return None
+        if math.isnan(self.value):
+            return False
+        return not (
+            (self.least is not None and self.value < self.least - _slack(self.least))
+            or (self.most is not None and self.value > self.most + _slack(self.most))
+        )
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Holds what real rays say about a lens.
+
+    Attributes:
+        checks: one a quantity.
+        beams: the rays that they are from.
+    """
+
+    checks: tuple[Check, ...]
+    beams: RealBeams
+
+    @property
+    def holds(self) -> bool:
+        """Return whether every limit is kept."""
+        return not self.broken
+
+    @property
+    def broken(self) -> tuple[Check, ...]:
+        """Return the checks whose limit is not kept."""
+        return tuple(check for check in self.checks if check.holds is False)
+
+    def value(self, name: str) -> float:
+        """Return the value of a quantity.
+
+        Raises:
+            InputError: no quantity has this name.
+        """
+        for check in self.checks:
+            if check.name == name:
+                return check.value
+        names = ", ".join(check.name for check in self.checks)
+        raise InputError(f"verification: no quantity '{name}' (allowed: {names})")
+
+
+@torch.no_grad()
+def verify(
+    lens: Lens, required: Requirements, fields: int = FIELDS, rays: int = RAYS
+) -> Verification:
+    """Trace the whole field of a lens and compare what is found with its required.
+
+    Rays of every wavelength of the lens cross the physical stop everywhere, from fields between the
+    axis and the edge; they are aimed at the stop one field at a time, whatever the pupil's
+    aberrations.  Thicknesses are taken where these beams really end.
+
+    Args:
+        lens: centred, in double precision, with stop, fields and wavelengths.
+        required: what it must keep.
+        fields: how many, from the axis to the edge.
+        rays: of each field and wavelength, a multiple of four.
+
+    Raises:
+        InputError: the lens is not centred, or has no field but the axis.
+    """
+    where = conditions(lens)
+    beams = real_beams(lens, fields, rays)
+    checks = [
+        *_first_order(lens, where, required, beams),
+        *_thicknesses(spaces(lens, beams.heights), required),
+        *_crossing(lens, beams, required.stop_to_glass),
+        *_light(beams, required),
+        *_image(lens, where, required, beams, rays),
+    ]
+    return Verification(tuple(checks), beams)
+
+
+def _first_order(
+    lens: Lens, where: Conditions, required: Requirements, beams: RealBeams
+) -> list[Check]:
+    first = lens.first_order(where.reference_wavelength, where.object_distance)
+    vertices = lens.system().vertices
+    behind = float(lens.materials[-1].index(where.reference_wavelength))
+    sine = behind * beams.marginal_sine
+    number = 0.5 / sine if sine > 0.0 else math.nan
+    return [
+        _about(
+            "focal length",
+            float(first.efl),
+            "mm",
+            required.focal_length,
+            required.focal_length_error,
+        ),
+        _about("F-number", number, "", required.f_number, required.f_number_error),
+        Check("total track", float(vertices[-1]), "mm", most=required.total_track),
+        Check("back focus", float(lens.sensor_distance), "mm", least=required.back_focus),
+    ]
+
+
+def _thicknesses(found: Sequence[Space], required: Requirements) -> list[Check]:
+    """Return the thinnest and thickest of glass and air, with the surfaces between which it is."""
+    checks = []
+    for kind, centre, edge in (
+        ("glass", required.glass_centre, required.glass_edge),
+        ("air", required.air_centre, required.air_edge),
+    ):
+        alike = [space for space in found if space.glass == (kind == "glass")]
+        if not alike:
+            continue
+        thin = min(alike, key=lambda space: space.centre)
+        thick = max(alike, key=lambda space: space.centre)
+        sharp = min(alike, key=lambda space: space.edge)
+        names = _GLASS if kind == "glass" else _AIR
+        rows = (
+            (names[0], thin, thin.centre, centre[0], None),
+            (names[1], thick, thick.centre, None, centre[1]),
+            (names[2], sharp, sharp.edge, edge, None),
+        )
+        checks += [
+            Check(name, value, "mm", least, most, f"surfaces {space.first}–{space.last}")
+            for name, space, value, least, most in rows
+        ]
+    return checks
+
+
+def _crossing(lens: Lens, beams: RealBeams, stop_to_glass: float | None) -> list[Check]:
+    """Return the least way that a ray has from one surface to the next, and to a stop between."""
+    at = int(beams.advance.argmin())
+    ends = [*beams.refracting[1:], None]
+    place = f"surface {beams.refracting[at]} to sensor"
+    if ends[at] is not None:
+        place = f"surfaces {beams.refracting[at]}–{ends[at]}"
+    least = float(beams.advance[at])
+    value = least if math.isfinite(least) else math.nan
+    checks = [Check("shortest ray segment", value, "mm", least=0.0, place=place)]
+    if math.isfinite(beams.stop_clearance):
+        stop, clear = f"surface {lens.stop}", beams.stop_clearance
+        checks.append(Check("stop to glass", clear, "mm", least=stop_to_glass, place=stop))
+    return checks
+
+
+def _light(beams: RealBeams, required: Requirements) -> list[Check]:
+    checks = []
+    for name, shares, most in (
+        ("rays that fail", beams.failed, 0.0),
+        ("vignetting", beams.vignetted, required.vignetting),
+    ):
+        at = int(shares.argmax())
+        place = _field(beams, at) if float(shares[at]) > 0.0 else ""
+        limit = None if most is None else 100.0 * most
+        checks.append(Check(name, 100.0 * float(shares[at]), "%", most=limit, place=place))
+    return checks
+
+
+def _image(
+    lens: Lens, where: Conditions, required: Requirements, beams: RealBeams, rays: int
+) -> list[Check]:
+    scan, distance = beams.scan, where.object_distance
+    first = lens.first_order(where.reference_wavelength, distance)
+    chief = parabasal_rays(lens, scan.fields, [where.reference_wavelength], distance)
+    height = chief.position[:, 0] @ scan.direction
+    if distance is None:
+        ideal = float(first.efl) * torch.deg2rad(scan.coordinate).tan()
+    else:
+        ideal = float(first.magnification) * scan.coordinate
+    distortion = torch.where(ideal == 0.0, 0.0, 100.0 * (height / ideal - 1.0))
+    angle = torch.rad2deg(chief.slope[:, 0].norm(dim=-1).atan())
+    edge = tuple(scan.fields[-1].tolist())
+    spots = rms_against_field(
+        lens,
+        beams.wavelengths,
+        edge,
+        len(scan.fields),
+        rays,
+        distance,
+        where.weights.tolist(),
+    )
+    rows = (
+        ("distortion", distortion, "%", required.distortion),
+        ("chief-ray angle", angle, "°", required.chief_ray_angle),
+        ("largest RMS spot", 1e3 * spots.polychromatic, "µm", required.rms_spot_um),
+    )
+    checks = []
+    for name, values, unit, most in rows:
+        # A field whose chief ray does not arrive counts as the worst.
+        at = int(values.abs().nan_to_num(math.inf).argmax())
+        least = -most if most is not None and name == "distortion" else None
+        checks.append(Check(name, float(values[at]), unit, least, most, _field(beams, at)))
+    return checks
+
+
+def _field(beams: RealBeams, at: int) -> str:
+    unit = beams.scan.field_unit
+    return f"field {float(beams.scan.coordinate[at]):.3g}{'' if unit == '°' else ' '}{unit}"
+
+
+def _about(name: str, value: float, unit: str, target: float | None, error: float) -> Check:
+    if target is None:
+        return Check(name, value, unit)
+    return Check(name, value, unit, target * (1.0 - error), target * (1.0 + error))
+
+
+def _slack(limit: float) -> float:
+    return _ALLOWED * max(abs(limit), 1.0)

@@ -1,0 +1,1 @@
+"""Searches for lenses as experiments."""

@@ -1,0 +1,1 @@
+"""Parts of the independent check of a lens search: see `compare.py` and `retrace.py`."""

@@ -1,0 +1,124 @@
+"""Coordinates of glass: what they give is the model glass, and real glass is near."""
+
+import pytest
+import torch
+
+from dolens import InputError
+from dolens.lens_search.glass.dispersion_coordinates import (
+    conrady_basis,
+    coordinates_of,
+    fitted_basis,
+    glass_coordinates,
+    material_text,
+    medium_indices,
+    nd_vd_deviation,
+)
+from dolens.optics.glass_catalog import find_glass
+from dolens.optics.glass_tables import MAKERS, table, table_glass
+from dolens.optics.materials import index_model, parse_material
+
+VISIBLE = (435.8343, 460.0, 486.1327, 520.0, 546.074, 587.5618, 620.0, 656.2725)
+
+
+def makers_glasses():
+    glasses = []
+    for maker in MAKERS[:-1]:
+        for key in table(maker):
+            glass = table_glass(maker, key)
+            first, last = glass.wavelengths
+            if first <= 400.0 and last >= 700.0:
+                glasses.append(glass)
+    return glasses
+
+
+@pytest.fixture(scope="module")
+def glasses():
+    return makers_glasses()
+
+
+@pytest.mark.parametrize("glass", [(1.5168, 64.17, -0.0009), (1.80518, 25.36, 0.0092)])
+def test_conrady_s_basis_is_the_model_glass_of_a_prescription(glass):
+    text = "/".join(map(str, glass))
+    medium = parse_material(text, index_model("dfc"))
+    x = torch.tensor(coordinates_of(*glass), dtype=torch.float64)
+    index = conrady_basis(VISIBLE).index(x)
+    torch.testing.assert_close(index, medium_indices([medium], VISIBLE)[0], rtol=1e-14, atol=0.0)
+    assert nd_vd_deviation(x) == pytest.approx(glass, rel=1e-12)
+    again = parse_material(material_text(x), index_model("dfc"))
+    assert again.index(460.0) == pytest.approx(medium.index(460.0), rel=1e-12)
+
+
+def test_coordinates_of_a_catalogue_glass_are_those_of_its_three_numbers():
+    x = glass_coordinates(find_glass("SCHOTT:N-BK7"))
+    assert nd_vd_deviation(x) == pytest.approx((1.5168, 64.17, -0.0009), rel=1e-4, abs=1e-4)
+
+
+def test_the_derivative_is_that_of_the_index():
+    basis = conrady_basis(VISIBLE)
+    x = torch.tensor([[0.3, -0.4, 0.7], [1.0, 2.0, -0.5]], dtype=torch.float64)
+    for row, slopes in zip(x, basis.derivative(x), strict=True):
+        exact = torch.autograd.functional.jacobian(basis.index, row)
+        torch.testing.assert_close(slopes, exact.T, rtol=1e-14, atol=1e-16)
+
+
+def test_real_glass_is_near_in_the_visible(glasses):
+    assert len(glasses) > 2000
+    x = torch.tensor([glass_coordinates(g) for g in glasses], dtype=torch.float64)
+    indices = medium_indices(glasses, VISIBLE)
+    conrady = (conrady_basis(VISIBLE).index(x) - indices).abs()
+    fitted = (fitted_basis(VISIBLE, glasses).index(x) - indices).abs()
+    assert fitted.max() < 1e-4
+    assert fitted.square().mean().sqrt() < 1e-5
+    assert conrady.square().mean().sqrt() < 6e-5
+    assert (conrady.amax(1) > 1e-4).double().mean() < 0.1
+    # nd is given exactly.
+    assert fitted[:, VISIBLE.index(587.5618)].max() < 1e-14
+
+
+def test_a_step_of_one_is_as_common_in_each_coordinate(glasses):
+    x = torch.tensor([glass_coordinates(g) for g in glasses], dtype=torch.float64)
+    assert ((x.std(0) > 0.8) & (x.std(0) < 1.6)).all()
+
+
+def test_two_coordinates_leave_out_the_deviation_alone():
+    glasses = [find_glass(name) for name in ("N-BK7", "SCHOTT:F2", "N-SF6", "N-LAK33B", "N-FK51A")]
+    basis = fitted_basis((486.1327, 587.5618, 656.2725), glasses, count=2)
+    assert basis.slopes.shape == (2, 3)
+    x = torch.tensor([glass_coordinates(g)[:2] for g in glasses], dtype=torch.float64)
+    error = basis.index(x) - medium_indices(glasses, basis.wavelengths)
+    assert error.abs().max() < 1e-4
+
+
+def test_one_glass_is_met_exactly_by_the_basis_fitted_to_it():
+    glass = find_glass("N-KZFS4")
+    basis = fitted_basis((400.0, 700.0, 1000.0), [glass])
+    x = torch.tensor(glass_coordinates(glass), dtype=torch.float64)
+    expected = medium_indices([glass], basis.wavelengths)[0]
+    torch.testing.assert_close(basis.index(x), expected, rtol=1e-13, atol=0.0)
+
+
+def test_a_plastic_whose_range_begins_above_the_g_line_has_coordinates():
+    glass = find_glass("PLASTIC:POLYCARBONATE")
+    assert glass.wavelengths[0] > 435.9
+    x = torch.tensor(glass_coordinates(glass), dtype=torch.float64)
+    lines = (436.8, 486.1327, 587.5618, 656.2725)
+    index = conrady_basis(lines).index(x)
+    exact = medium_indices([glass], lines)[0]
+    # Conrady's formula meets nd, nF - nC and the rise from F to the first wavelength.
+    for error in (index[2] - exact[2], *(index - exact)[[1]] - (index - exact)[[3]],
+                  (index - exact)[0] - (index - exact)[1]):  # fmt: skip
+        assert abs(error) < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("ask", "word"),
+    [
+        (lambda: conrady_basis((0.0,)), "positive"),
+        (lambda: conrady_basis((500.0,), count=4), "2 or 3"),
+        (lambda: glass_coordinates(parse_material("1.5", index_model("dfc"))), "does not fall"),
+        (lambda: glass_coordinates(find_glass("INFRARED:GERMANIUM")), "range"),
+    ],
+)
+def test_what_is_wrong_is_said(ask, word):
+    with pytest.raises(InputError, match=word):
+        ask()

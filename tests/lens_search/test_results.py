@@ -1,0 +1,148 @@
+"""The results of a search: files that read back, a page that needs nothing else, and pictures."""
+
+import copy
+import re
+from html.parser import HTMLParser
+
+import pytest
+import torch
+
+from dolens import load_lens
+from dolens.errors import InputError
+from dolens.lens_search.course import search_course
+from dolens.lens_search.files import SUFFIXES, write_form
+from dolens.lens_search.form_words import element_powers, glasses_text, powers_text
+from dolens.lens_search.forms import distinct
+from dolens.lens_search.found import FoundLens
+from dolens.lens_search.requirements import Requirements
+from dolens.lens_search.results import Starts, write_results
+from dolens.lens_search.sensitivity import lens_sensitivity
+from dolens.lens_search.start_map import start_map
+
+VOID = {"meta", "br", "hr", "img", "input", "link"}
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    lens = load_lens("cooke_triplet").requires_grad_(False)
+    lens.wavelengths = (587.5618,)
+    return lens
+
+
+def test_the_usual_tolerances_make_a_lens_worse(triplet):
+    found = lens_sensitivity(triplet)
+    assert found.nominal_um < found.expected_um
+    assert found.nominal_um < found.ninety_percent_um < 3.0 * found.expected_um
+    # The flint of a triplet is known for it.
+    assert found.worst == "element 3–4 tilt"
+    assert 0.0 < found.worst_share <= 1.0
+    assert "0.02 mm" in found.tolerances
+
+
+def test_a_form_is_said_in_signs_of_powers(triplet):
+    assert powers_text(triplet) == "+ − | +"
+    gauss = load_lens("double_gauss").requires_grad_(False)
+    assert powers_text(gauss) == "+ (+ −) | (− +) +"
+    assert glasses_text(gauss).startswith("2 × 1.670/47.1, 1.699/30.1")
+    front, flint, back = element_powers(triplet)
+    assert flint.power < -1.0 < 1.0 < front.power and (front.first, back.first) == (1, 5)
+
+
+def test_files_of_every_format_are_written_and_what_cannot_hold_a_lens_is_named(triplet, tmp_path):
+    found = write_form(triplet, tmp_path, 3)
+    assert [file.path.suffix for file in found] == list(SUFFIXES)
+    for file in found:
+        assert file.written and file.exact and file.path.name == f"form_03{file.path.suffix}"
+        again = load_lens(file.path)
+        assert torch.equal(
+            again.surfaces["1"].curvature.detach(), triplet.surfaces["1"].curvature.detach()
+        )
+    freeform = load_lens("wavefront_coding").requires_grad_(False)
+    refused = [file for file in write_form(freeform, tmp_path, 4) if not file.written]
+    for file in refused:
+        assert not file.path.exists() and len(file.changes) == 1
+        assert file.path.name in file.changes[0]
+    with pytest.raises(InputError, match="cannot be written"):
+        (tmp_path / "file").write_text("")
+        write_form(triplet, tmp_path / "file", 1)
+
+
+class Page(HTMLParser):
+    """Collects addresses, and that every element ends."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.links, self.sources = [], [], []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.links += [found["href"]] if tag == "a" else []
+        self.sources += [found["src"]] if "src" in found else []
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        pass
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_results_of_a_search(triplet, tmp_path):
+    other = copy.deepcopy(triplet)
+    other.surfaces["3"].curvature.fill_(-0.03)
+    lenses = [
+        *(FoundLens(triplet, 10.0, (8.0, 10.0, 12.0), 5), FoundLens(triplet, 11.0, (9, 11, 13), 9)),
+        FoundLens(other, 50.0, (40.0, 50.0, 60.0), 2, ("start 2", "<inserted> at 3")),
+    ]
+    forms = distinct(lenses)
+    assert [form.places for form in forms] == [(0, 1), (2,)]
+    features = torch.tensor([[1.0, -2.0, 1.5], [0.5, -2.2, 1.1], [3.0, 1.0, -1.0]])
+    starts = Starts(start_map(features, ["φ₁", "φ₂", "φ₃"]), torch.tensor([0, 0, 1]), 40)
+    course = search_course([3.0, 1.0, 2.0], [10.0, 50.0, 11.0], [0, 1, 0])
+    required = Requirements(50.0, total_track=65.0, back_focus=45.0, vignetting=0.5)
+    reports = write_results(
+        forms, tmp_path, required, "Triplets & more", [("F/", "5")], starts, course
+    )
+    assert [report.powers for report in reports] == ["+ − | +", "+ − | +"]
+    assert "back focus" in reports[0].broken and not reports[0].problems
+    text = (tmp_path / "forms.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.sources == [] and not re.search(r"https?://|@import", text)
+    assert "Triplets &amp; more" in text and "&lt;inserted&gt; at 3" in text
+    outside = {link for link in page.links if not link.startswith("#")}
+    assert {f"form_0{n}{suffix}" for n in (1, 2) for suffix in SUFFIXES} == outside
+    assert all((tmp_path / link).is_file() for link in outside)
+    for link in page.links:
+        assert not link.startswith("#") or f'id="{link[1:]}"' in text
+    assert "back focus</span>" in text  # red, with the sign of what is not kept
+    for name in ("forms", "starts", "merit_over_time"):
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_search_that_found_nothing_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="no lens"):
+        write_results([], tmp_path, Requirements(), "nothing")
+
+
+def test_forms_near_the_best_so_far_are_counted_over_time():
+    course = search_course([4.0, 1.0, 2.0, 3.0], [1.0, 2.0, 2.4, 2.6], [3, 0, 1, 2])
+    assert course.seconds == (1.0, 2.0, 3.0, 4.0)
+    assert course.best == (2.0, 2.0, 2.0, 1.0)
+    # 2.6 is more than a quarter above 2; at last all others are far above 1.
+    assert course.forms == (1, 2, 2, 1)
+    with pytest.raises(InputError, match="as many of each"):
+        search_course([1.0], [1.0, 2.0], [0])
+
+
+def test_a_map_of_starts_shows_where_they_differ_most():
+    along = torch.linspace(-1.0, 1.0, 9, dtype=torch.float64)
+    features = torch.stack([3.0 * along, along.square(), -3.0 * along], 1)
+    found = start_map(features, ["a", "b", "c"])
+    assert found.labels == ("0.71 a − 0.71 c", "1.00 b")
+    assert found.share == pytest.approx(1.0)
+    assert float((found.points[1:, 0] > found.points[:-1, 0]).double().mean()) == 1.0
+    with pytest.raises(InputError, match="two features"):
+        start_map(features[:, :1], ["a"])

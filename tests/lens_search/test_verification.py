@@ -1,0 +1,195 @@
+"""Checks of a found lens agree with what other parts of the tree, or geometry, say of it."""
+
+import copy
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dolens import load_lens
+from dolens.errors import InputError
+from dolens.lens_search.real_beams import real_beams, spaces, with_drawn_heights
+from dolens.lens_search.requirements import Requirements
+from dolens.lens_search.specification import Limits, Specification
+from dolens.lens_search.verification import Check, verify
+from dolens.optics.surfaces.clear_aperture import Circle
+from dolens.optimize.operands import LensProperties, operand
+from dolens.prescriptions import lens_from_prescription
+
+FIELDS, RAYS = 3, 40
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    lens = load_lens("cooke_triplet").requires_grad_(False)
+    lens.wavelengths = (587.5618,)
+    return lens
+
+
+@pytest.fixture(scope="module")
+def checked(triplet):
+    required = Requirements(50.0, f_number=4.9, total_track=60.0, back_focus=40.0, vignetting=0.5)
+    return verify(triplet, required, FIELDS, RAYS)
+
+
+def test_chief_rays_are_those_of_the_operands(triplet, checked):
+    properties = LensProperties(triplet.system(), 587.5618, None)
+    found = {check.name: check for check in checked.checks}
+    for name, kind in (("distortion", "distortion"), ("chief-ray angle", "chief_ray_angle")):
+        values = [
+            float(value)
+            for angle in (10.0, 20.0)
+            for value in operand({"kind": kind, "target": 0.0, "field": (0.0, angle)}, triplet)
+            .values(properties)
+            .values()
+        ]
+        assert found[name].value == pytest.approx(max(values, key=abs), rel=1e-9)
+    assert found["chief-ray angle"].place == "field 20°"
+
+
+def test_first_order_numbers_and_lengths_are_compared_with_what_is_asked_for(checked):
+    assert checked.value("focal length") == pytest.approx(50.019, abs=5e-4)
+    assert checked.value("F-number") == pytest.approx(4.93, rel=0.02)
+    assert checked.value("total track") == pytest.approx(60.177)
+    assert [check.name for check in checked.broken] == ["total track"]
+    assert not checked.holds
+    with pytest.raises(InputError, match="no quantity 'weight'"):
+        checked.value("weight")
+
+
+def test_apertures_that_clip_are_vignetting(triplet):
+    def vignetted(semi_diameter):
+        lens = copy.deepcopy(triplet)
+        surface = lens.surfaces["6"]
+        surface.aperture = replace(surface.aperture, edge=Circle(semi_diameter))
+        return verify(lens, Requirements(), FIELDS, RAYS)
+
+    narrow, wide = vignetted(4.0), vignetted(20.0)
+    assert narrow.value("vignetting") > 20.0 > wide.value("vignetting")
+    broken = {check.name: check for check in narrow.broken}
+    assert broken["vignetting"].place == "field 20°"
+    assert wide.value("rays that fail") == 0.0
+
+
+def singlets(gap):
+    """Two meniscus lenses whose neighbouring surfaces bulge towards each other."""
+    glass = "1.5168/64.17"
+    rows = [(80.0, 5.0, glass), (-40.0, gap, "air"), (40.0, 5.0, glass), (-80.0, 0.0, "air")]
+    surfaces = {
+        str(n): {"type": "sphere", "radius": radius, "semi_diameter": 12.0, "material": material}
+        | ({"thickness": thickness} if n < 4 else {})
+        for n, (radius, thickness, material) in enumerate(rows, 1)
+    }
+    return lens_from_prescription(
+        {
+            "stop": 1,
+            "wavelengths": [587.5618],
+            "fields": {"angles": [[0, 0], [0, 5]]},
+            "surfaces": surfaces,
+            "sensor": {"distance": 20.0},
+        }
+    ).requires_grad_(False)
+
+
+def test_surfaces_that_cross_within_the_beam_are_found():
+    apart, crossing = (verify(singlets(gap), Requirements(), FIELDS, RAYS) for gap in (1.0, -1.0))
+    assert apart.value("shortest ray segment") == pytest.approx(1.0, rel=1e-9)
+    # Vertices stand apart by -1 mm, and so does the axial ray.
+    assert crossing.value("shortest ray segment") == pytest.approx(-1.0, rel=1e-9)
+    names = {check.name for check in crossing.broken}
+    assert {"shortest ray segment", "smallest air space"} <= names
+    assert not {"shortest ray segment", "smallest air space"} & {c.name for c in apart.broken}
+
+
+def test_a_stop_within_glass_is_found():
+    """A concave surface with a sag of some 1.7 mm at the beam's edge, in front of the stop."""
+
+    def made(gap):
+        glass = {"material": "1.5168/64.17", "thickness": 4.0, "semi_diameter": 12.0}
+        rows = {
+            "1": {"type": "sphere", "radius": 60.0, **glass},
+            "2": {"type": "sphere", "radius": 20.0, "semi_diameter": 10.0, "material": "air"}
+            | {"thickness": gap},
+            "3": {"type": "aperture", "semi_diameter": 8.0, "material": "air", "thickness": 8.0},
+            "4": {"type": "sphere", "radius": 90.0, **glass},
+            "5": {"type": "sphere", "radius": -40.0, "semi_diameter": 12.0, "material": "air"},
+        }
+        fields = {"angles": [[0, 0], [0, 2]]}
+        return lens_from_prescription(
+            {"stop": 3, "fields": fields, "surfaces": rows, "sensor": {"distance": 60.0}}
+        ).requires_grad_(False)
+
+    asked = Requirements(stop_to_glass=0.0)
+    inside, clear = (verify(made(gap), asked, FIELDS, RAYS) for gap in (1.0, 3.0))
+    found = {check.name: check for check in inside.checks}
+    assert found["stop to glass"].holds is False and found["shortest ray segment"].holds is True
+    assert clear.value("stop to glass") > 0.0
+    height = float(inside.beams.heights[1])
+    sag = 20.0 - math.sqrt(20.0**2 - height**2)
+    assert found["stop to glass"].value == pytest.approx(1.0 - sag, rel=1e-6)
+
+
+def test_thicknesses_are_taken_where_beams_end():
+    """Sags of spheres by Pythagoras; a flat leads out to the edge of an element."""
+    heights = torch.tensor([10.0, 8.0, 6.0, 9.0], dtype=torch.float64)
+    first, air, second = spaces(singlets(1.0), heights)
+
+    def sag(radius, height):
+        return radius - math.copysign(math.sqrt(radius**2 - height**2), radius)
+
+    assert (first.first, first.last, first.glass, first.centre) == (1, 2, True, 5.0)
+    assert first.edge == pytest.approx(5.0 + sag(-40.0, 8.0) - sag(80.0, 10.0), rel=1e-12)
+    assert second.edge == pytest.approx(5.0 + sag(-80.0, 9.0) - sag(40.0, 6.0), rel=1e-12)
+    # Between them it is least on the axis.
+    assert (air.glass, air.edge) == (False, 1.0)
+
+
+def test_a_stop_between_elements_parts_no_air_space():
+    gauss = load_lens("double_gauss").requires_grad_(False)
+    found = spaces(gauss, torch.full((11,), 10.0, dtype=torch.float64))
+    assert [(space.first, space.last) for space in found if not space.glass] == [
+        *((2, 3), (5, 7), (9, 10)),
+    ]
+    assert found[4].centre == pytest.approx(11.41 + 9.0)
+
+
+def test_surfaces_are_drawn_as_far_as_their_beams_go():
+    lens = lens_from_prescription(
+        {
+            "stop": 1,
+            "fields": {"angles": [[0, 0], [0, 10]]},
+            "surfaces": {
+                "1": {"type": "aperture", "semi_diameter": 3.0, "thickness": 10.0}
+                | {"material": "air"},
+                "2": {"type": "plane", "semi_diameter": "auto", "material": "1.5"}
+                | {"thickness": 5},
+                "3": {"type": "sphere", "radius": -30.0, "semi_diameter": "auto"}
+                | {"material": "air"},
+            },
+            "sensor": {"distance": 60.0},
+        }
+    ).requires_grad_(False)
+    heights = real_beams(lens, FIELDS, RAYS).heights
+    # From the edge of the stop upwards at 10°.
+    assert float(heights[1]) == pytest.approx(3.0 + 10.0 * math.tan(math.radians(10.0)), rel=1e-3)
+    drawn = with_drawn_heights(lens, heights)
+    assert drawn.surfaces["2"].semi_diameter == pytest.approx(1.02 * float(heights[1]))
+    assert drawn.surfaces["1"].semi_diameter == 3.0
+
+
+def test_what_cannot_be_computed_keeps_no_limit():
+    assert Check("track", math.nan, "mm", most=1.0).holds is False
+    assert Check("track", math.nan, "mm").holds is None
+    assert Check("track", 1.0005, "mm", most=1.0).holds is True
+    assert Check("track", 1.002, "mm", most=1.0).holds is False
+
+
+def test_requirements_follow_from_the_specification_of_a_search():
+    specification = Specification(
+        100.0, 3.0, (0.0, 15.0), (587.5618,), (1, 1), ("1.5168",), limits=Limits(track=250.0)
+    )
+    required = Requirements.of(specification, vignetting=None)
+    assert (required.focal_length, required.f_number, required.total_track) == (100.0, 3.0, 250.0)
+    assert required.distortion == 1.0 and required.glass_centre == (2.0, 120.0)
+    assert required.vignetting is None
