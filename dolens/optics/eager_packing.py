@@ -63,8 +63,8 @@ def eager_cotangents(layout: Records, of_values: np.ndarray, count: int) -> Tens
 
 
 def eager_indices(found: LaidOut, wavelength: float | Tensor) -> Tensor:
-    """Return what `record_indices` does; of a number a tensor that is kept, not to be written to."""
-    if isinstance(wavelength, Tensor):
+    """Return what `record_indices` does; of a number a tensor that is kept, not to be changed."""
+    if not isinstance(wavelength, (int, float)):
         return record_indices(found, wavelength, found.scalars[0].device)
     known = found.indices.get(wavelength)
     if known is None:

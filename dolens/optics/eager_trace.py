@@ -22,9 +22,12 @@ from dolens.optics.packing import cotangents_of_numbers, record_indices, record_
 Traced = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
-def traces_eagerly(found: LaidOut, *rays: Tensor) -> bool:
+def traces_eagerly(found: LaidOut, wavelength: float | Tensor, *rays: Tensor) -> bool:
     """Return whether `trace_eagerly` can trace these rays: on the CPU, where nobody looks on."""
-    return rays[0].device.type == "cpu" and is_eager((*rays, *found.scalars, *found.arrays))
+    if rays[0].device.type != "cpu":
+        return False
+    waves = (wavelength,) if isinstance(wavelength, Tensor) else ()
+    return is_eager((*rays, *waves, *found.scalars, *found.arrays))
 
 
 def trace_eagerly(

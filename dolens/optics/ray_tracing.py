@@ -59,7 +59,8 @@ def trace_rays(
     position, direction, shape = _joined(system, rays, ray, before)
     found = lay_out(system, sense, first, end, to_sensor)
     which = _columns(rays.wavelength, shape, system.device)
-    run = trace_eagerly if traces_eagerly(found, position, direction) else trace_by_operator
+    eager = traces_eagerly(found, rays.wavelength, position, direction)
+    run = trace_eagerly if eager else trace_by_operator
     traced = run(found, rays.wavelength, position, direction, which)
     if len(shape) != 1:
         position, direction, *others = traced

@@ -79,9 +79,8 @@ class OpticalSystem:
     @cached_property
     def kinds(self) -> frozenset[tuple[type[Surface], type[Law] | None]]:
         """Return the shapes of the surfaces, each with the law that deflects light there."""
-        laws = (surface.deflection and surface.deflection.law for surface in self.surfaces)
-        shapes = (surface.shape for surface in self.surfaces)
-        return frozenset(zip(shapes, laws, strict=True))
+        deflections = [(surface.shape, surface.deflection) for surface in self.surfaces]
+        return frozenset((shape, None if d is None else d.law) for shape, d in deflections)
 
     @cached_property
     def met(self) -> tuple[int, ...]:
