@@ -217,9 +217,9 @@ def record_indices(found: LaidOut, wavelength: Wavelength, device: torch.device)
     if isinstance(wavelength, Tensor):
         wavelength = wavelength.to(device=device, dtype=torch.float64).reshape(-1)
         one = torch.ones_like(wavelength)
-        found = {medium: medium.index(wavelength) * one for medium in dict.fromkeys(used)}
+        known = {medium: medium.index(wavelength) * one for medium in dict.fromkeys(used)}
         last = [torch.as_tensor(per_radian(wavelength, wavelength))] if waves else []
-        return torch.stack([*(found[medium] for medium in used), *last])
+        return torch.stack([*(known[medium] for medium in used), *last])
     several = (wavelength,) if isinstance(wavelength, (int, float)) else tuple(wavelength)
     return tensor(_index_rows(used, several, waves), np.float64).to(device)
 

@@ -61,12 +61,12 @@ def trace_rays(
     which = _columns(rays.wavelength, shape, system.device)
     eager = traces_eagerly(found, rays.wavelength, position, direction)
     run = trace_eagerly if eager else trace_by_operator
-    traced = run(found, rays.wavelength, position, direction, which)
+    position, direction, path, status, surface = run(
+        found, rays.wavelength, position, direction, which
+    )
     if len(shape) != 1:
-        position, direction, *others = traced
-        ends = (position.reshape(*shape, 3), direction.reshape(*shape, 3))
-        traced = (*ends, *(other.reshape(shape) for other in others))
-    position, direction, path, status, surface = traced
+        position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
+        path, status, surface = (v.reshape(shape) for v in (path, status, surface))
     valid = status.logical_not()  # of OK, which is zero, in half the time of a comparison
     if before is not None:
         path = torch.where(valid, path + before, path + before.detach())
