@@ -5,6 +5,7 @@ It is one HTML file that needs no network; the prescriptions that it links to li
 
 import math
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,8 @@ GENERATOR = "dolens search"
 # The share of a section's width that the bar of its scale may take.
 _BAR = 0.35
 _YES, _NO = "✓", "✗"
+# A number in a sentence.
+_NUMBER = re.compile(r"-?\d+\.\d+(e[-+]?\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +121,9 @@ def _card(report: FormReport, width: float, folder: Path) -> Markup:
         drawn = joined(figure_html(svg, False), bar)
     rows = [("RMS spots", _spots(report)), ("glasses", report.glasses)]
     if report.sensitivity is not None:
-        rows.append(("90 % as made", f"≤ {number(report.sensitivity.ninety_percent_um, 3)} µm"))
+        rows.append(
+            ("90 % as made", f"≤ {number(report.sensitivity.ninety_percent_um, 3, zeros=True)} µm")
+        )
     if report.starts is not None and report.designs is not None:
         starts, designs = (
             f"{count} {word}{'s' * (count != 1)}"
@@ -275,7 +280,8 @@ def _files(reports: Sequence[FormReport], folder: Path) -> Markup:
     """Return which formats hold each form, and what those say otherwise that cannot hold all."""
     suffixes = [file.path.suffix for file in reports[0].files]
     rows: list[list[Child]] = []
-    notes: dict[str, list[int]] = {}
+    # A change that only differs in its number is one.
+    notes: dict[str, dict[int, str]] = {}
     for report in reports:
         row: list[Child] = [report.name]
         for file in report.files:
@@ -286,16 +292,15 @@ def _files(reports: Sequence[FormReport], folder: Path) -> Markup:
                 name = f"{file.path.suffix}{mark}"
                 row.append(element("a", name, href=_address(file.path, folder)))
             for change in file.changes:
-                notes.setdefault(f"{file.path.suffix}: {change}", []).append(report.number)
+                note = f"{file.path.suffix}: {change}"
+                notes.setdefault(_NUMBER.sub("…", note), {})[report.number] = note
         rows.append(row)
     kinds = dict.fromkeys(range(len(suffixes) + 1), "words")
-    every = len(reports)
-    said = [
-        element(
-            "li", note if len(of) == every else f"{note} (form {', '.join(map(str, sorted(of)))})"
-        )
-        for note, of in notes.items()
-    ]
+    said = []
+    for general, of in notes.items():
+        alike = set(of.values())
+        where = "" if len(of) == len(reports) else f" (form {', '.join(map(str, of))})"
+        said.append(element("li", (alike.pop() if len(alike) == 1 else general) + where))
     caption = "Every file was read again: it gives the same numbers to the last bit, but for ≈."
     return joined(
         element("div", table(("form", *suffixes), rows, column_kinds=kinds), class_="scroll"),
