@@ -35,6 +35,8 @@ from dolens.optics.lens import Lens
 
 # A share of the lens's length, or a difference of slopes or indices.
 TOLERANCE = 0.05
+# Numbers that are compared before all others.
+_FEW = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,15 +120,17 @@ def form_numbers(
     ways = [coordinates] + ([] if reversed_coordinates is None else [reversed_coordinates])
     neighbours = [_Neighbours(way, tolerance) for way in ways]
     numbers = torch.full((len(merit),), -1, dtype=torch.int64)
+    wanted = torch.ones_like(numbers, dtype=torch.bool)
     number = 0
     for best in order.tolist():
-        if int(numbers[best]) >= 0:
+        if not bool(wanted[best]):
             continue
         one = coordinates.taken([best])
         for near in neighbours:
-            numbers[near.of(one, numbers < 0)] = number
+            places = near.of(one, wanted)
+            numbers[places], wanted[places] = number, False
         # A lens is of its own form, even where its numbers are no numbers.
-        numbers[best] = number
+        numbers[best], wanted[best] = number, False
         number += 1
     return numbers
 
@@ -134,8 +138,8 @@ def form_numbers(
 class _Neighbours:
     """Finds the lenses that are near one lens.
 
-    Most lenses differ in any one number already: they are kept in the order of the number that
-    differs most.
+    Most lenses differ in a few numbers already: they are kept in the order of the number that
+    differs most, and those near in it are compared in the next few before all others.
 
     Args:
         coordinates: of all lenses.
@@ -145,16 +149,18 @@ class _Neighbours:
     def __init__(self, coordinates: FormCoordinates, tolerance: float) -> None:
         self.coordinates, self.tolerance = coordinates, tolerance
         numbers = coordinates.numbers.nan_to_num()
-        self.column = int((numbers - numbers.mean(0)).square().sum(0).argmax())
-        self.sorted, self.places = numbers[:, self.column].sort()
+        columns = (numbers - numbers.mean(0)).square().sum(0).argsort(descending=True)
+        self.columns = columns[:_FEW]
+        self.few = numbers[:, self.columns].contiguous()
+        self.sorted, self.places = self.few[:, 0].sort()
 
     def of(self, one: FormCoordinates, wanted: Tensor) -> Tensor:
         """Return the places of the wanted lenses, (L,), that are near."""
-        middle = float(one.numbers[0, self.column])
-        ends = torch.tensor([middle - self.tolerance, middle + self.tolerance]).to(self.sorted)
-        first = int(torch.searchsorted(self.sorted, ends[0]))
-        last = int(torch.searchsorted(self.sorted, ends[1], right=True))
+        own = one.numbers[0, self.columns]
+        first = int(torch.searchsorted(self.sorted, own[:1] - self.tolerance))
+        last = int(torch.searchsorted(self.sorted, own[:1] + self.tolerance, right=True))
         places = self.places[first:last]
+        places = places[(self.few[places] - own).abs().amax(1) <= self.tolerance]
         places = places[wanted[places]]
         return places[form_distances(self.coordinates.taken(places), one) <= self.tolerance]
 
@@ -162,7 +168,7 @@ class _Neighbours:
 def form_distances(coordinates: FormCoordinates, others: FormCoordinates) -> Tensor:
     """Return the distances (L,) of lenses from as many others, or from one.
 
-    It is the largest difference of a length, over the mean length of both lenses, or of an index.
+    It is the largest difference of a gap, over the mean length of both lenses, a slope or an index.
     """
     whole = 0.5 * (coordinates.whole + others.whole)
     lengths = (coordinates.lengths - others.lengths).abs().amax(1) / whole
