@@ -52,6 +52,8 @@ LIMITS = (
     "stop in glass",
 )
 _SLACK = np.array([1e-4 if "distortion" in limit else 0.03 for limit in LIMITS])
+# Units in which broken limits are alike.
+UNITS = _SLACK.copy()
 _SLACK[LIMITS.index("rays that fail")] = 0.0
 
 
