@@ -50,8 +50,8 @@ ALLOWED = {
     "manufacturing": {"errors", "packaged", "optics", "prescriptions", "tolerancing", "plotting"},
     # A search for lenses begins with paraxial optics, and ends with files and a page.
     "lens_search": {
-        *("errors", "html", "packaged", "whole_files", "optics", "prescriptions", "analysis"),
-        *("optimize", "tolerancing", "plotting", "lens_page", "kernels"),
+        *("errors", "tasks", "html", "packaged", "whole_files", "optics", "prescriptions"),
+        *("analysis", "optimize", "tolerancing", "plotting", "lens_page", "kernels"),
     },
 }
 # The command line stands above everything, the experiments too.

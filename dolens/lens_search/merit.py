@@ -26,6 +26,10 @@ OPERAND_WEIGHT = 0.03
 _WITHIN = 0.999
 
 
+# Shift, scale, bend, dip, scale across and keystone of a circle about the axis.
+PARAXIAL_PUPIL = (0.0, 1.0, 0.0, 0.0, 1.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Conditions:
     """What a lens is asked at some stage of its growth.
@@ -36,7 +40,7 @@ class Conditions:
         field_weights: (L, F), ω.
         shifts: (L, O), added to the deviations of operands: the multipliers of the augmented
             Lagrangian over twice the weight, which let operands hold exactly at a small weight.
-        pupils: (L, F, 4), where the beam of each field crosses the plane of the entrance pupil;
+        pupils: (L, F, 6), where the beam of each field crosses the plane of the entrance pupil;
             see `dolens.lens_search.real_pupils`.
         beam: (L, S + 1), the beam's real height on each surface, and that of the axial beam at the
             stop, over its paraxial one.
@@ -116,7 +120,7 @@ class SearchMerit:
             torch.ones(lenses, dtype=torch.float64),
             torch.full((lenses, fields), 1.0 / fields, dtype=torch.float64),
             torch.zeros((lenses, self.operands), dtype=torch.float64),
-            torch.tensor([0.0, 1.0, 0.0, 1.0], dtype=torch.float64).expand(lenses, fields, 4),
+            torch.tensor(PARAXIAL_PUPIL, dtype=torch.float64).expand(lenses, fields, -1),
             torch.ones((lenses, self.arrangement.surfaces + 1), dtype=torch.float64),
         )
 
@@ -154,8 +158,10 @@ class SearchMerit:
             upper.append(2.0 if high is None else high / f)
         lower.append(limits.back_focus / f)
         upper.append(3.0)
-        options = {"dtype": torch.float64}
-        return torch.tensor(lower, **options), torch.tensor(upper, **options)
+        return (
+            torch.tensor(lower, dtype=torch.float64),
+            torch.tensor(upper, dtype=torch.float64),
+        )
 
     # ---------------------------------------------------------------- values
 

@@ -1,12 +1,12 @@
 """Real beams: where each field's beam enters so that it fills the stop, and how wide it becomes.
 
 Where the entrance pupil has aberrations the beam of a field does not cross its plane in the
-paraxial circle.  Rays at the middle, the rim above and below and the rim at the side of the stop
-say where it does: the point (px, py) of the stop, in radii, is reached from
+paraxial circle.  Rays at the middle of the stop and at five points of its rim say where it does:
+the point (px, py) of the stop, in radii, is reached from
 
-    x = r·d·px,   y = r·(a + b·py + c·py²)
+    x = r·px·(d + k·py),   y = r·(a + b·py + c·py² + e·px²)
 
-on the plane of the paraxial entrance pupil of radius r.  These four numbers of each field are held
+on the plane of the paraxial entrance pupil of radius r.  These six numbers of each field are held
 while a lens is optimised, and found anew between rounds.
 """
 
@@ -20,8 +20,12 @@ from dolens.lens_search.paraxial import numbers_of, paraxial
 from dolens.lens_search.search_rays import through_points
 from dolens.optics.lens_family import FamilyRays
 
-# Of the stop, in radii: the middle, the rim above, below, and at the side.
-_PROBES = torch.tensor([[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
+# Of the stop, in radii: the middle, and the rim above, below, at the side and between these.
+_SLANT = 0.5**0.5
+_PROBES = torch.tensor(
+    [[0.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [_SLANT, _SLANT], [_SLANT, -_SLANT]],
+    dtype=torch.float64,
+)
 _STEPS = 6
 # Rays that miss their points of the stop by more than this share of its radius are not believed.
 _MISSED = 1e-3
@@ -83,7 +87,16 @@ def with_real_beams(merit: SearchMerit, u: Tensor, conditions: Conditions) -> Co
     at_rim = (points / radius[:, None, None]).unflatten(1, (fields, len(_PROBES)))
     middle, above, below = at_rim[..., 0, 1], at_rim[..., 1, 1], at_rim[..., 2, 1]
     pupils = torch.stack(
-        [middle, 0.5 * (above - below), 0.5 * (above + below) - middle, at_rim[..., 3, 0]], -1
+        [
+            middle,
+            0.5 * (above - below),
+            0.5 * (above + below) - middle,
+            at_rim[..., 3, 1] - middle,
+            at_rim[..., 3, 0],
+            # x at the slanting points is s·(d ± s·k), with s² = 1/2.
+            at_rim[..., 4, 0] - at_rim[..., 5, 0],
+        ],
+        -1,
     )
     beam = []
     for number in range(merit.arrangement.surfaces):

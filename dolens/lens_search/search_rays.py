@@ -108,19 +108,14 @@ def launched(
         rays: N of them.
         radius: of the entrance pupil of each lens, mm, (L,).
         field: factor of the fields' tangents of each lens, (L,).
-        pupils: of each field, (L, F, 4): see `dolens.lens_search.real_pupils`.
+        pupils: of each field, (L, F, 6): see `dolens.lens_search.real_pupils`.
     """
     tangent = field[:, None] * rays.tangent
-    shift, scale, bend, across = pupils[:, rays.field].unbind(-1)
+    shift, scale, bend, dip, across, keystone = pupils[:, rays.field].unbind(-1)
     px, py = rays.pupil.unbind(-1)
-    return (
-        *_rays(
-            radius[:, None] * across * px,
-            radius[:, None] * (shift + py * (scale + py * bend)),
-            tangent,
-        ),
-        tangent,
-    )
+    x = px * (across + py * keystone)
+    y = shift + py * (scale + py * bend) + px * px * dip
+    return (*_rays(radius[:, None] * x, radius[:, None] * y, tangent), tangent)
 
 
 def through_points(points: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:

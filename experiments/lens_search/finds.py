@@ -8,8 +8,8 @@ from torch import Tensor
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.designed_lens import designed_lens
 from dolens.lens_search.designs import Designs
-from dolens.lens_search.forms import distinct, form_numbers
 from dolens.lens_search.form_coordinates import form_coordinates
+from dolens.lens_search.forms import distinct, form_numbers
 from dolens.lens_search.found import FoundLens
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.search import SearchPlan, Step, with_step

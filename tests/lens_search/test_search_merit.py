@@ -59,7 +59,7 @@ def conditions(merit):
         field=torch.tensor([0.4, 0.5, 0.6, 0.7], dtype=torch.float64),
         field_weights=weights,
         shifts=shifts,
-        pupils=torch.tensor([0.02, 0.97, 0.01, 0.99], dtype=torch.float64).expand(4, 3, 4),
+        pupils=torch.tensor([0.02, 0.97, 0.01, -0.01, 0.99, 0.02]).double().expand(4, 3, 6),
     )
 
 
@@ -113,7 +113,7 @@ GAPS = (4.1945, 6.6717, 65.478, 0.05, 0.05, 75.2021, 3.8137, 2.0, 30.0)
 
 def test_spots_of_real_beams_are_those_of_the_lens_through_its_stop():
     specification = replace(QUARTET, wavelengths=(587.5618,), glasses=("1.5168/64.17",))
-    merit = SearchMerit.of(ARRANGEMENT, specification)
+    merit = SearchMerit.of(ARRANGEMENT, specification, 8, 16)
     numbers = [*(100.0 / radius for radius in RADII), *(gap / 100.0 for gap in GAPS)]
     u = torch.tensor([numbers], dtype=torch.float64)
     conditions = with_real_beams(merit, u, merit.full(1))
@@ -121,10 +121,10 @@ def test_spots_of_real_beams_are_those_of_the_lens_through_its_stop():
     lens = designed_lens(ARRANGEMENT, specification, u[0], "made")
     fields = [(0.0, angle) for angle in specification.fields]
     exact = spot_diagram(lens, fields, specification.wavelengths).polychromatic_rms
-    torch.testing.assert_close(spots, exact, rtol=0.03, atol=0.0)
+    torch.testing.assert_close(spots, exact, rtol=5e-3, atol=0.0)
     # Paraxial circles of the pupil are another beam.
     paraxial_spots = merit.spots(u, merit.full(1))[0]
-    assert float((paraxial_spots / exact - 1.0).abs().max()) > 0.05
+    assert float((paraxial_spots / exact - 1.0).abs().max()) > 0.03
 
 
 @pytest.mark.parametrize(("rings", "arms"), [(2, 4), (3, 6), (4, 8)])
