@@ -23,8 +23,8 @@ from dolens.optics.rays import TracedRays
 from dolens.optimize.batch_least_squares import BatchModel
 
 # Of the distance beyond a wall of the region of existing glasses, in the coordinates' units, beside
-# an RMS spot over the focal length.  A triplet's glasses end 0.01 to 0.03 beyond, less than from one
-# real glass to the next; steeper walls stop the descent where they begin.
+# an RMS spot over the focal length.  A triplet's glasses end 0.01 to 0.03 beyond, less than it is
+# from one real glass to the next; steeper walls stop the descent where they begin.
 WALL_WEIGHT = 3e-4
 
 
