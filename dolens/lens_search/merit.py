@@ -158,8 +158,10 @@ class SearchMerit:
             upper.append(2.0 if high is None else high / f)
         lower.append(limits.back_focus / f)
         upper.append(3.0)
-        options = {"dtype": torch.float64}
-        return torch.tensor(lower, **options), torch.tensor(upper, **options)
+        return (
+            torch.tensor(lower, dtype=torch.float64),
+            torch.tensor(upper, dtype=torch.float64),
+        )
 
     # ---------------------------------------------------------------- values
 

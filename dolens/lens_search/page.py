@@ -138,7 +138,7 @@ def _card(report: FormReport, width: float, folder: Path) -> Markup:
         element(
             "h3",
             element("b", str(report.number)),
-            element("span", f"{number(best.mean_rms_spot_um, 3)} µm"),
+            element("span", f"{number(best.mean_rms_spot_um, 3, zeros=True)} µm"),
             element("span", report.powers, class_="powers"),
             mark,
         ),
@@ -153,7 +153,7 @@ def _card(report: FormReport, width: float, folder: Path) -> Markup:
 
 def _spots(report: FormReport) -> str:
     best = report.found
-    return ", ".join(number(value, 3) for value in best.rms_spot_um) + " µm"
+    return ", ".join(number(value, 3, zeros=True) for value in best.rms_spot_um) + " µm"
 
 
 def _comparison(reports: Sequence[FormReport], merit_label: str) -> Markup:

@@ -55,8 +55,11 @@ class RealBeams:
             totally or cannot be aimed.
         vignetted: (F,), the share that apertures clip.
         heights: (S,), mm, the largest distance from the axis of rays that pass; NaN without any.
-        advance: (S + 1,), mm: of the rays that pass, the least way along z from each surface to the
-            next, and to the sensor; below zero where surfaces cross within a beam.
+        advance: mm, of the rays that pass, the least way along z from each refracting surface to
+            the next, the last one to the sensor; below zero where surfaces cross within a beam.
+        refracting: numbers of the refracting surfaces.
+        stop_clearance: mm, likewise to a stop of its own from the surfaces beside it; infinite
+            where the stop is on a refracting surface.
         marginal_sine: sine of the angle to the axis at the sensor of the outermost real ray from
             the axial object point, through the rim of the stop where nothing else clips it, at the
             wavelength nearest to the reference.
@@ -68,6 +71,8 @@ class RealBeams:
     vignetted: Tensor
     heights: Tensor
     advance: Tensor
+    refracting: tuple[int, ...]
+    stop_clearance: float
     marginal_sine: float
 
 
@@ -104,7 +109,12 @@ def real_beams(lens: Lens, count: int = FIELDS, rays: int = RAYS) -> RealBeams:
     kept = passes.expand(points.shape[:-1])
     lowest = torch.full_like(points[..., 0], -math.inf)
     heights = torch.where(kept, points[..., :2].norm(dim=-1), lowest)[:-1].flatten(1).amax(1)
-    steps = torch.where(kept[1:], points.diff(dim=0)[..., 2], math.inf).flatten(1).amin(1)
+    z = torch.where(passes, points[..., 2], math.nan).flatten(1)
+    refracting = tuple(n for n in range(1, len(system.surfaces) + 1) if system.refracts(n))
+    advance = _least_steps(z[[*(n - 1 for n in refracting), -1]])
+    beside = [n for n in (lens.stop - 1, lens.stop, lens.stop + 1) if 1 <= n <= len(z) - 1]
+    apart = lens.stop not in refracting
+    clearance = float(_least_steps(z[[n - 1 for n in beside]]).amin()) if apart else math.inf
     at = int((waves - reference).abs().argmin())
     sines = hit.direction[0, at, :, :2].norm(dim=-1)[passes[0, at]]
     return RealBeams(
@@ -113,7 +123,9 @@ def real_beams(lens: Lens, count: int = FIELDS, rays: int = RAYS) -> RealBeams:
         (failed * weight).sum(-1).amax(1),
         ((~failed & ~passes) * weight).sum(-1).amax(1),
         torch.where(heights >= 0.0, heights, math.nan),
-        steps,
+        advance,
+        refracting,
+        clearance,
         float(sines.max()) if len(sines) else math.nan,
     )
 
@@ -160,6 +172,13 @@ def with_drawn_heights(lens: Lens, heights: Tensor) -> Lens:
             size = min(_MARGIN * height, surface.reach)
             surface.aperture = replace(surface.aperture, edge=Unlimited(size))
     return drawn
+
+
+def _least_steps(z: Tensor) -> Tensor:
+    """Return the least difference from each row to the next, of the rays (columns) that are no NaN;
+    infinite without any.
+    """
+    return z.diff(dim=0).nan_to_num(math.inf).amin(1)
 
 
 def _element_heights(lens: Lens, refracting: list[int], heights: Tensor) -> dict[int, float]:

@@ -1,8 +1,8 @@
 """Real beams: where each field's beam enters so that it fills the stop, and how wide it becomes.
 
 Where the entrance pupil has aberrations the beam of a field does not cross its plane in the
-paraxial circle.  Rays at the middle of the stop and at five points of its rim say where it does: the
-point (px, py) of the stop, in radii, is reached from
+paraxial circle.  Rays at the middle of the stop and at five points of its rim say where it does:
+the point (px, py) of the stop, in radii, is reached from
 
     x = r·px·(d + k·py),   y = r·(a + b·py + c·py² + e·px²)
 

@@ -20,6 +20,8 @@ class Requirements:
         glass_edge: mm, the least thickness of glass at its edge.
         air_centre: mm, least and largest air space on the axis.
         air_edge: mm, the least air space out to the edge.
+        stop_to_glass: mm, at least, between a stop of its own and the surfaces beside it within the
+            beam; below zero its plane lies within glass, and its rim is that of the surface.
         distortion: per cent of f·tan θ, at most, either way.
         chief_ray_angle: degrees to the axis at the sensor, at most.
         vignetting: the share of a field's light that may be clipped.
@@ -36,6 +38,7 @@ class Requirements:
     glass_edge: float | None = 0.0
     air_centre: tuple[float | None, float | None] = (0.0, None)
     air_edge: float | None = 0.0
+    stop_to_glass: float | None = None
     distortion: float | None = None
     chief_ray_angle: float | None = None
     vignetting: float | None = 0.0

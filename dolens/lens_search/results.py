@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dolens.analysis.conditions import conditions
 from dolens.errors import InputError
+from dolens.lens_page.tables import number
 from dolens.lens_search.course import SearchCourse
 from dolens.lens_search.form_report import FormReport, report_form
 from dolens.lens_search.forms import Form
@@ -18,7 +19,6 @@ from dolens.lens_search.requirements import Requirements
 from dolens.lens_search.start_map import StartMap
 from dolens.plotting.export import save_figure
 from dolens.plotting.forms import FormPicture, forms_figure
-from dolens.plotting.number_text import number_text
 from dolens.plotting.search_course import search_course_figure
 from dolens.plotting.starts import starts_figure
 from dolens.whole_files import written_whole
@@ -109,12 +109,12 @@ def write_results(
     said = progress or (lambda name, done, total: None)
     reports = []
     chosen = list(forms)[:most]
-    for number, form in enumerate(chosen, 1):
-        said(f"form {number}", number - 1, len(chosen))
+    for rank, form in enumerate(chosen, 1):
+        said(f"form {rank}", rank - 1, len(chosen))
         counts = len(form.starts), len(form.members)
-        reports.append(report_form(form.best, number, required, folder, *counts))
+        reports.append(report_form(form.best, rank, required, folder, *counts))
         for problem in reports[-1].problems:
-            logger.warning("form %d: %s", number, problem)
+            logger.warning("form %d: %s", rank, problem)
     said("page", len(chosen), len(chosen))
     pictures = Pictures(
         None if starts is None else starts.figure(),
@@ -175,7 +175,7 @@ def sections_figure(reports: Sequence[FormReport], title: str | None = None) -> 
         FormPicture(
             report.section,
             str(report.number),
-            f"{number_text(report.found.mean_rms_spot_um)} µm    {report.powers}",
+            f"{number(report.found.mean_rms_spot_um, 3, zeros=True)} µm    {report.powers}",
             report.broken,
         )
         for report in reports

@@ -46,7 +46,7 @@ class SearchPlan:
     """
 
     starts: int = 10_000
-    batch: int = 1000
+    batch: int = 2000
     stages: tuple[Stage, ...] = STAGES
     finished: float = 0.5
     finish_rounds: int = 6
@@ -141,12 +141,12 @@ def escapes(specification: Specification, plan: SearchPlan, parents: Designs) ->
         merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
         values = torch.cat([part[0] for part in made])
         of = torch.cat([part[1] for part in made])
-        words = [part[2] for part in made for _ in range(len(part[0]))]
+        all_words = [part[2] for part in made for _ in range(len(part[0]))]
         done = _finished(merit, plan, _best(grow(merit, values, plan.stages[-2:]), plan.finished))
         iterations += done.iterations
         parent = of[done.starts].tolist()
         history = tuple(
-            (*parents.history[p], words[row])
+            (*parents.history[p], all_words[row])
             for p, row in zip(parent, done.starts.tolist(), strict=True)
         )
         designs = Designs(

@@ -117,7 +117,7 @@ def verify(
     checks = [
         *_first_order(lens, where, required, beams),
         *_thicknesses(spaces(lens, beams.heights), required),
-        _crossing(lens, beams),
+        *_crossing(lens, beams, required.stop_to_glass),
         *_light(beams, required),
         *_image(lens, where, required, beams, rays),
     ]
@@ -172,14 +172,20 @@ def _thicknesses(found: Sequence[Space], required: Requirements) -> list[Check]:
     return checks
 
 
-def _crossing(lens: Lens, beams: RealBeams) -> Check:
-    """Return the least way that a ray has from one surface to the next."""
+def _crossing(lens: Lens, beams: RealBeams, stop_to_glass: float | None) -> list[Check]:
+    """Return the least way that a ray has from one surface to the next, and to a stop between."""
     at = int(beams.advance.argmin())
-    count = len(lens.surfaces)
-    behind = f"surfaces {at + 1}–{at + 2}" if at + 1 < count else f"surface {count} to sensor"
+    ends = [*beams.refracting[1:], None]
+    place = f"surface {beams.refracting[at]} to sensor"
+    if ends[at] is not None:
+        place = f"surfaces {beams.refracting[at]}–{ends[at]}"
     least = float(beams.advance[at])
     value = least if math.isfinite(least) else math.nan
-    return Check("shortest ray segment", value, "mm", least=0.0, place=behind)
+    checks = [Check("shortest ray segment", value, "mm", least=0.0, place=place)]
+    if math.isfinite(beams.stop_clearance):
+        stop, clear = f"surface {lens.stop}", beams.stop_clearance
+        checks.append(Check("stop to glass", clear, "mm", least=stop_to_glass, place=stop))
+    return checks
 
 
 def _light(beams: RealBeams, required: Requirements) -> list[Check]:

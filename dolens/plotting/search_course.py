@@ -51,9 +51,12 @@ def search_course_figure(
     upper.plot(
         seconds, merits, "o", color="0.6", markersize=2.6, markeredgewidth=0.0, label="designs"
     )
-    last = max(seconds)
+    # Designs that were known at once make one step.
+    steps = dict(zip(seconds, zip(best, forms, strict=True), strict=True))
+    times = [*steps, max(seconds)]
+    least, number = (list(values) for values in zip(*steps.values(), strict=True))
     upper.step(
-        *([*seconds, last], [*best, best[-1]]),
+        *(times, [*least, best[-1]]),
         where="post",
         color=PALETTE[1],
         linewidth=1.4,
@@ -67,9 +70,9 @@ def search_course_figure(
     else:
         upper.set_ylim(best[-1] - 0.08 * (max(near) - best[-1] or best[-1]), None)
     upper.set_ylabel(merit_label, fontsize=SMALL + 1)
-    lower.step([*seconds, last], [*forms, forms[-1]], where="post", color=PALETTE[0], linewidth=1.4)
+    lower.step(times, [*number, forms[-1]], where="post", color=PALETTE[0], linewidth=1.4)
     lower.yaxis.set_major_locator(MaxNLocator(integer=True))
-    lower.set_ylim(0.0, 1.1 * max(*forms, 1))
+    lower.set_ylim(0.0, 1.1 * max(*number, 1))
     lower.set_xlim(0.0, None)
     lower.set_ylabel(f"forms within {100.0 * within:g} %\nof the best (number)", fontsize=SMALL + 1)
     lower.set_xlabel("wall time (s)", fontsize=SMALL + 1)

@@ -1,4 +1,4 @@
-"""Where the starts of a search led is plotted: a map of the starts, and how many each form has."""
+"""A map of the starts of a search shows which of them led to which form, and how many did."""
 
 from collections.abc import Sequence
 
@@ -87,17 +87,20 @@ def _draw_counts(axes: Axes, reached: np.ndarray, tried: int) -> None:
     """Draw a bar for each form, as long as the starts that led there."""
     own = [n for n in range(_OWN) if bool((reached == n).any())]
     rows = [(f"form {n + 1}", int((reached == n).sum()), n) for n in own]
+    longest = max((count for _, count, _ in rows), default=1)
     others = reached[reached >= _OWN]
     if len(others):
         kinds = len(set(others.tolist()))
         rows.append((f"{kinds} other{'s' * (kinds > 1)}", len(others), _OWN))
-    longest = max((count for _, count, _ in rows), default=1)
     rows.append(("no design", tried - int((reached >= 0).sum()), -1))
     for place, (_, count, form) in enumerate(rows):
         colour, marker = _look(form)
-        # What led nowhere dwarfs all others: its bar is cut, and its number says how long it is.
+        # What led elsewhere dwarfs the rest: its bar is cut, and its number says how long it is.
         length = min(count, 1.18 * longest)
         axes.barh(place, length, height=0.62, color=colour)
+        if count > length:
+            cut = 0.9 * longest * np.ones(2)
+            axes.plot(cut, [place - 0.36, place + 0.36], color="white", linewidth=2.5)
         axes.text(length + 0.04 * longest, place, f"{count}", fontsize=SMALL, va="center")
         axes.plot(-0.07 * longest, place, marker=marker, color=colour, markersize=5, clip_on=False)
     axes.set_yticks(range(len(rows)), [name for name, _, _ in rows], fontsize=SMALL)

@@ -53,5 +53,9 @@ def starts_picture(finds: Finds, name: str) -> Figure:
     names = [f"φ{n}" for n in range(1, features.shape[1] + 1)]
     found = start_map(features, names)
     return starts_figure(
-        found.points.numpy(), reached.tolist(), found.labels, len(features), title=name
+        found.points.numpy(),
+        reached.tolist(),
+        found.labels,
+        len(features),
+        title=f"{name}: which start led where",
     )

@@ -51,6 +51,8 @@ LIMITS = (
     "rays that fail",
     "stop in glass",
 )
+_SLACK = np.array([1e-4 if "distortion" in limit else 0.03 for limit in LIMITS])
+_SLACK[LIMITS.index("rays that fail")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -87,9 +89,15 @@ class Measured:
         return self.excess.max(axis=1) <= 1e-9
 
     @property
+    def nearly(self) -> np.ndarray:
+        """Whether it keeps them to 0.03 mm, and distortion to 1e-4."""
+        return (self.excess <= _SLACK).all(axis=1)
+
+    @property
     def broken(self) -> list[str]:
-        """What the first candidate breaks, in words."""
-        return [f"{n} by {v:.3g}" for n, v in zip(LIMITS, self.excess[0], strict=True) if v > 1e-9]
+        """What the first candidate breaks by more than that, in words."""
+        found = zip(LIMITS, self.excess[0], _SLACK, strict=True)
+        return [f"{name} by {value:.3g}" for name, value, slack in found if value > slack]
 
 
 def split(candidates: Array) -> tuple[Array, Array, Array, Array]:
@@ -105,7 +113,21 @@ def measure(candidates: Array, rays: PupilRays = SAMPLE, air_stop: bool = False)
         rays: of each beam.
         air_stop: whether a stop in glass breaks a limit.
     """
-    traced, distortion = _beams(candidates, rays, 1.0, 1.0)
+    return judged(candidates, *_beams(candidates, rays, 1.0, 1.0), rays, air_stop)
+
+
+def judged(
+    candidates: Array, traced: Traced, distortion: Array, rays: PupilRays, air_stop: bool = False
+) -> Measured:
+    """Return what candidates are, from their beams.
+
+    Args:
+        candidates: (lenses, 17).
+        traced: the beams.
+        distortion: (lenses, 2) of their chief rays.
+        rays: of each beam.
+        air_stop: whether a stop in glass breaks a limit.
+    """
     depth = stop_depth(candidates)
     curvature, gap, image, _ = split(candidates)
     focal, _ = first_order(curvature, gap, INDICES)
@@ -148,8 +170,13 @@ def _beams(
     angles = part * ANGLES
     diameter = aperture * FOCAL_LENGTH / F_NUMBER
     traced = trace(curvature, gap, INDICES, image, pupil, diameter, angles, rays)
+    return traced, distortion_of(traced, rays, angles)
+
+
+def distortion_of(traced: Traced, rays: PupilRays, angles: Array = ANGLES) -> Array:
+    """Return the relative distortion of the fields off axis."""
     ideal = FOCAL_LENGTH * np.tan(np.radians(angles[1:]))
-    return traced, traced.y[:, 1:, rays.chief] / ideal - 1.0
+    return traced.y[:, 1:, rays.chief] / ideal - 1.0
 
 
 def residuals(

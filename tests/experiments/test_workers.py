@@ -15,6 +15,7 @@ from dolens import InputError, load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.workers import workers_of
+from dolens.experiments.workers.own_threads import OwnThreads
 from dolens.experiments.workers.ray_workers import RayWorkers
 from dolens.stages import listening
 from dolens.tasks import TaskError, in_turn
@@ -157,3 +158,27 @@ def test_workers_of_an_experiment_without_tasks_are_refused(composed):
     with pytest.raises(InputError, match=r"^workers: nothing in experiment=asphere reads this"):
         checked(composed("experiment=asphere", "workers=2"))
     checked(composed("experiment=pose_accuracy", "workers=2"))
+
+
+def test_threads_of_this_process_give_results_in_order_and_the_bits_of_one_thread():
+    before = torch.get_num_threads()
+    with OwnThreads(2).open() as map_tasks:
+        found = list(map_tasks(long_sum, range(6), "sums"))
+        assert list(map_tasks(first_is_slow, range(4), "tasks")) == [0, 1, 2, 3]
+    with workers_of(0).open() as map_tasks:
+        assert found == list(map_tasks(long_sum, range(6), "sums"))
+    assert {threads for _, threads in found} == {1}
+    assert torch.get_num_threads() == before
+
+
+def test_a_task_that_fails_in_a_thread_is_named():
+    def refuse(task):
+        if task == 1:
+            raise InputError("too thick")
+        return task
+
+    with OwnThreads(2).open() as map_tasks:
+        found = map_tasks(refuse, range(9), "lenses")
+        assert next(found) == 0
+        with pytest.raises(InputError, match="lenses: 2 of 9: too thick"):
+            next(found)

@@ -102,6 +102,34 @@ def test_surfaces_that_cross_within_the_beam_are_found():
     assert not {"shortest ray segment", "smallest air space"} & {c.name for c in apart.broken}
 
 
+def test_a_stop_within_glass_is_found():
+    """A concave surface with a sag of some 1.7 mm at the beam's edge, in front of the stop."""
+
+    def made(gap):
+        glass = {"material": "1.5168/64.17", "thickness": 4.0, "semi_diameter": 12.0}
+        rows = {
+            "1": {"type": "sphere", "radius": 60.0, **glass},
+            "2": {"type": "sphere", "radius": 20.0, "semi_diameter": 10.0, "material": "air"}
+            | {"thickness": gap},
+            "3": {"type": "aperture", "semi_diameter": 8.0, "material": "air", "thickness": 8.0},
+            "4": {"type": "sphere", "radius": 90.0, **glass},
+            "5": {"type": "sphere", "radius": -40.0, "semi_diameter": 12.0, "material": "air"},
+        }
+        fields = {"angles": [[0, 0], [0, 2]]}
+        return lens_from_prescription(
+            {"stop": 3, "fields": fields, "surfaces": rows, "sensor": {"distance": 60.0}}
+        ).requires_grad_(False)
+
+    asked = Requirements(stop_to_glass=0.0)
+    inside, clear = (verify(made(gap), asked, FIELDS, RAYS) for gap in (1.0, 3.0))
+    found = {check.name: check for check in inside.checks}
+    assert found["stop to glass"].holds is False and found["shortest ray segment"].holds is True
+    assert clear.value("stop to glass") > 0.0
+    height = float(inside.beams.heights[1])
+    sag = 20.0 - math.sqrt(20.0**2 - height**2)
+    assert found["stop to glass"].value == pytest.approx(1.0 - sag, rel=1e-6)
+
+
 def test_thicknesses_are_taken_where_beams_end():
     """Sags of spheres by Pythagoras; a flat leads out to the edge of an element."""
     heights = torch.tensor([10.0, 8.0, 6.0, 9.0], dtype=torch.float64)
