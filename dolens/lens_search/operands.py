@@ -58,8 +58,12 @@ def paraxial_operands(
         limits.air_edge if arrangement.media_behind[n] == AIR else limits.glass_edge for n in before
     ]
     found.append(torch.tensor(least, dtype=torch.float64)[:, None] / f - edge)
-    # The stop's opening is clear of the surfaces beside it.
     stop = arrangement.stop_place
+    widest = limits.air[1]
+    if widest is not None and 0 < stop < len(arrangement.sequence) - 1:
+        around = Tangents.stacked([lenses.gaps[stop - 1] + lenses.gaps[stop]])
+        found.append(around - widest / f)
+    # The stop's opening is clear of the surfaces beside it.
     opening = Tangents.stacked([zero + first_order.stop_height]).abs() * (aperture * beam[:, -1])
     for neighbour, side in ((stop - 1, -1.0), (stop + 1, 1.0)):
         if 0 <= neighbour < len(arrangement.sequence):

@@ -18,6 +18,7 @@ from dolens.experiments.lens_search.page import form_reports, write_forms_page
 from dolens.experiments.lens_search.tables import check_rows, form_rows
 from dolens.experiments.tables import Row
 from dolens.experiments.workers import workers_of
+from dolens.experiments.workers.own_threads import OwnThreads
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.course import WITHIN
 from dolens.lens_search.designed_lens import designed_lens
@@ -42,7 +43,7 @@ class LensSearchModule(Analysis):
         specification: of the lens.
         plan: how much is searched.
         forms: how many of the best forms are checked and written.
-        workers: where batches run; see `workers_of`.
+        workers: where batches run; None: in threads of this process; else see `workers_of`.
 
     Raises:
         InputError: a setting is out of range.
@@ -73,7 +74,7 @@ class LensSearchModule(Analysis):
         check_count("forms", forms)
         super().__init__(first_start(specification), experiment, folder)
         self.specification, self.plan, self.forms = specification, plan, forms
-        self.workers = workers_of(0 if workers is None else workers)
+        self.workers = OwnThreads() if workers is None else workers_of(workers)
         self.finds = Finds(specification, plan)
         self.reports: list[FormReport] = []
 

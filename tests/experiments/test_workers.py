@@ -15,7 +15,9 @@ from dolens import InputError, load_lens
 from dolens.analysis.pupil_quadrature import gaussian_quadrature
 from dolens.experiments.running.configuration import checked
 from dolens.experiments.workers import workers_of
+from dolens.experiments.workers.own_threads import OwnThreads
 from dolens.experiments.workers.ray_workers import RayWorkers
+from dolens.kernels.cpu.kernel_files import cache_folder
 from dolens.stages import listening
 from dolens.tasks import TaskError, in_turn
 from dolens.tolerancing import tolerances_from, trace_perturbed
@@ -84,6 +86,7 @@ def same(one, other):
 def test_a_local_cluster_of_two(triplet_and_spots, tmp_path, monkeypatch):
     """One cluster for all that takes one: to start it takes most of the time."""
     importlib.import_module("ray")  # who imported it before has settled its mode of authentication
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache_folder()))  # that workers need not compile
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     (tmp_path / "home").mkdir()
     with workers_of(0).open() as own:
@@ -157,3 +160,27 @@ def test_workers_of_an_experiment_without_tasks_are_refused(composed):
     with pytest.raises(InputError, match=r"^workers: nothing in experiment=asphere reads this"):
         checked(composed("experiment=asphere", "workers=2"))
     checked(composed("experiment=pose_accuracy", "workers=2"))
+
+
+def test_threads_of_this_process_give_results_in_order_and_the_bits_of_one_thread():
+    before = torch.get_num_threads()
+    with OwnThreads(2).open() as map_tasks:
+        found = list(map_tasks(long_sum, range(6), "sums"))
+        assert list(map_tasks(first_is_slow, range(4), "tasks")) == [0, 1, 2, 3]
+    with workers_of(0).open() as map_tasks:
+        assert found == list(map_tasks(long_sum, range(6), "sums"))
+    assert {threads for _, threads in found} == {1}
+    assert torch.get_num_threads() == before
+
+
+def test_a_task_that_fails_in_a_thread_is_named():
+    def refuse(task):
+        if task == 1:
+            raise InputError("too thick")
+        return task
+
+    with OwnThreads(2).open() as map_tasks:
+        found = map_tasks(refuse, range(9), "lenses")
+        assert next(found) == 0
+        with pytest.raises(InputError, match="lenses: 2 of 9: too thick"):
+            next(found)
