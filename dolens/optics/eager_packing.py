@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dolens.kernels.operators import kernels_of
 from dolens.optics.lens_numbers import LaidOut
-from dolens.optics.packing import record_indices, record_values
+from dolens.optics.packing import packed_values, record_indices
 from dolens.optics.records import Records
 
 # So many wavelengths' indices are kept.
@@ -41,10 +41,10 @@ def _in_precision(layout: Records, dtype: np.dtype) -> _Fixed:
 
 
 def eager_values(found: LaidOut) -> Tensor:
-    """Return what `record_values` does, without a graph."""
+    """Return what `packed_values` does, without a graph."""
     numbers = kernels_of(found.scalars[0]).read(found.scalars)
     if numbers is None:
-        return record_values(found.layout, found.scalars, found.arrays).detach()
+        return packed_values(found.layout, found.scalars, found.arrays).detach()
     if found.arrays:
         parts = (array.detach().reshape(-1).numpy() for array in found.arrays)
         numbers = np.concatenate([numbers, *(part.astype(numbers.dtype) for part in parts)])

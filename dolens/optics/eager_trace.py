@@ -17,7 +17,7 @@ from dolens.kernels.operators import kernels_of
 from dolens.kernels.table import SurfaceTable
 from dolens.optics.eager_packing import eager_cotangents, eager_indices, eager_values
 from dolens.optics.lens_numbers import LaidOut
-from dolens.optics.packing import cotangents_of_numbers, record_indices, record_values
+from dolens.optics.packing import cotangents_of_numbers, packed_values, record_indices
 
 Traced = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -61,7 +61,7 @@ def trace_by_operator(
     which: Tensor | None,
 ) -> Traced:
     """Carry rays through a lens as `trace_eagerly` does, by operations that PyTorch sees."""
-    values = record_values(found.layout, found.scalars, found.arrays)
+    values = packed_values(found.layout, found.scalars, found.arrays)
     indices = record_indices(found, wavelength, position.device)
     codes, extras = found.layout.codes, found.layout.extras
     return operators.trace(values, indices, position, direction, which, codes, extras)
@@ -115,7 +115,7 @@ class _Trace(torch.autograd.Function):
             # The gradient's own graph: its operator says that it has no derivative.
             scalars = len(found.scalars)
             of_values, of_indices, of_position, of_direction = operators.trace_adjoint(
-                record_values(layout, numbers[:scalars], numbers[scalars:]),
+                packed_values(layout, numbers[:scalars], numbers[scalars:]),
                 *(indices, *rays, layout.codes, layout.extras, status, *cotangents, list(wanted)),
             )
             flat = cotangents_of_numbers(layout, of_values, count)

@@ -83,8 +83,8 @@ def record_values(system: OpticalSystem) -> Tensor:
     """Return the numbers of a whole lens's records up to its sensor, (V,), by operations that
     `torch.func` follows.
     """
-    layout, scalars, arrays = _lay_out(system, 1.0, 1, len(system.surfaces), True)
-    return _values(layout, scalars, arrays)
+    found = lay_out(system, 1.0, 1, len(system.surfaces), True)
+    return packed_values(found.layout, found.scalars, found.arrays)
 
 
 def pack_with_variables(
@@ -108,7 +108,7 @@ def pack_with_variables(
     return table, _variable_map(found.layout, [*found.scalars, *found.arrays], variables)
 
 
-def record_values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
+def packed_values(layout: Records, scalars: Sequence[Tensor], arrays: Sequence[Tensor]) -> Tensor:
     """Return the records as one tensor, a function of the numbers."""
     numbers = torch.stack(tuple(scalars))
     if arrays:
@@ -148,7 +148,7 @@ def _in_precision(layout: Records, dtype: torch.dtype, device: torch.device) -> 
 
 def _table(found: LaidOut, system: OpticalSystem, wavelength: Wavelength) -> SurfaceTable:
     layout = found.layout
-    values = record_values(layout, found.scalars, found.arrays)
+    values = packed_values(layout, found.scalars, found.arrays)
     indices = record_indices(found, wavelength, system.device)
     return SurfaceTable(values, indices, layout.codes, layout.extras)
 
