@@ -5,6 +5,7 @@ from functools import lru_cache, wraps
 from typing import ParamSpec, TypeVar
 
 import torch
+from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -15,7 +16,8 @@ def cached_tensors(maxsize: int | None = None) -> Callable[[Callable[P, R]], Cal
 
     A tensor that is made under `torch.inference_mode` can never be saved for a backward pass.  A
     lens that is evaluated in that mode, and then trained by the same process, would fail on one
-    that was kept; so the function runs outside of that mode, and without a graph.
+    that was kept; so the function runs outside of that mode, without a graph, and outside of the
+    transforms of `torch.func`, which would wrap what is made within them.
 
     Args:
         maxsize: how many results are kept; None keeps all.
@@ -25,7 +27,8 @@ def cached_tensors(maxsize: int | None = None) -> Callable[[Callable[P, R]], Cal
         @lru_cache(maxsize=maxsize)
         @wraps(function)
         def kept(*args: P.args, **options: P.kwargs) -> R:
-            with torch.inference_mode(False), torch.no_grad():
+            transforms = temporarily_clear_interpreter_stack()
+            with transforms, torch.inference_mode(False), torch.no_grad():
                 return function(*args, **options)
 
         return kept  # type: ignore[return-value]  # a wrapper takes what the function takes

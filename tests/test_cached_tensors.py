@@ -48,3 +48,9 @@ def test_chebyshev_coefficients_that_were_first_made_in_inference_mode_have_grad
         chief_ray_map._to_coefficients(7)
     (chief_ray_map._to_coefficients(7) @ values).sum().backward()
     assert torch.isfinite(values.grad).all()
+
+
+def test_a_tensor_first_made_within_a_transform_is_no_part_of_it():
+    made = cached_tensors()(lambda count: torch.ones(count).to(torch.float64))
+    torch.func.grad(lambda x: (x * made(3)).sum())(torch.ones(3, dtype=torch.float64))
+    assert not torch._C._functorch.is_functorch_wrapped_tensor(made(3))
