@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lens_search.plain_trace import Array
-from lens_search.quartet import Measured
+from lens_search.quartet import UNITS, Measured
 
 
 class OutOfTime(Exception):
@@ -28,7 +28,7 @@ class Progress:
             keeps all limits.
         designs: (processor seconds, merit, candidate) of each local optimum of a multi-start.
         merit: of the best design that keeps all limits.
-        nearest: (sum of broken limits, candidate) of the best that breaks some.
+        nearest: (sum of broken limits in `UNITS`, candidate) of the best that breaks some.
     """
 
     seconds: float
@@ -61,7 +61,7 @@ class Progress:
                 (self.spent, self.evaluations, self.merit, candidates[place].copy())
             )
         if not self.history:
-            broken = measured.excess.sum(axis=1) + 1e-3 * measured.mean
+            broken = (measured.excess / UNITS).sum(axis=1) + 1e-3 * measured.mean
             place = int(broken.argmin())
             if broken[place] < self.nearest[0]:
                 self.nearest = (float(broken[place]), candidates[place].copy())

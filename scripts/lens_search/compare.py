@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lens_search import quartet
 from lens_search.budget import Progress
 from lens_search.least_squares import multi_start
-from lens_search.quartet_files import candidate
+from lens_search.quartet_files import candidate, stop_of
 from lens_search.real_stop import measure as measure_real
 from lens_search.scipy_global import METHODS, search
 
@@ -178,9 +178,12 @@ def _own_row(folder: Path) -> list[str]:
     rows, merits, broken = [], [], 0
     for path in sorted(folder.glob("*.yaml")):
         row = candidate(path)
-        measured, real = _dense(row.tolist()), measure_real(row)
+        stop = stop_of(path)
+        measured, real = _dense(row.tolist()), measure_real(row, stop=stop)
         judge = measured if real is None else real
-        print(f"{path.name}: pupil {measured.mean[0]:.5g} µm; real stop {_real(row)}; ", end="")
+        print(
+            f"{path.name}: pupil {measured.mean[0]:.5g} µm; real stop {_real(row, stop)}; ", end=""
+        )
         print("; ".join(judge.broken) or "all limits kept", end="")
         print(f"; edge out to the larger beam {judge.outer_edge[0].min():.3g} mm")
         rows.append(row)
@@ -196,11 +199,11 @@ def _own_row(folder: Path) -> list[str]:
     return [str(folder), "", "", "", "", "", f"{best:.4g}", real, said, str(len(several))]
 
 
-def _real(row: quartet.Array) -> str:
+def _real(row: quartet.Array, stop: tuple[int, float] | None = None) -> str:
     """Return the merit by rays aimed at the real stop, and a star where that breaks limits."""
     if quartet.stop_depth(row[None])[0] > 1e-6:
         return "in glass"
-    found = measure_real(row)
+    found = measure_real(row, stop=stop)
     if found is None:
         return "not aimed"
     return f"{found.mean[0]:.4g}" + ("" if found.nearly[0] else "*")

@@ -45,13 +45,15 @@ def problem_of(optic: Any, progress: Progress) -> Any:
     class Timed(OptimizationProblem):
         part = 1.0
         best = np.inf
+        best_row: quartet.Array | None = None
         air_stop = progress.air_stop
 
         def _seen(self, merit: float) -> None:
             progress.evaluations += 1
             if np.isfinite(merit) and merit < self.best:
                 self.best = float(merit)
-                keep(candidate(optic), progress)
+                self.best_row = candidate(optic)
+                keep(self.best_row, progress)
             progress.check(self.part)
 
         def sum_squared(self) -> Any:
@@ -133,10 +135,11 @@ def search(method: str, progress: Progress, seed: int) -> None:
             run()
     while True:
         try:
-            _polish(progress, start if method == "LeastSquares" else None, start, segment)
+            _polish(progress, start if problem.best_row is None else problem.best_row, segment)
             if method != "LeastSquares":
                 return
             start = _random(np.random.default_rng([seed, progress.evaluations]), segment)
+            problem.best_row = None
         except OutOfTime:
             return
 
@@ -151,14 +154,10 @@ def _random(generator: np.random.Generator, segment: int | None) -> quartet.Arra
     return row[0]
 
 
-def _polish(
-    progress: Progress, own: quartet.Array | None, start: quartet.Array, segment: int | None
-) -> None:
-    """Fit a lens, or else the best so far, by Optiland's own least squares."""
+def _polish(progress: Progress, own: quartet.Array, segment: int | None) -> None:
+    """Fit a lens by Optiland's own least squares."""
     from optiland.optimization import LeastSquares
 
-    if own is None:
-        own = start if progress.best is None else progress.best
     lens = built(np.clip(own, *_inside()), segment)
     problem = problem_of(lens, progress)
     add_variables(problem, lens, bounded=True)

@@ -52,6 +52,8 @@ LIMITS = (
     "stop in glass",
 )
 _SLACK = np.array([1e-4 if "distortion" in limit else 0.03 for limit in LIMITS])
+# Units in which broken limits are alike.
+UNITS = _SLACK.copy()
 _SLACK[LIMITS.index("rays that fail")] = 0.0
 
 
@@ -220,7 +222,7 @@ def residuals(
 
 
 def stop_depth(candidates: Array) -> Array:
-    """Return how deep in glass the stop's place is, mm: 0 in air, or in front of the lens.
+    """Return how deep in glass the stop's place is, up to 5 mm: 0 in air, or in front of the lens.
 
     The stop may lie wherever the paraxial chief ray crosses the axis; a pupil whose ray crosses it
     nowhere from the first vertex to the image has none, and counts as 5 mm deep.

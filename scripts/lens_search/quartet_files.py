@@ -47,6 +47,24 @@ def of_lens(lens: PlainLens) -> Array:
     return np.array([*curvatures, *gaps, distance - lead])
 
 
+def stop_of(path: Path) -> tuple[int, float] | None:
+    """Return the segment of air and the place (mm) of a file's own stop, as in `stops`.
+
+    None where the stop is no plane in air.
+    """
+    lens = read(path)
+    spheres, place = 0, 0.0
+    for number, row in enumerate(lens.rows):
+        if number == lens.stop:
+            if row.curvature or spheres % 2:
+                return None
+            return spheres // 2, place if spheres else row.gap
+        if row.curvature or row.material != "air":
+            spheres, place = spheres + 1, 0.0
+        place += row.gap
+    return None
+
+
 def write(candidate: Array, path: Path, name: str) -> None:
     """Write a candidate as a lens file whose first surface is a stop in its entrance pupil.
 

@@ -26,14 +26,17 @@ _DIAMETER = FOCAL_LENGTH / F_NUMBER
 _STEP = 1e-7
 
 
-def measure(candidate: Array, rays: PupilRays = DENSE) -> Measured | None:
+def measure(
+    candidate: Array, rays: PupilRays = DENSE, stop: tuple[int, float] | None = None
+) -> Measured | None:
     """Measure one candidate whose stop is in air; None where rays cannot be aimed at it.
 
     Args:
         candidate: the 17 variables.
         rays: of each beam, over the stop.
+        stop: segment and place of the stop; else where its paraxial image says, in front first.
     """
-    segment, place = segment_of(candidate)
+    segment, place = stop or segment_of(candidate)
     curvature, gap, image, pupil = split(candidate[None])
     beams = []
     for angle in ANGLES[:, None]:

@@ -1,6 +1,7 @@
 """A stop in air: where it stands, and the entrance pupil that it makes.
 
-Segments of air are numbered from the front: 0 is in front of the lens, 1 to 3 are its air spaces.
+Segments of air are numbered from the front: 0 is in front of the lens, 1 to 3 are its air spaces,
+4 is behind it.  Searches use the first four.
 """
 
 import numpy as np
@@ -15,8 +16,8 @@ FRONT = 60.0
 
 def room(candidates: Array, segment: Array) -> Array:
     """Return the length of each lens's segment of air, mm."""
-    gap = split(candidates)[1]
-    lengths = np.column_stack([np.full(len(candidates), FRONT), gap[:, 1::2]])
+    _, gap, image, _ = split(candidates)
+    lengths = np.column_stack([np.full(len(candidates), FRONT), gap[:, 1::2], image])
     return lengths[np.arange(len(candidates)), segment]
 
 
@@ -58,7 +59,7 @@ def segment_of(candidate: Array) -> tuple[int, float]:
         before = index
         length = gap[0, k] if k < 7 else image[0]
         place = -y / (u or 1e-300)
-        if index == 1.0 and k < 7:
+        if index == 1.0:
             near = float(np.clip(place, 0.0, length))
             best = min(best, (abs(place - near), k // 2 + 1, near))
         y = y + length * u

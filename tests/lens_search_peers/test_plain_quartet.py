@@ -165,6 +165,36 @@ def test_rays_aimed_at_the_stop_meet_its_rim(part):
     assert math.dist(map(float, other.points[lens.stop]), (x, y)) > 0.01
 
 
+def test_both_tracers_aim_at_the_same_stop(part, tmp_path):
+    """In 80 digits and in NumPy; and where the stop is in front, both measures are one."""
+    files, real, quartet = part("quartet_files"), part("real_stop"), part("quartet")
+    rays = part("plain_trace").pupil_rays(1, 3)
+    front = QUARTET.copy()
+    front[16] = -15.0
+    aimed = real.measure(front, rays)
+    assert aimed.rms == pytest.approx(quartet.measure(front[None], rays).rms, rel=1e-12)
+    row = part("stops").with_stop(np.append(QUARTET[:16], 5.0)[None], np.array([2]))[0]
+    path = tmp_path / "air.yaml"
+    files.write(row, path, "a stop in its second air space")
+    data = yaml.safe_load(path.read_text())
+    rows = list(data["surfaces"].values())[1:]
+    rows[3]["thickness"] = 5.0
+    rows.insert(4, {"type": "aperture", "semi_diameter": 9.0, "thickness": float(row[11]) - 5.0})
+    data |= {"stop": 5, "surfaces": {str(k): entry for k, entry in enumerate(rows, 1)}}
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    # As wide as the real axial beam of f/3 is there, which is what the plain tracer takes.
+    exact = part("exact_trace")
+    lens = part("plain_lens").read(path)
+    at = exact.ExactLens(lens, lens.reference)
+    rim = at.through_pupil(0.0, 0.0, 1.0).points[4][1]
+    data["surfaces"]["5"]["semi_diameter"] = float(rim)
+    del data["entrance_pupil_diameter"]
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    spots = exact.spots(part("plain_lens").read(path), rays, aimed=True)
+    found = real.measure(row, rays, files.stop_of(path))
+    assert found.rms[0] == pytest.approx([float(r) for r in spots.rms], rel=1e-9)
+
+
 def test_limits_are_seen(part):
     quartet = part("quartet")
     broken = QUARTET.copy()
@@ -230,6 +260,7 @@ def test_a_stop_in_air_makes_the_pupil_that_dolens_sees(part, tmp_path):
             data["surfaces"] = {str(k): entry for k, entry in enumerate(rows, 1)}
             path.write_text(yaml.safe_dump(data, sort_keys=False))
         assert files.candidate(path) == pytest.approx(found, rel=1e-12)
+        assert files.stop_of(path) == (segment, pytest.approx(place))
         pupil = dolens.load_lens(path, dtype=torch.float64).first_order(587.5618).entrance_pupil
         first = 0.0 if segment else place
         assert pupil.z.item() - first == pytest.approx(found[16], rel=1e-9)
