@@ -116,29 +116,59 @@ def form_numbers(
     """
     if not tolerance > 0.0:
         raise InputError(f"tolerance: must be a positive number, not {tolerance!r}")
-    count = len(merit)
     order = torch.where(torch.isnan(merit), torch.inf, merit.double()).argsort(stable=True)
     ways = [coordinates] + ([] if reversed_coordinates is None else [reversed_coordinates])
-    ranked = [way.taken(order) for way in ways]
-    numbers = torch.full((count,), -1, dtype=torch.int64)
-    waiting = torch.arange(count)
+    neighbours = [_Neighbours(way, tolerance) for way in ways]
+    numbers = torch.full((len(merit),), -1, dtype=torch.int64)
+    wanted = torch.ones_like(numbers, dtype=torch.bool)
     number = 0
-    while len(waiting):
-        first = ranked[0].taken(waiting[:1])
-        near = torch.zeros(len(waiting), dtype=torch.bool)
-        for way in ranked:
-            near[_within(way, waiting, first, tolerance)] = True
-        # A lens is its own form, even where its numbers are no numbers.
-        near[0] = True
-        numbers[order[waiting[near]]] = number
-        waiting, number = waiting[~near], number + 1
+    for best in order.tolist():
+        if not bool(wanted[best]):
+            continue
+        one = coordinates.taken([best])
+        for near in neighbours:
+            places = near.of(one, wanted)
+            numbers[places], wanted[places] = number, False
+        # A lens is of its own form, even where its numbers are no numbers.
+        numbers[best], wanted[best] = number, False
+        number += 1
     return numbers
+
+
+class _Neighbours:
+    """Finds the lenses that are near one lens.
+
+    Most lenses differ in a few numbers already: they are kept in the order of the number that
+    differs most, and those near in it are compared in the next few before all others.
+
+    Args:
+        coordinates: of all lenses.
+        tolerance: how near.
+    """
+
+    def __init__(self, coordinates: FormCoordinates, tolerance: float) -> None:
+        self.coordinates, self.tolerance = coordinates, tolerance
+        numbers = coordinates.numbers.nan_to_num()
+        columns = (numbers - numbers.mean(0)).square().sum(0).argsort(descending=True)
+        self.columns = columns[:_FEW]
+        self.few = numbers[:, self.columns].contiguous()
+        self.sorted, self.places = self.few[:, 0].sort()
+
+    def of(self, one: FormCoordinates, wanted: Tensor) -> Tensor:
+        """Return the places of the wanted lenses, (L,), that are near."""
+        own = one.numbers[0, self.columns]
+        first = int(torch.searchsorted(self.sorted, own[:1] - self.tolerance))
+        last = int(torch.searchsorted(self.sorted, own[:1] + self.tolerance, right=True))
+        places = self.places[first:last]
+        places = places[(self.few[places] - own).abs().amax(1) <= self.tolerance]
+        places = places[wanted[places]]
+        return places[form_distances(self.coordinates.taken(places), one) <= self.tolerance]
 
 
 def form_distances(coordinates: FormCoordinates, others: FormCoordinates) -> Tensor:
     """Return the distances (L,) of lenses from as many others, or from one.
 
-    It is the largest difference of a length, over the mean length of both lenses, or of an index.
+    It is the largest difference of a gap, over the mean length of both lenses, a slope or an index.
     """
     whole = 0.5 * (coordinates.whole + others.whole)
     lengths = (coordinates.lengths - others.lengths).abs().amax(1) / whole
@@ -158,22 +188,6 @@ def lens_distance(lens: Lens, other: Lens) -> float:
     if is_reversible(lens) and is_reversible(other):
         ways.append(_coordinates([lens], [True]))
     return min(float(form_distances(way, there)) for way in ways)
-
-
-def _within(
-    coordinates: FormCoordinates, rows: Tensor, one: FormCoordinates, tolerance: float
-) -> Tensor:
-    """Return which of the rows are near one lens, as places among the rows.
-
-    Most lenses differ in the first few numbers already: those are compared alone.
-    """
-    places = torch.arange(len(rows))
-    for columns in (slice(0, _FEW), slice(_FEW, None)):
-        differences = (coordinates.numbers[rows[places], columns] - one.numbers[:, columns]).abs()
-        if differences.shape[1]:
-            places = places[differences.amax(1) <= tolerance]
-    near = form_distances(coordinates.taken(rows[places]), one)
-    return places[near <= tolerance]
 
 
 def _coordinates(lenses: Sequence[Lens], turned: Sequence[bool] | None = None) -> FormCoordinates:

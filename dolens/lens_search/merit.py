@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dolens.lens_search.arrangement import Arrangement, parameter_names, template
 from dolens.lens_search.operands import paraxial_operands
-from dolens.lens_search.paraxial import numbers_of, paraxial
+from dolens.lens_search.paraxial import LensNumbers, numbers_of, paraxial
 from dolens.lens_search.search_rays import SearchRays, launched, search_rays
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.tangents import Tangents
@@ -175,6 +175,10 @@ class SearchMerit:
         f, s = self.specification.focal_length, self.arrangement.surfaces
         return torch.cat([u[:, :s] / f, -pupil[:, None] * f, u[:, s:] * f], 1)
 
+    def lens_numbers(self, u: Tensor) -> LensNumbers:
+        """Return the numbers of lenses u (L, P), with derivatives with respect to u."""
+        return numbers_of(self.arrangement, Tangents.variables(u), list(self.indices))
+
     def paraxial_of(self, u: Tensor) -> "tuple[Tensor, ...]":
         """Return power, entrance pupil, back focus and Petzval sum of lenses u (L, P), times or
         over f.
@@ -265,7 +269,7 @@ class SearchMerit:
         """Return the entrance pupil's place and the paraxial operands (L, 1 + O), their derivatives
         (L, 1 + O, P), and which operands are limits.
         """
-        numbers = numbers_of(self.arrangement, Tangents.variables(u), list(self.indices))
+        numbers = self.lens_numbers(u)
         first_order = paraxial(self.arrangement, numbers)
         operands, limits = paraxial_operands(
             self.arrangement, self.specification, numbers, first_order, radius, field, beam

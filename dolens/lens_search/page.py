@@ -4,11 +4,9 @@ It is one HTML file that needs no network; the prescriptions that it links to li
 """
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import quote
 
 from matplotlib.figure import Figure
 
@@ -16,6 +14,7 @@ from dolens.html import Child, Markup, element, joined, table
 from dolens.lens_page.inline_svg import inline_svg
 from dolens.lens_page.markup import Block, figure_html, page_html, problem_html
 from dolens.lens_page.tables import number
+from dolens.lens_search.file_table import address, file_table
 from dolens.lens_search.form_report import FormReport
 from dolens.lens_search.page_style import STYLE
 from dolens.lens_search.verification import Check
@@ -83,7 +82,7 @@ def forms_page(
             with laid_out(figure):
                 svg = inline_svg(figure, name, heading)
             blocks.append(Block(name, heading, figure_html(svg, False)))
-    blocks.append(Block("files", "Prescriptions", _files(reports, Path(folder))))
+    blocks.append(Block("files", "Prescriptions", file_table(reports, Path(folder))))
     return page_html(title, told, "", blocks, STYLE, GENERATOR)
 
 
@@ -118,7 +117,9 @@ def _card(report: FormReport, width: float, folder: Path) -> Markup:
         drawn = joined(figure_html(svg, False), bar)
     rows = [("RMS spots", _spots(report)), ("glasses", report.glasses)]
     if report.sensitivity is not None:
-        rows.append(("90 % as made", f"≤ {number(report.sensitivity.ninety_percent_um, 3)} µm"))
+        rows.append(
+            ("90 % as made", f"≤ {number(report.sensitivity.ninety_percent_um, 3, zeros=True)} µm")
+        )
     if report.starts is not None and report.designs is not None:
         starts, designs = (
             f"{count} {word}{'s' * (count != 1)}"
@@ -129,7 +130,7 @@ def _card(report: FormReport, width: float, folder: Path) -> Markup:
         rows.append(("way", ", ".join(best.history)))
     facts = (joined(element("dt", name), element("dd", value)) for name, value in rows)
     links = [
-        element("a", file.path.suffix, href=_address(file.path, folder))
+        element("a", file.path.suffix, href=address(file.path, folder))
         for file in report.files
         if file.written
     ]
@@ -264,41 +265,3 @@ def _cell(check: Check | None) -> Markup:
     # What rounding leaves of zero is zero.
     value = 0.0 if abs(check.value) < 1e-9 else check.value
     return element("span", number(value, 4), class_=kind, title=check.place or None)
-
-
-def _address(path: Path, folder: Path) -> str:
-    """Return where a file lies, seen from a page in a folder."""
-    return quote(Path(os.path.relpath(path, folder)).as_posix())
-
-
-def _files(reports: Sequence[FormReport], folder: Path) -> Markup:
-    """Return which formats hold each form, and what those say otherwise that cannot hold all."""
-    suffixes = [file.path.suffix for file in reports[0].files]
-    rows: list[list[Child]] = []
-    notes: dict[str, list[int]] = {}
-    for report in reports:
-        row: list[Child] = [report.name]
-        for file in report.files:
-            if not file.written:
-                row.append(element("span", f"{_NO} not written", class_="bad"))
-            else:
-                mark = "" if file.exact else " ≈"
-                name = f"{file.path.suffix}{mark}"
-                row.append(element("a", name, href=_address(file.path, folder)))
-            for change in file.changes:
-                notes.setdefault(f"{file.path.suffix}: {change}", []).append(report.number)
-        rows.append(row)
-    kinds = dict.fromkeys(range(len(suffixes) + 1), "words")
-    every = len(reports)
-    said = [
-        element(
-            "li", note if len(of) == every else f"{note} (form {', '.join(map(str, sorted(of)))})"
-        )
-        for note, of in notes.items()
-    ]
-    caption = "Every file was read again: it gives the same numbers to the last bit, but for ≈."
-    return joined(
-        element("div", table(("form", *suffixes), rows, column_kinds=kinds), class_="scroll"),
-        element("p", caption, class_="caption"),
-        element("ul", *said, class_="notes") if said else None,
-    )

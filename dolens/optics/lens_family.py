@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.func import jacfwd, vmap
 
-from dolens.errors import InputError
 from dolens.kernels.table import SurfaceTable
 from dolens.kernels.variable_map import IndexMap, VariableMap
 from dolens.optics.lens import Lens
-from dolens.optics.packing import pack, pack_with_variables
+from dolens.optics.packing import pack, pack_with_variables, record_values
 from dolens.optics.rays import TracedRays
 
 OUTPUTS = ("x", "y", "path_length", "l", "m", "n")
@@ -79,8 +79,8 @@ class FamilySums:
 class LensFamily:
     """Traces lenses of one structure: those of a lens whose variables take other values.
 
-    Variables are parameters that the records depend on linearly: curvatures, conics, coefficients,
-    thicknesses and the sensor's distance.  Poses of elements are not.
+    Records depend linearly on curvatures, conics, coefficients and thicknesses, and are one sum for
+    all lenses; where poses of elements vary they are packed by `torch.func.vmap`.
 
     Args:
         lens: gives the structure, and all that is no variable.  Its apertures clip rays.
@@ -89,7 +89,7 @@ class LensFamily:
         wavelengths: nm.
 
     Raises:
-        InputError: no such parameter, a surface without a kernel, or a pose among the variables.
+        InputError: no such parameter, or a surface without a kernel.
     """
 
     def __init__(self, lens: Lens, names: Sequence[str], wavelengths: Sequence[float]) -> None:
@@ -103,15 +103,15 @@ class LensFamily:
         for name, parameter in parameters.items():
             self.columns[name] = slice(first, first + parameter.numel())
             first += parameter.numel()
-        poses = [name for name in parameters if name.startswith("elements.")]
-        if poses:
-            raise InputError(
-                f"'{poses[0]}' cannot vary in a family: its records do not depend on poses linearly"
-            )
+        self._shapes = {name: parameter.shape for name, parameter in parameters.items()}
+        self._has_poses = any(name.startswith("elements.") for name in parameters)
         # At the origin, so that no lens has the rounding of another.
         leaves = {n: torch.zeros_like(p.detach()).requires_grad_() for n, p in parameters.items()}
-        system = lens.system(leaves)
-        self._table, self.map = pack_with_variables(system, self.wavelengths, list(leaves.values()))
+        with torch.enable_grad():
+            system = lens.system(leaves)
+            self._table, self.map = pack_with_variables(
+                system, self.wavelengths, list(leaves.values())
+            )
         self._codes: dict[int, Tensor] = {}
         self._start = torch.cat([p.detach().reshape(-1) for p in parameters.values()])
 
@@ -135,11 +135,28 @@ class LensFamily:
         """
         base = self._table.values
         values = values.to(base)
-        moved = values[:, self.map.columns] * self.map.weights.to(base)
-        records = base.expand(len(values), -1).clone().index_add_(1, self.map.places, moved)
+        if self._has_poses:
+            records = vmap(self._records_of)(values)
+        else:
+            moved = values[:, self.map.columns] * self.map.weights.to(base)
+            records = base.expand(len(values), -1).clone().index_add_(1, self.map.places, moved)
         if indices is None:
             indices = self._table.indices.expand(len(values), -1, -1)
         return SurfaceTable(records, indices, self._table.codes, self._table.extras)
+
+    def _records_of(self, values: Tensor) -> Tensor:
+        """Return the records (V,) of a lens with variables (P,)."""
+        parts = {n: values[s].reshape(self._shapes[n]) for n, s in self.columns.items()}
+        return record_values(self.lens.system(parts))
+
+    def _map_at(self, values: Tensor) -> tuple[VariableMap, Tensor | None]:
+        """Return the map of the variables, and its weights (L, E) where lenses have their own."""
+        if not self._has_poses:
+            return self.map, None
+        derivatives = vmap(jacfwd(self._records_of))(values.to(self._table.values)).double()
+        places, columns = (derivatives != 0.0).any(0).nonzero(as_tuple=True)
+        weights = derivatives[:, places, columns]
+        return VariableMap(places, columns, weights[0], self.count), weights
 
     def _which(self, rays: FamilyRays) -> Tensor | None:
         """Return each ray's column of the indices; None where there is but one wavelength."""
@@ -233,12 +250,14 @@ class LensFamily:
         """
         from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
 
+        own, weights = self._map_at(values)
         found = kernels.ray_jacobians(
             self.table(values, indices),
-            variables or self.map,
+            variables or own,
             outputs,
             (rays.position, rays.direction, self._which(rays)),
-            index_derivatives=index_derivatives,
+            weights,
+            index_derivatives,
         )
         return FamilyJacobian(*found)
 
@@ -272,16 +291,18 @@ class LensFamily:
         """
         from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
 
+        own, weights = self._map_at(values)
         head, jtr, jtj, sums = kernels.normal_equations(
             self.table(values, indices),
-            variables or self.map,
+            variables or own,
             outputs,
             (rays.position, rays.direction, self._which(rays)),
             target,
             weight,
             group,
             groups,
-            index_derivatives=index_derivatives,
+            weights,
+            index_derivatives,
         )
         k = len(outputs)
         return FamilySums(

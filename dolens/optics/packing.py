@@ -71,6 +71,14 @@ def pack(
     return _table(layout, system, wavelength, _values(layout, scalars, arrays))
 
 
+def record_values(system: OpticalSystem) -> Tensor:
+    """Return the numbers of a whole lens's records up to its sensor, (V,), by operations that
+    `torch.func` follows.
+    """
+    layout, scalars, arrays = _lay_out(system, 1.0, 1, len(system.surfaces), True)
+    return _values(layout, scalars, arrays)
+
+
 def pack_with_variables(
     system: OpticalSystem, wavelengths: Sequence[float], variables: Sequence[Tensor]
 ) -> tuple[SurfaceTable, VariableMap]:

@@ -6,7 +6,7 @@ and the damping ρ follows the gain ratio (Nielsen, IMM-REP-1999-05), as in `Dam
 All problems are evaluated together; those that have ended take part no longer.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -37,6 +37,15 @@ class BatchModel:
     merit: Tensor
     gradient: Tensor
     hessian: Tensor
+
+    @staticmethod
+    def joined(parts: "Sequence[BatchModel]") -> "BatchModel":
+        """Return the models of several groups of problems as one."""
+        return BatchModel(
+            torch.cat([part.merit for part in parts]),
+            torch.cat([part.gradient for part in parts]),
+            torch.cat([part.hessian for part in parts]),
+        )
 
 
 class Ended(IntEnum):

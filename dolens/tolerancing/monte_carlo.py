@@ -12,8 +12,10 @@ from torch.func import vmap
 
 from dolens.analysis.pupil_quadrature import SpotRays
 from dolens.errors import InputError
+from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
-from dolens.optics.rays import Components
+from dolens.optics.lens_family import FamilyRays, LensFamily
+from dolens.optics.rays import Components, Rays, Status
 from dolens.optics.straight import require_plane_sensor
 from dolens.optics.trace import Trace, trace_surfaces, trace_to_sensor
 from dolens.tasks import TaskMap
@@ -57,7 +59,8 @@ def trace_perturbed(
     entrance pupil stayed where it is.  A ray that an aperture of the displaced lens clips still
     counts, and is reported; a lens with a ray that fails altogether counts as failing.
 
-    The lenses are a batch of `torch.func.vmap` over the reference tracer in double precision.
+    The lenses are a `LensFamily`, which the kernels trace by one call; where they do not serve, a
+    batch of `torch.func.vmap` over the reference tracer.  Both work in double precision.
 
     Args:
         lens: as designed.
@@ -131,17 +134,40 @@ class _Moments:
     @torch.no_grad()
     def __call__(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return moments (K, 7, S), and shares of failed and vignetted rays (K,)."""
+        rays = Rays.from_components(self.ray, self.wavelength)
+        if choose_backend(self.lens.system(), rays) == "cpu":
+            return self._moments(*self._by_kernels(values, rays))
         return vmap(self._of_one)(values)
+
+    def _by_kernels(self, values: Tensor, rays: Rays) -> tuple[Components, Tensor, Tensor]:
+        """Return the rays of every lens (K, N) on its sensor, and which failed and were clipped."""
+        given = torch.as_tensor(self.wavelength, dtype=torch.float64)
+        waves, which = given.expand(self.ray.x.shape).unique(return_inverse=True)
+        family = LensFamily(self.lens, self.names, waves.tolist())
+        shape = (len(values), *rays.position.shape)
+        hit = family.trace(
+            values,
+            FamilyRays(rays.position.expand(shape), rays.direction.expand(shape), which.int()),
+        )
+        clipped = hit.status == int(Status.VIGNETTED)
+        return hit.components(), ~(hit.valid | clipped), clipped
 
     def _of_one(self, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         trace = _traced(self.lens, self.names, self.ray, self.wavelength, values)
-        pairs = zip(_intercepts(trace.ray), self.means.unbind(), strict=True)
-        x, y, u, v = (c - m for c, m in pairs)
-        sums = torch.stack([x, y, u, v, x * x + y * y, x * u + y * v, u * u + v * v]) @ self.shares
         goes_on, inside = _smallest_margins(trace)
         failed = ~(goes_on > 0.0)
-        clipped = (~(inside > 0.0) & ~failed).double()
-        return sums, failed.double().mean(), clipped @ self.weight / self.shares.shape[1]
+        return self._moments(trace.ray, failed, ~(inside > 0.0) & ~failed)
+
+    def _moments(
+        self, ray: Components, failed: Tensor, clipped: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return moments (..., 7, S) of rays (..., N), and shares (...)."""
+        pairs = zip(_intercepts(ray), self.means.unbind(), strict=True)
+        x, y, u, v = (c - m for c, m in pairs)
+        terms = [x, y, u, v, x * x + y * y, x * u + y * v, u * u + v * v]
+        sums = torch.stack(terms, -2) @ self.shares
+        lost = clipped.double() @ self.weight / self.shares.shape[1]
+        return sums, failed.double().mean(-1), lost
 
 
 def _traced(

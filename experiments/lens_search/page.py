@@ -19,7 +19,7 @@ def form_reports(finds: Finds, folder: Path) -> list[FormReport]:
     """Check the best forms of a search, and write their files to a folder."""
     required, course = Requirements.of(finds.specification), finds.course()
     return [
-        report_form(found, number, required, folder, *_counts(course, found))
+        report_form(found, number, required, folder, *starts_and_designs(course, found))
         for number, found in enumerate(finds.found, 1)
     ]
 
@@ -39,7 +39,7 @@ def write_forms_page(finds: Finds, reports: Sequence[FormReport], folder: Path, 
     )
 
 
-def _counts(course: Course, found: FoundLens) -> tuple[int, int]:
+def starts_and_designs(course: Course, found: FoundLens) -> tuple[int, int]:
     """Return how many starts and designs have the form of a found lens."""
     nearest = int((course.merits - found.merit).abs().argmin())
     same = course.forms == course.forms[nearest]

@@ -17,6 +17,7 @@ from dolens.experiments.running.configuration import checked
 from dolens.experiments.workers import workers_of
 from dolens.experiments.workers.own_threads import OwnThreads
 from dolens.experiments.workers.ray_workers import RayWorkers
+from dolens.kernels.cpu.kernel_files import cache_folder
 from dolens.stages import listening
 from dolens.tasks import TaskError, in_turn
 from dolens.tolerancing import tolerances_from, trace_perturbed
@@ -85,6 +86,7 @@ def same(one, other):
 def test_a_local_cluster_of_two(triplet_and_spots, tmp_path, monkeypatch):
     """One cluster for all that takes one: to start it takes most of the time."""
     importlib.import_module("ray")  # who imported it before has settled its mode of authentication
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache_folder()))  # that workers need not compile
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     (tmp_path / "home").mkdir()
     with workers_of(0).open() as own:

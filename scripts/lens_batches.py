@@ -1,0 +1,143 @@
+"""Times kernels over many lenses of one structure, beside one call a lens.
+
+    python scripts/lens_batches.py --seconds 1.0 --threads 1
+
+Lenses have four elements and a stop, 17 variables, and 3 × 32 rays each, in double precision.  Rows
+are measured in turn, again and again, and the least time of each counts.  The last columns are the
+difference of the sums from those of one lens at a time, and the time of one iteration of the search
+(evaluation, model and bounded step) for a lens.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from dolens.lens_search.arrangement import Arrangement
+from dolens.lens_search.merit import SearchMerit
+from dolens.lens_search.specification import Limits, Specification
+from dolens.optics.jacobian import normal_equations
+from dolens.optics.lens_family import FamilyRays
+from dolens.optics.rays import Rays
+from dolens.optimize.batch_least_squares import bounded_steps
+
+START = [
+    *(1.082, 0.344, -1.127, -0.978, 1.847, -0.787, -2.688, 0.312),
+    *(0.0419, 0.0667, 0.6548, 0.0005, 0.0005, 0.752, 0.0381, 0.02, 0.3),
+]
+
+
+def best_of(calls: dict[str, Callable[[], object]], seconds: float) -> dict[str, float]:
+    """Return the least time of each call, s, measured in turn."""
+    found = dict.fromkeys(calls, float("inf"))
+    end = time.perf_counter() + seconds * len(calls)
+    while time.perf_counter() < end:
+        for name, call in calls.items():
+            started = time.perf_counter()
+            call()
+            found[name] = min(found[name], time.perf_counter() - started)
+    return found
+
+
+def problem(count: int) -> tuple[SearchMerit, Tensor]:
+    """Return the merit of a quartet, and so many lenses near one that exists."""
+    specification = Specification(
+        focal_length=100.0,
+        f_number=3.0,
+        fields=(0.0, 10.5, 15.0),
+        wavelengths=(587.5618,),
+        groups=(1, 1, 1, 1),
+        glasses=("1.5168/64.17",),
+        limits=Limits(track=250.0),
+    )
+    merit = SearchMerit.of(Arrangement((1, 1, 1, 1), 2), specification)
+    generator = torch.Generator().manual_seed(0)
+    off = torch.randn(count, len(START), generator=generator, dtype=torch.float64)
+    return merit, torch.tensor(START, dtype=torch.float64) * (1.0 + 1e-4 * off)
+
+
+def measured(count: int, seconds: float) -> list[str]:
+    """Return a row of the table for so many lenses."""
+    merit, u = problem(count)
+    conditions = merit.full(count)
+    values = merit.lens_values(u, merit.paraxial_of(u)[1])
+    rays, tangent = merit._launched(conditions)
+    target = torch.stack([torch.zeros_like(tangent), 100.0 * tangent], -1)
+    lens = merit.family.lens
+    names = list(merit.family.columns)
+    # One lens as a user has it, with the numbers of the first.
+    with torch.no_grad():
+        for name, where in merit.family.columns.items():
+            parameter = lens.variables([name])[name]
+            parameter.copy_(values[0, where].reshape(parameter.shape))
+    alone = Rays(rays.position[0], rays.direction[0], merit.specification.wavelengths[0])
+    leaf = values.clone().requires_grad_()
+
+    def gradient() -> None:
+        torch.autograd.grad(merit.family.trace(leaf, rays).position.square().sum(), leaf)
+
+    def iteration() -> None:
+        model = merit.evaluate(u, conditions)
+        bound = torch.full_like(u, 0.1)
+        bounded_steps(model, 1e-3 * model.hessian.diagonal(dim1=1, dim2=2), -bound, bound)
+
+    found = best_of(
+        {
+            "one": lambda: normal_equations(lens, alone, names, target[0]),
+            "trace": lambda: merit.family.trace(values, rays),
+            "gradient": gradient,
+            "equations": lambda: merit.family.normal_equations(values, rays, target),
+            "iteration": iteration,
+        },
+        seconds,
+    )
+    together = merit.family.normal_equations(
+        values[:1], FamilyRays(rays.position[:1], rays.direction[:1], rays.wavelength), target[:1]
+    )
+    single = normal_equations(lens, alone, names, target[0])
+    order = torch.cat(
+        [torch.arange(p.start, p.stop) for p in (single.columns[name] for name in names)]
+    )
+    difference = (
+        together.jtj[0] - single.jtj[order][:, order]
+    ).abs().max() / single.jtj.abs().max()
+    surfaces = merit.arrangement.surfaces
+    per = found["equations"] / (count * tangent.shape[1] * surfaces * merit.family.count)
+    return [
+        f"{count}",
+        *(f"{1e6 * found[name] / count:.2f}" for name in ("trace", "gradient", "equations")),
+        f"{count / found['equations']:.3g}",
+        f"{1e9 * per:.2f}",
+        f"{found['one'] * count / found['equations']:.1f}",
+        f"{float(difference):.0e}",
+        f"{1e6 * found['iteration'] / count:.1f}",
+    ]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=1.0, help="for each figure")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--lenses", type=int, nargs="+", default=[1, 10, 100, 1000, 10_000])
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    head = (
+        "lenses",
+        *("trace, µs a lens", "with gradient", "normal equations"),
+        "lenses a second",
+        "ns a ray, surface and variable",
+        "times as fast as one call a lens",
+        "difference",
+        "iteration of the search, µs a lens",
+    )
+    print("| " + " | ".join(head) + " |")
+    print("|" + "---|" * len(head))
+    for count in arguments.lenses:
+        print("| " + " | ".join(measured(count, arguments.seconds)) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
