@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 
 from dolens.analysis.spot_diagram import spot_diagram
+from dolens.errors import InputError
 from dolens.experiments.analysis import Analysis
 from dolens.experiments.checks import check_count
 from dolens.experiments.experiment import Figures
@@ -43,6 +44,7 @@ class LensSearchModule(Analysis):
         specification: of the lens.
         plan: how much is searched.
         forms: how many of the best forms are checked and written.
+        lens: must be None.
         workers: where batches run; None: in threads of this process; else see `workers_of`.
 
     Raises:
@@ -70,7 +72,10 @@ class LensSearchModule(Analysis):
         plan: SearchPlan,
         forms: int,
         workers: int | str | None = None,
+        lens: Lens | None = None,
     ) -> None:
+        if lens is not None:
+            raise InputError("lens: a search makes its own lens; allowed: null")
         check_count("forms", forms)
         super().__init__(first_start(specification), experiment, folder)
         self.specification, self.plan, self.forms = specification, plan, forms

@@ -47,7 +47,6 @@ class RunSettings:
         InputError: a value that is not allowed.
     """
 
-    lens: DictConfig | None
     module: DictConfig
     data: DictConfig
     trainer: DictConfig
@@ -63,6 +62,7 @@ class RunSettings:
     test: bool
     ckpt_path: str | None
     objective: str | ListConfig
+    lens: DictConfig | None = None
     # Run folders of old lack it.
     state: str | None = None
 
@@ -113,7 +113,13 @@ class RunSettings:
         return DTYPES[self.lens_dtype]
 
     def prescription(self) -> dict[str, Any]:
-        """Return the lens as plain data."""
+        """Return the lens as plain data.
+
+        Raises:
+            InputError: there is none, as in a search for lenses, which makes its own.
+        """
+        if self.lens is None:
+            raise InputError("lens: is missing from the configuration")
         return OmegaConf.to_container(self.lens, resolve=True)
 
 

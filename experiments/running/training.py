@@ -1,5 +1,6 @@
 """From a composed configuration to a finished run folder."""
 
+import inspect
 import logging
 import sys
 import time
@@ -176,9 +177,12 @@ def logged_if(failing: bool) -> Iterator[None]:
 
 
 def build_module(settings: RunSettings) -> Experiment:
-    """Return the experiment with its lens; one without a prescription makes a lens of its own."""
+    """Return the experiment with its lens; a search for lenses makes its own."""
     make = instantiate(settings.module)
-    return make() if settings.lens is None else make(lens=build_lens(settings))
+    lens = inspect.signature(make).parameters.get("lens")
+    if settings.lens is None and lens is not None and lens.default is None:
+        return make()
+    return make(lens=build_lens(settings))
 
 
 def build_lens(settings: RunSettings) -> Lens:

@@ -147,6 +147,8 @@ def _spread(values: list[float]) -> str:
     known = [v for v in values if not np.isnan(v)]
     if not known:
         return ""
+    if min(known) == np.inf:
+        return "none"
     text = f"{np.median(known):.4g}"
     return text if len(known) == 1 else f"{text} [{min(known):.4g}, {max(known):.4g}]"
 

@@ -85,3 +85,9 @@ def test_a_wrong_number_is_said_in_one_line(finished):
     *_, composed = finished
     with pytest.raises(Exception, match="fields must begin with 0"):
         run(composed(*SMALL, "specification.fields=[3.0]", folder="other"))
+
+
+def test_a_lens_that_a_search_would_not_read_is_refused(finished):
+    *_, composed = finished
+    with pytest.raises(InputError, match="lens: a search makes its own lens"):
+        run(composed(*SMALL, "lens=cooke_triplet", folder="third"))
