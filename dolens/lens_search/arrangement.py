@@ -25,10 +25,12 @@ class Arrangement:
     Attributes:
         groups: elements of each cemented group.
         stop: behind how many groups the stop stands.
+        within: behind how many surfaces of the next group it stands, in glass; 0: in air.
     """
 
     groups: tuple[int, ...]
     stop: int
+    within: int = 0
 
     @cached_property
     def sequence(self) -> tuple[int, ...]:
@@ -36,11 +38,12 @@ class Arrangement:
         found: list[int] = []
         surface = 0
         for number, elements in enumerate((*self.groups, 0)):
+            end = surface + elements + (1 if number < len(self.groups) else 0)
+            own = list(range(surface, end))
             if number == self.stop:
-                found.append(STOP)
-            if number < len(self.groups):
-                found += range(surface, surface + elements + 1)
-                surface += elements + 1
+                own.insert(self.within, STOP)
+            found += own
+            surface = end
         return tuple(found)
 
     @cached_property

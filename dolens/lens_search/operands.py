@@ -59,7 +59,7 @@ def paraxial_operands(
     ]
     found.append(torch.tensor(least, dtype=torch.float64)[:, None] / f - edge)
     stop = arrangement.stop_place
-    widest = limits.air[1]
+    widest = limits.glass[1] if arrangement.within else limits.air[1]
     if widest is not None and 0 < stop < len(arrangement.sequence) - 1:
         around = Tangents.stacked([lenses.gaps[stop - 1] + lenses.gaps[stop]])
         found.append(around - widest / f)

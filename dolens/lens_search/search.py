@@ -87,8 +87,12 @@ class Step:
     iterations: int
 
 
-def start_tasks(specification: Specification, plan: SearchPlan) -> list[tuple[int, int, int]]:
-    """Return the tasks of growth: place of the stop, number of the first start, and how many."""
+# The place of the stop, the number of the first start, and how many.
+StartTask = tuple[tuple[int, int], int, int]
+
+
+def start_tasks(specification: Specification, plan: SearchPlan) -> list[StartTask]:
+    """Return the tasks of growth."""
     stops = specification.places_of_stop
     # Every place of the stop has its turn; a round of batches goes through them all.
     rounds = max(1, -(-plan.starts // (plan.batch * len(stops))))
@@ -101,12 +105,10 @@ def start_tasks(specification: Specification, plan: SearchPlan) -> list[tuple[in
     ]
 
 
-def grown_starts(
-    specification: Specification, plan: SearchPlan, task: tuple[int, int, int]
-) -> Step:
+def grown_starts(specification: Specification, plan: SearchPlan, task: StartTask) -> Step:
     """Grow one batch of starts, and finish the better ones."""
     stop, first, count = task
-    arrangement = Arrangement(specification.groups, stop)
+    arrangement = Arrangement(specification.groups, *stop)
     merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
     generator = torch.Generator().manual_seed(1_000_003 * plan.seed + first)
     starts = random_starts(merit, count, generator)
@@ -131,7 +133,7 @@ def escapes(specification: Specification, plan: SearchPlan, parents: Designs) ->
         for more in inserted(fewer.arrangement, grown.values, specification):
             if more.arrangement.groups != specification.groups:
                 continue
-            if more.arrangement.stop not in specification.places_of_stop:
+            if (more.arrangement.stop, 0) not in specification.places_of_stop:
                 continue
             of = fewer.parents[grown.starts][more.parents]
             words = f"{fewer.words}, {more.words}"
@@ -214,13 +216,14 @@ def _parents(
 ) -> list[Designs]:
     """Return the best forms of all arrangements that have not been parents yet, and note them."""
     ranked = sorted(
-        (float(merit), arrangement.stop, row, arrangement)
+        (float(merit), arrangement.stop, arrangement.within, row, arrangement)
         for arrangement, designs in pool.items()
+        if not arrangement.within  # elements around a stop in glass cannot be taken apart
         for row, merit in enumerate(designs.merit)
     )
     rows: dict[Arrangement, list[int]] = {}
     count = 0
-    for _, _, row, arrangement in ranked:
+    for _, _, _, row, arrangement in ranked:
         values = pool[arrangement].values[row]
         before = tried.get(arrangement)
         if before is not None and bool((before - values).abs().amax(-1).lt(1e-3).any()):

@@ -67,7 +67,8 @@ class Specification:
         reference_wavelength: of the focal length and of the chief rays, nm; one of `wavelengths`.
         groups: elements of each cemented group, from the front: (1, 2, 2, 1) has six elements, of
             which two pairs are cemented.
-        stops: behind how many groups the stop may stand; 0 is in front of the lens.
+        stops: behind how many groups the stop may stand, in air; 0 is in front of the lens.
+        stop_in_glass: whether it may stand within any element too, as a ring let into it.
         glasses: of each element, as a prescription names them; a single one is that of all.
         limits: what must be kept.
     """
@@ -80,6 +81,7 @@ class Specification:
     glasses: tuple[str, ...]
     stops: tuple[int, ...] = ()
     reference_wavelength: float | None = None
+    stop_in_glass: bool = False
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
@@ -122,9 +124,15 @@ class Specification:
         return self.glasses * (self.elements // len(self.glasses))
 
     @property
-    def places_of_stop(self) -> tuple[int, ...]:
-        """Return behind how many groups the stop may stand."""
-        return self.stops or tuple(range(len(self.groups) + 1))
+    def places_of_stop(self) -> tuple[tuple[int, int], ...]:
+        """Return where the stop may stand: behind so many groups, and so many surfaces of the next
+        one.
+        """
+        places = [(stop, 0) for stop in self.stops or range(len(self.groups) + 1)]
+        if self.stop_in_glass:
+            for group, elements in enumerate(self.groups):
+                places += [(group, surfaces) for surfaces in range(1, elements + 1)]
+        return tuple(places)
 
     @property
     def reference(self) -> int:

@@ -99,12 +99,12 @@ class Finds:
         form.
         """
         ranked = sorted(
-            (float(merit), arrangement.stop, row, arrangement)
+            (float(merit), arrangement.stop, arrangement.within, row, arrangement)
             for arrangement, designs in self._pool.items()
             for row, merit in enumerate(designs.merit)
         )
         lenses = []
-        for merit, _, row, arrangement in ranked[: 2 * count]:
+        for merit, _, _, row, arrangement in ranked[: 2 * count]:
             designs = self._pool[arrangement]
             lens = designed_lens(
                 arrangement, self.specification, designs.values[row], f"form {len(lenses) + 1}"

@@ -79,6 +79,7 @@ class KeptSteps:
                 {
                     "groups": list(designs.arrangement.groups),
                     "stop": designs.arrangement.stop,
+                    "within": designs.arrangement.within,
                     "values": designs.values,
                     "spots": designs.spots,
                     "violation": designs.violation,
@@ -101,7 +102,7 @@ class KeptSteps:
         self.seconds_before = max(self.seconds_before, float(plain["seconds"]))
         designs = tuple(
             Designs(
-                Arrangement(tuple(part["groups"]), part["stop"]),
+                Arrangement(tuple(part["groups"]), part["stop"], part["within"]),
                 part["values"],
                 part["spots"],
                 part["violation"],

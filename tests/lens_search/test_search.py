@@ -53,7 +53,7 @@ SMALL = SearchPlan(starts=40, batch=20, finish_rounds=3, finish_iterations=15, e
 
 def test_every_place_of_the_stop_has_starts_and_no_start_is_lost():
     tasks = start_tasks(TRIPLET, SearchPlan(starts=45, batch=10))
-    assert {stop for stop, _, _ in tasks} == {0, 1}
+    assert {stop for stop, _, _ in tasks} == {(0, 0), (1, 0)}
     assert sum(count for _, _, count in tasks) == 45
     firsts = [first for _, first, _ in tasks]
     assert firsts == sorted(set(firsts))

@@ -68,6 +68,10 @@ def test_the_sequence_has_cemented_surfaces_once_and_the_stop_in_its_air_space()
     assert found.sequence == (0, 1, 2, 3, 4, STOP, 5, 6)
     assert found.gap_media == (0, AIR, 1, 2, AIR, AIR, 3)
     assert found.variables == 7 + 7 + 1
+    # In glass, behind the first surface of the second group.
+    within = Arrangement((1, 2, 1), 1, 1)
+    assert within.sequence == (0, 1, 2, STOP, 3, 4, 5, 6)
+    assert within.gap_media == (0, AIR, 1, 1, 2, AIR, 3)
 
 
 def test_the_gradient_is_the_difference_of_the_merit(merit, conditions):
