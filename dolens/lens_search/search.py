@@ -19,7 +19,7 @@ from dolens.lens_search.growth import STAGES, Grown, Stage, finish, grow
 from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.neighbours import inserted, taken_out
 from dolens.lens_search.specification import Specification
-from dolens.lens_search.starts import random_starts
+from dolens.lens_search.starts import DRAWN, random_starts
 from dolens.tasks import TaskMap
 
 
@@ -30,6 +30,7 @@ class SearchPlan:
     Attributes:
         starts: random starts, over all places of the stop.
         batch: of one task.
+        drawn: lenses that are drawn for a start that is kept.
         stages: of growth.
         finished: share of a batch's grown lenses that are optimised to the end.
         finish_rounds: see `finish`.
@@ -47,6 +48,7 @@ class SearchPlan:
 
     starts: int = 10_000
     batch: int = 2000
+    drawn: int = DRAWN
     stages: tuple[Stage, ...] = STAGES
     finished: float = 0.5
     finish_rounds: int = 6
@@ -60,7 +62,15 @@ class SearchPlan:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stages", tuple(self.stages))
-        for name in ("starts", "batch", "finish_rounds", "finish_iterations", "rings", "arms"):
+        for name in (
+            "starts",
+            "batch",
+            "drawn",
+            "finish_rounds",
+            "finish_iterations",
+            "rings",
+            "arms",
+        ):
             if getattr(self, name) < 1:
                 raise InputError(f"plan.{name} must be 1 or more, not {getattr(self, name)}")
         for name in ("escapes", "parents"):
@@ -111,7 +121,7 @@ def grown_starts(specification: Specification, plan: SearchPlan, task: StartTask
     arrangement = Arrangement(specification.groups, *stop)
     merit = SearchMerit.of(arrangement, specification, plan.rings, plan.arms)
     generator = torch.Generator().manual_seed(1_000_003 * plan.seed + first)
-    starts = random_starts(merit, count, generator)
+    starts = random_starts(merit, count, generator, plan.drawn)
     grown = grow(merit, starts, plan.stages)
     done = _finished(merit, plan, _best(grown, plan.finished))
     history = (("start",),) * len(done.values)
@@ -182,7 +192,9 @@ def search(specification: Specification, plan: SearchPlan, map_tasks: TaskMap) -
         return
     tried: dict[Arrangement, Tensor] = {}
     for number in range(plan.escapes):
-        parents = _parents(pool, plan, tried, specification)
+        parents = _parents(pool, plan, tried)
+        if not parents:
+            return
         tasks = [part for group in parents for part in _shares(group)]
         name = f"escapes of round {number + 1}"
         for step in map_tasks(partial(escapes, specification, plan), tasks, name):
@@ -212,7 +224,6 @@ def _parents(
     pool: dict[Arrangement, Designs],
     plan: SearchPlan,
     tried: dict[Arrangement, Tensor],
-    specification: Specification,
 ) -> list[Designs]:
     """Return the best forms of all arrangements that have not been parents yet, and note them."""
     ranked = sorted(

@@ -15,21 +15,23 @@ from dolens.lens_search.merit import SearchMerit
 from dolens.lens_search.paraxial import numbers_of, paraxial
 
 # Lenses that are drawn for one that is kept.
-_DRAWN = 24
+DRAWN = 24
 # Newton's steps for the factor of the curvatures.
 _STEPS = 12
 
 
-def random_starts(merit: SearchMerit, count: int, generator: torch.Generator) -> Tensor:
+def random_starts(
+    merit: SearchMerit, count: int, generator: torch.Generator, drawn: int = DRAWN
+) -> Tensor:
     """Return variables u of up to `count` starts, (n, P), the most promising first.
 
     Args:
         merit: knows the arrangement and the specification.
         count: how many.
         generator: of the random numbers.
+        drawn: lenses that are drawn for one that is kept.
     """
-    drawn = _drawn(merit, _DRAWN * count, generator)
-    scaled = _with_focal_length(merit, drawn)
+    scaled = _with_focal_length(merit, _drawn(merit, drawn * count, generator))
     rank = _rank(merit, scaled)
     best = rank.argsort()[:count]
     return scaled[best[torch.isfinite(rank[best])]]
