@@ -11,6 +11,7 @@ from triton.runtime import interpreter
 from dolens import Rays
 from dolens.kernels import operators
 from dolens.kernels.cuda import backend as cuda
+from dolens.optics import ray_tracing
 from tests.kernels.trace_cases import (
     LENSES,
     bundle,
@@ -64,7 +65,9 @@ def triplet(root):
 def interpreted(*args, **options):
     """Trace as `backend: cpu` would, with the Triton kernels in its place."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(operators, "_backend", lambda position: cuda)
+        patch.setattr(operators, "kernels_of", lambda position: cuda)
+        # By the operator, as on a GPU.
+        patch.setattr(ray_tracing, "traces_eagerly", lambda *_: False)
         return traced(*args, backend="cpu", **options)
 
 
@@ -117,7 +120,7 @@ def test_gradients_of_the_indices_are_those_of_the_cpu_kernels(triplet):
             indices = table.indices.clone().requires_grad_()
             with pytest.MonkeyPatch.context() as patch:
                 if backend is not None:
-                    patch.setattr(operators, "_backend", lambda position: cuda)
+                    patch.setattr(operators, "kernels_of", lambda position: cuda)
                 out = operators.trace(
                     table.values.detach(), indices[:, :1] if columns is None else indices,
                     rays.position, rays.direction, columns, table.codes, table.extras,
@@ -174,7 +177,7 @@ def test_rays_of_any_strides(root):
 
 def test_no_rays_at_all(triplet):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(operators, "_backend", lambda position: cuda)
+        patch.setattr(operators, "kernels_of", lambda position: cuda)
         position = torch.zeros((0, 3), dtype=torch.float64, requires_grad=True)
         triplet.backend = "cpu"
         hit = triplet.trace(Rays(position, torch.zeros((0, 3), dtype=torch.float64), 550.0))
