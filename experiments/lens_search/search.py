@@ -99,8 +99,15 @@ class LensSearchModule(Analysis):
         with named_stage("checks of the best forms"):
             self.reports = form_reports(self.finds, self.folder / "forms")
             write_forms_page(self.finds, self.reports, self.folder, self.experiment)
-        self.lens = self.finds.found[0].lens.requires_grad_(False)
+        if not self._best.holds:
+            logger.warning("No form keeps every check with real rays: see checks.csv.")
+        self.lens = self._best.found.lens.requires_grad_(False)
         return self._numbers()
+
+    @property
+    def _best(self) -> FormReport:
+        """Return the best form that keeps every check, or the best of all where none does."""
+        return next((report for report in self.reports if report.holds), self.reports[0])
 
     def tables(self) -> dict[str, Iterable[Row]]:
         """Return `forms` and `checks`."""
@@ -114,7 +121,7 @@ class LensSearchModule(Analysis):
         return search_figures(self.finds, self.reports, self.experiment)
 
     def _numbers_of_best(self) -> dict[str, float]:
-        best = self.finds.found[0]
+        best = self._best.found
         fields = [(0.0, float(angle)) for angle in self.specification.fields]
         spots = spot_diagram(best.lens, fields, self.specification.wavelengths)
         return {

@@ -41,7 +41,7 @@ def of_lens(lens: PlainLens) -> Array:
         before = index
     wanted = [INDEX, 1.0] * 4
     found = [n for n in indices if n != 1.0]
-    if len(curvatures) != 8 or not np.allclose(found, wanted[::2], atol=2e-5):
+    if len(curvatures) != 8 or len(found) != 4 or not np.allclose(found, wanted[::2], atol=2e-5):
         raise SystemExit(f"{lens.path}: not four lenses of n = {INDEX}")
     distance, *_ = entrance_pupil(lens)
     return np.array([*curvatures, *gaps, distance - lead])
