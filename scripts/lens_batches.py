@@ -9,19 +9,23 @@ difference of the sums from those of one lens at a time, and the time of one ite
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from dolens.lens_search.arrangement import Arrangement
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.specification import Limits, Specification
 from dolens.optics.jacobian import normal_equations
 from dolens.optics.lens_family import FamilyRays
 from dolens.optics.rays import Rays
 from dolens.optimize.batch_least_squares import bounded_steps
+from scripts.search_parts import QUARTET
 
 START = [
     *(1.082, 0.344, -1.127, -0.978, 1.847, -0.787, -2.688, 0.312),
@@ -43,16 +47,7 @@ def best_of(calls: dict[str, Callable[[], object]], seconds: float) -> dict[str,
 
 def problem(count: int) -> tuple[SearchMerit, Tensor]:
     """Return the merit of a quartet, and so many lenses near one that exists."""
-    specification = Specification(
-        focal_length=100.0,
-        f_number=3.0,
-        fields=(0.0, 10.5, 15.0),
-        wavelengths=(587.5618,),
-        groups=(1, 1, 1, 1),
-        glasses=("1.5168/64.17",),
-        limits=Limits(track=250.0),
-    )
-    merit = SearchMerit.of(Arrangement((1, 1, 1, 1), 2), specification)
+    merit = SearchMerit.of(Arrangement(QUARTET.groups, 2), QUARTET)
     generator = torch.Generator().manual_seed(0)
     off = torch.randn(count, len(START), generator=generator, dtype=torch.float64)
     return merit, torch.tensor(START, dtype=torch.float64) * (1.0 + 1e-4 * off)

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from dolens.lens_search.arrangement import AIR, STOP, Arrangement
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.paraxial import numbers_of, paraxial
 from dolens.lens_search.real_pupils import stop_radii, with_real_beams
 from dolens.lens_search.specification import Specification
 from dolens.optics.lens import Lens
@@ -33,8 +32,7 @@ def designed_lens(
     """
     f = specification.focal_length
     merit = SearchMerit.of(arrangement, specification, 1, 1)
-    numbers = numbers_of(arrangement, values[None].unbind(-1), list(merit.indices))
-    found = paraxial(arrangement, numbers)
+    numbers, found = merit.first_order(values[None])
     radius = 0.5 * f / specification.f_number
     field = max(float(t) for t in merit.rays.tangent) * f
     zero = torch.zeros(1, dtype=torch.float64)

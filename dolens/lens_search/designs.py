@@ -10,7 +10,6 @@ from dolens.lens_search.arrangement import STOP, Arrangement
 from dolens.lens_search.form_coordinates import FormArrays, form_coordinates
 from dolens.lens_search.forms import TOLERANCE, form_numbers
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.paraxial import numbers_of, paraxial
 
 
 @dataclass(frozen=True)
@@ -88,8 +87,7 @@ class Designs:
     def arrays(self, merit: SearchMerit) -> FormArrays:
         """Return them as plain numbers of their sequences, for a comparison of forms."""
         a = self.arrangement
-        numbers = numbers_of(a, self.values.unbind(-1), list(merit.indices))
-        found = paraxial(a, numbers)
+        numbers, found = merit.first_order(self.values)
         radius = 0.5 / merit.specification.f_number
         field = float(merit.rays.tangent.max())
         zero = torch.zeros_like(numbers.image)

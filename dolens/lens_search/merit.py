@@ -5,14 +5,14 @@ that one is like the other.  The merit is Σ_fields ω·(RMS spot/f)² + Σ (wei
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
 
 from dolens.lens_search.arrangement import Arrangement, parameter_names, template
 from dolens.lens_search.operands import paraxial_operands
-from dolens.lens_search.paraxial import LensNumbers, numbers_of, paraxial
+from dolens.lens_search.paraxial import LensNumbers, Paraxial, numbers_of, paraxial
 from dolens.lens_search.search_rays import SearchRays, launched, search_rays
 from dolens.lens_search.specification import Specification
 from dolens.lens_search.tangents import Tangents
@@ -90,16 +90,12 @@ class SearchMerit:
 
     def sampled(self, rings: int, arms: int) -> "SearchMerit":
         """Return the same with other rays."""
-        other = replace(self, rays=search_rays(self.specification, rings, arms))
-        other.__dict__["family"] = self.family
-        return other
+        return replace(self, rays=search_rays(self.specification, rings, arms))
 
     @cached_property
     def family(self) -> LensFamily:
         """Return what the lenses share."""
-        lens = template(self.arrangement, self.specification, 2.0 * self.specification.focal_length)
-        names = parameter_names(self.arrangement)
-        return LensFamily(lens, names, self.specification.wavelengths)
+        return _family(self.arrangement, self.specification)
 
     @cached_property
     def indices(self) -> Tensor:
@@ -179,12 +175,18 @@ class SearchMerit:
         """Return the numbers of lenses u (L, P), with derivatives with respect to u."""
         return numbers_of(self.arrangement, Tangents.variables(u), list(self.indices))
 
+    def first_order(self, u: Tensor) -> tuple[LensNumbers, Paraxial]:
+        """Return the numbers of lenses u (L, P), times or over f, and what follows for paraxial
+        rays.
+        """
+        numbers = numbers_of(self.arrangement, u.unbind(-1), list(self.indices))
+        return numbers, paraxial(self.arrangement, numbers)
+
     def paraxial_of(self, u: Tensor) -> "tuple[Tensor, ...]":
         """Return power, entrance pupil, back focus and Petzval sum of lenses u (L, P), times or
         over f.
         """
-        numbers = numbers_of(self.arrangement, u.unbind(-1), list(self.indices))
-        found = paraxial(self.arrangement, numbers)
+        _, found = self.first_order(u)
         pupil = found.entrance_pupil + torch.zeros_like(found.power)
         return found.power, pupil, found.back_focus, found.petzval
 
@@ -337,3 +339,10 @@ def _in_variables(model: BatchModel, of_pupil: Tensor, f: float, surfaces: int) 
     first = _row_in_variables(model.hessian, of_pupil[:, None], f, surfaces)
     both = _row_in_variables(first.mT, of_pupil[:, None], f, surfaces)
     return BatchModel(model.merit, _row_in_variables(model.gradient, of_pupil, f, surfaces), both)
+
+
+@lru_cache(maxsize=64)
+def _family(arrangement: Arrangement, specification: Specification) -> LensFamily:
+    """Return what lenses share: one for all merits of an arrangement."""
+    lens = template(arrangement, specification, 2.0 * specification.focal_length)
+    return LensFamily(lens, parameter_names(arrangement), specification.wavelengths)

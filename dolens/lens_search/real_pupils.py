@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from dolens.lens_search.merit import Conditions, SearchMerit
-from dolens.lens_search.paraxial import numbers_of, paraxial
 from dolens.lens_search.search_rays import through_points
 from dolens.optics.lens_family import FamilyRays
 
@@ -45,8 +44,7 @@ def with_real_beams(merit: SearchMerit, u: Tensor, conditions: Conditions) -> Co
         conditions: of the lenses.
     """
     f = merit.specification.focal_length
-    numbers = numbers_of(merit.arrangement, u.unbind(-1), list(merit.indices))
-    first_order = paraxial(merit.arrangement, numbers)
+    _, first_order = merit.first_order(u)
     zero = torch.zeros(len(u), dtype=torch.float64)
     pupil = first_order.entrance_pupil + zero
     values = merit.lens_values(u, pupil)

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from dolens.lens_search.arrangement import AIR
 from dolens.lens_search.merit import SearchMerit
-from dolens.lens_search.paraxial import numbers_of, paraxial
 
 # Lenses that are drawn for one that is kept.
 DRAWN = 24
@@ -101,8 +100,7 @@ def _rank(merit: SearchMerit, lenses: Tensor) -> Tensor:
     surface at full aperture and field, and the Petzval sum.
     """
     specification = merit.specification
-    numbers = numbers_of(merit.arrangement, lenses.unbind(-1), list(merit.indices))
-    found = paraxial(merit.arrangement, numbers)
+    numbers, found = merit.first_order(lenses)
     aperture = 0.5 / specification.f_number
     field = math.tan(math.radians(specification.fields[-1]))
     strain = 4.0 * found.petzval.square()

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from dolens.errors import InputError
+from dolens.kernels.table import SurfaceTable
 from dolens.optics.backend import choose_backend
 from dolens.optics.lens import Lens
 from dolens.optics.packing import pack_with_variables
-from dolens.optics.ray_tracing import flat_rays
+from dolens.optics.ray_tracing import FlatRays, flat_rays
 from dolens.optics.rays import Rays
 from dolens.optics.reference_jacobian import reference_jacobian, reference_sums
 from dolens.optics.system import OpticalSystem
@@ -138,13 +139,12 @@ def ray_jacobian(
     if not _has_kernel(system, rays):
         values, derivatives, valid = reference_jacobian(lens, rays, parameters, outputs)
         return RayJacobian(outputs, columns, values, derivatives, valid)
-    from dolens.kernels.cpu import derivatives as kernels  # compiles when first needed
+    from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
 
     flat = flat_rays(system, rays)
     table, entries = pack_with_variables(system, flat.wavelengths, leaves)
-    valid, values, jacobian = kernels.ray_jacobian(
-        table, entries, outputs, (flat.position, flat.direction, flat.column)
-    )
+    found = kernels.ray_jacobians(_alone(table), entries, outputs, _of_one_lens(flat))
+    valid, values, jacobian = (part[0] for part in found)
     if flat.before is not None and "path_length" in outputs:
         values[outputs.index("path_length")] += torch.where(valid, flat.before, 0.0)
     return RayJacobian(
@@ -197,17 +197,19 @@ def normal_equations(
         group, groups = _checked_groups(group.to(lens.device), shape)
     system, leaves = _with_leaves(lens, parameters)
     if _has_kernel(system, rays):
-        from dolens.kernels.cpu import derivatives as kernels  # compiles when first needed
+        from dolens.kernels.cpu import lenses as kernels  # compiles when first needed
 
         flat = flat_rays(system, rays)
         table, entries = pack_with_variables(system, flat.wavelengths, leaves)
         if flat.before is not None and "path_length" in outputs:
             target = target.clone()
             target[:, outputs.index("path_length")] -= flat.before
-        rays_of_kernel = (flat.position, flat.direction, flat.column)
-        sums = kernels.normal_equations(
-            table, entries, outputs, rays_of_kernel, target, weight, group, groups
+        own = None if weight is None else weight[None]
+        found_sums = kernels.normal_equations(
+            *(_alone(table), entries, outputs, _of_one_lens(flat)),
+            *(target[None], own, group, groups),
         )
+        sums = tuple(part[0] for part in found_sums)
     else:
         sums = reference_sums(lens, rays, parameters, outputs, target, weight, group, groups)
     head, jtr, jtj, by_group = sums
@@ -224,6 +226,16 @@ def normal_equations(
             jacobian=by_group[:, 2 + k :].reshape(groups, k, len(jtr)),
         ),
     )
+
+
+def _alone(table: SurfaceTable) -> SurfaceTable:
+    """Return the table of one lens as that of many, of which there is one."""
+    return replace(table, values=table.values[None], indices=table.indices[None])
+
+
+def _of_one_lens(flat: FlatRays) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return rays as those of many lenses, of which there is one."""
+    return flat.position[None], flat.direction[None], flat.column
 
 
 def _checked_outputs(outputs: Sequence[str]) -> tuple[str, ...]:

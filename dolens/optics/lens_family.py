@@ -18,8 +18,6 @@ from dolens.optics.lens import Lens
 from dolens.optics.packing import pack, pack_with_variables, record_values
 from dolens.optics.rays import TracedRays
 
-OUTPUTS = ("x", "y", "path_length", "l", "m", "n")
-
 
 @dataclass(frozen=True)
 class FamilyRays:
@@ -243,7 +241,7 @@ class LensFamily:
         Args:
             values: (L, P).
             rays: L × N of them.
-            outputs: some of `OUTPUTS`.
+            outputs: some of `dolens.optics.jacobian.OUTPUTS`.
             indices: as in `table`.
             variables: with indices among them, see `with_indices`; None: the family's own.
             index_derivatives: (L, E, wavelengths), of the indices with respect to these.
@@ -284,7 +282,7 @@ class LensFamily:
             weight: (L, N), may be expanded; None: one.
             group: (N,), int64, from 0 to `groups` - 1.
             groups: G.
-            outputs: K of `OUTPUTS`.
+            outputs: K of `dolens.optics.jacobian.OUTPUTS`.
             indices: as in `table`.
             variables: as in `jacobians`, and the last.
             index_derivatives: of the media.

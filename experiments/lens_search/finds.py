@@ -54,11 +54,13 @@ class Finds:
         self.features: dict[int, Tensor] = {}
         self.iterations = 0
         self._pool: dict[Arrangement, Designs] = {}
+        self._course: Course | None = None
         self._all: list[tuple[Designs, float]] = []
 
     def add(self, step: Step, seconds: float) -> None:
         """Add a step that was known at a time."""
         self.iterations += step.iterations
+        self._course = None
         if len(step.features):
             self.features[step.first] = step.features
         self._all += [(designs, seconds) for designs in step.designs if len(designs.values)]
@@ -115,7 +117,12 @@ class Finds:
         self.found = [form.best for form in distinct(lenses)][:count]
 
     def course(self) -> Course:
-        """Return when each design was found, and its form."""
+        """Return when each design was found, and its form; it is worked out once for a step."""
+        if self._course is None:
+            self._course = self._whole_course()
+        return self._course
+
+    def _whole_course(self) -> Course:
         seconds, merits, starts, numbers = [], [], [], []
         first = 0
         for arrangement in self._pool:

@@ -1,7 +1,6 @@
-"""These functions run the drivers of Jacobians and of least squares on tensors."""
+"""A program of derivatives: what the drivers of Jacobians and of least squares run on."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -10,108 +9,17 @@ import torch
 from torch import Tensor
 
 from dolens.kernels.cpu import jobs
-from dolens.kernels.cpu.jacobian import jacobian_driver
 from dolens.kernels.cpu.layout import BLOCK, COTANGENT_HEADER
-from dolens.kernels.cpu.normal_equations import normal_equations_driver
 from dolens.kernels.cpu.program import Program, functions_of
 from dolens.kernels.table import Code, Slot, SurfaceTable
 from dolens.kernels.variable_map import VariableMap
 
 # Where an output lies among a state's rows, and so where its cotangent is one.
 OUTPUT_ROWS = {"x": 0, "y": 1, "l": 3, "m": 4, "n": 5, "path_length": 6}
-# Fewer rays than this are differentiated sooner than another thread is woken.
-_SMALL = 1 << 10
 # Sums are kept for this many chunks, or fewer where they would take more numbers than that.
 _CHUNKS, _NUMBERS = 64, 1 << 23
 
 RayTensors = tuple[Tensor, Tensor, Tensor | None]
-
-
-def ray_jacobian(
-    table: SurfaceTable, variables: VariableMap, outputs: Sequence[str], rays: RayTensors
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the outputs of every ray and their derivatives with respect to every variable.
-
-    Args:
-        table: the lens, up to the sensor.
-        variables: P of them.
-        outputs: K names of `OUTPUT_ROWS`.
-        rays: position (N, 3), direction (N, 3), and wavelength's column (N,), int32, or None.
-
-    Returns:
-        valid (N,), bool; outputs (K, N); derivatives (K, P, N); zero where a ray is not valid.
-    """
-    position = rays[0]
-    count, wanted = position.shape[0], len(outputs)
-    valid = torch.empty(count, dtype=torch.bool)
-    values = position.new_empty((wanted, count))
-    jacobian = position.new_empty((wanted, variables.count, count))
-    if count:
-        chunk = rays_of_a_chunk(count, 1)
-        derivatives = Derivatives(table, variables, outputs, rays, chunk, further=0)
-        derivatives.program.point(OUT_VALID=valid, OUT_VALUES=values, OUT_JACOBIAN=jacobian)
-        derivatives.program.run(jacobian_driver, -(-count // chunk), _SMALL)
-    return valid, values, jacobian
-
-
-def normal_equations(
-    table: SurfaceTable,
-    variables: VariableMap,
-    outputs: Sequence[str],
-    rays: RayTensors,
-    target: Tensor,
-    weight: Tensor | None,
-    group: Tensor | None,
-    groups: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return sums over valid rays for least squares with residuals r = output - target.
-
-    Args:
-        table: and the three that follow, as in `ray_jacobian`.
-        variables: P of them.
-        outputs: K names.
-        rays: N of them.
-        target: (N, K), of any strides, in the rays' precision.
-        weight: (N,), of any stride, in the rays' precision; None: one.
-        group: (N,), int64, contiguous, from 0 to `groups` - 1; None: no sums by group.
-        groups: G.
-
-    Returns:
-        All float64: number of rays and Σ w·r² (2,); Jᵀwr (P,); JᵀwJ (P, P); and by groups
-        (G, 2 + K + K·P): number of rays, Σ w, Σ w·r, Σ w·J.  Where products overflow in single
-        precision, everything is computed once more in double.
-    """
-    count, wanted, p = rays[0].shape[0], len(outputs), variables.count
-    by_group = 2 + wanted * (1 + p)
-    length = 2 + p + p * p + groups * by_group
-    chunk = rays_of_a_chunk(count, length)
-    chunks = -(-count // chunk)
-    sums = torch.zeros((chunks, length), dtype=torch.float64)
-    if count:
-        derivatives = Derivatives(table, variables, outputs, rays, chunk, further=p + 1 + wanted)
-        program = derivatives.program
-        program.point(SUMS=sums, TARGET=target, WEIGHT=weight, GROUP=group)
-        job = program.job
-        job[jobs.SUM_LENGTH], job[jobs.GROUPS] = length, groups
-        job[jobs.TARGET_ROW], job[jobs.TARGET_COLUMN] = target.stride()
-        job[jobs.WEIGHT_ROW] = 0 if weight is None else weight.stride(0)
-        program.run(normal_equations_driver, chunks, _SMALL)
-    if table.values.dtype == torch.float32 and not bool(torch.isfinite(sums).all()):
-        # Squares of r¹⁶ and the like overflow in single precision before they are summed.
-        position, direction, column = rays
-        return normal_equations(
-            replace(table, values=table.values.double()),
-            variables,
-            outputs,
-            (position.double(), direction.double(), column),
-            target.double(),
-            None if weight is None else weight.double(),
-            group,
-            groups,
-        )
-    head, right, square, rest = sums.sum(0).split([2, p, p * p, groups * by_group])
-    lower = square.reshape(p, p)
-    return head, right, lower + lower.tril(-1).mT, rest.reshape(groups, by_group)
 
 
 def rays_of_a_chunk(count: int, length: int) -> int:
@@ -124,10 +32,10 @@ class Derivatives:
     """A program is held together with the arrays that its job points to while it runs.
 
     Args:
-        table: as in `ray_jacobian`, and the three that follow.
+        table: the lens, up to the sensor.
         variables: P of them.
-        outputs: K names.
-        rays: N of them.
+        outputs: K names of `OUTPUT_ROWS`.
+        rays: position (N, 3), direction (N, 3), and wavelength's column (N,), int32, or None.
         chunk: rays of a chunk.
         further: rows of a block that the driver needs beside the columns.
         index_derivatives: (E, wavelengths), float64, contiguous, for `variables.indices`.

@@ -26,6 +26,9 @@ from dolens.kernels.variable_map import VariableMap
 # Fewer rays than these, of all lenses, are done sooner than another thread is woken.
 _SMALL_TRACE, _SMALL_DERIVATIVES = 1 << 13, 1 << 10
 
+# Places of addresses that the strides of their tensors follow.
+_COTANGENTS = (jobs.POSITION_COTANGENT, jobs.DIRECTION_COTANGENT, jobs.PATH_COTANGENT)
+
 RayTensors = tuple[Tensor, Tensor, Tensor | None]
 
 
@@ -111,12 +114,7 @@ def trace_adjoint(
             if tensor is not None:
                 job[place] = tensor.data_ptr()
                 by_lens[place] = tensor
-        for place, tensor in (
-            (jobs.POSITION_COTANGENT, cotangents[0]),
-            (jobs.DIRECTION_COTANGENT, cotangents[1]),
-            (jobs.PATH_COTANGENT, cotangents[2]),
-        ):
-            if tensor is not None:
+            if tensor is not None and place in _COTANGENTS:
                 job[place + 1 : place + tensor.dim()] = tensor.stride()[1:]
         run_lenses(program, adjoint_driver, lenses, chunks, by_lens, _SMALL_DERIVATIVES)
     total = sums.sum(1)

@@ -43,7 +43,7 @@ def run_lenses(
     by_lens: Mapping[int, Tensor],
     small: int,
 ) -> None:
-    """Run a driver for every lens.
+    """Run a driver for every lens; threads share lenses, or the pieces of a single one.
 
     Args:
         program: of the first lens, pointed to everything that the driver needs.
@@ -54,6 +54,9 @@ def run_lenses(
             of zero shares it.
         small: fewer rays than this, of all lenses, are traced by one thread.
     """
+    if lenses == 1:
+        program.run(driver, pieces, small)
+        return
     pairs = [(place, t.stride(0) * t.element_size()) for place, t in by_lens.items()]
     strides = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     job = program.job
